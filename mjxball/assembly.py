@@ -1,0 +1,123 @@
+"""Leader, object, ball and follower as one MuJoCo model, built with MjSpec from the typed config."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from mjxball.config import Plant
+from mjxball.physics.constants import box_inertia_per_mass
+
+ASSEMBLY = "assembly"
+LEADER = "leader"
+FOLLOWER = "follower"
+BALL = "ball"
+BALL_JOINT = "cg"
+ROTOR_AXES = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])  # plus layout
+ROTOR_SPIN = (1, -1, 1, -1)  # sign of the yaw moment of a positive force
+COLOURS = {LEADER: (0.85, 0.25, 0.2, 1.0), FOLLOWER: (0.2, 0.4, 0.85, 1.0)}
+
+
+def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
+    """Return the model's MjSpec: one free body, two welded drones, the object's mass on a slide joint along x.
+
+    The drones' centres sit at their mounts, the shell of the object is massless, and the ball carries the
+    object's whole mass with the box's inertia (design section 4). Eight `motor` actuators, in the order
+    leader 1..4, follower 1..4, take rotor forces in newtons; their gear holds the yaw moment.
+    `timestep` [s] matters only to viewers and to MuJoCo's own integrator.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = "mjxball"
+    spec.option.timestep = timestep
+    spec.option.gravity = [0.0, 0.0, -plant.gravity]
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    _add_scenery(spec)
+    body = spec.worldbody.add_body(name=ASSEMBLY, mass=0.0, explicitinertial=True, ipos=[0, 0, 0], inertia=[0, 0, 0])
+    body.add_freejoint(name="free")
+    half = np.array(plant.object_size) / 2
+    _add_visual(body, "shell", mujoco.mjtGeom.mjGEOM_BOX, half, (0.75, 0.65, 0.45, 0.35))
+    body.add_site(name="origin", pos=[0, 0, 0], size=[0.01, 0.01, 0.01])
+    _add_drone(spec, body, LEADER, plant.leader_mass, plant.leader_inertia, plant.leader_mount, plant)
+    _add_drone(spec, body, FOLLOWER, plant.follower_mass, plant.follower_inertia, plant.follower_mount, plant)
+    inertia = plant.object_mass * box_inertia_per_mass(plant.object_size)
+    ball = body.add_body(
+        name=BALL, mass=plant.object_mass, explicitinertial=True, ipos=[0, 0, 0], inertia=inertia.tolist()
+    )
+    ball.add_joint(name=BALL_JOINT, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+    _add_visual(ball, "cg", mujoco.mjtGeom.mjGEOM_SPHERE, [0.6 * half[2] + 0.01, 0, 0], (0.95, 0.75, 0.1, 1.0))
+    return spec
+
+
+def build_model(plant: Plant, timestep: float = 0.002, fuse: bool = False) -> mujoco.MjModel:
+    """Compile `build_spec`; `fuse` merges the welded drones into the assembly's body and drops what is only seen.
+
+    The fused model has the same dynamics and is what MJX steps; contact wrenches need the unfused one.
+    """
+    spec = build_spec(plant, timestep)
+    if fuse:
+        for element in [*spec.actuators, *spec.sites, *spec.geoms, *spec.lights, *spec.cameras, *spec.textures]:
+            spec.delete(element)
+        for material in [*spec.materials]:
+            spec.delete(material)
+        spec.compiler.fusestatic = True
+    return spec.compile()
+
+
+def to_mjcf(plant: Plant) -> str:
+    """The model as MJCF text, which any MuJoCo viewer opens."""
+    spec = build_spec(plant)
+    spec.compile()
+    return spec.to_xml()
+
+
+def _add_scenery(spec: mujoco.MjSpec) -> None:
+    spec.add_texture(
+        name="grid",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.32, 0.36, 0.42],
+        rgb2=[0.38, 0.42, 0.48],
+        width=256,
+        height=256,
+    )
+    material = spec.add_material(name="grid", texrepeat=[8, 8], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "grid"
+    floor = spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[4, 4, 0.1], pos=[0, 0, -1], material="grid"
+    )
+    floor.contype = floor.conaffinity = 0
+    spec.worldbody.add_light(pos=[0, -2, 4], dir=[0, 0.4, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    spec.worldbody.add_camera(name="side", pos=[0.5, -3.2, 1.0], xyaxes=[1, 0, 0, 0, 0.2, 1])
+
+
+def _add_visual(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: object, rgba: object) -> mujoco.MjsGeom:
+    geom = body.add_geom(name=name, type=kind, rgba=rgba, group=1)
+    geom.size[: len(size)] = size
+    geom.contype = geom.conaffinity = 0
+    geom.mass = 0.0
+    return geom
+
+
+def _add_drone(
+    spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, mass: float, inertia: object, mount: object, plant: Plant
+) -> None:
+    drone = parent.add_body(
+        name=name, pos=mount, mass=mass, explicitinertial=True, ipos=[0, 0, 0], inertia=list(inertia)
+    )
+    _add_visual(drone, f"{name}_hub", mujoco.mjtGeom.mjGEOM_BOX, [0.035, 0.035, 0.015], COLOURS[name])
+    for number, (axis, spin) in enumerate(zip(ROTOR_AXES, ROTOR_SPIN, strict=True), start=1):
+        place = plant.arm * axis
+        label = f"{name}_rotor{number}"
+        arm = _add_visual(drone, f"{label}_arm", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.005], COLOURS[name])
+        arm.fromto[:] = [0, 0, 0, *place]
+        disc = _add_visual(
+            drone, f"{label}_disc", mujoco.mjtGeom.mjGEOM_CYLINDER, [0.4 * plant.arm, 0.003], (0.2, 0.2, 0.2, 0.4)
+        )
+        disc.pos = [place[0], place[1], 0.015]
+        drone.add_site(name=label, pos=place, size=[0.005, 0.005, 0.005])
+        motor = spec.add_actuator(name=label, target=label, trntype=mujoco.mjtTrn.mjTRN_SITE)
+        motor.set_to_motor()
+        motor.gear[:] = [0, 0, 1, 0, 0, spin * plant.yaw_per_thrust]
+        motor.ctrllimited = True
+        motor.ctrlrange[:] = [0, plant.rotor_force_max]

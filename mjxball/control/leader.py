@@ -1,0 +1,33 @@
+"""The leader's law: PID on the object's error (paper eq. 5), then roll and pitch from the linearised dynamics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+Array = Any
+
+
+def desired_acceleration(error: Array, error_rate: Array, integral: Array, kp: Array, kd: Array, ki: Array) -> Array:
+    """kp e + kd de/dt + ki int(e) (paper eq. 5), all (..., 3) -> (..., 3) [m/s2]."""
+    return kp * error + kd * error_rate + ki * integral
+
+
+def command(acceleration: Array, yaw: Array | float, gravity: float, tilt_limit: float, vertical_limit: float) -> Array:
+    """(roll, pitch [rad], vertical acceleration [m/s2]) (..., 3) for a desired `acceleration` (..., 3).
+
+    phi = (ax sin psi - ay cos psi) / g, theta = (ax cos psi + ay sin psi) / g at the desired `yaw`
+    (the paper's equations after eq. 5; both drones fly at psi = 0), clipped to the limits.
+    """
+    xp = acceleration.__array_namespace__()
+    yaw = xp.asarray(yaw, dtype=acceleration.dtype)
+    ax, ay, az = (acceleration[..., i] for i in range(3))
+    roll = (ax * xp.sin(yaw) - ay * xp.cos(yaw)) / gravity
+    pitch = (ax * xp.cos(yaw) + ay * xp.sin(yaw)) / gravity
+    return clip_command(xp.stack([roll, pitch, az], axis=-1), tilt_limit, vertical_limit)
+
+
+def clip_command(value: Array, tilt_limit: float, vertical_limit: float) -> Array:
+    """Clip (roll, pitch, vertical acceleration) (..., 3) to +-(tilt_limit, tilt_limit, vertical_limit)."""
+    xp = value.__array_namespace__()
+    limit = xp.asarray([tilt_limit, tilt_limit, vertical_limit], dtype=value.dtype)
+    return xp.clip(value, -limit, limit)

@@ -1,0 +1,123 @@
+"""Rotations: Z-X-Y Euler angles, MuJoCo quaternions (w, x, y, z), rotation matrices body -> world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+Array = Any  # any array that implements the Python array API standard
+
+
+def rotate(matrix: Array, vector: Array) -> Array:
+    """R v for `matrix` (..., 3, 3) and `vector` (..., 3) -> (..., 3)."""
+    return (matrix * vector[..., None, :]).sum(axis=-1)
+
+
+def rotate_back(matrix: Array, vector: Array) -> Array:
+    """R^T v for `matrix` (..., 3, 3) and `vector` (..., 3) -> (..., 3)."""
+    return (matrix * vector[..., :, None]).sum(axis=-2)
+
+
+def cross(a: Array, b: Array) -> Array:
+    """a x b for (..., 3) each, broadcast -> (..., 3)."""
+    xp = a.__array_namespace__()
+    return xp.stack(
+        [
+            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
+            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
+            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
+        ],
+        axis=-1,
+    )
+
+
+def matrix_from_euler(euler: Array) -> Array:
+    """R = Rz(psi) Rx(phi) Ry(theta) from `euler` = (phi, theta, psi) (..., 3) [rad] -> (..., 3, 3).
+
+    The paper's Z-X-Y convention (design section 2).
+    """
+    xp = euler.__array_namespace__()
+    cf, ct, cp = (xp.cos(euler[..., i]) for i in range(3))
+    sf, st, sp = (xp.sin(euler[..., i]) for i in range(3))
+    rows = [
+        xp.stack([cp * ct - sp * sf * st, -sp * cf, cp * st + sp * sf * ct], axis=-1),
+        xp.stack([sp * ct + cp * sf * st, cp * cf, sp * st - cp * sf * ct], axis=-1),
+        xp.stack([-cf * st, sf, cf * ct], axis=-1),
+    ]
+    return xp.stack(rows, axis=-2)
+
+
+def euler_from_matrix(matrix: Array) -> Array:
+    """(phi, theta, psi) [rad] of `matrix` (..., 3, 3) -> (..., 3); |phi| <= pi/2, singular at its ends."""
+    xp = matrix.__array_namespace__()
+    roll = xp.asin(xp.clip(matrix[..., 2, 1], -1.0, 1.0))
+    pitch = xp.atan2(-matrix[..., 2, 0], matrix[..., 2, 2])
+    yaw = xp.atan2(-matrix[..., 0, 1], matrix[..., 1, 1])
+    return xp.stack([roll, pitch, yaw], axis=-1)
+
+
+def matrix_from_quaternion(quaternion: Array) -> Array:
+    """R of a unit `quaternion` (w, x, y, z) (..., 4) -> (..., 3, 3)."""
+    xp = quaternion.__array_namespace__()
+    w, x, y, z = (quaternion[..., i] for i in range(4))
+    rows = [
+        xp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
+        xp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
+        xp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
+    ]
+    return xp.stack(rows, axis=-2)
+
+
+def multiply_quaternions(a: Array, b: Array) -> Array:
+    """Hamilton product a b of `a`, `b` (w, x, y, z) (..., 4) -> (..., 4)."""
+    xp = a.__array_namespace__()
+    aw, ax, ay, az = (a[..., i] for i in range(4))
+    bw, bx, by, bz = (b[..., i] for i in range(4))
+    return xp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def quaternion_from_euler(euler: Array) -> Array:
+    """Unit quaternion of Rz(psi) Rx(phi) Ry(theta), `euler` = (phi, theta, psi) (..., 3) -> (..., 4)."""
+    xp = euler.__array_namespace__()
+    half = euler / 2
+    c, s = xp.cos(half), xp.sin(half)
+    zero = xp.zeros_like(c[..., 0])
+    about_z = xp.stack([c[..., 2], zero, zero, s[..., 2]], axis=-1)
+    about_x = xp.stack([c[..., 0], s[..., 0], zero, zero], axis=-1)
+    about_y = xp.stack([c[..., 1], zero, s[..., 1], zero], axis=-1)
+    return multiply_quaternions(multiply_quaternions(about_z, about_x), about_y)
+
+
+def integrate_quaternion(quaternion: Array, rotation: Array) -> Array:
+    """q exp(rotation / 2), normalised: turn `quaternion` (..., 4) by the body-axes vector `rotation` (..., 3) [rad].
+
+    The exponential's sine and cosine are Taylor sums in |rotation|^2, smooth at zero and exact to 1e-16
+    for |rotation| <= 0.5 rad, far beyond what one physics step turns.
+    """
+    xp = quaternion.__array_namespace__()
+    h2 = (rotation * rotation).sum(axis=-1, keepdims=True) / 4
+    sine = 0.5 * (1 - h2 / 6 * (1 - h2 / 20 * (1 - h2 / 42 * (1 - h2 / 72))))
+    cosine = 1 - h2 / 2 * (1 - h2 / 12 * (1 - h2 / 30 * (1 - h2 / 56 * (1 - h2 / 90))))
+    turned = multiply_quaternions(quaternion, xp.concat([cosine, sine * rotation], axis=-1))
+    return turned / xp.sqrt((turned * turned).sum(axis=-1, keepdims=True))
+
+
+def solve_symmetric(matrix: Array, vector: Array) -> Array:
+    """Solve a symmetric 3 x 3 system by its adjugate: `matrix` (..., 3, 3), `vector` (..., 3)."""
+    xp = matrix.__array_namespace__()
+    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
+    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
+    aa, ab, ac = d * f - e * e, c * e - b * f, b * e - c * d
+    bb, bc, cc = a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * aa + b * ab + c * ac
+    x, y, z = (vector[..., i] for i in range(3))
+    rows = [aa * x + ab * y + ac * z, ab * x + bb * y + bc * z, ac * x + bc * y + cc * z]
+    return xp.stack(rows, axis=-1) / determinant[..., None]
+

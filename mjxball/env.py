@@ -1,0 +1,198 @@
+"""The Brax environment: reset and step of one world; nothing but wiring of config, control and physics."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjxball.config import Config
+from mjxball.control import leader, observation, rotations
+from mjxball.physics import newton_euler
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.mjx import jax_repeat, make_acceleration
+from mjxball.physics.step import make_control_step, start_state
+from mjxball.quiet import import_brax_env
+from mjxball.rewards import paper_reward, task_reward
+
+Array = Any
+Env, State = import_brax_env()
+PHYSICS = ("mjx", "newton-euler")
+STEADY_AFTER = 8.0  # [s] of an episode, after which its error counts as steady state in the metrics
+RATE_BOUND = 50.0  # [rad/s] beyond which a world has diverged
+
+
+class World(NamedTuple):
+    """Everything that one world carries from step to step."""
+
+    plant: PlantState
+    load: Load
+    goal: Array  # (3,) of O [m]
+    integral: Array  # (3,) of the leader's error [m s]
+    memory: Array  # (m,) older observations and the last action, as the network sees them
+    action: Array  # (3,) last network action in [-1, 1]
+    steps: Array  # () control steps since the reset
+
+
+class CoupledPairEnv(Env):
+    """Two drones, one object with a moving CG: the follower acts, the leader flies its PID (design section 5).
+
+    `reset` draws goal, start, CG motion and object mass anew. `step` takes the network's action in
+    [-1, 1] (3,). An episode terminates at |e_o| > d_term or when the world diverges, and is truncated at
+    `timing.episode_steps`: `done` is 1 in both cases, `info["truncation"]` only in the second.
+    """
+
+    def __init__(self, config: Config, physics: str = "mjx"):
+        if physics not in PHYSICS:
+            raise ValueError(f"physics must be one of {PHYSICS}, not {physics!r}")
+        self.config = config
+        self._backend = physics
+        make = make_acceleration if physics == "mjx" else newton_euler.make_acceleration
+        self._control_step = make_control_step(config, make(config.plant, config.attitude), jax_repeat)
+        self._mount = jnp.asarray(config.plant.follower_mount, jnp.float32)
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the network's input."""
+        follower = self.config.follower
+        return observation.OBSERVATION_SIZE + observation.memory_size(follower.history, follower.previous_action)
+
+    @property
+    def action_size(self) -> int:
+        """Roll, pitch, vertical acceleration."""
+        return observation.ACTION_SIZE
+
+    @property
+    def backend(self) -> str:
+        """Name of the physics engine."""
+        return self._backend
+
+    @property
+    def dt(self) -> float:
+        """Control period [s]."""
+        return self.config.timing.control_period
+
+    def reset(self, rng: Array) -> State:
+        """A fresh world at rest or nearly so, drawn from `config.scenario`."""
+        scenario = self.config.scenario
+        keys = jax.random.split(rng, 8)
+
+        def symmetric(key: Array, reach: Any, shape: tuple[int, ...] = (3,)) -> Array:
+            return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) * reach
+
+        def between(key: Array, bounds: tuple[float, float]) -> Array:
+            return bounds[0] + (bounds[1] - bounds[0]) * jax.random.uniform(key)
+
+        mass = between(keys[0], scenario.object_mass)
+        nominal = jnp.full_like(mass, self.config.plant.object_mass)
+        load = Load(
+            object_mass=mass,
+            believed_mass=mass if scenario.mass_known else nominal,
+            cg_amplitude=between(keys[1], scenario.cg_amplitude),
+            cg_speed=between(keys[2], scenario.cg_speed),
+            cg_phase=between(keys[3], (0.0, 2 * jnp.pi)),
+        )
+        tilt = symmetric(keys[4], scenario.start_tilt) * jnp.array([1.0, 1.0, 0.0])
+        plant = start_state(
+            self.config,
+            position=symmetric(keys[5], scenario.start_position),
+            euler=tilt,
+            velocity=symmetric(keys[6], scenario.start_velocity),
+            believed_mass=load.believed_mass,
+        )
+        goal = symmetric(keys[7], scenario.goal_reach)
+        follower = self.config.follower
+        first = self._observe(plant, goal)
+        world = World(
+            plant=plant,
+            load=load,
+            goal=goal,
+            integral=jnp.zeros(3),
+            memory=observation.start_memory(first, follower.history, follower.previous_action),
+            action=jnp.zeros(3),
+            steps=jnp.zeros((), jnp.int32),
+        )
+        zero = jnp.zeros(())
+        metrics = {"error": zero, "steady_error": zero, "steady": zero, "diverged": zero}
+        return State(world, observation.network_input(first, world.memory), zero, zero, metrics, {"truncation": zero})
+
+    def step(self, state: State, action: Array) -> State:
+        """Apply the network's `action` (3,) in [-1, 1] for one control period."""
+        world: World = state.pipeline_state
+        follower, timing = self.config.follower, self.config.timing
+        seen = state.obs[: observation.OBSERVATION_SIZE]
+        led = self._leader_command(world)
+        followed = self._follower_command(action, seen)
+        plant = self._control_step(world.plant, jnp.stack([led, followed]), world.load)
+
+        diverged = self._diverged(plant)
+        plant = jax.tree.map(lambda new, old: jnp.where(diverged, old, new), plant, world.plant)
+        error = world.goal - plant.position
+        distance = jnp.linalg.norm(error)
+        terminated = jnp.logical_or(diverged, distance > self.config.scenario.termination_distance)
+        steps = world.steps + 1
+        truncated = jnp.logical_and(steps >= timing.episode_steps, ~terminated)
+        reward = self._reward(led, followed, plant, error, action, world.action, terminated)
+
+        moved = world._replace(
+            plant=plant,
+            integral=world.integral + timing.control_period * (world.goal - world.plant.position),
+            memory=observation.next_memory(world.memory, seen, action, follower.history, follower.previous_action),
+            action=action,
+            steps=steps,
+        )
+        steady = (plant.time > STEADY_AFTER).astype(jnp.float32)
+        return state.replace(
+            pipeline_state=moved,
+            obs=observation.network_input(self._observe(plant, world.goal), moved.memory),
+            reward=reward,
+            done=jnp.logical_or(terminated, truncated).astype(jnp.float32),
+            metrics={
+                **state.metrics,
+                "error": distance,
+                "steady_error": distance * steady,
+                "steady": steady,
+                "diverged": diverged.astype(jnp.float32),
+            },
+            info={**state.info, "truncation": truncated.astype(jnp.float32)},
+        )
+
+    def _observe(self, plant: PlantState, goal: Array) -> Array:
+        matrix = rotations.matrix_from_quaternion(plant.quaternion)
+        return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, self._mount)
+
+    def _leader_command(self, world: World) -> Array:
+        law = self.config.leader
+        gains = (jnp.asarray(gain, jnp.float32) for gain in (law.kp, law.kd, law.ki))
+        error = world.goal - world.plant.position
+        wanted = leader.desired_acceleration(error, -world.plant.velocity, world.integral, *gains)
+        return leader.command(wanted, 0.0, self.config.plant.gravity, law.tilt_limit, law.vertical_limit)
+
+    def _follower_command(self, action: Array, seen: Array) -> Array:
+        follower, law = self.config.follower, self.config.leader
+        return observation.follower_command(
+            action,
+            seen,
+            follower.action == "residual",
+            (follower.tilt_limit, follower.vertical_limit),
+            law.kp,
+            law.kd,
+            self.config.plant.gravity,
+            (law.tilt_limit, law.vertical_limit),
+        )
+
+    def _reward(
+        self, led: Array, followed: Array, plant: PlantState, error: Array, action: Array, last: Array, ended: Array
+    ) -> Array:
+        if self.config.reward.kind == "paper":
+            reward = paper_reward(led, followed)
+        else:
+            euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
+            reward = task_reward(self.config.reward, error, plant.velocity, euler, plant.rates, action, last)
+        return reward - jnp.where(ended, self.config.reward.termination, 0.0)
+
+    @staticmethod
+    def _diverged(plant: PlantState) -> Array:
+        finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in plant]))
+        return jnp.logical_or(~finite, jnp.linalg.norm(plant.rates) > RATE_BOUND)

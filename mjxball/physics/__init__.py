@@ -1,0 +1,1 @@
+"""Advance the plant one control step. Interchangeable engines give accelerations; one integrator moves the state."""

@@ -1,0 +1,47 @@
+"""Numbers that follow from the plant: inertia about O, attitude gains, hover shares. NumPy, float64."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mjxball.config import Attitude, Plant
+from mjxball.control.attitude import AttitudeGains, design_gains
+
+
+class PlantConstants(NamedTuple):
+    """Derived constants of one plant."""
+
+    drone_mass: np.ndarray  # (2,) leader, follower [kg]
+    mounts: np.ndarray  # (2, 3) leader, follower from O, body axes [m]
+    share: np.ndarray  # (2,) share of the object's weight that each drone carries with the CG at O
+    gains: AttitudeGains  # attitude gains of each drone
+    box_inertia_per_mass: np.ndarray  # (3,) principal inertia of the object about its own centre, per kg [m2]
+    drone_inertia: np.ndarray  # (3, 3) inertia of both drones about O, body axes [kg m2]
+
+
+def box_inertia_per_mass(size: tuple[float, float, float]) -> np.ndarray:
+    """Principal inertia (3,) [m2] of a uniform box with edges `size` [m], about its centre, per unit mass."""
+    a, b, c = size
+    return np.array([b * b + c * c, a * a + c * c, a * a + b * b]) / 12
+
+
+def point_inertia(position: np.ndarray) -> np.ndarray:
+    """Inertia (3, 3) [m2] about the origin of a unit point mass at `position` (3,) [m]."""
+    return float(position @ position) * np.eye(3) - np.outer(position, position)
+
+
+def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
+    """Derive the constants of `plant`; the attitude gains are those of `attitude.design_object_mass` at c = 0."""
+    mass = np.array([plant.leader_mass, plant.follower_mass])
+    mounts = np.array([plant.leader_mount, plant.follower_mount])
+    own = np.diag(plant.leader_inertia) + np.diag(plant.follower_inertia)
+    drone_inertia = own + sum(m * point_inertia(r) for m, r in zip(mass, mounts, strict=True))
+    box = box_inertia_per_mass(plant.object_size)
+    design_inertia = np.diag(drone_inertia) + attitude.design_object_mass * box
+    ahead, behind = mounts[0, 0], mounts[1, 0]
+    share = np.array([-behind, ahead]) / (ahead - behind)
+    gains = design_gains(design_inertia, attitude.natural_frequency, attitude.damping)
+    gains = AttitudeGains(tuple(map(float, gains.kp)), tuple(map(float, gains.kd)))
+    return PlantConstants(mass, mounts, share, gains, box, drone_inertia)

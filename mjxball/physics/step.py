@@ -1,0 +1,121 @@
+"""One control step of the plant: attitude loops, rotor lag and the integrator, the same for every engine."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from mjxball.config import Config
+from mjxball.control import attitude, mixer, rotations
+from mjxball.physics import motion
+from mjxball.physics.constants import plant_constants
+from mjxball.physics.engine import Acceleration, Load, PlantState, Wrench
+
+Array = Any
+# control_step(state, commands (..., 2, 3) of leader and follower, load) -> state one control period later
+ControlStep = Callable[[PlantState, Array, Load], PlantState]
+# repeat(body, count, value): apply `body` to `value` `count` times
+Repeat = Callable[[Callable[[PlantState], PlantState], int, PlantState], PlantState]
+
+
+def python_repeat(body: Callable[[PlantState], PlantState], count: int, value: PlantState) -> PlantState:
+    """Apply `body` `count` times in a Python loop."""
+    for _ in range(count):
+        value = body(value)
+    return value
+
+
+def make_control_step(config: Config, acceleration: Acceleration, repeat: Repeat = python_repeat) -> ControlStep:
+    """Return the function that advances the plant one control period with commands held.
+
+    Each physics step samples the attitude loop, moves the rotors' first-order lag exactly (its mean force
+    acts over the step), and integrates drift-kick-drift: half a step of motion, the accelerations there,
+    the velocities, half a step of motion. Second order in the step, one evaluation of `acceleration`.
+    """
+    plant = config.plant
+    constants = plant_constants(plant, config.attitude)
+    h = config.physics_step
+    keep = math.exp(-h / plant.rotor_lag)  # share of the old rotor force left after a step
+    mean = plant.rotor_lag / h * (1 - keep)  # its mean share over the step
+
+    def physics_step(state: PlantState, commands: Array, load: Load) -> PlantState:
+        xp = commands.__array_namespace__()
+        target = rotor_targets(config, constants, state, commands, load.believed_mass)
+        acting = target + mean * (state.rotor_force - target)
+        wrench = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust)
+        middle = _drift(state, h / 2)
+        cg = motion.sine(middle.time, load.cg_amplitude, load.cg_speed, load.cg_phase)
+        linear, angular = acceleration(middle, wrench, load.object_mass, cg)
+        kicked = middle._replace(
+            velocity=state.velocity + h * linear,
+            rates=state.rates + h * angular,
+            rotor_force=target + keep * (state.rotor_force - target),
+        )
+        return _drift(kicked, h / 2)
+
+    def control_step(state: PlantState, commands: Array, load: Load) -> PlantState:
+        return repeat(lambda s: physics_step(s, commands, load), config.timing.physics_steps, state)
+
+    return control_step
+
+
+def rotor_targets(config: Config, constants: Any, state: PlantState, commands: Array, believed_mass: Array) -> Array:
+    """Rotor forces (..., 2, 4) [N] that both attitude loops ask for at `commands` (..., 2, 3)."""
+    xp = commands.__array_namespace__()
+    plant = config.plant
+    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
+    own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
+    return attitude.rotor_commands(
+        commands,
+        euler[..., None, :],
+        state.rates[..., None, :],
+        own + share * believed_mass[..., None],
+        constants.gains,
+        plant.gravity,
+        plant.arm,
+        plant.yaw_per_thrust,
+        plant.rotor_force_max,
+    )
+
+
+def total_wrench(xp: Any, rotor_force: Array, mounts: Array, arm: float, yaw_per_thrust: float) -> Wrench:
+    """Wrench about O of all rotors, `rotor_force` (..., 2, 4) [N], drones at `mounts` (2, 3) [m]."""
+    drones = mixer.wrench_from_rotors(rotor_force, arm, yaw_per_thrust)  # (..., 2, 4)
+    thrust = drones[..., 0]
+    zero = xp.zeros_like(thrust[..., 0])
+    lever_x, lever_y = (xp.asarray(mounts[:, i], dtype=rotor_force.dtype) for i in (0, 1))
+    torque = drones[..., 1:].sum(axis=-2) + xp.stack(
+        [(lever_y * thrust).sum(axis=-1), -(lever_x * thrust).sum(axis=-1), zero], axis=-1
+    )
+    return Wrench(xp.stack([zero, zero, thrust.sum(axis=-1)], axis=-1), torque)
+
+
+def hover_rotor_force(config: Config, believed_mass: Array) -> Array:
+    """Rotor forces (..., 2, 4) [N] that hover the believed object mass (...) [kg] with the CG at O."""
+    xp = believed_mass.__array_namespace__()
+    constants = plant_constants(config.plant, config.attitude)
+    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (constants.drone_mass, constants.share))
+    per_rotor = (own + share * believed_mass[..., None]) * config.plant.gravity / 4
+    return xp.stack([per_rotor] * 4, axis=-1)
+
+
+def start_state(config: Config, position: Array, euler: Array, velocity: Array, believed_mass: Array) -> PlantState:
+    """State at time 0 with the rotors at the believed hover thrust; `position`, `euler`, `velocity` (..., 3)."""
+    xp = position.__array_namespace__()
+    return PlantState(
+        position=position,
+        quaternion=rotations.quaternion_from_euler(euler),
+        velocity=velocity,
+        rates=xp.zeros_like(velocity),
+        rotor_force=hover_rotor_force(config, believed_mass),
+        time=xp.zeros_like(position[..., 0]),
+    )
+
+
+def _drift(state: PlantState, h: float) -> PlantState:
+    return state._replace(
+        position=state.position + h * state.velocity,
+        quaternion=rotations.integrate_quaternion(state.quaternion, h * state.rates),
+        time=state.time + h,
+    )
