@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import io
 from types import ModuleType
+from typing import NamedTuple
 
 
 def import_mjx() -> ModuleType:
@@ -19,3 +20,30 @@ def import_brax_env() -> tuple[type, type]:
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         base = importlib.import_module("brax.envs.base")
     return base.Env, base.State
+
+
+class BraxTraining(NamedTuple):
+    """The parts of Brax's training library that work on current JAX."""
+
+    networks: ModuleType
+    sac_networks: ModuleType
+    losses: ModuleType
+    running_statistics: ModuleType
+    specs: ModuleType
+    distribution: ModuleType
+    types: ModuleType
+
+
+def import_brax_training() -> BraxTraining:
+    """Return Brax's networks, SAC losses, running statistics and types, imported silently."""
+    names = (
+        "brax.training.networks",
+        "brax.training.agents.sac.networks",
+        "brax.training.agents.sac.losses",
+        "brax.training.acme.running_statistics",
+        "brax.training.acme.specs",
+        "brax.training.distribution",
+        "brax.training.types",
+    )
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        return BraxTraining(*map(importlib.import_module, names))

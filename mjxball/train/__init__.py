@@ -1,0 +1,1 @@
+"""Training: soft actor-critic on Brax's networks, losses and running statistics, in one compiled program."""

@@ -1,0 +1,179 @@
+"""The training program: collect, record and update in one compiled function that also prefills and evaluates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.env import CoupledPairEnv
+from mjxball.quiet import import_brax_training
+from mjxball.train import replay, sac
+
+Array = Any
+statistics = import_brax_training().running_statistics
+
+
+class Mode(NamedTuple):
+    """What a call of `Program.advance` does; all traced, so that one executable serves every phase."""
+
+    steps: Array  # steps of all worlds
+    updates: Array  # gradient updates after each step
+    random: Array  # act uniformly at random
+    deterministic: Array  # act with the averaged policy's mean
+    record: Array  # write transitions to the replay and update the normaliser
+
+
+def prefill(steps: int) -> Mode:
+    """Random actions, recorded."""
+    return _mode(steps, 0, random=True, deterministic=False, record=True)
+
+
+def train(steps: int, updates: int) -> Mode:
+    """Sampled actions, recorded, with updates."""
+    return _mode(steps, updates, random=False, deterministic=False, record=True)
+
+
+def evaluate(steps: int) -> Mode:
+    """The averaged policy's mean; nothing is recorded or learnt."""
+    return _mode(steps, 0, random=False, deterministic=True, record=False)
+
+
+def _mode(steps: int, updates: int, random: bool, deterministic: bool, record: bool) -> Mode:
+    flags = (jnp.asarray(flag) for flag in (random, deterministic, record))
+    return Mode(jnp.asarray(steps, jnp.int32), jnp.asarray(updates, jnp.int32), *flags)
+
+
+class TrainState(NamedTuple):
+    """Everything needed to continue a run exactly."""
+
+    learner: sac.Learner
+    replay: replay.Replay
+    worlds: Any  # brax State of all worlds
+    key: Array
+    steps: Array  # () environment steps recorded
+
+
+class Tally(NamedTuple):
+    """Sums over the steps of one call of `Program.advance`."""
+
+    reward: Array  # mean reward per step, summed over steps
+    steady_error: Array  # |e_o| summed over worlds and steps in steady state [m]
+    steady: Array  # their number
+    peak: Array  # (worlds,) largest |e_o| in steady state [m]
+    ended: Array  # episodes terminated
+    diverged: Array  # worlds that diverged
+    losses: sac.Losses  # of the last update
+
+
+class Program:
+    """`create(key)` makes the state, `advance(state, mode)` moves it on; both jittable and vmappable.
+
+    `overrides` maps config paths to values, arrays included, so that a population can differ in them.
+    """
+
+    def __init__(self, config: Config, physics: str, overrides: Mapping[str, Any] | None = None):
+        for path, value in (overrides or {}).items():
+            config = configs.replace(config, path, value)
+        self.config = config
+        self.env = CoupledPairEnv(config, physics)
+        self.sizes = (self.env.observation_size, self.env.action_size)
+        self.networks = sac.make_networks(config.sac, *self.sizes)
+        self._update = sac.make_update(self.networks, config.sac, self.sizes[1])
+        self._reset, self._step = jax.vmap(self.env.reset), jax.vmap(self.env.step)
+
+    def create(self, key: Array) -> TrainState:
+        """A fresh training state; the worlds' episodes are staggered so that they do not end together."""
+        learner_key, world_key, stagger_key, key = jax.random.split(key, 4)
+        limits = self.config.sac
+        worlds = self.fresh_worlds(world_key)
+        spread = jax.random.randint(stagger_key, (limits.worlds,), 0, self.config.timing.episode_steps)
+        worlds = worlds.replace(pipeline_state=worlds.pipeline_state._replace(steps=spread))
+        return TrainState(
+            learner=sac.create(self.networks, limits, self.sizes[0], learner_key),
+            replay=replay.create(limits.replay, limits.worlds, *self.sizes),
+            worlds=worlds,
+            key=key,
+            steps=jnp.zeros((), jnp.int32),
+        )
+
+    def fresh_worlds(self, key: Array) -> Any:
+        """All worlds, newly reset."""
+        return self._reset(jax.random.split(key, self.config.sac.worlds))
+
+    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
+        """Step all worlds `mode.steps` times, with `mode.updates` gradient updates after each."""
+        zero = jnp.zeros(())
+        tally = Tally(
+            zero, zero, zero, jnp.zeros(self.config.sac.worlds), zero, zero, sac.Losses(zero, zero, zero)
+        )
+
+        def body(_: Array, carry: tuple[TrainState, Tally]) -> tuple[TrainState, Tally]:
+            state, tally = self._collect(*carry, mode)
+            return self._learn(state, tally, mode)
+
+        return jax.lax.fori_loop(0, mode.steps, body, (state, tally))
+
+    def _act(self, learner: sac.Learner, seen: Array, key: Array, mode: Mode) -> Array:
+        sample_key, random_key = jax.random.split(key)
+        policy = jax.tree.map(
+            lambda mean, new: jnp.where(mode.deterministic, mean, new), learner.average, learner.policy
+        )
+        parameters = self.networks.policy_network.apply(learner.normaliser, policy, seen)
+        distribution = self.networks.parametric_action_distribution
+        sampled = distribution.sample(parameters, sample_key)
+        uniform = jax.random.uniform(random_key, sampled.shape, minval=-1.0, maxval=1.0)
+        chosen = jnp.where(mode.random, uniform, sampled)
+        return jnp.where(mode.deterministic, distribution.mode(parameters), chosen)
+
+    def _collect(self, state: TrainState, tally: Tally, mode: Mode) -> tuple[TrainState, Tally]:
+        act_key, reset_key, key = jax.random.split(state.key, 3)
+        worlds = state.worlds
+        action = self._act(state.learner, worlds.obs, act_key, mode)
+        after = self._step(worlds, action)
+        terminated = after.done * (1 - after.info["truncation"])
+        transitions = replay.Transitions(worlds.obs, action, after.reward, 1 - terminated, after.obs)
+        fresh = self.fresh_worlds(reset_key)
+
+        def reset_if_done(new: Array, old: Array) -> Array:
+            done = after.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
+            return jnp.where(done, new, old)
+
+        normaliser = statistics.update(state.learner.normaliser, worlds.obs)
+        normaliser = jax.tree.map(
+            lambda new, old: jnp.where(mode.record, new, old), normaliser, state.learner.normaliser
+        )
+        metrics = after.metrics
+        moved = TrainState(
+            learner=state.learner._replace(normaliser=normaliser),
+            replay=replay.insert(state.replay, transitions, mode.record),
+            worlds=jax.tree.map(reset_if_done, fresh, after),
+            key=key,
+            steps=state.steps + jnp.where(mode.record, self.config.sac.worlds, 0),
+        )
+        return moved, tally._replace(
+            reward=tally.reward + after.reward.mean(),
+            steady_error=tally.steady_error + metrics["steady_error"].sum(),
+            steady=tally.steady + metrics["steady"].sum(),
+            peak=jnp.maximum(tally.peak, metrics["steady_error"]),
+            ended=tally.ended + terminated.sum(),
+            diverged=tally.diverged + metrics["diverged"].sum(),
+        )
+
+    def _learn(self, state: TrainState, tally: Tally, mode: Mode) -> tuple[TrainState, Tally]:
+        limits = self.config.sac
+        progress = jnp.minimum(state.steps / limits.steps, 1.0)
+        rate = 1.0 + (limits.learning_rate_end - 1.0) * progress
+        keys = jax.random.split(state.key)
+
+        def update(number: Array, carry: tuple[sac.Learner, sac.Losses]) -> tuple[sac.Learner, sac.Losses]:
+            sample_key, update_key = jax.random.split(jax.random.fold_in(keys[1], number))
+            batch = replay.sample(state.replay, sample_key, limits.batch, limits.worlds, *self.sizes)
+            return self._update(carry[0], batch, update_key, rate)
+
+        learner, losses = jax.lax.fori_loop(0, mode.updates, update, (state.learner, tally.losses))
+        return state._replace(learner=learner, key=keys[0]), tally._replace(losses=losses)
