@@ -99,6 +99,9 @@ class Follower:
     tilt_limit: float = setting(0.2, "reach of the network's roll and pitch action [rad]", above=0, high=1.2)
     vertical_limit: float = setting(2.0, "reach of the network's vertical action [m/s2]", above=0)
     history: int = setting(1, "observations that the network sees, the newest included", low=1, high=100)
+    ignore_position: bool = setting(
+        True, "the network's input omits the absolute position: the dynamics do not depend on it"
+    )
     previous_action: bool = setting(False, "the network also sees its last action, scaled to [-1, 1]")
 
 
@@ -157,6 +160,7 @@ class Sac:
     learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", above=0)
     alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
+    return_steps: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
     target_rate: float = setting(0.02, "tau of the target critics", above=0, high=1)
     alpha: float = setting(0.02, "temperature at the start", above=0)
     alpha_fixed: bool = setting(False, "keep the temperature at its start")
@@ -350,11 +354,12 @@ def config_hash(config: Any) -> str:
 def _paper() -> Config:
     return Config(
         preset="paper",
-        follower=Follower(action="direct", tilt_limit=0.6, vertical_limit=6.0),
+        follower=Follower(action="direct", tilt_limit=0.6, vertical_limit=6.0, ignore_position=False),
         reward=Reward(kind="paper", termination=0.0),
         sac=Sac(
             steps=1_000_000,
             worlds=16,
+            replay=1_000_000,
             batch=256,
             updates=16,
             prefill=10_000,
@@ -379,6 +384,15 @@ def _transport() -> Config:
             object_mass=(0.1, 0.3),
             start_velocity=0.2,
             start_tilt=0.05,
+        ),
+        reward=Reward(error_scale=0.05),
+        sac=Sac(
+            steps=768_000,
+            replay=768_000,
+            discount=0.97,
+            return_steps=5,
+            learning_rate=2e-3,
+            learning_rate_end=0.02,
         ),
     )
 

@@ -59,6 +59,12 @@ class CoupledPairEnv(Env):
         return observation.OBSERVATION_SIZE + observation.memory_size(follower.history, follower.previous_action)
 
     @property
+    def input_mask(self) -> list[float]:
+        """1 for each number of the observation that the networks use, else 0."""
+        follower = self.config.follower
+        return observation.input_mask(follower.history, follower.previous_action, follower.ignore_position)
+
+    @property
     def action_size(self) -> int:
         """Roll, pitch, vertical acceleration."""
         return observation.ACTION_SIZE

@@ -60,6 +60,12 @@ def memory_size(history: int, previous_action: bool) -> int:
     return (history - 1) * OBSERVATION_SIZE + (ACTION_SIZE if previous_action else 0)
 
 
+def input_mask(history: int, previous_action: bool, ignore_position: bool) -> list[float]:
+    """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
+    one = [0.0 if ignore_position else 1.0] * 3 + [1.0] * (OBSERVATION_SIZE - 3)
+    return one * history + [1.0] * (memory_size(1, previous_action))
+
+
 def start_memory(observation: Array, history: int, previous_action: bool) -> Array:
     """Memory (..., m) at the start of an episode: the first observation repeated, and a zero action."""
     xp = observation.__array_namespace__()

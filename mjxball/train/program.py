@@ -82,7 +82,7 @@ class Program:
         self.config = config
         self.env = CoupledPairEnv(config, physics)
         self.sizes = (self.env.observation_size, self.env.action_size)
-        self.networks = sac.make_networks(config.sac, *self.sizes)
+        self.networks = sac.make_networks(config.sac, self.env.input_mask, self.sizes[1])
         self._update = sac.make_update(self.networks, config.sac, self.sizes[1])
         self._reset, self._step = jax.vmap(self.env.reset), jax.vmap(self.env.step)
 
@@ -136,7 +136,7 @@ class Program:
         action = self._act(state.learner, worlds.obs, act_key, mode)
         after = self._step(worlds, action)
         terminated = after.done * (1 - after.info["truncation"])
-        transitions = replay.Transitions(worlds.obs, action, after.reward, 1 - terminated, after.obs)
+        transitions = replay.Transitions(worlds.obs, action, after.reward, 1 - terminated, after.obs, after.done)
         fresh = self.fresh_worlds(reset_key)
 
         def reset_if_done(new: Array, old: Array) -> Array:
@@ -164,6 +164,11 @@ class Program:
             diverged=tally.diverged + metrics["diverged"].sum(),
         )
 
+    def _sample(self, buffer: replay.Replay, key: Array) -> replay.Transitions:
+        limits = self.config.sac
+        steps, discount = limits.return_steps, limits.discount
+        return replay.sample(buffer, key, limits.batch, limits.worlds, *self.sizes, steps, discount)
+
     def _learn(self, state: TrainState, tally: Tally, mode: Mode) -> tuple[TrainState, Tally]:
         limits = self.config.sac
         progress = jnp.minimum(state.steps / limits.steps, 1.0)
@@ -172,7 +177,7 @@ class Program:
 
         def update(number: Array, carry: tuple[sac.Learner, sac.Losses]) -> tuple[sac.Learner, sac.Losses]:
             sample_key, update_key = jax.random.split(jax.random.fold_in(keys[1], number))
-            batch = replay.sample(state.replay, sample_key, limits.batch, limits.worlds, *self.sizes)
+            batch = self._sample(state.replay, sample_key)
             return self._update(carry[0], batch, update_key, rate)
 
         learner, losses = jax.lax.fori_loop(0, mode.updates, update, (state.learner, tally.losses))

@@ -11,40 +11,33 @@ Array = Any
 
 
 class Transitions(NamedTuple):
-    """A batch of transitions. `discount` is 0 after a termination, 1 otherwise (a time limit is no end)."""
+    """A batch of transitions. `discount` is 0 after a termination (a time limit is none), else gamma^(n-1)."""
 
     observation: Array  # (..., n)
     action: Array  # (..., 3) in [-1, 1]
     reward: Array  # (...)
     discount: Array  # (...)
     next_observation: Array  # (..., n), the true one, before any reset
+    last: Array  # (...) 1 if the episode ended here, by termination or time limit
 
 
 class Replay(NamedTuple):
     """`rows` holds the capacity and, behind it, one step of scratch rows for steps that are not recorded."""
 
-    rows: Array  # (capacity + worlds, 2 n + 5)
-    inserted: Array  # () transitions ever recorded
+    rows: Array  # (capacity + worlds, 2 n + 6)
+    inserted: Array  # () transitions ever recorded, folded at twice the capacity
 
 
 def create(capacity: int, worlds: int, observation_size: int, action_size: int) -> Replay:
     """An empty buffer; `capacity` must be a multiple of `worlds`."""
-    width = 2 * observation_size + action_size + 2
+    width = 2 * observation_size + action_size + 3
     return Replay(jnp.zeros((capacity + worlds, width), jnp.float32), jnp.zeros((), jnp.int32))
 
 
 def insert(replay: Replay, transitions: Transitions, record: Array) -> Replay:
     """Write one step of all worlds (worlds, ...) over the oldest rows, or to scratch unless `record`."""
-    rows = jnp.concatenate(
-        [
-            transitions.observation,
-            transitions.action,
-            transitions.reward[:, None],
-            transitions.discount[:, None],
-            transitions.next_observation,
-        ],
-        axis=-1,
-    )
+    columns = [column if column.ndim == 2 else column[:, None] for column in transitions]
+    rows = jnp.concatenate(columns, axis=-1)
     worlds = rows.shape[0]
     capacity = replay.rows.shape[0] - worlds
     slot = jnp.where(record, replay.inserted % capacity, capacity)
@@ -54,16 +47,56 @@ def insert(replay: Replay, transitions: Transitions, record: Array) -> Replay:
     return Replay(jax.lax.dynamic_update_slice_in_dim(replay.rows, rows, slot, axis=0), count)
 
 
-def sample(replay: Replay, key: Array, batch: int, worlds: int, observation_size: int, action_size: int) -> Transitions:
-    """Draw `batch` transitions uniformly, with replacement, from those recorded."""
+def sample(
+    replay: Replay,
+    key: Array,
+    batch: int,
+    worlds: int,
+    observation_size: int,
+    action_size: int,
+    steps: int,
+    discount: Array | float,
+) -> Transitions:
+    """Draw `batch` transitions of up to `steps` steps, uniformly with replacement from those recorded.
+
+    Rewards are summed with `discount` (gamma) until `steps` or the episode's end, whichever comes first.
+    The buffer must hold at least `steps` steps of all worlds.
+    """
     capacity = replay.rows.shape[0] - worlds
-    index = jax.random.randint(key, (batch,), 0, jnp.maximum(jnp.minimum(replay.inserted, capacity), 1))
-    rows = replay.rows[index]
+    size = jnp.minimum(replay.inserted, capacity)
+    oldest = jnp.where(replay.inserted < capacity, 0, replay.inserted)
+    age = jax.random.randint(key, (batch,), 0, jnp.maximum(size - (steps - 1) * worlds, 1))
+    first = oldest + age
+    rows = _unpack(replay.rows[first % capacity], observation_size, action_size)
+    reward, factor, last, bootstrap = rows.reward, jnp.ones(batch), rows.last, rows
+    for step in range(1, steps):
+        rows_k = _unpack(replay.rows[(first + step * worlds) % capacity], observation_size, action_size)
+        going = last == 0
+        factor = jnp.where(going, factor * discount, factor)
+        reward = reward + jnp.where(going, factor * rows_k.reward, 0.0)
+        bootstrap = jax.tree.map(
+            lambda new, old, going=going: jnp.where(going.reshape((-1,) + (1,) * (new.ndim - 1)), new, old),
+            rows_k,
+            bootstrap,
+        )
+        last = jnp.where(going, rows_k.last, last)
+    return Transitions(
+        observation=rows.observation,
+        action=rows.action,
+        reward=reward,
+        discount=factor * bootstrap.discount,
+        next_observation=bootstrap.next_observation,
+        last=last,
+    )
+
+
+def _unpack(rows: Array, observation_size: int, action_size: int) -> Transitions:
     n, a = observation_size, action_size
     return Transitions(
         observation=rows[:, :n],
         action=rows[:, n : n + a],
         reward=rows[:, n + a],
         discount=rows[:, n + a + 1],
-        next_observation=rows[:, n + a + 2 :],
+        next_observation=rows[:, n + a + 2 : 2 * n + a + 2],
+        last=rows[:, 2 * n + a + 2],
     )

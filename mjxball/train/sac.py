@@ -40,10 +40,17 @@ class Losses(NamedTuple):
     entropy: Array  # of the policy [nat], in [-1, 1] action units
 
 
-def make_networks(config: Sac, observation_size: int, action_size: int) -> Any:
-    """Brax's SAC networks: tanh-squashed Gaussian policy and twin critics, ReLU, on normalised observations."""
+def make_networks(config: Sac, mask: Any, action_size: int) -> Any:
+    """Brax's SAC networks: tanh-squashed Gaussian policy and twin critics, ReLU, on normalised observations.
+
+    `mask` (n,) of 0 and 1 hides slots of the observation from all networks.
+    """
     distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
-    normalise = brax.running_statistics.normalize
+    mask = jnp.asarray(mask, jnp.float32)
+    observation_size = mask.size
+
+    def normalise(seen: Array, statistics: Any) -> Array:
+        return brax.running_statistics.normalize(seen, statistics) * mask
     return brax.sac_networks.SACNetworks(
         policy_network=brax.networks.make_policy_network(
             distribution.param_size,

@@ -1,0 +1,64 @@
+"""What the command lines share: exit codes, output places, and flags generated from the configuration."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from mjxball import config as configs
+from mjxball.errors import InputError
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one sentence on stderr and exit code 2."""
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        """Print `message` and exit with code 2."""
+        self.exit(2, f"{self.prog}: {message}\n")
+
+
+def run_command(command: Callable[[], int]) -> int:
+    """Run `command`; an InputError becomes one line on stderr and exit code 2."""
+    try:
+        return command()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+
+
+def output_directory(path: Path) -> Path:
+    """Return `path` if it does not exist or is an empty directory, else raise InputError. Creates nothing."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"output directory {path} exists and is a file")
+    if path.is_dir() and any(path.iterdir()):
+        raise InputError(f"output directory {path} exists and is not empty; choose another with --out")
+    return path
+
+
+def output_file(path: Path, suffix: str) -> Path:
+    """Return `path` if it ends in `suffix`, its directory exists and it does not, else raise InputError."""
+    if path.suffix != suffix:
+        raise InputError(f"output file {path} must end in {suffix}")
+    if path.exists():
+        raise InputError(f"output file {path} exists; choose another name")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"directory {path.absolute().parent} does not exist")
+    return path
+
+
+def add_config_flags(parser: argparse.ArgumentParser) -> None:
+    """Add `--<path> VALUE` for every leaf of the configuration, with its help text."""
+    group = parser.add_argument_group("configuration", "defaults are the preset's; tuples are comma-separated")
+    for path, _, item in configs.leaves(configs.Config()):
+        about = item.metadata["about"].replace("%", "%%")
+        group.add_argument(f"--{path}", metavar="VALUE", dest=f"config:{path}", default=None, help=about)
+
+
+def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> configs.Config:
+    """Return `config` with every `--<path> VALUE` that was given, validated."""
+    for name, text in vars(options).items():
+        if name.startswith("config:") and text is not None:
+            config = configs.override(config, name.removeprefix("config:"), text)
+    return configs.validate(config)

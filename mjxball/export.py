@@ -1,0 +1,100 @@
+"""Flax follower -> NumPy policy file. `python -m mjxball.export RUN_DIR OUT.npz` exports a run's newest checkpoint."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball import __version__
+from mjxball.cli import output_file, run_command
+from mjxball.config import Config, config_hash, to_dict
+from mjxball.control.observation import ACTION, OBSERVATION, input_mask
+from mjxball.errors import InputError
+from mjxball.policy import PolicyFile, save_file
+from mjxball.policy.file import FORMAT_VERSION
+
+
+def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any] | None = None) -> PolicyFile:
+    """The policy file of a `train.sac.Learner`: its averaged policy and its observation statistics.
+
+    `origin` (command, seed, commit, ...) is added to the card.
+    """
+    layers = learner.average["params"]
+    names = sorted(layers, key=lambda name: int(name.rsplit("_", 1)[1]))
+    follower, leader = config.follower, config.leader
+    mask = np.array(input_mask(follower.history, follower.previous_action, follower.ignore_position))
+    deviation = np.asarray(learner.normaliser.std, np.float64)
+    reach = [follower.tilt_limit, follower.vertical_limit]
+    card = {
+        "format_version": FORMAT_VERSION,
+        "observation": [list(slot) for slot in OBSERVATION],
+        "history": follower.history,
+        "previous_action": follower.previous_action,
+        "action": [list(slot) for slot in ACTION],
+        "action_mode": follower.action,
+        "action_reach": reach,
+        "command_limits": [leader.tilt_limit, leader.vertical_limit],
+        "leader_kp": list(leader.kp),
+        "leader_kd": list(leader.kd),
+        "gravity": config.plant.gravity,
+        "control_period": config.timing.control_period,
+        "plant": to_dict(config.plant),
+        "preset": config.preset,
+        "config": to_dict(config),
+        "config_hash": config_hash(config),
+        "package_version": __version__,
+        "training_steps": int(steps),
+        "bounds": to_dict(config.bounds),
+        **(origin or {}),
+    }
+    return PolicyFile(
+        weights=tuple(np.asarray(layers[name]["kernel"], np.float32) for name in names),
+        biases=tuple(np.asarray(layers[name]["bias"], np.float32) for name in names),
+        observation_mean=np.asarray(learner.normaliser.mean, np.float32),
+        observation_scale=(mask / deviation).astype(np.float32),
+        action_scale=np.array([reach[0], reach[0], reach[1]], np.float32),
+        card=card,
+    )
+
+
+def is_sound(policy: PolicyFile) -> bool:
+    """True if every number of `policy` is finite."""
+    return all(
+        math.isfinite(float(np.abs(array).sum()))
+        for array in (*policy.weights, *policy.biases, policy.observation_mean, policy.observation_scale)
+    )
+
+
+def export_run(run: Path, out: Path) -> None:
+    """Export the newest checkpoint of the run directory `run` to the new file `out`."""
+    from mjxball.train.checkpoint import restore_policy
+
+    config, learner, steps, origin = restore_policy(run)
+    policy = policy_file(config, learner, steps, origin)
+    if not is_sound(policy):
+        raise InputError(f"the newest checkpoint of {run} holds values that are not finite")
+    save_file(out, policy)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line of `python -m mjxball.export`."""
+    parser = argparse.ArgumentParser(prog="python -m mjxball.export", description=__doc__)
+    parser.add_argument("run", metavar="RUN_DIR", type=Path, help="run directory written by train.py")
+    parser.add_argument("out", metavar="OUT.npz", type=Path, help="policy file to write; must not exist")
+    options = parser.parse_args(arguments)
+
+    def command() -> int:
+        export_run(options.run, output_file(options.out, ".npz"))
+        print(options.out)  # noqa: T201
+        return 0
+
+    return run_command(command)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

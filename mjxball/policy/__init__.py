@@ -1,0 +1,10 @@
+"""Follower policies as plain NumPy. Imports NumPy and `control/` only: no JAX, no MuJoCo.
+
+    policy = Policy.load("policies/transport.npz")
+    roll, pitch, vertical_acceleration = policy(observation)  # SI units
+"""
+
+from mjxball.policy.file import PolicyFile, PolicyFileError, load_file, save_file
+from mjxball.policy.policy import Policy
+
+__all__ = ["Policy", "PolicyFile", "PolicyFileError", "load_file", "save_file"]

@@ -1,0 +1,214 @@
+"""The policy file: one `.npz` without pickles (design section 10). Reading verifies everything it uses."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, memory_size
+from mjxball.errors import InputError
+
+FORMAT_VERSION = 1
+MAX_BYTES = 64 * 2**20
+MAX_LAYERS = 32
+CARD_FIELDS: dict[str, type | tuple[type, ...]] = {
+    "format_version": int,
+    "observation": list,
+    "history": int,
+    "previous_action": bool,
+    "action": list,
+    "action_mode": str,
+    "action_reach": list,
+    "command_limits": list,
+    "leader_kp": list,
+    "leader_kd": list,
+    "gravity": float,
+    "control_period": float,
+    "plant": dict,
+    "preset": str,
+    "config_hash": str,
+    "package_version": str,
+    "training_steps": int,
+    "bounds": dict,
+}
+
+
+class PolicyFileError(InputError):
+    """A policy file that cannot be used; the message names the file and what is wrong."""
+
+
+@dataclass(frozen=True)
+class PolicyFile:
+    """Contents of a policy file."""
+
+    weights: tuple[np.ndarray, ...]  # float32, (n_in, n_out) each
+    biases: tuple[np.ndarray, ...]  # float32, (n_out,) each; the last layer gives mean and deviation parameters
+    observation_mean: np.ndarray  # (n,) float32
+    observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation
+    action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
+    card: dict[str, Any]
+
+
+def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
+    """Write `policy` to `path` atomically: a reader sees the old file or the whole new one."""
+    check(policy, str(path))
+    arrays = {
+        "observation_mean": policy.observation_mean,
+        "observation_scale": policy.observation_scale,
+        "action_scale": policy.action_scale,
+        "card": np.array(json.dumps(policy.card, sort_keys=True)),
+    }
+    for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        arrays[f"weight_{number}"], arrays[f"bias_{number}"] = weight, bias
+    target = Path(path)
+    partial = target.with_name(f".{target.name}.partial")
+    try:
+        with partial.open("wb") as stream:
+            np.savez(stream, **arrays)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.replace(target)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_file(path: str | os.PathLike[str]) -> PolicyFile:
+    """Read and verify a policy file; raise PolicyFileError with one sentence on anything unsound."""
+    name = str(path)
+    arrays = _read_arrays(name)
+    for needed in ("observation_mean", "observation_scale", "action_scale", "card"):
+        if needed not in arrays:
+            raise PolicyFileError(f"{name} is not a policy file: it has no {needed}")
+    card = _read_card(name, arrays.pop("card"))
+    layers = 0
+    while f"weight_{layers}" in arrays:
+        layers += 1
+    expected = {"observation_mean", "observation_scale", "action_scale"}
+    expected |= {f"{kind}_{i}" for kind in ("weight", "bias") for i in range(layers)}
+    odd = sorted(set(arrays) ^ expected)
+    if odd or not layers:
+        raise PolicyFileError(f"{name}: unexpected or missing array {odd[0] if odd else 'weight_0'}")
+    policy = PolicyFile(
+        weights=tuple(arrays[f"weight_{i}"] for i in range(layers)),
+        biases=tuple(arrays[f"bias_{i}"] for i in range(layers)),
+        observation_mean=arrays["observation_mean"],
+        observation_scale=arrays["observation_scale"],
+        action_scale=arrays["action_scale"],
+        card=card,
+    )
+    check(policy, name)
+    return policy
+
+
+def _read_arrays(name: str) -> dict[str, np.ndarray]:
+    try:
+        with zipfile.ZipFile(name) as archive:
+            entries = archive.infolist()
+        if len(entries) > 2 * MAX_LAYERS + 4 or sum(entry.file_size for entry in entries) > MAX_BYTES:
+            raise PolicyFileError(f"{name} is not a policy file: it unpacks to more than {MAX_BYTES >> 20} MiB")
+        with np.load(name, allow_pickle=False) as data:
+            return {key: data[key] for key in data.files}
+    except FileNotFoundError:
+        raise PolicyFileError(f"policy file {name} does not exist") from None
+    except PolicyFileError:
+        raise
+    except IsADirectoryError:
+        raise PolicyFileError(f"policy file {name} is a directory") from None
+    except OSError as error:
+        raise PolicyFileError(f"policy file {name} cannot be read: {error.strerror or error}") from None
+    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged bytes
+        reason = "it holds a pickle" if "pickle" in str(error).lower() else "it is damaged or not an .npz"
+        raise PolicyFileError(f"policy file {name} cannot be read: {reason}") from None
+
+
+def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
+    if text.ndim != 0 or text.dtype.kind != "U":
+        raise PolicyFileError(f"{name}: the card is not one string")
+    try:
+        card = json.loads(str(text))
+    except (ValueError, RecursionError):
+        raise PolicyFileError(f"{name}: the card is not JSON") from None
+    if not isinstance(card, dict):
+        raise PolicyFileError(f"{name}: the card is not a JSON object")
+    return card
+
+
+def check(policy: PolicyFile, name: str) -> None:
+    """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
+    _check_card(policy.card, name)
+    size = OBSERVATION_SIZE + memory_size(policy.card["history"], policy.card["previous_action"])
+    vectors = [
+        ("observation_mean", policy.observation_mean, size),
+        ("observation_scale", policy.observation_scale, size),
+        ("action_scale", policy.action_scale, ACTION_SIZE),
+    ]
+    for label, array, length in vectors:
+        _check_array(name, label, array, (length,))
+    if (policy.observation_scale <= 0).any() or (policy.action_scale <= 0).any():
+        raise PolicyFileError(f"{name}: observation_scale and action_scale must be positive")
+    if not np.allclose(policy.action_scale, _reach(policy.card), rtol=1e-6, atol=0):
+        raise PolicyFileError(f"{name}: action_scale differs from the card's action_reach")
+    width = size
+    for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        last = number == len(policy.weights) - 1
+        out = 2 * ACTION_SIZE if last else (weight.shape[1] if weight.ndim == 2 else -1)
+        _check_array(name, f"weight_{number}", weight, (width, out))
+        _check_array(name, f"bias_{number}", bias, (out,))
+        width = out
+
+
+def _reach(card: dict[str, Any]) -> list[float]:
+    tilt, vertical = card["action_reach"]
+    return [tilt, tilt, vertical]
+
+
+def _check_array(name: str, label: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if array.dtype != np.float32:
+        raise PolicyFileError(f"{name}: {label} must be float32, not {array.dtype}")
+    if array.shape != shape:
+        raise PolicyFileError(f"{name}: {label} must have shape {shape}, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise PolicyFileError(f"{name}: {label} holds a value that is not finite")
+
+
+def _check_card(card: dict[str, Any], name: str) -> None:
+    version = card.get("format_version")
+    if version != FORMAT_VERSION or isinstance(version, bool):
+        raise PolicyFileError(f"{name} has policy format {version!r}; this version reads format {FORMAT_VERSION}")
+    for field, kind in CARD_FIELDS.items():
+        value = card.get(field)
+        if isinstance(value, bool) and kind is not bool:
+            value = None
+        if kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if not isinstance(value, kind):
+            raise PolicyFileError(f"{name}: card field {field} is missing or not {kind.__name__}")
+    if [tuple(slot) for slot in card["observation"] if isinstance(slot, list)] != list(OBSERVATION):
+        raise PolicyFileError(f"{name} was made for another observation than this version's 18 numbers")
+    if [tuple(slot) for slot in card["action"] if isinstance(slot, list)] != list(ACTION):
+        raise PolicyFileError(f"{name} was made for another action than roll, pitch, vertical acceleration")
+    if card["action_mode"] not in ("residual", "direct"):
+        raise PolicyFileError(f"{name}: action_mode must be residual or direct, not {card['action_mode']!r}")
+    if not 1 <= card["history"] <= 100:
+        raise PolicyFileError(f"{name}: history must be 1 to 100, not {card['history']}")
+    lengths = {"action_reach": 2, "command_limits": 2, "leader_kp": 3, "leader_kd": 3}
+    for field, length in lengths.items():
+        numbers = card[field]
+        if len(numbers) != length or not all(_is_finite(value) and value >= 0 for value in numbers):
+            raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
+    for field in ("control_period", "gravity"):
+        if not (_is_finite(card[field]) and card[field] > 0):
+            raise PolicyFileError(f"{name}: card field {field} must be positive")
+    if not all(isinstance(key, str) and _is_finite(value) for key, value in card["bounds"].items()):
+        raise PolicyFileError(f"{name}: card field bounds must hold finite numbers")
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

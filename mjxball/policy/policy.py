@@ -1,0 +1,75 @@
+"""A trained follower, ready to be called once per control period."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball.control import observation as layout
+from mjxball.policy.file import PolicyFile, load_file
+from mjxball.policy.network import mean_action
+
+Array = Any
+
+
+class Policy:
+    """A follower from a policy file. It remembers past observations if the file asks for them.
+
+    One instance serves one flight, or one batch of worlds: `reset()` starts anew.
+    """
+
+    def __init__(self, contents: PolicyFile, name: str, dtype: type = np.float32):
+        """Prepare `contents` for inference in `dtype` (float32 on the laptop, float64 for tests)."""
+        card = contents.card
+        self.name = name
+        self.card = card
+        self.control_period = float(card["control_period"])
+        self._dtype = np.dtype(dtype)
+        half = layout.ACTION_SIZE
+        weights = [*contents.weights[:-1], contents.weights[-1][:, :half]]
+        biases = [*contents.biases[:-1], contents.biases[-1][:half]]
+        self._weights = [np.ascontiguousarray(weight, dtype) for weight in weights]
+        self._biases = [np.ascontiguousarray(bias, dtype) for bias in biases]
+        self._mean = contents.observation_mean.astype(dtype)
+        self._scale = contents.observation_scale.astype(dtype)
+        self._memory_shape = (card["history"], card["previous_action"])
+        self._remembers = layout.memory_size(*self._memory_shape) > 0
+        self._memory: Array | None = None
+        self._law = (
+            card["action_mode"] == "residual",
+            tuple(card["action_reach"]),
+            np.asarray(card["leader_kp"], dtype),
+            np.asarray(card["leader_kd"], dtype),
+            card["gravity"],
+            tuple(card["command_limits"]),
+        )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Policy:
+        """Load a policy file; raise PolicyFileError with one sentence if it is unsound."""
+        return cls(load_file(path), Path(path).stem)
+
+    def reset(self) -> None:
+        """Forget past observations: the next call starts an episode."""
+        self._memory = None
+
+    def scaled(self, observation: Array) -> Array:
+        """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
+        seen = np.asarray(observation, self._dtype)
+        if seen.shape[-1:] != (layout.OBSERVATION_SIZE,):
+            raise ValueError(f"observation must have {layout.OBSERVATION_SIZE} numbers last, not shape {seen.shape}")
+        if not self._remembers:
+            return mean_action(self._weights, self._biases, self._mean, self._scale, seen)
+        if self._memory is None:
+            self._memory = layout.start_memory(seen, *self._memory_shape)
+        full = layout.network_input(seen, self._memory)
+        action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
+        self._memory = layout.next_memory(self._memory, seen, action, *self._memory_shape)
+        return action
+
+    def __call__(self, observation: Array) -> Array:
+        """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18)."""
+        return layout.follower_command(self.scaled(observation), np.asarray(observation, self._dtype), *self._law)
