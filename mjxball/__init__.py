@@ -1,3 +1,26 @@
 """mjxball: two quadrotors carry one object whose centre of gravity moves."""
 
+from typing import TYPE_CHECKING, Any
+
 __version__ = "0.1.0"
+__all__ = ["Policy", "Scenario", "Trajectory", "__version__", "simulate"]
+
+if TYPE_CHECKING:
+    from mjxball.policy import Policy
+    from mjxball.rollout import Scenario, Trajectory, simulate
+
+_HOMES = {
+    "Policy": "mjxball.policy",
+    "Scenario": "mjxball.rollout",
+    "Trajectory": "mjxball.rollout",
+    "simulate": "mjxball.rollout",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names on first use, so that the base install needs nothing but NumPy."""
+    import importlib
+
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mjxball' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -53,9 +53,7 @@ class Plant:
     follower_inertia: Vector3 = setting(
         (2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the follower about its centre [kg m2]", above=0
     )
-    object_size: Vector3 = setting(
-        (0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", above=0
-    )
+    object_size: Vector3 = setting((0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", above=0)
     leader_mount: Vector3 = setting((0.17, 0.0, 0.0), "centre of the leader from O, body axes [m]")
     follower_mount: Vector3 = setting((-0.17, 0.0, 0.0), "centre of the follower from O, body axes [m]")
     arm: float = setting(0.12, "centre of a drone to each rotor, plus layout [m]", above=0)
@@ -166,7 +164,9 @@ class Sac:
     alpha_fixed: bool = setting(False, "keep the temperature at its start")
     target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]")
     reward_scale: float = setting(1.0, "factor on the reward inside the critic", above=0)
-    policy_average: float = setting(0.002, "rate of the running average of the policy that is exported", above=0, high=1)
+    policy_average: float = setting(
+        0.002, "rate of the running average of the policy that is exported", above=0, high=1
+    )
     learning_rate_end: float = setting(0.1, "rate at the end of the run over the rate at its start", above=0, high=1)
 
 

@@ -120,4 +120,3 @@ def solve_symmetric(matrix: Array, vector: Array) -> Array:
     x, y, z = (vector[..., i] for i in range(3))
     rows = [aa * x + ab * y + ac * z, ab * x + bb * y + bc * z, ac * x + bc * y + cc * z]
     return xp.stack(rows, axis=-1) / determinant[..., None]
-

@@ -1,7 +1,7 @@
 """Follower policies as plain NumPy. Imports NumPy and `control/` only: no JAX, no MuJoCo.
 
-    policy = Policy.load("policies/transport.npz")
-    roll, pitch, vertical_acceleration = policy(observation)  # SI units
+policy = Policy.load("policies/transport.npz")
+roll, pitch, vertical_acceleration = policy(observation)  # SI units
 """
 
 from mjxball.policy.file import PolicyFile, PolicyFileError, load_file, save_file

@@ -51,7 +51,7 @@ class PolicyFile:
     weights: tuple[np.ndarray, ...]  # float32, (n_in, n_out) each
     biases: tuple[np.ndarray, ...]  # float32, (n_out,) each; the last layer gives mean and deviation parameters
     observation_mean: np.ndarray  # (n,) float32
-    observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation
+    observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for a slot that is not used
     action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
     card: dict[str, Any]
 
@@ -151,8 +151,8 @@ def check(policy: PolicyFile, name: str) -> None:
     ]
     for label, array, length in vectors:
         _check_array(name, label, array, (length,))
-    if (policy.observation_scale <= 0).any() or (policy.action_scale <= 0).any():
-        raise PolicyFileError(f"{name}: observation_scale and action_scale must be positive")
+    if (policy.observation_scale < 0).any() or (policy.action_scale <= 0).any():
+        raise PolicyFileError(f"{name}: observation_scale must not be negative and action_scale must be positive")
     if not np.allclose(policy.action_scale, _reach(policy.card), rtol=1e-6, atol=0):
         raise PolicyFileError(f"{name}: action_scale differs from the card's action_reach")
     width = size

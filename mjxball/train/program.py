@@ -108,9 +108,7 @@ class Program:
     def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
         """Step all worlds `mode.steps` times, with `mode.updates` gradient updates after each."""
         zero = jnp.zeros(())
-        tally = Tally(
-            zero, zero, zero, jnp.zeros(self.config.sac.worlds), zero, zero, sac.Losses(zero, zero, zero)
-        )
+        tally = Tally(zero, zero, zero, jnp.zeros(self.config.sac.worlds), zero, zero, sac.Losses(zero, zero, zero))
 
         def body(_: Array, carry: tuple[TrainState, Tally]) -> tuple[TrainState, Tally]:
             state, tally = self._collect(*carry, mode)

@@ -51,6 +51,7 @@ def make_networks(config: Sac, mask: Any, action_size: int) -> Any:
 
     def normalise(seen: Array, statistics: Any) -> Array:
         return brax.running_statistics.normalize(seen, statistics) * mask
+
     return brax.sac_networks.SACNetworks(
         policy_network=brax.networks.make_policy_network(
             distribution.param_size,

@@ -1,0 +1,1 @@
+"""Judge followers: scenarios, metrics, figures, and the tables that `eval.py` prints."""

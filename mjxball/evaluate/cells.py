@@ -1,0 +1,84 @@
+"""Evaluation cells: every follower on every scenario, flown in one batch."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mjxball.config import Config
+from mjxball.control.followers import Follower
+from mjxball.errors import InputError
+from mjxball.evaluate.metrics import Metrics, measure
+from mjxball.policy import Policy
+from mjxball.rollout import Scenario, Trajectory, simulate_batch
+
+REFERENCE = Scenario()
+# Design section 6: copy without CG motion, then five speeds of the CG.
+STANDARD = (
+    dataclasses.replace(REFERENCE, amplitude=0.0),
+    *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.31, 0.62, 1.0, 2.0, 3.1)),
+)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One follower on one scenario."""
+
+    follower: str
+    scenario: Scenario
+    metrics: Metrics
+    flight: Trajectory
+
+    def record(self) -> dict[str, Any]:
+        """The cell as `eval.py --json` writes it."""
+        s = self.scenario
+        believed = s.mass if s.believed_mass is None else s.believed_mass
+        keys = {"omega": s.omega, "amplitude": s.amplitude, "mass": s.mass, "believed_mass": believed}
+        return {"follower": self.follower, **keys, **dataclasses.asdict(self.metrics)}
+
+
+def cross(
+    omegas: Sequence[float], amplitudes: Sequence[float], masses: Sequence[float], **common: Any
+) -> tuple[Scenario, ...]:
+    """Full cross product of the lists, in the given order."""
+    cells = itertools.product(omegas, amplitudes, masses)
+    return tuple(Scenario(omega=w, amplitude=a, mass=m, **common) for w, a, m in cells)
+
+
+def run_cells(config: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str) -> list[Cell]:
+    """Fly every follower through every scenario; cells are ordered by scenario, then by follower."""
+    flights = simulate_batch(config, [(follower, scenarios) for follower in followers], physics)
+    limit = config.scenario.termination_distance
+    cells = []
+    for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
+        flight = flights.world(j * len(scenarios) + i)
+        cells.append(Cell(follower.name, scenario, measure(flight, limit), flight))
+    return cells
+
+
+def load_policy(path: Path, config: Config) -> Policy:
+    """Load a policy and refuse one that was made for another plant or rate."""
+    policy = Policy.load(path)
+    period = config.timing.control_period
+    if abs(policy.control_period - period) > 1e-9:
+        raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
+    expected = dataclasses.asdict(config.plant)
+    made_for = {key: tuple(v) if isinstance(v, list) else v for key, v in policy.card["plant"].items()}
+    for key, value in expected.items():
+        if key != "object_mass" and made_for.get(key) != value:
+            raise InputError(f"{path} was made for another plant: {key} is {made_for.get(key)}, not {value}")
+    return policy
+
+
+def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
+    """What of the card's bounds a policy misses on the reference scenario, one phrase each."""
+    misses = ["the flight failed"] if metrics.failed else []
+    for name, bound in sorted(policy.card["bounds"].items()):
+        value = getattr(metrics, name, None)
+        if value is None or value > bound:
+            misses.append(f"{name} {'never' if value is None else f'{value:.4g}'} > {bound:g}")
+    return misses

@@ -1,0 +1,126 @@
+"""Command line of `eval.py`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mjxball import __version__, cli, config
+from mjxball.control.followers import BASELINES, make_baseline
+from mjxball.errors import InputError
+from mjxball.evaluate.cells import REFERENCE, STANDARD, Cell, check_bounds, cross, load_policy, run_cells
+from mjxball.evaluate.report import to_json, write_report
+from mjxball.evaluate.table import table
+from mjxball.physics.stepper import ENGINES
+from mjxball.policy import Policy
+from mjxball.policy.shipped import shipped_policies
+from mjxball.rollout import Scenario, check_scenario
+
+SCENARIO_FLAGS = ("omega", "amplitude", "mass", "believed_mass", "goal", "seconds")
+
+
+def parser() -> cli.Parser:
+    """The argument parser of `eval.py` (design section 9)."""
+    result = cli.Parser(
+        prog="eval.py",
+        description="Fly policies and baselines through scenarios on a CPU and print their metrics.",
+        epilog="Without policies, followers or scenarios: every shipped policy and baseline on the standard scenarios.",
+        allow_abbrev=False,
+    )
+    names = ", ".join(BASELINES)
+    result.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="policy files")
+    result.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=f"baselines: {names}")
+    result.add_argument("--omega", nargs="+", type=float, metavar="W", help="CG speeds [rad/s] (default 0.31)")
+    result.add_argument("--amplitude", nargs="+", type=float, metavar="A", help="CG amplitudes [m] (default 0.05)")
+    result.add_argument("--mass", nargs="+", type=float, metavar="M", help="object masses [kg] (default 0.2)")
+    result.add_argument("--believed-mass", type=float, metavar="M", help="mass that hover thrust assumes (true mass)")
+    result.add_argument("--wn-pitch", type=float, metavar="W", help="pitch natural frequency of both drones [rad/s]")
+    result.add_argument("--goal", nargs=3, type=float, metavar=("X", "Y", "Z"), help="goal of O [m] (default 1 1 1)")
+    result.add_argument("--seconds", type=float, metavar="S", help="length of each flight (default 45)")
+    result.add_argument("--physics", choices=ENGINES, default="mjx", help="physics engine (default mjx)")
+    result.add_argument("--json", type=Path, metavar="FILE", help="write the cells as JSON")
+    result.add_argument("--out", type=Path, metavar="DIR", help="write cells.json and a figure per scenario")
+    result.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its card")
+    result.add_argument("--version", action="version", version=f"mjxball {__version__}")
+    return result
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Evaluate; return the exit code."""
+    options = parser().parse_args(arguments)
+    return cli.run_command(lambda: _evaluate(options))
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    setup = _setup(options)
+    scenarios = _scenarios(options)
+    for scenario in scenarios:
+        check_scenario(setup, scenario)
+    if options.out:
+        cli.output_directory(options.out)
+    if options.json:
+        cli.output_file(options.json, ".json")
+    chosen = bool(options.policies or options.followers)
+    paths = options.policies if chosen else shipped_policies()
+    names = options.followers if chosen else list(BASELINES)
+    policies = [load_policy(path, setup) for path in paths]
+    followers = [*(make_baseline(name, setup) for name in dict.fromkeys(names)), *policies]
+    _refuse_same_names([follower.name for follower in followers])
+
+    cells = run_cells(setup, followers, scenarios, options.physics)
+    print(table(cells))  # noqa: T201
+    if options.json:
+        options.json.write_text(to_json(cells))
+    if options.out:
+        write_report(cells, options.out)
+        print(f"figures and cells.json are in {options.out}")  # noqa: T201
+    return _check(setup, policies, cells, options.physics) if options.check else 0
+
+
+def _setup(options: argparse.Namespace) -> config.Config:
+    setup = config.preset("paper")
+    if options.wn_pitch is not None:
+        roll, _, yaw = setup.attitude.natural_frequency
+        setup = config.replace(setup, "attitude.natural_frequency", (roll, options.wn_pitch, yaw))
+    return config.validate(setup)
+
+
+def _scenarios(options: argparse.Namespace) -> Sequence[Scenario]:
+    given = any(getattr(options, name) is not None for name in SCENARIO_FLAGS)
+    if not (given or options.policies or options.followers):
+        return STANDARD
+    return cross(
+        options.omega or [REFERENCE.omega],
+        options.amplitude or [REFERENCE.amplitude],
+        options.mass or [REFERENCE.mass],
+        believed_mass=options.believed_mass,
+        goal=tuple(options.goal or REFERENCE.goal),
+        seconds=REFERENCE.seconds if options.seconds is None else options.seconds,
+    )
+
+
+def _refuse_same_names(names: list[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two followers are called {name!r}; rename a policy file")
+
+
+def _check(setup: config.Config, policies: Sequence[Policy], cells: Sequence[Cell], physics: str) -> int:
+    """Hold every policy against its card on the reference scenario, flown anew if the cells lack it."""
+    if not policies:
+        raise InputError("--check needs a policy")
+    plain = dataclasses.replace(setup, attitude=config.Attitude())
+    known = {cell.follower: cell for cell in cells if cell.scenario == REFERENCE} if plain == setup else {}
+    missing = [policy for policy in policies if policy.name not in known]
+    if missing:
+        known |= {cell.follower: cell for cell in run_cells(plain, missing, [REFERENCE], physics)}
+    failed = False
+    for policy in policies:
+        misses = check_bounds(policy, known[policy.name].metrics)
+        failed = failed or bool(misses)
+        print(f"check {policy.name}: {'ok' if not misses else '; '.join(misses)}")  # noqa: T201
+    sys.stdout.flush()
+    return 1 if failed else 0

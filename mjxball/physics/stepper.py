@@ -1,0 +1,42 @@
+"""Choose an engine by name and step a batch of plants on NumPy arrays, in float64."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mjxball.config import Config
+from mjxball.errors import InputError
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.step import ControlStep, make_control_step
+
+ENGINES = ("mjx", "newton-euler", "mujoco")
+
+
+def make_stepper(config: Config, physics: str) -> ControlStep:
+    """Return a control step for batches (n, ...) of NumPy float64 arrays; raise InputError for an unknown engine."""
+    if physics == "mujoco":
+        from mjxball.physics.mujoco import make_acceleration
+
+        return make_control_step(config, make_acceleration(config.plant, config.attitude))
+    if physics not in ENGINES:
+        raise InputError(f"unknown physics {physics!r}; choose from {', '.join(ENGINES)}")
+    return _jax_stepper(config, physics)
+
+
+def _jax_stepper(config: Config, physics: str) -> ControlStep:
+    import jax
+
+    from mjxball.physics import mjx, newton_euler
+
+    make = mjx.make_acceleration if physics == "mjx" else newton_euler.make_acceleration
+    with jax.enable_x64(True):
+        step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
+        compiled = jax.jit(jax.vmap(step))
+
+    def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
+        with jax.enable_x64(True):
+            return PlantState(*map(np.asarray, compiled(state, commands, load)))
+
+    return stepper

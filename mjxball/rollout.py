@@ -1,0 +1,198 @@
+"""`simulate`: fly one follower, or a batch of them, through scenarios and return everything that happened."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjxball.config import Config, Plant, preset
+from mjxball.control import leader, observation, rotations
+from mjxball.control.followers import Follower
+from mjxball.errors import InputError
+from mjxball.physics import motion
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.step import start_state
+from mjxball.physics.stepper import make_stepper
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal (design section 9)."""
+
+    omega: float = 0.31  # angular speed of the CG's sine [rad/s]
+    amplitude: float = 0.05  # of the CG's sine [m]
+    mass: float = 0.2  # true mass of the object [kg]
+    believed_mass: float | None = None  # mass that the hover thrust assumes, None: the true one [kg]
+    goal: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of O [m]
+    seconds: float = 45.0
+    phase: float = 0.0  # of the CG's sine [rad]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A flight, or a batch of flights with the batch axis second. NumPy float64, one row per control step.
+
+    T = round(seconds / control period) + 1 rows; row 0 is the start. A flight that diverges (|e_o| or a body
+    rate beyond any bound, or a value that is not finite) is frozen there and marked in `diverged`.
+    """
+
+    time: np.ndarray  # (T,) [s]
+    position: np.ndarray  # (T, ..., 3) of O in the world [m]
+    velocity: np.ndarray  # (T, ..., 3) of O in the world [m/s]
+    euler: np.ndarray  # (T, ..., 3) roll, pitch, yaw [rad]
+    rates: np.ndarray  # (T, ..., 3) body rates [rad/s]
+    quaternion: np.ndarray  # (T, ..., 4) body -> world (w, x, y, z)
+    rotor_force: np.ndarray  # (T, ..., 2, 4) leader, follower [N]
+    leader_command: np.ndarray  # (T, ..., 3) roll, pitch [rad], vertical acceleration [m/s2]
+    follower_command: np.ndarray  # (T, ..., 3) likewise
+    observation: np.ndarray  # (T, ..., 18) what the follower saw
+    cg_offset: np.ndarray  # (T, ...) along body x from O [m]
+    goal: np.ndarray  # (..., 3) of O [m]
+    diverged: np.ndarray  # (...) bool
+
+    @property
+    def error(self) -> np.ndarray:
+        """e_o = goal - position (T, ..., 3) [m]."""
+        return self.goal - self.position
+
+    def world(self, index: int) -> Trajectory:
+        """Flight `index` of a batch."""
+        parts = {}
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            per_flight = item.name in ("goal", "diverged")
+            parts[item.name] = value if item.name == "time" else value[index] if per_flight else value[:, index]
+        return Trajectory(**parts)
+
+
+def simulate(
+    plant: Plant | Config, follower: Follower, scenario: Scenario = Scenario(), physics: str = "mjx"
+) -> Trajectory:
+    """Fly `follower` through `scenario` on `plant` (or on a whole `Config`: gains, limits and rates too).
+
+    `physics` is mjx, newton-euler or mujoco. Raises InputError for an unsound scenario.
+    """
+    config = plant if isinstance(plant, Config) else dataclasses.replace(preset("paper"), plant=plant)
+    return simulate_batch(config, [(follower, [scenario])], physics).world(0)
+
+
+def simulate_batch(
+    config: Config, flights: Sequence[tuple[Follower, Sequence[Scenario]]], physics: str = "mjx"
+) -> Trajectory:
+    """Fly every (follower, scenarios) pair at once; the batch axis runs over all scenarios in order.
+
+    All scenarios must last equally long. Each follower is called once per control step for its own part.
+    """
+    scenarios = [scenario for _, part in flights for scenario in part]
+    for scenario in scenarios:
+        check_scenario(config, scenario)
+    if len({scenario.seconds for scenario in scenarios}) != 1:
+        raise InputError("scenarios of one batch must last equally long")
+    ends = np.cumsum([len(part) for _, part in flights])
+    parts = [slice(end - len(part), end) for end, (_, part) in zip(ends, flights, strict=True)]
+    followers = [follower for follower, _ in flights]
+    for follower in followers:
+        follower.reset()
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        commands = [np.asarray(f(seen[part]), float) for f, part in zip(followers, parts, strict=True)]
+        return np.concatenate(commands)
+
+    return _fly(config, scenarios, act, physics)
+
+
+def check_scenario(config: Config, scenario: Scenario) -> None:
+    """Raise InputError with one sentence if `scenario` makes no sense on `config`'s plant."""
+    numbers = dataclasses.astuple(dataclasses.replace(scenario, goal=0.0, believed_mass=scenario.believed_mass or 0.0))
+    if not np.isfinite([*numbers, *scenario.goal]).all():
+        raise InputError("every number of a scenario must be finite")
+    if len(scenario.goal) != 3:
+        raise InputError(f"goal takes 3 numbers, not {len(scenario.goal)}")
+    if scenario.mass <= 0:
+        raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
+    if scenario.believed_mass is not None and scenario.believed_mass < 0:
+        raise InputError(f"believed mass must not be negative, but is {scenario.believed_mass:g} kg")
+    if scenario.omega < 0 or scenario.amplitude < 0:
+        raise InputError("omega and amplitude must not be negative")
+    half = config.plant.object_size[0] / 2
+    if scenario.amplitude > half + 1e-12:
+        raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object, whose half length is {half:g} m")
+    limit = config.scenario.termination_distance
+    if np.linalg.norm(scenario.goal) > limit:
+        raise InputError(
+            f"goal {scenario.goal} is {np.linalg.norm(scenario.goal):.3g} m away, beyond d_term = {limit:g} m"
+        )
+    if scenario.seconds < config.timing.control_period or scenario.seconds > 86_400:
+        raise InputError(f"seconds must be between one control period and a day, not {scenario.seconds:g}")
+
+
+def _fly(config: Config, scenarios: Sequence[Scenario], act: object, physics: str) -> Trajectory:
+    step = make_stepper(config, physics)
+    period = config.timing.control_period
+    count = round(scenarios[0].seconds / period)
+    load, goal = _load(scenarios), np.array([scenario.goal for scenario in scenarios], float)
+    zero = np.zeros_like(goal)
+    state = start_state(config, zero, zero, zero, load.believed_mass)
+    integral, diverged = zero.copy(), np.zeros(len(scenarios), bool)
+    mount = np.array(config.plant.follower_mount)
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in _ROWS}
+    for number in range(count + 1):
+        matrix = rotations.matrix_from_quaternion(state.quaternion)
+        seen = observation.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
+        led = _leader_command(config, goal, state, integral)
+        followed = act(seen)
+        cg = motion.sine(number * period, load.cg_amplitude, load.cg_speed, load.cg_phase)
+        euler = rotations.euler_from_matrix(matrix)
+        values = (state.position, state.velocity, euler, state.rates, state.quaternion, state.rotor_force)
+        for name, value in zip(_ROWS, (*values, led, followed, seen, cg.offset), strict=True):
+            rows[name].append(value)
+        if number < count:
+            integral = integral + period * (goal - state.position)
+            moved = step(state, np.stack([led, followed], axis=1), load)
+            diverged |= _diverged(moved)
+            state = PlantState(*(_keep(diverged, old, new) for old, new in zip(state, moved, strict=True)))
+    stacked = {name: np.stack(values) for name, values in rows.items()}
+    return Trajectory(time=np.arange(count + 1) * period, goal=goal, diverged=diverged, **stacked)
+
+
+_ROWS = (
+    "position",
+    "velocity",
+    "euler",
+    "rates",
+    "quaternion",
+    "rotor_force",
+    "leader_command",
+    "follower_command",
+    "observation",
+    "cg_offset",
+)
+DIVERGED_POSITION, DIVERGED_RATE = 1e3, 1e2  # [m], [rad/s]
+
+
+def _load(scenarios: Sequence[Scenario]) -> Load:
+    mass = np.array([scenario.mass for scenario in scenarios], float)
+    believed = [s.mass if s.believed_mass is None else s.believed_mass for s in scenarios]
+    sine = ([getattr(s, name) for s in scenarios] for name in ("amplitude", "omega", "phase"))
+    return Load(mass, np.array(believed, float), *(np.array(values, float) for values in sine))
+
+
+def _leader_command(config: Config, goal: np.ndarray, state: PlantState, integral: np.ndarray) -> np.ndarray:
+    law = config.leader
+    gains = (np.array(gain) for gain in (law.kp, law.kd, law.ki))
+    wanted = leader.desired_acceleration(goal - state.position, -state.velocity, integral, *gains)
+    return leader.command(wanted, 0.0, config.plant.gravity, law.tilt_limit, law.vertical_limit)
+
+
+def _diverged(state: PlantState) -> np.ndarray:
+    flat = np.concatenate([leaf.reshape(len(state.time), -1) for leaf in state], axis=1)
+    with np.errstate(invalid="ignore"):
+        far = (np.abs(state.position) > DIVERGED_POSITION).any(-1) | (np.abs(state.rates) > DIVERGED_RATE).any(-1)
+    return far | ~np.isfinite(flat).all(-1)
+
+
+def _keep(diverged: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    return np.where(diverged.reshape((-1,) + (1,) * (new.ndim - 1)), old, new)

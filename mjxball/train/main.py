@@ -1,0 +1,116 @@
+"""Command line of `train.py`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from mjxball import __version__, cli, config
+from mjxball.errors import InputError
+
+PHYSICS = ("mjx", "newton-euler")
+
+
+def parser() -> cli.Parser:
+    """The argument parser; configuration flags are generated from `mjxball.config`."""
+    result = cli.Parser(
+        prog="train.py",
+        usage="train.py [PRESET] [--seed N] [--out DIR] [--resume DIR] [--physics ENGINE] [--<config path> VALUE ...]",
+        description="Train a follower with soft actor-critic, export it to NumPy and judge it against `copy`.",
+        epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
+        allow_abbrev=False,
+    )
+    names = ", ".join(config.PRESETS)
+    result.add_argument("preset", nargs="?", default="transport", metavar="PRESET", help=f"one of {names}")
+    result.add_argument("--seed", type=int, default=0, metavar="N", help="seed of everything random (default 0)")
+    result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
+    result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
+    result.add_argument("--physics", choices=PHYSICS, default="mjx", help="physics engine (default mjx)")
+    result.add_argument("--version", action="version", version=f"mjxball {__version__}")
+    cli.add_config_flags(result)
+    return result
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Train, export, evaluate; return the exit code."""
+    options = parser().parse_args(arguments)
+    command = shlex.join(["python", "train.py", *(sys.argv[1:] if arguments is None else arguments)])
+    return cli.run_command(lambda: _train(options, command))
+
+
+def _train(options: argparse.Namespace, command: str) -> int:
+    resume = options.resume is not None
+    settings = cli.apply_config_flags(config.preset(options.preset), options)
+    if not -(2**31) <= options.seed < 2**31:
+        raise InputError(f"--seed must fit 32 bits, not {options.seed}")
+    if resume:
+        _refuse_with_resume(options)
+        out = options.resume
+    else:
+        out = cli.output_directory(options.out or Path("runs") / f"{options.preset}-{time.strftime('%Y%m%d-%H%M%S')}")
+
+    from mjxball.train.checkpoint import restore_run
+    from mjxball.train.run import POLICY, Run, TrainingDivergedError
+
+    state = None
+    origin = {
+        "command": command,
+        "seed": options.seed,
+        "physics": options.physics,
+        "package_version": __version__,
+        "commit": _commit(),
+    }
+    if resume:
+        settings, state, origin = restore_run(out)
+    run = Run(settings, origin["seed"], origin["physics"], out, origin, state)
+    started = time.monotonic()
+    try:
+        finished = run.train()
+    except TrainingDivergedError as error:
+        print(f"training diverged: {error}; the last good policy and checkpoint are in {out}", file=sys.stderr)  # noqa: T201
+        return 1
+    print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)  # noqa: T201
+    if not finished:
+        return 130
+    return _evaluate(settings, out, out / POLICY)
+
+
+def _refuse_with_resume(options: argparse.Namespace) -> None:
+    given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
+    given += ["--out"] if options.out else []
+    if given:
+        raise InputError(f"--resume continues with the run's own configuration; drop {', '.join(given)}")
+
+
+def _evaluate(settings: config.Config, out: Path, policy: Path) -> int:
+    """Judge the exported policy against `copy` on the standard scenarios of its plant; figures go to DIR/eval."""
+    from mjxball.control.followers import make_baseline
+    from mjxball.evaluate.cells import STANDARD, check_bounds, load_policy, run_cells
+    from mjxball.evaluate.report import write_report
+    from mjxball.evaluate.table import table
+
+    setup = dataclasses.replace(settings, scenario=config.Scenario())
+    trained = load_policy(policy, setup)
+    cells = run_cells(setup, [make_baseline("copy", setup), trained], STANDARD, "mjx")
+    print(table(cells))  # noqa: T201
+    write_report(cells, out / "eval")
+    reference = next(cell for cell in cells if cell.follower == trained.name and cell.scenario == STANDARD[1])
+    misses = check_bounds(trained, reference.metrics)
+    verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
+    print(f"{policy} {verdict}; figures in {out / 'eval'}")  # noqa: T201
+    return 0
+
+
+def _commit() -> str:
+    """The commit of the source tree, marked if it has changes, or 'unknown' outside a repository."""
+    here = Path(__file__).parent
+    try:
+        command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"

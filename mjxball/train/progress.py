@@ -1,0 +1,84 @@
+"""The live progress line and the rows of `metrics.csv`."""
+
+from __future__ import annotations
+
+import csv
+import sys
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import TextIO
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of `metrics.csv`. Evaluation columns are empty between evaluations."""
+
+    steps: int  # environment steps so far
+    seconds: float  # since the start of training, compilation included
+    rate: float  # environment steps per second, updates included
+    episode_return: float  # mean reward x episode steps, exploring policy
+    steady_error: float  # mean |e_o| later than 8 s into an episode, exploring policy [m]
+    alpha: float
+    entropy: float  # of the policy [nat]
+    critic_loss: float
+    policy_loss: float
+    terminated: int  # episodes that ended before their time limit
+    diverged: int  # worlds that left the finite range
+    eval_return: float | None = None  # the same for the averaged policy's mean
+    eval_steady_error: float | None = None  # [m]
+    eval_peak: float | None = None  # mean over worlds of the largest steady |e_o| [m]
+
+
+class Progress:
+    """Prints one line that is overwritten on a terminal, and appends rows to `metrics.csv`."""
+
+    def __init__(self, path: Path, total: int, stream: TextIO = sys.stderr):
+        self._total = total
+        self._stream = stream
+        self._live = stream.isatty()
+        self._start = time.monotonic()
+        self._width = 0
+        new = not path.exists()
+        self._file = path.open("a", newline="")
+        self._writer = csv.DictWriter(self._file, [item.name for item in fields(Row)])
+        if new:
+            self._writer.writeheader()
+
+    def elapsed(self) -> float:
+        """Seconds since this object was made."""
+        return time.monotonic() - self._start
+
+    def say(self, text: str) -> None:
+        """Print a line of its own."""
+        clear = "\r" + " " * self._width + "\r" if self._live and self._width else ""
+        self._width = 0
+        print(clear + text, file=self._stream, flush=True)
+
+    def show(self, row: Row) -> None:
+        """Record `row` and show it."""
+        self._writer.writerow(asdict(row))
+        self._file.flush()
+        left = max(self._total - row.steps, 0) / max(row.rate, 1e-9)
+        shown = row.eval_steady_error
+        metric = (
+            f"steady error {row.steady_error:.4f} m exploring"
+            if shown is None
+            else f"steady error {shown:.4f} m, peak {row.eval_peak:.4f} m"
+        )
+        text = (
+            f"{row.steps:>9,} / {self._total:,} steps  {row.rate / 1e3:6.1f} k/s  "
+            f"{int(left) // 60}:{int(left) % 60:02d} left  return {row.episode_return:9.1f}  {metric}"
+        )
+        if self._live and shown is None:
+            self._stream.write("\r" + text.ljust(self._width))
+            self._stream.flush()
+            self._width = len(text)
+        else:
+            self.say(text)
+
+    def close(self) -> None:
+        """End the line and close the file."""
+        if self._live and self._width:
+            self._stream.write("\n")
+        self._file.close()

@@ -1,0 +1,9 @@
+#!/usr/bin/env python3
+"""Train a follower: `python train.py [PRESET]`, see `python train.py --help`."""
+
+import sys
+
+from mjxball.train.main import main
+
+if __name__ == "__main__":
+    sys.exit(main())
