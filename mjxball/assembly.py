@@ -5,8 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from mjxball.config import Plant
-from mjxball.physics.constants import box_inertia_per_mass
+from mjxball.config import Attitude, Plant
+from mjxball.physics.constants import plant_constants
+from mjxball.physics.engine import ROLLING_INERTIA
 
 ASSEMBLY = "assembly"
 LEADER = "leader"
@@ -19,13 +20,16 @@ COLOURS = {LEADER: (0.85, 0.25, 0.2, 1.0), FOLLOWER: (0.2, 0.4, 0.85, 1.0)}
 
 
 def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
-    """Return the model's MjSpec: one free body, two welded drones, the object's mass on a slide joint along x.
+    """Return the model's MjSpec: the object's shell, two welded drones, and the moving mass on a slide joint.
 
-    The drones' centres sit at their mounts, the shell of the object is massless, and the ball carries the
-    object's whole mass with the box's inertia (design section 4). Eight `motor` actuators, in the order
-    leader 1..4, follower 1..4, take rotor forces in newtons; their gear holds the yaw moment.
+    The drones' centres sit at their mounts. In the reference plant the shell is massless and the ball carries
+    the object's whole mass with the box's inertia (design section 4). The root is free, or on a stand: a
+    hinge along x (`pivot`), or a vertical slide and that hinge (`heave`). Eight `motor` actuators, in the
+    order leader 1..4, follower 1..4, take rotor forces in newtons; their gear holds the yaw moment.
     `timestep` [s] matters only to viewers and to MuJoCo's own integrator.
     """
+    constants = plant_constants(plant, Attitude())
+    fixed, moving = (1 - plant.moving_fraction) * plant.object_mass, plant.moving_fraction * plant.object_mass
     spec = mujoco.MjSpec()
     spec.modelname = "mjxball"
     spec.option.timestep = timestep
@@ -33,19 +37,26 @@ def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     _add_scenery(spec)
-    body = spec.worldbody.add_body(name=ASSEMBLY, mass=0.0, explicitinertial=True, ipos=[0, 0, 0], inertia=[0, 0, 0])
-    body.add_freejoint(name="free")
+    shell_inertia = (plant.object_mass * constants.shell_inertia_per_mass).tolist()
+    body = spec.worldbody.add_body(
+        name=ASSEMBLY, mass=fixed, explicitinertial=True, ipos=[0, 0, 0], inertia=shell_inertia
+    )
+    _add_root_joints(body, plant.stand)
     half = np.array(plant.object_size) / 2
     _add_visual(body, "shell", mujoco.mjtGeom.mjGEOM_BOX, half, (0.75, 0.65, 0.45, 0.35))
     body.add_site(name="origin", pos=[0, 0, 0], size=[0.01, 0.01, 0.01])
     _add_drone(spec, body, LEADER, plant.leader_mass, plant.leader_inertia, plant.leader_mount, plant)
     _add_drone(spec, body, FOLLOWER, plant.follower_mass, plant.follower_inertia, plant.follower_mount, plant)
-    inertia = plant.object_mass * box_inertia_per_mass(plant.object_size)
     ball = body.add_body(
-        name=BALL, mass=plant.object_mass, explicitinertial=True, ipos=[0, 0, 0], inertia=inertia.tolist()
+        name=BALL,
+        mass=moving,
+        explicitinertial=True,
+        ipos=[0, 0, 0],
+        inertia=(plant.object_mass * constants.ball_inertia_per_mass).tolist(),
     )
-    ball.add_joint(name=BALL_JOINT, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
-    _add_visual(ball, "cg", mujoco.mjtGeom.mjGEOM_SPHERE, [0.6 * half[2] + 0.01, 0, 0], (0.95, 0.75, 0.1, 1.0))
+    axis = [1.0, 0, 0] if plant.cg_axis == "x" else [0, 1.0, 0]
+    ball.add_joint(name=BALL_JOINT, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, armature=ROLLING_INERTIA * moving)
+    _add_visual(ball, "cg", mujoco.mjtGeom.mjGEOM_SPHERE, [plant.ball_radius, 0, 0], (0.95, 0.75, 0.1, 1.0))
     return spec
 
 
@@ -69,6 +80,15 @@ def to_mjcf(plant: Plant) -> str:
     spec = build_spec(plant)
     spec.compile()
     return spec.to_xml()
+
+
+def _add_root_joints(body: mujoco.MjsBody, stand: str) -> None:
+    if stand == "free":
+        body.add_freejoint(name="free")
+        return
+    if stand == "heave":
+        body.add_joint(name="heave", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+    body.add_joint(name="roll", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[1, 0, 0])
 
 
 def _add_scenery(spec: mujoco.MjSpec) -> None:

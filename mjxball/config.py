@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import math
 import types
@@ -54,6 +55,17 @@ class Plant:
         (2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the follower about its centre [kg m2]", above=0
     )
     object_size: Vector3 = setting((0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", above=0)
+    moving_fraction: float = setting(
+        1.0,
+        "share of the object's mass that moves, m_b / m_o; the rest is a fixed shell, a box about O",
+        above=0,
+        high=1,
+    )
+    ball_radius: float = setting(0.02, "radius of the moving ball [m]", above=0)
+    cg_axis: Literal["x", "y"] = setting("x", "body axis along which the CG moves and the drones are mounted")
+    stand: Literal["free", "pivot", "heave"] = setting(
+        "free", "free flight; pivot: O fixed, only roll free; heave: roll and height free"
+    )
     leader_mount: Vector3 = setting((0.17, 0.0, 0.0), "centre of the leader from O, body axes [m]")
     follower_mount: Vector3 = setting((-0.17, 0.0, 0.0), "centre of the follower from O, body axes [m]")
     arm: float = setting(0.12, "centre of a drone to each rotor, plus layout [m]", above=0)
@@ -61,6 +73,22 @@ class Plant:
     rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", above=0)
     yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", above=0)
     gravity: float = setting(9.81, "gravitational acceleration [m/s2]", above=0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the centre of gravity moves along `plant.cg_axis`."""
+
+    kind: Literal["sine", "waveform", "rolling"] = setting(
+        "sine", "sine: drawn or given per flight; waveform: the samples below; rolling: a free ball with end stops"
+    )
+    times: tuple[float, ...] = setting((), "waveform: increasing sample times [s]")
+    offsets: tuple[float, ...] = setting(
+        (), "waveform: CG offsets at those times, a C2 spline between, held outside [m]"
+    )
+    rolling_friction: float = setting(0.005, "rolling: friction over the normal force", low=0, high=1)
+    stop_frequency: float = setting(60.0, "rolling: natural frequency of the ball against an end stop [rad/s]", above=0)
+    stop_damping: float = setting(0.4, "rolling: damping ratio of an end stop, 1 does not bounce", low=0, high=2)
 
 
 @dataclass(frozen=True)
@@ -123,6 +151,11 @@ class Scenario:
     cg_speed: Range = setting((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0, ordered=True)
     cg_amplitude: Range = setting((0.05, 0.05), "amplitude of the CG's sine [m]", low=0, ordered=True)
     object_mass: Range = setting((0.2, 0.2), "true mass of the object [kg]", above=0, ordered=True)
+    mass_change: Range = setting(
+        (0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]", ordered=True
+    )
+    mass_change_time: Range = setting((5.0, 15.0), "when the object's mass changes [s]", low=0, ordered=True)
+    ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0)
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
     termination_distance: float = setting(2.5, "an episode ends when |e_o| exceeds this, d_term [m]", above=0)
 
@@ -185,6 +218,7 @@ class Config:
 
     preset: str = "paper"
     plant: Plant = Plant()
+    motion: Motion = Motion()
     attitude: Attitude = Attitude()
     leader: Leader = Leader()
     follower: Follower = Follower()
@@ -235,8 +269,8 @@ def _parse(path: str, text: str, example: Any) -> Any:
         if isinstance(example, bool):
             return {"true": True, "false": False, "1": True, "0": False}[text.lower()]
         if isinstance(example, tuple):
-            kind = type(example[0])
-            return tuple(kind(part) for part in text.split(","))
+            kind = type(example[0]) if example else float
+            return tuple(kind(part) for part in text.split(",")) if text else ()
         return type(example)(text)
     except (ValueError, KeyError):
         kind = "comma-separated numbers" if isinstance(example, tuple) else type(example).__name__
@@ -260,7 +294,7 @@ def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> No
         wanted = len(typing.get_args(hint))
         if len(value) != wanted:
             raise InputError(f"{path} takes {wanted} numbers, not {len(value)}")
-    if not numbers:
+    if not numbers and item.default:
         raise InputError(f"{path} must hold at least one number")
     bounds = item.metadata
     for number in numbers:
@@ -283,12 +317,8 @@ def validate(config: Config) -> Config:
         for part in path.split(".")[:-1]:
             owner = getattr(owner, part)
         _check_leaf(path, value, item, _types_of(owner)[item.name])
-    half = config.plant.object_size[0] / 2
-    if config.scenario.cg_amplitude[1] > half + 1e-12:
-        raise InputError(
-            f"scenario.cg_amplitude {config.scenario.cg_amplitude[1]:g} m leaves the object, "
-            f"whose half length is {half:g} m"
-        )
+    _validate_plant(config.plant)
+    _validate_motion(config)
     start, goal = config.scenario.start_position, config.scenario.goal_reach
     farthest = math.sqrt(3) * (start + goal)
     if farthest >= config.scenario.termination_distance:
@@ -296,8 +326,6 @@ def validate(config: Config) -> Config:
             f"scenario.goal_reach and start_position allow |e_o| = {farthest:.3g} m at the start, "
             f"beyond termination_distance {config.scenario.termination_distance:g} m"
         )
-    if config.plant.leader_mount[0] <= config.plant.follower_mount[0]:
-        raise InputError("plant.leader_mount must lie ahead of plant.follower_mount along x")
     if config.physics_step > 0.005 + 1e-12:
         raise InputError(
             f"timing gives physics steps of {config.physics_step * 1e3:.3g} ms, but the attitude loop "
@@ -308,6 +336,42 @@ def validate(config: Config) -> Config:
     if config.sac.replay % config.sac.worlds:
         raise InputError("sac.replay must be a multiple of sac.worlds")
     return config
+
+
+def _validate_plant(plant: Plant) -> None:
+    along = "xy".index(plant.cg_axis)
+    if plant.leader_mount[along] <= plant.follower_mount[along]:
+        raise InputError(f"plant.leader_mount must lie ahead of plant.follower_mount along {plant.cg_axis}")
+    if 2 * plant.ball_radius > plant.object_size[along]:
+        raise InputError(
+            f"plant.ball_radius {plant.ball_radius:g} m makes a ball larger than the object, "
+            f"which is {plant.object_size[along]:g} m long"
+        )
+
+
+def cg_reach(plant: Plant) -> float:
+    """Largest offset of the CG from O that keeps the moving mass on the object [m]."""
+    return plant.moving_fraction * plant.object_size["xy".index(plant.cg_axis)] / 2
+
+
+def _validate_motion(config: Config) -> None:
+    reach = cg_reach(config.plant) + 1e-12
+    scenario, motion = config.scenario, config.motion
+    if motion.kind == "sine" and scenario.cg_amplitude[1] > reach:
+        raise InputError(
+            f"scenario.cg_amplitude {scenario.cg_amplitude[1]:g} m leaves the object: the CG reaches {reach:.4g} m"
+        )
+    if scenario.object_mass[0] + scenario.mass_change[0] <= 0:
+        raise InputError(f"scenario.mass_change {scenario.mass_change[0]:g} kg would leave no object mass")
+    if motion.kind == "rolling" and scenario.ball_start > reach / config.plant.moving_fraction:
+        raise InputError(f"scenario.ball_start {scenario.ball_start:g} m lies beyond the object's end")
+    if motion.kind == "waveform":
+        if len(motion.times) != len(motion.offsets) or len(motion.times) < 2:
+            raise InputError("motion.times and motion.offsets must hold the same number of samples, two or more")
+        if any(later <= earlier for earlier, later in itertools.pairwise(motion.times)):
+            raise InputError("motion.times must increase from sample to sample")
+        if max(map(abs, motion.offsets)) > reach:
+            raise InputError(f"motion.offsets leave the object: the CG reaches {reach:.4g} m")
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from mjxball.config import Config
 from mjxball.control import leader, observation, rotations
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.mjx import jax_repeat, make_acceleration
+from mjxball.physics.mjx import jax_repeat, make_engine
 from mjxball.physics.step import make_control_step, start_state
 from mjxball.quiet import import_brax_env
 from mjxball.rewards import paper_reward, task_reward
@@ -48,7 +48,7 @@ class CoupledPairEnv(Env):
             raise ValueError(f"physics must be one of {PHYSICS}, not {physics!r}")
         self.config = config
         self._backend = physics
-        make = make_acceleration if physics == "mjx" else newton_euler.make_acceleration
+        make = make_engine if physics == "mjx" else newton_euler.make_engine
         self._control_step = make_control_step(config, make(config.plant, config.attitude), jax_repeat)
         self._mount = jnp.asarray(config.plant.follower_mount, jnp.float32)
 
@@ -82,7 +82,7 @@ class CoupledPairEnv(Env):
     def reset(self, rng: Array) -> State:
         """A fresh world at rest or nearly so, drawn from `config.scenario`."""
         scenario = self.config.scenario
-        keys = jax.random.split(rng, 8)
+        keys = jax.random.split(rng, 11)
 
         def symmetric(key: Array, reach: Any, shape: tuple[int, ...] = (3,)) -> Array:
             return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) * reach
@@ -98,6 +98,8 @@ class CoupledPairEnv(Env):
             cg_amplitude=between(keys[1], scenario.cg_amplitude),
             cg_speed=between(keys[2], scenario.cg_speed),
             cg_phase=between(keys[3], (0.0, 2 * jnp.pi)),
+            mass_change=between(keys[8], scenario.mass_change)[None],
+            mass_change_time=between(keys[9], scenario.mass_change_time)[None],
         )
         tilt = symmetric(keys[4], scenario.start_tilt) * jnp.array([1.0, 1.0, 0.0])
         plant = start_state(
@@ -106,6 +108,7 @@ class CoupledPairEnv(Env):
             euler=tilt,
             velocity=symmetric(keys[6], scenario.start_velocity),
             believed_mass=load.believed_mass,
+            ball_offset=symmetric(keys[10], scenario.ball_start, ()),
         )
         goal = symmetric(keys[7], scenario.goal_reach)
         follower = self.config.follower

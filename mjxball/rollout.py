@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from mjxball.config import Config, Plant, preset
+from mjxball.config import Config, Plant, cg_reach, preset
 from mjxball.control import leader, observation, rotations
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
-from mjxball.physics import motion
+from mjxball.physics import newton_euler
+from mjxball.physics.constants import plant_constants
+from mjxball.physics.contact import contact_wrenches
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import start_state
+from mjxball.physics.motion import object_mass
+from mjxball.physics.step import make_accelerations, make_cg_offset, start_state, total_wrench
 from mjxball.physics.stepper import make_stepper
+
+Act = Callable[[np.ndarray], np.ndarray]  # observations (n, 18) -> commands (n, 3)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal (design section 9)."""
+    """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal (design section 9).
+
+    How the CG moves (sine, waveform, rolling ball) is the configuration's `motion`; a sine's numbers are here.
+    """
 
     omega: float = 0.31  # angular speed of the CG's sine [rad/s]
     amplitude: float = 0.05  # of the CG's sine [m]
@@ -29,6 +37,8 @@ class Scenario:
     goal: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of O [m]
     seconds: float = 45.0
     phase: float = 0.0  # of the CG's sine [rad]
+    mass_changes: tuple[tuple[float, float], ...] = ()  # (time [s], mass added or, if negative, dropped [kg])
+    ball_start: float = 0.0  # of a rolling ball from O along the CG axis [m]
 
 
 @dataclass(frozen=True)
@@ -49,7 +59,10 @@ class Trajectory:
     leader_command: np.ndarray  # (T, ..., 3) roll, pitch [rad], vertical acceleration [m/s2]
     follower_command: np.ndarray  # (T, ..., 3) likewise
     observation: np.ndarray  # (T, ..., 18) what the follower saw
-    cg_offset: np.ndarray  # (T, ...) along body x from O [m]
+    cg_offset: np.ndarray  # (T, ...) along the CG axis from O [m]
+    object_mass: np.ndarray  # (T, ...) [kg]
+    contact_force: np.ndarray  # (T, ..., 2, 3) of leader, follower on the object, body axes [N]
+    contact_torque: np.ndarray  # (T, ..., 2, 3) likewise, about each drone's centre [N m]
     goal: np.ndarray  # (..., 3) of O [m]
     diverged: np.ndarray  # (...) bool
 
@@ -106,20 +119,29 @@ def simulate_batch(
 
 def check_scenario(config: Config, scenario: Scenario) -> None:
     """Raise InputError with one sentence if `scenario` makes no sense on `config`'s plant."""
-    numbers = dataclasses.astuple(dataclasses.replace(scenario, goal=0.0, believed_mass=scenario.believed_mass or 0.0))
-    if not np.isfinite([*numbers, *scenario.goal]).all():
-        raise InputError("every number of a scenario must be finite")
     if len(scenario.goal) != 3:
         raise InputError(f"goal takes 3 numbers, not {len(scenario.goal)}")
+    plain = dataclasses.replace(scenario, goal=(), mass_changes=(), believed_mass=scenario.believed_mass or 0.0)
+    numbers = [value for value in dataclasses.astuple(plain) if value != ()]
+    changes = [number for change in scenario.mass_changes for number in change]
+    if not np.isfinite([*numbers, *scenario.goal, *changes]).all():
+        raise InputError("every number of a scenario must be finite")
     if scenario.mass <= 0:
         raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
     if scenario.believed_mass is not None and scenario.believed_mass < 0:
         raise InputError(f"believed mass must not be negative, but is {scenario.believed_mass:g} kg")
     if scenario.omega < 0 or scenario.amplitude < 0:
         raise InputError("omega and amplitude must not be negative")
-    half = config.plant.object_size[0] / 2
-    if scenario.amplitude > half + 1e-12:
-        raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object, whose half length is {half:g} m")
+    left = scenario.mass + np.cumsum([mass for _, mass in sorted(scenario.mass_changes)])
+    if (left <= 0).any():
+        raise InputError(f"the mass changes would leave {left.min():.3g} kg of object; it must stay positive")
+    if any(time < 0 for time, _ in scenario.mass_changes):
+        raise InputError("the time of a mass change must not be negative")
+    reach = cg_reach(config.plant)
+    if config.motion.kind == "sine" and scenario.amplitude > reach + 1e-12:
+        raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object: the CG reaches {reach:.4g} m")
+    if abs(scenario.ball_start) > reach / config.plant.moving_fraction + 1e-12:
+        raise InputError(f"ball start {scenario.ball_start:g} m lies beyond the object's end")
     limit = config.scenario.termination_distance
     if np.linalg.norm(scenario.goal) > limit:
         raise InputError(
@@ -129,55 +151,83 @@ def check_scenario(config: Config, scenario: Scenario) -> None:
         raise InputError(f"seconds must be between one control period and a day, not {scenario.seconds:g}")
 
 
-def _fly(config: Config, scenarios: Sequence[Scenario], act: object, physics: str) -> Trajectory:
-    step = make_stepper(config, physics)
+def _fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Trajectory:
+    step, cg_offset = make_stepper(config, physics), make_cg_offset(config)
     period = config.timing.control_period
     count = round(scenarios[0].seconds / period)
     load, goal = _load(scenarios), np.array([scenario.goal for scenario in scenarios], float)
     zero = np.zeros_like(goal)
-    state = start_state(config, zero, zero, zero, load.believed_mass)
+    start = np.array([scenario.ball_start for scenario in scenarios], float)
+    state = start_state(config, zero, zero, zero, load.believed_mass, start)
     integral, diverged = zero.copy(), np.zeros(len(scenarios), bool)
     mount = np.array(config.plant.follower_mount)
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in _ROWS}
+    states, others = [], []
     for number in range(count + 1):
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         seen = observation.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
         led = _leader_command(config, goal, state, integral)
         followed = act(seen)
-        cg = motion.sine(number * period, load.cg_amplitude, load.cg_speed, load.cg_phase)
-        euler = rotations.euler_from_matrix(matrix)
-        values = (state.position, state.velocity, euler, state.rates, state.quaternion, state.rotor_force)
-        for name, value in zip(_ROWS, (*values, led, followed, seen, cg.offset), strict=True):
-            rows[name].append(value)
+        states.append(state)
+        others.append((rotations.euler_from_matrix(matrix), led, followed, seen, cg_offset(state, load)))
         if number < count:
             integral = integral + period * (goal - state.position)
             moved = step(state, np.stack([led, followed], axis=1), load)
             diverged |= _diverged(moved)
             state = PlantState(*(_keep(diverged, old, new) for old, new in zip(state, moved, strict=True)))
-    stacked = {name: np.stack(values) for name, values in rows.items()}
-    return Trajectory(time=np.arange(count + 1) * period, goal=goal, diverged=diverged, **stacked)
+    flown = PlantState(*(np.stack(leaves) for leaves in zip(*states, strict=True)))
+    grid = np.arange(count + 1) * period  # exact, so that a mass change falls on the same row for every engine
+    flown = flown._replace(time=np.broadcast_to(grid[:, None], flown.time.shape))
+    euler, led, followed, seen, offset = (np.stack(column) for column in zip(*others, strict=True))
+    force, torque = flown_contact_wrenches(config, flown, load, physics)
+    return Trajectory(
+        time=grid,
+        position=flown.position,
+        velocity=flown.velocity,
+        euler=euler,
+        rates=flown.rates,
+        quaternion=flown.quaternion,
+        rotor_force=flown.rotor_force,
+        leader_command=led,
+        follower_command=followed,
+        observation=seen,
+        cg_offset=offset,
+        object_mass=object_mass(flown.time, load),
+        contact_force=force,
+        contact_torque=torque,
+        goal=goal,
+        diverged=diverged,
+    )
 
 
-_ROWS = (
-    "position",
-    "velocity",
-    "euler",
-    "rates",
-    "quaternion",
-    "rotor_force",
-    "leader_command",
-    "follower_command",
-    "observation",
-    "cg_offset",
-)
+def flown_contact_wrenches(
+    config: Config, flown: PlantState, load: Load, physics: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Contact forces and torques (T, n, 2, 3) of recorded states (T, n, ...), see `physics.contact`.
+
+    `mujoco` reads MuJoCo's own internal forces; the other engines share the closed form.
+    """
+    if physics == "mujoco":
+        from mjxball.physics.mujoco import flown_contact_wrenches as measured
+
+        return measured(config, flown, load)
+    constants = plant_constants(config.plant, config.attitude)
+    accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
+    wrench = total_wrench(np, flown.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust)
+    linear, angular, _ = accelerate(flown, wrench, load)
+    return contact_wrenches(config.plant, constants, flown, linear, angular)
+
+
 DIVERGED_POSITION, DIVERGED_RATE = 1e3, 1e2  # [m], [rad/s]
 
 
 def _load(scenarios: Sequence[Scenario]) -> Load:
     mass = np.array([scenario.mass for scenario in scenarios], float)
     believed = [s.mass if s.believed_mass is None else s.believed_mass for s in scenarios]
-    sine = ([getattr(s, name) for s in scenarios] for name in ("amplitude", "omega", "phase"))
-    return Load(mass, np.array(believed, float), *(np.array(values, float) for values in sine))
+    sine = (np.array([getattr(s, name) for s in scenarios], float) for name in ("amplitude", "omega", "phase"))
+    most = max(len(scenario.mass_changes) for scenario in scenarios)
+    padded = [[*s.mass_changes, *[(np.inf, 0.0)] * (most - len(s.mass_changes))] for s in scenarios]
+    changes = np.array(padded, float).reshape(len(scenarios), most, 2)
+    return Load(mass, np.array(believed, float), *sine, changes[..., 1], changes[..., 0])
 
 
 def _leader_command(config: Config, goal: np.ndarray, state: PlantState, integral: np.ndarray) -> np.ndarray:

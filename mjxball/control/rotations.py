@@ -8,13 +8,35 @@ Array = Any  # any array that implements the Python array API standard
 
 
 def rotate(matrix: Array, vector: Array) -> Array:
-    """R v for `matrix` (..., 3, 3) and `vector` (..., 3) -> (..., 3)."""
-    return (matrix * vector[..., None, :]).sum(axis=-1)
+    """R v for `matrix` (..., 3, 3) and `vector` (..., 3) -> (..., 3).
+
+    Written out by component, like everything here: XLA then fuses a whole physics step into few kernels.
+    """
+    xp = matrix.__array_namespace__()
+    return xp.stack([dot(matrix[..., i, :], vector) for i in range(3)], axis=-1)
 
 
 def rotate_back(matrix: Array, vector: Array) -> Array:
     """R^T v for `matrix` (..., 3, 3) and `vector` (..., 3) -> (..., 3)."""
-    return (matrix * vector[..., :, None]).sum(axis=-2)
+    xp = matrix.__array_namespace__()
+    return xp.stack([dot(matrix[..., :, i], vector) for i in range(3)], axis=-1)
+
+
+def dot(a: Array, b: Array) -> Array:
+    """a . b for (..., 3) each, broadcast -> (...)."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+
+
+def point_inertia(r: Array) -> Array:
+    """|r|^2 I - r r^T (..., 3, 3) [m2] of a unit point mass at `r` (..., 3) [m]."""
+    xp = r.__array_namespace__()
+    x, y, z = (r[..., i] for i in range(3))
+    rows = [
+        xp.stack([y * y + z * z, -x * y, -x * z], axis=-1),
+        xp.stack([-x * y, x * x + z * z, -y * z], axis=-1),
+        xp.stack([-x * z, -y * z, x * x + y * y], axis=-1),
+    ]
+    return xp.stack(rows, axis=-2)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -95,6 +117,12 @@ def quaternion_from_euler(euler: Array) -> Array:
     return multiply_quaternions(multiply_quaternions(about_z, about_x), about_y)
 
 
+def roll_of_quaternion(quaternion: Array) -> Array:
+    """Angle (...) [rad] of a `quaternion` (..., 4) that turns about x alone."""
+    xp = quaternion.__array_namespace__()
+    return 2 * xp.atan2(quaternion[..., 1], quaternion[..., 0])
+
+
 def integrate_quaternion(quaternion: Array, rotation: Array) -> Array:
     """q exp(rotation / 2), normalised: turn `quaternion` (..., 4) by the body-axes vector `rotation` (..., 3) [rad].
 
@@ -102,11 +130,12 @@ def integrate_quaternion(quaternion: Array, rotation: Array) -> Array:
     for |rotation| <= 0.5 rad, far beyond what one physics step turns.
     """
     xp = quaternion.__array_namespace__()
-    h2 = (rotation * rotation).sum(axis=-1, keepdims=True) / 4
+    h2 = dot(rotation, rotation)[..., None] / 4
     sine = 0.5 * (1 - h2 / 6 * (1 - h2 / 20 * (1 - h2 / 42 * (1 - h2 / 72))))
     cosine = 1 - h2 / 2 * (1 - h2 / 12 * (1 - h2 / 30 * (1 - h2 / 56 * (1 - h2 / 90))))
     turned = multiply_quaternions(quaternion, xp.concat([cosine, sine * rotation], axis=-1))
-    return turned / xp.sqrt((turned * turned).sum(axis=-1, keepdims=True))
+    w, x, y, z = (turned[..., i : i + 1] for i in range(4))
+    return turned / xp.sqrt(w * w + x * x + y * y + z * z)
 
 
 def solve_symmetric(matrix: Array, vector: Array) -> Array:

@@ -17,8 +17,15 @@ class PlantConstants(NamedTuple):
     mounts: np.ndarray  # (2, 3) leader, follower from O, body axes [m]
     share: np.ndarray  # (2,) share of the object's weight that each drone carries with the CG at O
     gains: AttitudeGains  # attitude gains of each drone
-    box_inertia_per_mass: np.ndarray  # (3,) principal inertia of the object about its own centre, per kg [m2]
+    drone_moment: np.ndarray  # (3,) sum of m_i r_i [kg m]
     drone_inertia: np.ndarray  # (3, 3) inertia of both drones about O, body axes [kg m2]
+    shell_inertia_per_mass: np.ndarray  # (3,) of the fixed part of the object about O, per kg of object [m2]
+    ball_inertia_per_mass: np.ndarray  # (3,) of the moving part about its own centre, per kg of object [m2]
+
+    @property
+    def object_inertia_per_mass(self) -> np.ndarray:
+        """(3,) of the whole object about O with the CG at O, per kg of object [m2]."""
+        return self.shell_inertia_per_mass + self.ball_inertia_per_mass
 
 
 def box_inertia_per_mass(size: tuple[float, float, float]) -> np.ndarray:
@@ -33,15 +40,21 @@ def point_inertia(position: np.ndarray) -> np.ndarray:
 
 
 def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
-    """Derive the constants of `plant`; the attitude gains are those of `attitude.design_object_mass` at c = 0."""
+    """Derive the constants of `plant`; the attitude gains are those of `attitude.design_object_mass` at c = 0.
+
+    If the whole object moves (`moving_fraction` 1) the moving mass has the box's inertia, as in the reference
+    plant; else it is a solid ball, and the fixed rest is the box.
+    """
     mass = np.array([plant.leader_mass, plant.follower_mass])
     mounts = np.array([plant.leader_mount, plant.follower_mount])
     own = np.diag(plant.leader_inertia) + np.diag(plant.follower_inertia)
     drone_inertia = own + sum(m * point_inertia(r) for m, r in zip(mass, mounts, strict=True))
-    box = box_inertia_per_mass(plant.object_size)
-    design_inertia = np.diag(drone_inertia) + attitude.design_object_mass * box
-    ahead, behind = mounts[0, 0], mounts[1, 0]
+    box, fraction = box_inertia_per_mass(plant.object_size), plant.moving_fraction
+    ball = box if fraction == 1 else np.full(3, fraction * 0.4 * plant.ball_radius**2)
+    shell = (1 - fraction) * box
+    design_inertia = np.diag(drone_inertia) + attitude.design_object_mass * (shell + ball)
+    ahead, behind = mounts[:, "xy".index(plant.cg_axis)]
     share = np.array([-behind, ahead]) / (ahead - behind)
     gains = design_gains(design_inertia, attitude.natural_frequency, attitude.damping)
     gains = AttitudeGains(tuple(map(float, gains.kp)), tuple(map(float, gains.kd)))
-    return PlantConstants(mass, mounts, share, gains, box, drone_inertia)
+    return PlantConstants(mass, mounts, share, gains, mass @ mounts, drone_inertia, shell, ball)

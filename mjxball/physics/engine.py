@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from mjxball.physics.motion import CgState
-
 Array = Any
+ROLLING_INERTIA = 0.4  # spin inertia of a solid ball over r^2 and its mass: (7/5) m x'' = m g sin
 
 
 class PlantState(NamedTuple):
-    """State of the rigid assembly and its rotors, any leading batch shape."""
+    """State of the rigid assembly, its rotors and a rolling ball, any leading batch shape."""
 
     position: Array  # (..., 3) of O in the world [m]
     quaternion: Array  # (..., 4) body -> world, (w, x, y, z)
@@ -19,16 +18,28 @@ class PlantState(NamedTuple):
     rates: Array  # (..., 3) angular velocity in body axes [rad/s]
     rotor_force: Array  # (..., 2, 4) leader, follower [N]
     time: Array  # (...) since the start of the episode [s]
+    ball_offset: Array  # (...) of a rolling ball from O along the CG axis [m]; unused by prescribed motions
+    ball_rate: Array  # (...) [m/s]
+
+
+class CgState(NamedTuple):
+    """CG offset from O along the CG axis, with consistent derivatives."""
+
+    offset: Array  # (...) [m]
+    rate: Array  # (...) [m/s]
+    acceleration: Array  # (...) [m/s2]
 
 
 class Load(NamedTuple):
-    """The object's mass and the prescribed motion of its centre of gravity."""
+    """The object's mass and the motion of its centre of gravity."""
 
-    object_mass: Array  # (...) true mass [kg]
+    object_mass: Array  # (...) true mass at the start [kg]
     believed_mass: Array  # (...) mass that the hover thrust assumes [kg]
-    cg_amplitude: Array  # (...) [m]
-    cg_speed: Array  # (...) [rad/s]
-    cg_phase: Array  # (...) [rad]
+    cg_amplitude: Array  # (...) of a sine [m]
+    cg_speed: Array  # (...) of a sine [rad/s]
+    cg_phase: Array  # (...) of a sine [rad]
+    mass_change: Array  # (..., k) mass added, or dropped if negative [kg]
+    mass_change_time: Array  # (..., k) when [s]
 
 
 class Wrench(NamedTuple):
@@ -38,6 +49,13 @@ class Wrench(NamedTuple):
     torque: Array  # (..., 3) [N m]
 
 
-# acceleration(state, wrench, object_mass (...) [kg], cg)
-#   -> (acceleration of O in the world (..., 3) [m/s2], angular acceleration in body axes (..., 3) [rad/s2])
-Acceleration = Callable[[PlantState, Wrench, Array, CgState], tuple[Array, Array]]
+class Engine(NamedTuple):
+    """Accelerations of the assembly. Both functions return the acceleration of O in the world (..., 3) [m/s2]
+    and the angular acceleration in body axes (..., 3) [rad/s2]; directions that a stand locks are 0.
+    """
+
+    # prescribed(state, wrench, object_mass (...), cg): the CG follows `cg`, driven by whatever force that takes
+    prescribed: Callable[[PlantState, Wrench, Array, CgState], tuple[Array, Array]]
+    # rolling(state, wrench, object_mass (...), force (...) on the ball along the axis [N]):
+    #   the ball at state.ball_offset rolls freely; returns its acceleration (...) [m/s2] as well
+    rolling: Callable[[PlantState, Wrench, Array, Array], tuple[Array, Array, Array]]

@@ -1,4 +1,4 @@
-"""Accelerations of the assembly from MuJoCo MJX: the ball's slide joint is driven, so its reaction acts."""
+"""Accelerations of the assembly from MuJoCo MJX: the ball's slide joint is driven or rolls, its reaction acts."""
 
 from __future__ import annotations
 
@@ -7,63 +7,120 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjxball.assembly import BALL, build_model
+from mjxball.assembly import ASSEMBLY, BALL, build_model
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.physics.constants import box_inertia_per_mass
-from mjxball.physics.engine import Acceleration, PlantState, Wrench
-from mjxball.physics.motion import CgState
+from mjxball.physics.constants import plant_constants
+from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, PlantState, Wrench
 from mjxball.quiet import import_mjx
 
 Array = Any
-SLIDE = 6  # degree of freedom of the ball's joint; 0..5 are the free joint's
 
 
-def make_acceleration(plant: Plant, attitude: Attitude) -> Acceleration:
-    """Return the MJX `engine.Acceleration` of `plant` for one world; use `jax.vmap` for many.
+def make_engine(plant: Plant, attitude: Attitude) -> Engine:
+    """Return the MJX engine of `plant` for one world; use `jax.vmap` for many.
 
-    MJX computes the mass matrix and the bias forces. The ball's acceleration is prescribed, c''; the six
-    accelerations of the free joint follow from their own rows, and the force that drives the slide (whose
-    reaction moves the assembly) never needs to be formed. Dynamics do not depend on where the assembly is
-    or on its linear velocity, so both are zero here: that keeps float32 at its best.
+    MJX computes the mass matrix and the bias forces. With the ball's acceleration c'' prescribed, the root's
+    accelerations follow from their own rows, and the force that drives the slide (whose reaction moves the
+    assembly) never needs to be formed; a rolling ball adds its own row. Dynamics do not depend on where the
+    assembly is or on its linear velocity, so both are zero here: that keeps float32 at its best.
     """
-    mjx = import_mjx()
-    model = build_model(plant, fuse=True)
-    world = mjx.put_model(model)
-    blank = mjx.make_data(model)
-    ball = model.body(BALL).id
-    box = jnp.asarray(box_inertia_per_mass(plant.object_size))
+    stages = _Stages(plant, attitude)
+    share = plant.moving_fraction
 
-    def acceleration(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
+    def prescribed(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
+        mass, bias = stages.equations(state, object_mass, cg.offset / share, cg.rate / share)
+        n = stages.root
+        force = stages.applied(state, wrench) - bias[:n] - mass[:n, n] * (cg.acceleration / share)
+        return stages.result(state, _solve(mass[:n, :n], force))
+
+    def rolling(state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array) -> tuple[Array, Array, Array]:
+        mass, bias = stages.equations(state, object_mass, state.ball_offset, state.ball_rate)
+        n = stages.root
+        driven = _solve(mass[:n, :n], stages.applied(state, wrench) - bias[:n])
+        recoil = _solve(mass[:n, :n], -mass[:n, n])
+        ball = (ball_force - bias[n] - mass[n, :n] @ driven) / (mass[n, n] + mass[n, :n] @ recoil)
+        return *stages.result(state, driven + ball * recoil), ball
+
+    return Engine(prescribed, rolling)
+
+
+class _Stages:
+    """MJX's smooth dynamics of one plant, with the object's mass as an argument."""
+
+    def __init__(self, plant: Plant, attitude: Attitude):
+        self._mjx = import_mjx()
+        constants = plant_constants(plant, attitude)
+        # Merging the welded bodies is exact and faster; a shell whose mass varies must stay a body of its own.
+        model = build_model(plant, fuse=plant.moving_fraction == 1)
+        self._model, self._blank = self._mjx.put_model(model), self._mjx.make_data(model)
+        self._bodies = jnp.array([model.body(ASSEMBLY).id, model.body(BALL).id])
+        self._fractions = jnp.array([1 - plant.moving_fraction, plant.moving_fraction])
+        self._inertias = jnp.array([constants.shell_inertia_per_mass, constants.ball_inertia_per_mass])
+        self._stand, self._rigid = plant.stand, plant.moving_fraction == 1
+        self.root = model.nv - 1  # degrees of freedom of the root; the ball's slide comes last
+
+    def equations(self, state: PlantState, object_mass: Array, offset: Array, rate: Array) -> tuple[Array, Array]:
+        """Mass matrix (nv, nv) and bias force (nv,) with the ball at `offset` moving at `rate`."""
         dtype = state.rates.dtype
-        m = world.replace(
-            body_mass=world.body_mass.astype(dtype).at[ball].set(object_mass),
-            body_inertia=world.body_inertia.astype(dtype).at[ball].set(object_mass * box.astype(dtype)),
+        zero = jnp.zeros((), dtype)
+        if self._stand == "free":
+            position, velocity = [jnp.zeros(3, dtype), state.quaternion], [jnp.zeros(3, dtype), state.rates]
+        else:
+            heave = [zero[None]] if self._stand == "heave" else []
+            position = [*heave, rotations.roll_of_quaternion(state.quaternion)[None]]
+            velocity = [*heave, state.rates[:1]]
+        model = self._loaded(object_mass, dtype)
+        data = self._blank.replace(
+            qpos=jnp.concatenate([*position, offset[None]]), qvel=jnp.concatenate([*velocity, rate[None]])
         )
-        zero = jnp.zeros(3, dtype)
-        data = blank.replace(
-            qpos=jnp.concatenate([zero, state.quaternion, cg.offset[None]]),
-            qvel=jnp.concatenate([zero, state.rates, cg.rate[None]]),
-        )
+        mjx = self._mjx
         for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.com_vel, mjx.rne):
-            data = stage(m, data)
-        mass_matrix = mjx.full_m(m, data)
-        matrix = rotations.matrix_from_quaternion(state.quaternion)
-        applied = jnp.concatenate([rotations.rotate(matrix, wrench.force), wrench.torque])
-        force = applied - data.qfrc_bias[:SLIDE] - mass_matrix[:SLIDE, SLIDE] * cg.acceleration
-        solution = _solve_free_joint(mass_matrix[:SLIDE, :SLIDE], force)
-        return solution[:3], solution[3:]
+            data = stage(model, data)
+        return mjx.full_m(model, data), data.qfrc_bias
 
-    return acceleration
+    def _loaded(self, object_mass: Array, dtype: Any) -> Any:
+        m = self._model
+        mass, inertia, armature = (a.astype(dtype) for a in (m.body_mass, m.body_inertia, m.dof_armature))
+        part = slice(1, None) if self._rigid else slice(None)
+        bodies, fractions, inertias = self._bodies[part], self._fractions[part], self._inertias[part]
+        return m.replace(
+            body_mass=mass.at[bodies].set(object_mass * fractions.astype(dtype)),
+            body_inertia=inertia.at[bodies].set(object_mass * inertias.astype(dtype)),
+            dof_armature=armature.at[-1].set(ROLLING_INERTIA * object_mass * self._fractions[1].astype(dtype)),
+        )
+
+    def applied(self, state: PlantState, wrench: Wrench) -> Array:
+        """Generalized force of the rotors on the root (root,)."""
+        force = rotations.rotate(rotations.matrix_from_quaternion(state.quaternion), wrench.force)
+        if self._stand == "free":
+            return jnp.concatenate([force, wrench.torque])
+        heave = [force[2:]] if self._stand == "heave" else []
+        return jnp.concatenate([*heave, wrench.torque[:1]])
+
+    def result(self, state: PlantState, solution: Array) -> tuple[Array, Array]:
+        """Accelerations of O in the world (3,) and about the body axes (3,) from the root's (root,)."""
+        if self._stand == "free":
+            return solution[:3], solution[3:]
+        zero = jnp.zeros((), solution.dtype)
+        rise = solution[0] if self._stand == "heave" else zero
+        return jnp.stack([zero, zero, rise]), jnp.stack([solution[-1], zero, zero])
 
 
-def _solve_free_joint(mass_matrix: Array, force: Array) -> Array:
-    """Solve M a = f (6,) for a free joint's mass matrix, whose linear block is the total mass times I."""
-    mass = mass_matrix[0, 0]
-    coupling = mass_matrix[3:, :3]
-    central = mass_matrix[3:, 3:] - coupling @ coupling.T / mass
-    angular = rotations.solve_symmetric(central, force[3:] - coupling @ force[:3] / mass)
-    return jnp.concatenate([(force[:3] - angular @ coupling) / mass, angular])
+def _solve(mass: Array, force: Array) -> Array:
+    """Solve M a = f for the root: 6 (free joint, whose linear block is the total mass times I), 2 or 1."""
+    if mass.shape[0] == 1:
+        return force / mass[0]
+    if mass.shape[0] == 2:
+        (a, b), (_, c) = mass
+        return jnp.stack([c * force[0] - b * force[1], a * force[1] - b * force[0]]) / (a * c - b * b)
+    total, coupling = mass[0, 0], mass[3:, :3]
+    rows = [coupling[i] for i in range(3)]
+    squares = jnp.stack([jnp.stack([rotations.dot(a, b) for b in rows]) for a in rows])
+    push = jnp.stack([rotations.dot(row, force[:3]) for row in rows])
+    angular = rotations.solve_symmetric(mass[3:, 3:] - squares / total, force[3:] - push / total)
+    back = rotations.rotate_back(coupling, angular)
+    return jnp.concatenate([(force[:3] - back) / total, angular])
 
 
 def jax_repeat(body: Any, count: int, value: Any) -> Any:

@@ -1,18 +1,19 @@
-"""Prescribed motions of the object's centre of gravity along the body x axis."""
+"""Motions of the object's centre of gravity along the body axis `plant.cg_axis`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from mjxball.config import Config, cg_reach
+from mjxball.errors import InputError
+from mjxball.physics.engine import CgState, Load
+
 Array = Any
-
-
-class CgState(NamedTuple):
-    """CG offset from O along body x, with consistent derivatives."""
-
-    offset: Array  # (...) [m]
-    rate: Array  # (...) [m/s]
-    acceleration: Array  # (...) [m/s2]
+Prescribed = Callable[[Array, Load], CgState]
+CREEP = 0.005  # [m/s] below which rolling friction fades to zero, so that its sign is smooth
 
 
 def sine(time: Array, amplitude: Array, speed: Array, phase: Array) -> CgState:
@@ -21,3 +22,88 @@ def sine(time: Array, amplitude: Array, speed: Array, phase: Array) -> CgState:
     xp = angle.__array_namespace__()
     offset = amplitude * xp.sin(angle)
     return CgState(offset, amplitude * speed * xp.cos(angle), -speed * speed * offset)
+
+
+class Spline(NamedTuple):
+    """A C2 cubic spline: on piece k, c = sum_j coefficients[k, j] (t - times[k])^(3 - j)."""
+
+    times: np.ndarray  # (n,) knots [s]
+    coefficients: np.ndarray  # (n - 1, 4)
+
+
+def fit_spline(times: Any, offsets: Any) -> Spline:
+    """The clamped cubic spline (c' = 0 at both ends) through the samples, so that c' and c'' are consistent."""
+    from scipy.interpolate import CubicSpline
+
+    spline = CubicSpline(np.asarray(times, float), np.asarray(offsets, float), bc_type="clamped")
+    return Spline(spline.x, np.ascontiguousarray(spline.c.T))
+
+
+def largest_offset(spline: Spline) -> float:
+    """Largest |c| that the spline reaches, between its samples included [m]."""
+    from scipy.interpolate import PPoly
+
+    curve = PPoly(spline.coefficients.T, spline.times)
+    turns = curve.derivative().roots(extrapolate=False)
+    places = np.concatenate([spline.times, turns[np.isfinite(turns)]])
+    return float(np.abs(curve(places)).max())
+
+
+def follow_spline(spline: Spline, time: Array) -> CgState:
+    """Offset, rate and acceleration of `spline` at `time` (...); before and after it the CG stands still."""
+    xp = time.__array_namespace__()
+    knots, table = (xp.asarray(value, dtype=time.dtype) for value in spline)
+    piece = xp.clip((time[..., None] >= knots[1:-1]).sum(axis=-1), 0, len(spline.times) - 2)
+    a, b, c, d = (table[piece, j] for j in range(4))
+    inside = (time >= knots[0]) & (time <= knots[-1])
+    s = xp.clip(time, knots[0], knots[-1]) - knots[piece]
+    rate = (3 * a * s + 2 * b) * s + c
+    zero = xp.zeros_like(rate)
+    acceleration = 6 * a * s + 2 * b
+    return CgState(((a * s + b) * s + c) * s + d, xp.where(inside, rate, zero), xp.where(inside, acceleration, zero))
+
+
+def make_prescribed(config: Config) -> Prescribed:
+    """Return `prescribed(time, load)`, the CG's motion for the kinds sine and waveform.
+
+    Raises InputError if a waveform's spline leaves the object between its samples.
+    """
+    if config.motion.kind == "sine":
+        return lambda time, load: sine(time, load.cg_amplitude, load.cg_speed, load.cg_phase)
+    spline = fit_spline(config.motion.times, config.motion.offsets)
+    reach = cg_reach(config.plant)
+    if largest_offset(spline) > reach + 1e-9:
+        raise InputError(
+            f"the waveform swings to {largest_offset(spline):.4g} m between its samples "
+            f"and leaves the object: the CG reaches {reach:.4g} m; add samples"
+        )
+    return lambda time, load: follow_spline(spline, time)
+
+
+def make_rolling_force(config: Config) -> Callable[[Array, Array, Array], Array]:
+    """Return `force(offset, rate, ball_mass)` (...) [N] along the axis: rolling friction and end stops (ours).
+
+    Friction is -mu m_b g tanh(v / creep). A stop is a one-sided spring and damper that never pulls; the
+    inertia against it is 7/5 m_b, that of a solid ball that rolls.
+    """
+    plant, motion = config.plant, config.motion
+    end = plant.object_size["xy".index(plant.cg_axis)] / 2 - plant.ball_radius
+    stiffness = 1.4 * motion.stop_frequency**2
+    damping = 1.4 * 2 * motion.stop_damping * motion.stop_frequency
+
+    def force(offset: Array, rate: Array, ball_mass: Array) -> Array:
+        xp = offset.__array_namespace__()
+        friction = -motion.rolling_friction * plant.gravity * xp.tanh(rate / CREEP)
+        beyond = xp.maximum(offset - end, 0.0)
+        below = xp.maximum(-end - offset, 0.0)
+        upper = xp.where(beyond > 0, xp.minimum(-stiffness * beyond - damping * rate, 0.0), 0.0)
+        lower = xp.where(below > 0, xp.maximum(stiffness * below - damping * rate, 0.0), 0.0)
+        return ball_mass * (friction + upper + lower)
+
+    return force
+
+
+def object_mass(time: Array, load: Load) -> Array:
+    """The object's mass (...) [kg] at `time`: a change is impulse-free, velocities carry over."""
+    due = time[..., None] >= load.mass_change_time
+    return load.object_mass + (due * load.mass_change).sum(axis=-1)

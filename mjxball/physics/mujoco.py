@@ -1,63 +1,178 @@
-"""Accelerations of the assembly from C MuJoCo on the unfused model: the second engine, for evaluation and tests."""
+"""Accelerations and internal forces of the assembly from C MuJoCo on the unfused model: the second engine."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from mjxball.assembly import BALL, build_model
-from mjxball.config import Attitude, Plant
-from mjxball.control import rotations
-from mjxball.physics.constants import box_inertia_per_mass
-from mjxball.physics.engine import Acceleration, PlantState, Wrench
-from mjxball.physics.motion import CgState
+from mjxball.assembly import ASSEMBLY, BALL, FOLLOWER, LEADER, build_model
+from mjxball.config import Attitude, Config, Plant
+from mjxball.control import mixer, rotations
+from mjxball.physics import motion
+from mjxball.physics.constants import plant_constants
+from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, Load, PlantState, Wrench
 
 Array = Any
-SLIDE = 6  # degree of freedom of the ball's joint; 0..5 are the free joint's
 
 
-def make_acceleration(plant: Plant, attitude: Attitude) -> Acceleration:
-    """Return the C MuJoCo `engine.Acceleration` of `plant` on NumPy arrays of any batch shape, one world at a time.
+def make_engine(plant: Plant, attitude: Attitude) -> Engine:
+    """Return the C MuJoCo engine of `plant` on NumPy arrays of any batch shape, one world at a time.
 
-    The slide force that gives the ball its prescribed acceleration is computed from MuJoCo's mass matrix and
-    applied to the joint; the accelerations are then MuJoCo's own `qacc`.
+    For a prescribed motion the force on the slide that gives the ball its c'' is computed from MuJoCo's mass
+    matrix and applied; the accelerations are then MuJoCo's own.
     """
-    model = build_model(plant)
-    data = mujoco.MjData(model)
-    ball = model.body(BALL).id
-    box = box_inertia_per_mass(plant.object_size)
-    unit = np.zeros((1, model.nv))
-    unit[0, SLIDE] = 1.0
+    world = MujocoWorld(plant, attitude)
+    share = plant.moving_fraction
 
-    def one(state: PlantState, wrench: Wrench, object_mass: float, cg: CgState) -> np.ndarray:
-        model.body_mass[ball] = object_mass
-        model.body_inertia[ball] = object_mass * box
-        data.qpos[:] = [*state.position, *state.quaternion, cg.offset]
-        data.qvel[:] = [*state.velocity, *state.rates, cg.rate]
+    def prescribed(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
+        def one(s: PlantState, w: Wrench, mass: float, c: CgState) -> np.ndarray:
+            world.place(s, mass, c.offset / share, c.rate / share)
+            world.push(s, w)
+            return world.drive(c.acceleration / share)
+
+        result = _each((state, wrench, object_mass, cg), state.time.shape, one)
+        return result[..., :3], result[..., 3:6]
+
+    def rolling(state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array) -> tuple[Array, Array, Array]:
+        def one(s: PlantState, w: Wrench, mass: float, force: float) -> np.ndarray:
+            world.place(s, mass, s.ball_offset, s.ball_rate)
+            world.push(s, w)
+            return world.roll(force)
+
+        result = _each((state, wrench, object_mass, ball_force), state.time.shape, one)
+        return result[..., :3], result[..., 3:6], result[..., 6]
+
+    return Engine(prescribed, rolling)
+
+
+def _each(arguments: Sequence[Any], shape: tuple[int, ...], function: Any) -> np.ndarray:
+    """Stack `function` of every world's slice of the (named tuples of) arrays in `arguments`."""
+
+    def pick(value: Any, index: tuple[int, ...]) -> Any:
+        if isinstance(value, tuple):
+            return type(value)(*(pick(leaf, index) for leaf in value))
+        return np.asarray(value)[index] if np.ndim(value) else value
+
+    rows = [function(*(pick(value, index) for value in arguments)) for index in np.ndindex(shape)]
+    return np.array(rows).reshape(*shape, *rows[0].shape)
+
+
+class MujocoWorld:
+    """One MjModel and MjData of a plant, and the few operations that the engine and the contact wrenches need."""
+
+    def __init__(self, plant: Plant, attitude: Attitude):
+        self.model = build_model(plant)
+        self.data = mujoco.MjData(self.model)
+        self._plant, self._constants = plant, plant_constants(plant, attitude)
+        self._shell, self._ball = self.model.body(ASSEMBLY).id, self.model.body(BALL).id
+        self._drones = [self.model.body(name).id for name in (LEADER, FOLLOWER)]
+        self._slide = self.model.nv - 1
+
+    def place(self, state: PlantState, object_mass: float, offset: float, rate: float) -> None:
+        """Set mass, positions and velocities, and compute everything that depends on them; no force yet."""
+        model, data, share = self.model, self.data, self._plant.moving_fraction
+        model.body_mass[[self._shell, self._ball]] = object_mass * (1 - share), object_mass * share
+        model.body_inertia[self._shell] = object_mass * self._constants.shell_inertia_per_mass
+        model.body_inertia[self._ball] = object_mass * self._constants.ball_inertia_per_mass
+        model.dof_armature[self._slide] = ROLLING_INERTIA * object_mass * share
+        roll = rotations.roll_of_quaternion(state.quaternion)
+        root = {
+            "free": ([*state.position, *state.quaternion], [*state.velocity, *state.rates]),
+            "heave": ([state.position[2], roll], [state.velocity[2], state.rates[0]]),
+            "pivot": ([roll], [state.rates[0]]),
+        }
+        position, velocity = root[self._plant.stand]
+        data.qpos[:], data.qvel[:] = [*position, offset], [*velocity, rate]
+        data.qfrc_applied[:] = 0
+        data.xfrc_applied[:] = 0
         mujoco.mj_fwdPosition(model, data)
         mujoco.mj_fwdVelocity(model, data)
+
+    def push(self, state: PlantState, wrench: Wrench) -> None:
+        """Apply the rotors' wrench about O to the assembly's body."""
         matrix = rotations.matrix_from_quaternion(state.quaternion)
-        data.qfrc_applied[:] = [*(matrix @ wrench.force), *wrench.torque, 0.0]
+        force, torque = matrix @ wrench.force, matrix @ wrench.torque
+        origin = self.data.xpos[self._shell]
+        mujoco.mj_applyFT(self.model, self.data, force, torque, origin, self._shell, self.data.qfrc_applied)
+
+    def drive(self, acceleration: float) -> np.ndarray:
+        """Give the ball `acceleration` along its slide by the force that it takes; see `roll` for the result."""
+        model, data = self.model, self.data
+        unit = np.zeros((1, model.nv))
+        unit[0, self._slide] = 1.0
         free, response = np.zeros((1, model.nv)), np.zeros((1, model.nv))
-        mujoco.mj_solveM(model, data, free, (data.qfrc_applied - data.qfrc_bias)[None])
+        pushed = data.qfrc_applied + self._external() - data.qfrc_bias
+        mujoco.mj_solveM(model, data, free, pushed[None])
         mujoco.mj_solveM(model, data, response, unit)
-        data.qfrc_applied[SLIDE] = (cg.acceleration - free[0, SLIDE]) / response[0, SLIDE]
+        return self.roll((acceleration - free[0, self._slide]) / response[0, self._slide])
+
+    def roll(self, force: float) -> np.ndarray:
+        """Accelerations (7,): O in the world, angular in body axes, ball; with `force` on the slide [N]."""
+        model, data = self.model, self.data
+        data.qfrc_applied[self._slide] += force
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
-        return data.qacc_smooth[:SLIDE].copy()
+        data.qacc[:] = data.qacc_smooth
+        a = data.qacc
+        if self._plant.stand == "free":
+            return a.copy()
+        rise = a[0] if self._plant.stand == "heave" else 0.0
+        return np.array([0.0, 0.0, rise, a[-2], 0.0, 0.0, a[-1]])
 
-    def acceleration(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
-        shape = state.rates.shape[:-1]
-        result = np.empty((*shape, SLIDE))
-        for index in np.ndindex(shape):
-            result[index] = one(
-                PlantState(*(leaf[index] for leaf in state)),
-                Wrench(*(leaf[index] for leaf in wrench)),
-                np.broadcast_to(object_mass, shape)[index],
-                CgState(*(np.broadcast_to(leaf, shape)[index] for leaf in cg)),
-            )
-        return result[..., :3], result[..., 3:]
+    def load_drones(self, state: PlantState, rotor_force: Array) -> None:
+        """Apply each drone's rotor wrench to its own body, so that the welds carry it to the object."""
+        matrix = rotations.matrix_from_quaternion(state.quaternion)
+        wrenches = mixer.wrench_from_rotors(rotor_force, self._plant.arm, self._plant.yaw_per_thrust)
+        for body, wrench in zip(self._drones, wrenches, strict=True):
+            self.data.xfrc_applied[body, :3] = matrix[:, 2] * wrench[0]
+            self.data.xfrc_applied[body, 3:] = matrix @ wrench[1:]
 
-    return acceleration
+    def contact_wrenches(self, state: PlantState) -> np.ndarray:
+        """Force and torque (2, 2, 3) that leader and follower exert on the object, body axes, at their centres.
+
+        MuJoCo's `cfrc_int` of a drone's body is what the weld exerts on the drone: world axes, torque first,
+        about the centre of mass of the whole tree. `load_drones` and `drive` or `roll` must come first.
+        """
+        mujoco.mj_rnePostConstraint(self.model, self.data)
+        matrix = rotations.matrix_from_quaternion(state.quaternion)
+        about = self.data.subtree_com[self.model.body_rootid[self._shell]]
+        result = np.empty((2, 2, 3))
+        for number, body in enumerate(self._drones):
+            torque, force = -self.data.cfrc_int[body, :3], -self.data.cfrc_int[body, 3:]
+            moved = torque + np.cross(about - self.data.xipos[body], force)
+            result[number] = force @ matrix, moved @ matrix
+        return result
+
+    def _external(self) -> np.ndarray:
+        """Generalized force of `xfrc_applied` (nv,)."""
+        total = np.zeros(self.model.nv)
+        for body in self._drones:
+            force, torque = self.data.xfrc_applied[body, :3], self.data.xfrc_applied[body, 3:]
+            mujoco.mj_applyFT(self.model, self.data, force, torque, self.data.xipos[body], body, total)
+        return total
+
+
+def flown_contact_wrenches(config: Config, flown: PlantState, load: Load) -> tuple[np.ndarray, np.ndarray]:
+    """Contact forces and torques (T, n, 2, 3) of recorded states (T, n, ...) from MuJoCo's internal forces."""
+    world = MujocoWorld(config.plant, config.attitude)
+    share, rolling = config.plant.moving_fraction, config.motion.kind == "rolling"
+    mass = motion.object_mass(flown.time, load)
+    if rolling:
+        ball = CgState(flown.ball_offset, flown.ball_rate, flown.time)
+        drive = motion.make_rolling_force(config)(flown.ball_offset, flown.ball_rate, share * mass)
+    else:
+        ball = motion.make_prescribed(config)(flown.time, load)
+        ball = CgState(ball.offset / share, ball.rate / share, ball.acceleration / share)
+        drive = ball.acceleration
+
+    def one(state: PlantState, object_mass: float, ball: CgState, drive: float) -> np.ndarray:
+        world.place(state, object_mass, ball.offset, ball.rate)
+        world.load_drones(state, state.rotor_force)
+        world.roll(drive) if rolling else world.drive(drive)
+        return world.contact_wrenches(state)
+
+    result = _each((flown, mass, ball, drive), flown.time.shape, one)
+    return result[..., 0, :], result[..., 1, :]

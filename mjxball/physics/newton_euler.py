@@ -2,67 +2,129 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.physics.constants import plant_constants
-from mjxball.physics.engine import Acceleration, PlantState, Wrench
-from mjxball.physics.motion import CgState
+from mjxball.physics.constants import PlantConstants, plant_constants
+from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, PlantState, Wrench
 
 Array = Any
+# solve(mass, moment S, inertia J_O, down u = R^T E3, force, torque) -> (a_b, w') in body axes
+Solve = Callable[[Array, Array, Array, Array, Array, Array], tuple[Array, Array]]
 
 
-def make_acceleration(plant: Plant, attitude: Attitude) -> Acceleration:
-    """Return the closed-form `engine.Acceleration` of `plant`, on NumPy or JAX arrays of any batch shape."""
+def make_engine(plant: Plant, attitude: Attitude) -> Engine:
+    """Return the closed-form engine of `plant`, on NumPy or JAX arrays of any batch shape."""
     constants = plant_constants(plant, attitude)
-    drone_mass = float(constants.drone_mass.sum())
-    drone_moment = constants.drone_mass @ constants.mounts  # sum m_i r_i (3,) [kg m]
+    solve = {"free": _solve_free, "pivot": _solve_pivot, "heave": _solve_heave}[plant.stand]
+    axis = "xy".index(plant.cg_axis)
 
-    def acceleration(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
-        rates = state.rates
-        xp = rates.__array_namespace__()
-        matrix = rotations.matrix_from_quaternion(state.quaternion)
-        zero = xp.zeros_like(cg.offset)
-
-        def along_x(value: Array) -> Array:
-            return xp.stack([value, zero, zero], axis=-1)
-
-        mass = drone_mass + object_mass
-        offset, slide_rate, slide_acceleration = (along_x(value) for value in cg)
-        moment = xp.asarray(drone_moment, dtype=rates.dtype) + object_mass[..., None] * offset  # S
-        inertia = _inertia_about_origin(xp, constants, rates.dtype, object_mass, cg.offset)  # J_O
-        down = plant.gravity * matrix[..., 2, :]  # g R^T E3
-        weight = object_mass[..., None]
-
-        coriolis = 2 * rotations.cross(rates, slide_rate) + slide_acceleration
-        centripetal = rotations.cross(rates, rotations.cross(rates, moment))
-        force = wrench.force - mass[..., None] * down - centripetal - weight * coriolis
-        torque = (
-            wrench.torque
-            - rotations.cross(rates, rotations.rotate(inertia, rates))
-            - weight * rotations.cross(offset, coriolis)
-            - rotations.cross(moment, down)
-        )
-        # Eliminate a: (J_O + [S]x[S]x / M) w' = n - S x f / M, the inertia about the assembly's centre of mass.
-        arm = moment / mass[..., None]
-        central = inertia - mass[..., None, None] * _point_inertia(xp, arm)
-        angular = rotations.solve_symmetric(central, torque - rotations.cross(arm, force))
-        linear = force / mass[..., None] - rotations.cross(angular, arm)
+    def prescribed(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
+        terms = _terms(plant, constants, state, wrench, object_mass, cg)
+        matrix, (mass, moment, inertia, down, force, torque) = terms
+        pushed = _shift(force, axis, -object_mass * cg.acceleration)
+        linear, angular = solve(mass, moment, inertia, down, pushed, torque)
         return rotations.rotate(matrix, linear), angular
 
-    return acceleration
+    def rolling(state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array) -> tuple[Array, Array, Array]:
+        xp = state.rates.__array_namespace__()
+        share = plant.moving_fraction
+        ball_mass = share * object_mass
+        cg = CgState(share * state.ball_offset, share * state.ball_rate, xp.zeros_like(ball_mass))
+        matrix, (mass, moment, inertia, down, force, torque) = _terms(plant, constants, state, wrench, object_mass, cg)
+        linear, angular = solve(mass, moment, inertia, down, force, torque)
+        recoil = _shift(xp.zeros_like(force), axis, -ball_mass)
+        linear_1, angular_1 = solve(mass, moment, inertia, down, recoil, xp.zeros_like(torque))
+        # m_b (e . a_b + x (w_e^2 - |w|^2) + g e . u + x'') + 2/5 m_b x'' = F, and a_b is linear in x''.
+        rates = state.rates
+        spin = state.ball_offset * (rates[..., axis] ** 2 - rotations.dot(rates, rates))
+        driving = ball_force / ball_mass - linear[..., axis] - spin - plant.gravity * down[..., axis]
+        ball = driving / (1 + ROLLING_INERTIA + linear_1[..., axis])
+        linear, angular = linear + ball[..., None] * linear_1, angular + ball[..., None] * angular_1
+        return rotations.rotate(matrix, linear), angular, ball
+
+    return Engine(prescribed, rolling)
 
 
-def _point_inertia(xp: Any, r: Array) -> Array:
-    """|r|^2 I - r r^T (..., 3, 3) of `r` (..., 3)."""
-    square = (r * r).sum(axis=-1)[..., None, None]
-    return square * xp.eye(3, dtype=r.dtype) - r[..., :, None] * r[..., None, :]
+def _shift(vector: Array, axis: int, amount: Array) -> Array:
+    """`vector` (..., 3) with `amount` (...) added to component `axis`."""
+    xp = vector.__array_namespace__()
+    return xp.stack([vector[..., i] + amount if i == axis else vector[..., i] for i in range(3)], axis=-1)
 
 
-def _inertia_about_origin(xp: Any, constants: Any, dtype: Any, object_mass: Array, offset: Array) -> Array:
-    box = xp.asarray(constants.box_inertia_per_mass, dtype=dtype)
-    square = offset * offset
-    moving = xp.stack([xp.zeros_like(square), square, square], axis=-1)
-    diagonal = object_mass[..., None] * (box + moving)
-    return xp.asarray(constants.drone_inertia, dtype=dtype) + diagonal[..., None, :] * xp.eye(3, dtype=dtype)
+def _terms(
+    plant: Plant, constants: PlantConstants, state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState
+) -> tuple[Array, tuple[Array, Array, Array, Array, Array, Array]]:
+    """R, and (M, S, J_O, u, f, n) of design section 4 without the term of c''."""
+    rates = state.rates
+    xp = rates.__array_namespace__()
+    axis, share = "xy".index(plant.cg_axis), plant.moving_fraction
+    matrix = rotations.matrix_from_quaternion(state.quaternion)
+    down = matrix[..., 2, :]  # u = R^T E3
+    zero = xp.zeros_like(rates)
+    mass = float(constants.drone_mass.sum()) + object_mass
+    moment = _shift(zero + xp.asarray(constants.drone_moment, dtype=rates.dtype), axis, object_mass * cg.offset)
+    inertia = _inertia(plant, constants, rates.dtype, object_mass, cg.offset)
+    offset, rate = _shift(zero, axis, cg.offset), _shift(zero, axis, cg.rate)
+    weight = object_mass[..., None]
+    slip = 2 * rotations.cross(rates, rate)
+    swing = rotations.cross(rates, rotations.cross(rates, moment))
+    force = wrench.force - (plant.gravity * mass)[..., None] * down - swing - weight * slip
+    torque = (
+        wrench.torque
+        - rotations.cross(rates, rotations.rotate(inertia, rates))
+        - weight / share * rotations.cross(offset, slip)
+        - plant.gravity * rotations.cross(moment, down)
+    )
+    return matrix, (mass, moment, inertia, down, force, torque)
+
+
+def _inertia(plant: Plant, constants: PlantConstants, dtype: Any, object_mass: Array, offset: Array) -> Array:
+    """J_O (..., 3, 3): drones, shell and ball; the ball sits at c / share."""
+    xp = object_mass.__array_namespace__()
+    own = xp.asarray(constants.object_inertia_per_mass, dtype=dtype)
+    square = offset * offset / plant.moving_fraction
+    still = xp.zeros_like(square)
+    moving = [still if name == plant.cg_axis else square for name in "xyz"]
+    drones = xp.asarray(constants.drone_inertia, dtype=dtype)
+    rows = []
+    for i in range(3):
+        diagonal = object_mass * (own[i] + moving[i])
+        rows.append(xp.stack([drones[i, j] + (diagonal if i == j else still) for j in range(3)], axis=-1))
+    return xp.stack(rows, axis=-2)
+
+
+def _solve_free(
+    mass: Array, moment: Array, inertia: Array, down: Array, force: Array, torque: Array
+) -> tuple[Array, Array]:
+    """Eliminate a_b: (J_O + [S]x[S]x / M) w' = n - S x f / M, the inertia about the assembly's centre of mass."""
+    arm = moment / mass[..., None]
+    central = inertia - mass[..., None, None] * rotations.point_inertia(arm)
+    angular = rotations.solve_symmetric(central, torque - rotations.cross(arm, force))
+    return force / mass[..., None] - rotations.cross(angular, arm), angular
+
+
+def _solve_pivot(
+    mass: Array, moment: Array, inertia: Array, down: Array, force: Array, torque: Array
+) -> tuple[Array, Array]:
+    """O stands still and only roll is free."""
+    xp = torque.__array_namespace__()
+    roll = torque[..., 0] / inertia[..., 0, 0]
+    still = xp.zeros_like(roll)
+    return xp.zeros_like(force), xp.stack([roll, still, still], axis=-1)
+
+
+def _solve_heave(
+    mass: Array, moment: Array, inertia: Array, down: Array, force: Array, torque: Array
+) -> tuple[Array, Array]:
+    """Only roll and the world's vertical are free: a_b = a u."""
+    xp = torque.__array_namespace__()
+    coupling = rotations.cross(moment, down)[..., 0]
+    lift, twist, j = rotations.dot(down, force), torque[..., 0], inertia[..., 0, 0]
+    determinant = mass * j - coupling * coupling
+    rise = (j * lift - coupling * twist) / determinant
+    roll = (mass * twist - coupling * lift) / determinant
+    still = xp.zeros_like(roll)
+    return rise[..., None] * down, xp.stack([roll, still, still], axis=-1)

@@ -10,7 +10,7 @@ from mjxball.config import Config
 from mjxball.control import attitude, mixer, rotations
 from mjxball.physics import motion
 from mjxball.physics.constants import plant_constants
-from mjxball.physics.engine import Acceleration, Load, PlantState, Wrench
+from mjxball.physics.engine import Engine, Load, PlantState, Wrench
 
 Array = Any
 # control_step(state, commands (..., 2, 3) of leader and follower, load) -> state one control period later
@@ -26,18 +26,19 @@ def python_repeat(body: Callable[[PlantState], PlantState], count: int, value: P
     return value
 
 
-def make_control_step(config: Config, acceleration: Acceleration, repeat: Repeat = python_repeat) -> ControlStep:
+def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_repeat) -> ControlStep:
     """Return the function that advances the plant one control period with commands held.
 
     Each physics step samples the attitude loop, moves the rotors' first-order lag exactly (its mean force
     acts over the step), and integrates drift-kick-drift: half a step of motion, the accelerations there,
-    the velocities, half a step of motion. Second order in the step, one evaluation of `acceleration`.
+    the velocities, half a step of motion. Second order in the step, one evaluation of the accelerations.
     """
     plant = config.plant
     constants = plant_constants(plant, config.attitude)
     h = config.physics_step
     keep = math.exp(-h / plant.rotor_lag)  # share of the old rotor force left after a step
     mean = plant.rotor_lag / h * (1 - keep)  # its mean share over the step
+    accelerate = make_accelerations(config, engine)
 
     def physics_step(state: PlantState, commands: Array, load: Load) -> PlantState:
         xp = commands.__array_namespace__()
@@ -45,12 +46,12 @@ def make_control_step(config: Config, acceleration: Acceleration, repeat: Repeat
         acting = target + mean * (state.rotor_force - target)
         wrench = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust)
         middle = _drift(state, h / 2)
-        cg = motion.sine(middle.time, load.cg_amplitude, load.cg_speed, load.cg_phase)
-        linear, angular = acceleration(middle, wrench, load.object_mass, cg)
+        linear, angular, ball = accelerate(middle, wrench, load)
         kicked = middle._replace(
             velocity=state.velocity + h * linear,
             rates=state.rates + h * angular,
             rotor_force=target + keep * (state.rotor_force - target),
+            ball_rate=state.ball_rate + h * ball,
         )
         return _drift(kicked, h / 2)
 
@@ -58,6 +59,38 @@ def make_control_step(config: Config, acceleration: Acceleration, repeat: Repeat
         return repeat(lambda s: physics_step(s, commands, load), config.timing.physics_steps, state)
 
     return control_step
+
+
+def make_accelerations(config: Config, engine: Engine) -> Callable[[PlantState, Wrench, Load], tuple[Array, ...]]:
+    """Return `accelerate(state, wrench, load)` -> (linear, angular, ball), whatever way the CG moves.
+
+    The ball's acceleration (...) is 0 for prescribed motions, whose offset is a function of time alone.
+    """
+    if config.motion.kind == "rolling":
+        force = motion.make_rolling_force(config)
+
+        def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Array, ...]:
+            mass = motion.object_mass(state.time, load)
+            on_ball = force(state.ball_offset, state.ball_rate, config.plant.moving_fraction * mass)
+            return engine.rolling(state, wrench, mass, on_ball)
+
+        return roll
+    prescribed = motion.make_prescribed(config)
+
+    def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Array, ...]:
+        mass = motion.object_mass(state.time, load)
+        linear, angular = engine.prescribed(state, wrench, mass, prescribed(state.time, load))
+        return linear, angular, state.ball_rate.__array_namespace__().zeros_like(state.ball_rate)
+
+    return follow
+
+
+def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Array]:
+    """Return `cg_offset(state, load)` (...) [m], where the CG is now."""
+    if config.motion.kind == "rolling":
+        return lambda state, load: config.plant.moving_fraction * state.ball_offset
+    prescribed = motion.make_prescribed(config)
+    return lambda state, load: prescribed(state.time, load).offset
 
 
 def rotor_targets(config: Config, constants: Any, state: PlantState, commands: Array, believed_mass: Array) -> Array:
@@ -85,10 +118,13 @@ def total_wrench(xp: Any, rotor_force: Array, mounts: Array, arm: float, yaw_per
     thrust = drones[..., 0]
     zero = xp.zeros_like(thrust[..., 0])
     lever_x, lever_y = (xp.asarray(mounts[:, i], dtype=rotor_force.dtype) for i in (0, 1))
-    torque = drones[..., 1:].sum(axis=-2) + xp.stack(
-        [(lever_y * thrust).sum(axis=-1), -(lever_x * thrust).sum(axis=-1), zero], axis=-1
-    )
-    return Wrench(xp.stack([zero, zero, thrust.sum(axis=-1)], axis=-1), torque)
+    torque = drones[..., 0, 1:] + drones[..., 1, 1:]
+    levers = xp.stack([_total(lever_y * thrust), -_total(lever_x * thrust), zero], axis=-1)
+    return Wrench(xp.stack([zero, zero, _total(thrust)], axis=-1), torque + levers)
+
+
+def _total(pair: Array) -> Array:
+    return pair[..., 0] + pair[..., 1]
 
 
 def hover_rotor_force(config: Config, believed_mass: Array) -> Array:
@@ -100,9 +136,18 @@ def hover_rotor_force(config: Config, believed_mass: Array) -> Array:
     return xp.stack([per_rotor] * 4, axis=-1)
 
 
-def start_state(config: Config, position: Array, euler: Array, velocity: Array, believed_mass: Array) -> PlantState:
-    """State at time 0 with the rotors at the believed hover thrust; `position`, `euler`, `velocity` (..., 3)."""
+def start_state(
+    config: Config, position: Array, euler: Array, velocity: Array, believed_mass: Array, ball_offset: Array
+) -> PlantState:
+    """State at time 0 with the rotors at the believed hover thrust; `position`, `euler`, `velocity` (..., 3).
+
+    A stand overrules what it locks: position and velocity (height and climb stay free with `heave`), pitch, yaw.
+    """
     xp = position.__array_namespace__()
+    if config.plant.stand != "free":
+        free = xp.asarray([0.0, 0.0, float(config.plant.stand == "heave")], dtype=position.dtype)
+        position, velocity = position * free, velocity * free
+        euler = euler * xp.asarray([1.0, 0.0, 0.0], dtype=euler.dtype)
     return PlantState(
         position=position,
         quaternion=rotations.quaternion_from_euler(euler),
@@ -110,6 +155,8 @@ def start_state(config: Config, position: Array, euler: Array, velocity: Array, 
         rates=xp.zeros_like(velocity),
         rotor_force=hover_rotor_force(config, believed_mass),
         time=xp.zeros_like(position[..., 0]),
+        ball_offset=ball_offset,
+        ball_rate=xp.zeros_like(ball_offset),
     )
 
 
@@ -118,4 +165,5 @@ def _drift(state: PlantState, h: float) -> PlantState:
         position=state.position + h * state.velocity,
         quaternion=rotations.integrate_quaternion(state.quaternion, h * state.rates),
         time=state.time + h,
+        ball_offset=state.ball_offset + h * state.ball_rate,
     )

@@ -17,9 +17,9 @@ ENGINES = ("mjx", "newton-euler", "mujoco")
 def make_stepper(config: Config, physics: str) -> ControlStep:
     """Return a control step for batches (n, ...) of NumPy float64 arrays; raise InputError for an unknown engine."""
     if physics == "mujoco":
-        from mjxball.physics.mujoco import make_acceleration
+        from mjxball.physics.mujoco import make_engine
 
-        return make_control_step(config, make_acceleration(config.plant, config.attitude))
+        return make_control_step(config, make_engine(config.plant, config.attitude))
     if physics not in ENGINES:
         raise InputError(f"unknown physics {physics!r}; choose from {', '.join(ENGINES)}")
     return _jax_stepper(config, physics)
@@ -30,7 +30,7 @@ def _jax_stepper(config: Config, physics: str) -> ControlStep:
 
     from mjxball.physics import mjx, newton_euler
 
-    make = mjx.make_acceleration if physics == "mjx" else newton_euler.make_acceleration
+    make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
     with jax.enable_x64(True):
         step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
         compiled = jax.jit(jax.vmap(step))

@@ -1,0 +1,135 @@
+"""Physics steps per second of MJX, the closed form and C MuJoCo, in one run.
+
+A physics step is the whole plant: both attitude loops, rotor lag, accelerations and the integrator. Every figure
+is the median of several timed calls after one that is not counted; compile time is the first call's extra.
+
+    python benchmarks/physics.py --worlds 1024 65536 --json physics.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjxball import config as configs
+from mjxball.physics import mjx, newton_euler
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.step import make_control_step, python_repeat, start_state
+from mjxball.physics.stepper import make_stepper
+
+REPEATS = 5
+ENGINES = {"newton-euler": newton_euler.make_engine, "mjx": mjx.make_engine}
+
+
+def batch(config: configs.Config, worlds: int, dtype: type) -> tuple[PlantState, np.ndarray, Load]:
+    """A batch of hovering worlds with different CG motions, and their commands."""
+    random = np.random.default_rng(0)
+    mass = random.uniform(0.1, 0.3, worlds).astype(dtype)
+    sine = (random.uniform(low, high, worlds).astype(dtype) for low, high in ((0.02, 0.1), (0.3, 3.0), (0, 6.28)))
+    none = np.zeros((worlds, 0), dtype)
+    load = Load(mass, mass, *sine, none, none)
+    zero = np.zeros((worlds, 3), dtype)
+    euler = random.normal(0, 0.05, (worlds, 3)).astype(dtype)
+    commands = random.normal(0, 0.02, (worlds, 2, 3)).astype(dtype)
+    return start_state(config, zero, euler, zero, mass, zero[:, 0]), commands, load
+
+
+def time_jax(config: configs.Config, name: str, worlds: int, control_steps: int, unrolled: bool) -> dict[str, float]:
+    """Steps/s and compile seconds of one JAX engine at one size."""
+    engine = ENGINES[name](config.plant, config.attitude)
+    step = jax.vmap(make_control_step(config, engine, python_repeat if unrolled else mjx.jax_repeat))
+
+    def run(state: PlantState, commands: jax.Array, load: Load) -> PlantState:
+        return jax.lax.fori_loop(0, control_steps, lambda _, s: step(s, commands, load), state)
+
+    arguments = jax.tree.map(jnp.asarray, batch(config, worlds, np.float32))
+    started = time.perf_counter()
+    compiled = jax.jit(run).lower(*arguments).compile()
+    compile_seconds = time.perf_counter() - started
+    result = jax.block_until_ready(compiled(*arguments))
+    if not bool(jnp.isfinite(result.position).all()):
+        raise RuntimeError("the benchmark's plant diverged")
+    times = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        jax.block_until_ready(compiled(*arguments))
+        times.append(time.perf_counter() - started)
+    steps = worlds * control_steps * config.timing.physics_steps
+    return {"steps_per_second": steps / statistics.median(times), "compile_seconds": compile_seconds}
+
+
+def time_mujoco(config: configs.Config, control_steps: int) -> dict[str, float]:
+    """Steps/s of C MuJoCo through this package's Python loop, one world on one thread."""
+    stepper = make_stepper(config, "mujoco")
+    state, commands, load = batch(config, 1, np.float64)
+    times = []
+    for _ in range(REPEATS):
+        started = time.perf_counter()
+        moved = state
+        for _ in range(control_steps):
+            moved = stepper(moved, commands, load)
+        times.append(time.perf_counter() - started)
+    return {"steps_per_second": control_steps * config.timing.physics_steps / statistics.median(times)}
+
+
+def time_mj_step(config: configs.Config, steps: int = 20_000) -> dict[str, float]:
+    """Steps/s of bare `mj_step` on the fused model, one thread: MuJoCo's own ceiling here."""
+    import mujoco
+
+    from mjxball.assembly import build_model
+
+    model = build_model(config.plant, config.physics_step, fuse=True)
+    data = mujoco.MjData(model)
+    times = []
+    for _ in range(REPEATS):
+        mujoco.mj_resetData(model, data)
+        started = time.perf_counter()
+        mujoco.mj_step(model, data, steps)
+        times.append(time.perf_counter() - started)
+    return {"steps_per_second": steps / statistics.median(times)}
+
+
+def main() -> None:
+    """Print the table and write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, nargs="+", default=[256, 1024, 8192, 65536])
+    parser.add_argument("--engines", nargs="+", choices=[*ENGINES, "mujoco"], default=[*ENGINES, "mujoco"])
+    parser.add_argument("--unroll", choices=["no", "yes", "both"], default="both", help="unroll a control step")
+    parser.add_argument("--work", type=float, default=2e7, help="physics steps in a timed call, at most")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    config = configs.preset("transport")
+    device = jax.devices()[0].device_kind
+    rows = []
+    print(f"{device}, jax {jax.__version__}, float32, {config.physics_step * 1e3:g} ms steps")
+    print(f"{'engine':>14} {'unrolled':>9} {'worlds':>9} {'M steps/s':>11} {'compile s':>10}", flush=True)
+
+    def report(engine: str, unrolled: str, worlds: int, figures: dict[str, float]) -> None:
+        rows.append({"engine": engine, "unrolled": unrolled, "worlds": worlds, "device": device, **figures})
+        compiled = f"{figures['compile_seconds']:10.2f}" if "compile_seconds" in figures else f"{'-':>10}"
+        print(
+            f"{engine:>14} {unrolled:>9} {worlds:>9} {figures['steps_per_second'] / 1e6:>11.3f} {compiled}", flush=True
+        )
+
+    variants = {"no": [False], "yes": [True], "both": [False, True]}[options.unroll]
+    for name in (engine for engine in options.engines if engine in ENGINES):
+        for unrolled in variants:
+            for worlds in options.worlds:
+                steps = max(20, min(500, int(options.work / worlds / config.timing.physics_steps)))
+                report(name, "yes" if unrolled else "no", worlds, time_jax(config, name, worlds, steps, unrolled))
+    if "mujoco" in options.engines:
+        report("mujoco (ours)", "-", 1, time_mujoco(config, 500))
+        report("mj_step", "-", 1, time_mj_step(config))
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
