@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,11 +21,16 @@ class Parser(argparse.ArgumentParser):
 
 
 def run_command(command: Callable[[], int]) -> int:
-    """Run `command`; an InputError becomes one line on stderr and exit code 2."""
+    """Run `command`; an InputError or a package that is not installed becomes one line on stderr and exit code 2."""
     try:
         return command()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("mjxball"):
+            raise
+        print(f"error: {error.name} is not installed; pip install 'mjxball[train]'", file=sys.stderr)  # noqa: T201
         return 2
 
 
@@ -32,6 +38,11 @@ def output_directory(path: Path) -> Path:
     """Return `path` if it does not exist or is an empty directory, else raise InputError. Creates nothing."""
     if path.exists() and not path.is_dir():
         raise InputError(f"output directory {path} exists and is a file")
+    above = next(parent for parent in path.absolute().parents if parent.exists())
+    if not above.is_dir():
+        raise InputError(f"output directory {path} would lie below the file {above}")
+    if not os.access(path if path.exists() else above, os.W_OK):
+        raise InputError(f"output directory {path} cannot be written")
     if path.is_dir() and any(path.iterdir()):
         raise InputError(f"output directory {path} exists and is not empty; choose another with --out")
     return path

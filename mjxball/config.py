@@ -21,6 +21,7 @@ from mjxball.errors import InputError
 
 Vector3 = tuple[float, float, float]
 Range = tuple[float, float]
+LARGEST = 1e12  # of any number in a configuration
 MAX_LISTED = 6
 
 
@@ -287,27 +288,37 @@ def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> No
             allowed = " or ".join(str(choice) for choice in typing.get_args(hint))
             raise InputError(f"{path} must be {allowed}, not {value!r}")
         return
-    if isinstance(value, bool):
+    if hint is bool:
+        if not isinstance(value, bool):
+            raise InputError(f"{path} must be true or false, not {value!r}")
         return
-    numbers = value if isinstance(value, tuple) else (value,)
-    if isinstance(value, tuple) and Ellipsis not in typing.get_args(hint):
-        wanted = len(typing.get_args(hint))
-        if len(value) != wanted:
-            raise InputError(f"{path} takes {wanted} numbers, not {len(value)}")
-    if not numbers and item.default:
+    if typing.get_origin(hint) is not tuple:
+        _check_number(path, value, hint, item.metadata)
+        return
+    kinds = typing.get_args(hint)
+    if not isinstance(value, tuple) or (Ellipsis not in kinds and len(value) != len(kinds)):
+        count = "several" if Ellipsis in kinds else str(len(kinds))
+        raise InputError(f"{path} takes {count} numbers, not {value!r}")
+    if not value and item.default:
         raise InputError(f"{path} must hold at least one number")
-    bounds = item.metadata
-    for number in numbers:
-        if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number):
-            raise InputError(f"{path} must be finite, not {value!r}")
-        if bounds["above"] is not None and number <= bounds["above"]:
-            raise InputError(f"{path} must be greater than {bounds['above']:g}, not {number:g}")
-        if bounds["low"] is not None and number < bounds["low"]:
-            raise InputError(f"{path} must be at least {bounds['low']:g}, not {number:g}")
-        if bounds["high"] is not None and number > bounds["high"]:
-            raise InputError(f"{path} must be at most {bounds['high']:g}, not {number:g}")
-    if bounds["ordered"] and value[0] > value[1]:
+    for number in value:
+        _check_number(path, number, kinds[0], item.metadata)
+    if item.metadata["ordered"] and value[0] > value[1]:
         raise InputError(f"{path} must be low,high with low <= high, not {value[0]:g},{value[1]:g}")
+
+
+def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
+    allowed = (int,) if kind is int else (int, float)
+    if isinstance(number, bool) or not isinstance(number, allowed):
+        raise InputError(f"{path} takes {'whole numbers' if kind is int else 'numbers'}, not {number!r}")
+    if not abs(number) <= LARGEST:
+        raise InputError(f"{path} must be finite and at most {LARGEST:g}, not {number!r}")
+    if bounds["above"] is not None and number <= bounds["above"]:
+        raise InputError(f"{path} must be greater than {bounds['above']:g}, not {number:g}")
+    if bounds["low"] is not None and number < bounds["low"]:
+        raise InputError(f"{path} must be at least {bounds['low']:g}, not {number:g}")
+    if bounds["high"] is not None and number > bounds["high"]:
+        raise InputError(f"{path} must be at most {bounds['high']:g}, not {number:g}")
 
 
 def validate(config: Config) -> Config:
@@ -331,8 +342,8 @@ def validate(config: Config) -> Config:
             f"timing gives physics steps of {config.physics_step * 1e3:.3g} ms, but the attitude loop "
             "runs once a physics step and needs 5 ms or less (200 Hz)"
         )
-    if config.sac.replay < max(config.sac.worlds, config.sac.batch):
-        raise InputError("sac.replay must hold at least one step of all worlds and one batch")
+    if config.sac.replay < max(config.sac.worlds * config.sac.return_steps, config.sac.batch):
+        raise InputError("sac.replay must hold at least return_steps steps of all worlds and one batch")
     if config.sac.replay % config.sac.worlds:
         raise InputError("sac.replay must be a multiple of sac.worlds")
     return config
@@ -368,6 +379,8 @@ def _validate_motion(config: Config) -> None:
     if motion.kind == "waveform":
         if len(motion.times) != len(motion.offsets) or len(motion.times) < 2:
             raise InputError("motion.times and motion.offsets must hold the same number of samples, two or more")
+        if not all(map(math.isfinite, (*motion.times, *motion.offsets))):
+            raise InputError("motion.times and motion.offsets must be finite")
         if any(later <= earlier for earlier, later in itertools.pairwise(motion.times)):
             raise InputError("motion.times must increase from sample to sample")
         if max(map(abs, motion.offsets)) > reach:
@@ -397,11 +410,16 @@ def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
         if dataclasses.is_dataclass(hints[name]):
             value = from_dict(value, hints[name], f"{path}.{name}".lstrip("."))
         elif isinstance(value, list):
-            value = tuple(value)
+            value = tuple(map(float, value)) if _is_float_tuple(hints[name], value) else tuple(value)
         elif hints[name] is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         values[name] = value
     return kind(**values)
+
+
+def _is_float_tuple(hint: Any, value: list[Any]) -> bool:
+    plain = all(isinstance(number, (int, float)) and not isinstance(number, bool) for number in value)
+    return plain and typing.get_args(hint)[:1] == (float,)
 
 
 def to_json(config: Any) -> str:

@@ -11,8 +11,9 @@ from mjxball.config import Config
 from mjxball.control import leader, observation, rotations
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.fused import make_fused_step
 from mjxball.physics.mjx import jax_repeat, make_engine
-from mjxball.physics.step import make_control_step, start_state
+from mjxball.physics.step import ControlStep, make_control_step, start_state
 from mjxball.quiet import import_brax_env
 from mjxball.rewards import paper_reward, task_reward
 
@@ -40,7 +41,8 @@ class CoupledPairEnv(Env):
 
     `reset` draws goal, start, CG motion and object mass anew. `step` takes the network's action in
     [-1, 1] (3,). An episode terminates at |e_o| > d_term or when the world diverges, and is truncated at
-    `timing.episode_steps`: `done` is 1 in both cases, `info["truncation"]` only in the second.
+    `timing.episode_steps`: `done` is 1 in both cases, `info["truncation"]` only in the second. Inside Brax's
+    EpisodeWrapper the wrapper keeps the time. A non-finite action counts as divergence.
     """
 
     def __init__(self, config: Config, physics: str = "mjx"):
@@ -48,8 +50,7 @@ class CoupledPairEnv(Env):
             raise ValueError(f"physics must be one of {PHYSICS}, not {physics!r}")
         self.config = config
         self._backend = physics
-        make = make_engine if physics == "mjx" else newton_euler.make_engine
-        self._control_step = make_control_step(config, make(config.plant, config.attitude), jax_repeat)
+        self._control_step = _make_step(config, physics)
         self._mount = jnp.asarray(config.plant.follower_mount, jnp.float32)
 
     @property
@@ -129,19 +130,23 @@ class CoupledPairEnv(Env):
     def step(self, state: State, action: Array) -> State:
         """Apply the network's `action` (3,) in [-1, 1] for one control period."""
         world: World = state.pipeline_state
+        sound = jnp.all(jnp.isfinite(action))
+        action = jnp.where(sound, action, jnp.zeros_like(action))
         follower, timing = self.config.follower, self.config.timing
         seen = state.obs[: observation.OBSERVATION_SIZE]
         led = self._leader_command(world)
         followed = self._follower_command(action, seen)
         plant = self._control_step(world.plant, jnp.stack([led, followed]), world.load)
 
-        diverged = self._diverged(plant)
+        diverged = jnp.logical_or(self._diverged(plant), ~sound)
         plant = jax.tree.map(lambda new, old: jnp.where(diverged, old, new), plant, world.plant)
         error = world.goal - plant.position
         distance = jnp.linalg.norm(error)
         terminated = jnp.logical_or(diverged, distance > self.config.scenario.termination_distance)
         steps = world.steps + 1
-        truncated = jnp.logical_and(steps >= timing.episode_steps, ~terminated)
+        # Brax's EpisodeWrapper keeps the time limit itself, and takes an end that it did not set for a termination.
+        wrapped = "steps" in state.info
+        truncated = jnp.logical_and(steps >= timing.episode_steps, ~terminated) & (not wrapped)
         reward = self._reward(led, followed, plant, error, action, world.action, terminated)
 
         moved = world._replace(
@@ -205,3 +210,11 @@ class CoupledPairEnv(Env):
     def _diverged(plant: PlantState) -> Array:
         finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in plant]))
         return jnp.logical_or(~finite, jnp.linalg.norm(plant.rates) > RATE_BOUND)
+
+
+def _make_step(config: Config, physics: str) -> ControlStep:
+    """The control step that is fastest here: on a GPU the closed form's components are split, see `fused`."""
+    if physics == "newton-euler" and jax.default_backend() == "gpu":
+        return make_fused_step(config)
+    make = make_engine if physics == "mjx" else newton_euler.make_engine
+    return make_control_step(config, make(config.plant, config.attitude), jax_repeat)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mjxball import __version__
-from mjxball.cli import output_file, run_command
+from mjxball.cli import Parser, output_file, run_command
 from mjxball.config import Config, config_hash, to_dict
 from mjxball.control.observation import ACTION, OBSERVATION, input_mask
 from mjxball.errors import InputError
@@ -83,7 +82,7 @@ def export_run(run: Path, out: Path) -> None:
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.export`."""
-    parser = argparse.ArgumentParser(prog="python -m mjxball.export", description=__doc__)
+    parser = Parser(prog="python -m mjxball.export", description=__doc__)
     parser.add_argument("run", metavar="RUN_DIR", type=Path, help="run directory written by train.py")
     parser.add_argument("out", metavar="OUT.npz", type=Path, help="policy file to write; must not exist")
     options = parser.parse_args(arguments)

@@ -50,7 +50,7 @@ def observe(position: Array, matrix: Array, velocity: Array, rates: Array, goal:
 
 
 def network_input(observation: Array, memory: Array) -> Array:
-    """Input of the network (..., n): the observation (..., 18), then the `memory` of older ones and actions (..., m)."""
+    """Input of the network (..., n): the observation (..., 18), then `memory` (..., m), older ones and actions."""
     xp = observation.__array_namespace__()
     return xp.concat([observation, memory], axis=-1)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mjxball.config import Config
+from mjxball.config import Config, Plant
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics, measure
@@ -32,12 +32,21 @@ class Cell:
     scenario: Scenario
     metrics: Metrics
     flight: Trajectory
+    motion: str = "sine"  # how the CG moved: sine, waveform or rolling
 
     def record(self) -> dict[str, Any]:
-        """The cell as `eval.py --json` writes it."""
+        """The cell as `eval.py --json` writes it; omega and amplitude are None unless the CG moves in a sine."""
         s = self.scenario
         believed = s.mass if s.believed_mass is None else s.believed_mass
-        keys = {"omega": s.omega, "amplitude": s.amplitude, "mass": s.mass, "believed_mass": believed}
+        sine = self.motion == "sine"
+        keys = {
+            "motion": self.motion,
+            "omega": s.omega if sine else None,
+            "amplitude": s.amplitude if sine else None,
+            "mass": s.mass,
+            "believed_mass": believed,
+            "mass_changes": [list(change) for change in s.mass_changes],
+        }
         return {"follower": self.follower, **keys, **dataclasses.asdict(self.metrics)}
 
 
@@ -56,7 +65,7 @@ def run_cells(config: Config, followers: Sequence[Follower], scenarios: Sequence
     cells = []
     for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
         flight = flights.world(j * len(scenarios) + i)
-        cells.append(Cell(follower.name, scenario, measure(flight, limit), flight))
+        cells.append(Cell(follower.name, scenario, measure(flight, limit), flight, config.motion.kind))
     return cells
 
 
@@ -69,13 +78,15 @@ def load_policy(path: Path, config: Config) -> Policy:
     expected = dataclasses.asdict(config.plant)
     made_for = {key: tuple(v) if isinstance(v, list) else v for key, v in policy.card["plant"].items()}
     for key, value in expected.items():
-        if key != "object_mass" and made_for.get(key) != value:
-            raise InputError(f"{path} was made for another plant: {key} is {made_for.get(key)}, not {value}")
+        if key != "object_mass" and made_for.get(key, getattr(Plant(), key)) != value:
+            raise InputError(f"{path} was made for another plant: {key} is {made_for[key]}, not {value}")
     return policy
 
 
 def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
     """What of the card's bounds a policy misses on the reference scenario, one phrase each."""
+    if not policy.card["bounds"]:
+        raise InputError(f"the card of policy {policy.name} has no bounds to check")
     misses = ["the flight failed"] if metrics.failed else []
     for name, bound in sorted(policy.card["bounds"].items()):
         value = getattr(metrics, name, None)

@@ -33,15 +33,23 @@ def pyplot() -> Any:
 def scenario_title(cell: Cell) -> str:
     """What a figure says about its scenario."""
     s = cell.scenario
+    moves = {
+        "sine": f"{s.amplitude:g} m at {s.omega:g} rad/s",
+        "waveform": "given waveform",
+        "rolling": f"rolling ball from {s.ball_start:g} m",
+    }
     believed = "" if s.believed_mass is None else f", believed {s.believed_mass:g} kg"
-    return f"CG: {s.amplitude:g} m at {s.omega:g} rad/s, object {s.mass:g} kg{believed}"
+    changes = "".join(f", {mass:+g} kg at {time:g} s" for time, mass in s.mass_changes)
+    return f"CG: {moves[cell.motion]}, object {s.mass:g} kg{believed}{changes}"
 
 
 def scenario_name(cell: Cell) -> str:
     """Stem of a figure's file name."""
     s = cell.scenario
+    motion = f"omega{s.omega:g}_amplitude{s.amplitude:g}" if cell.motion == "sine" else cell.motion
     believed = "" if s.believed_mass is None else f"_believed{s.believed_mass:g}"
-    return f"omega{s.omega:g}_amplitude{s.amplitude:g}_mass{s.mass:g}{believed}"
+    changes = "".join(f"_{mass:+g}kg_at{time:g}s" for time, mass in s.mass_changes)
+    return f"{motion}_mass{s.mass:g}{believed}{changes}"
 
 
 def draw_flights(cells: Sequence[Cell], path: Path) -> None:
@@ -60,14 +68,14 @@ def draw_flights(cells: Sequence[Cell], path: Path) -> None:
 
 def _draw_panel(axis: Any, cells: Sequence[Cell], kind: str, index: int | None, label: str) -> None:
     time = cells[0].flight.time
-    if kind == "cg_offset":
-        axis.plot(time, cells[0].flight.cg_offset, color="#444444", linewidth=1.2)
     if kind == "position":
         axis.axhline(cells[0].flight.goal[index], color="black", linestyle=":", linewidth=1, label="goal")
     for cell, colour in zip(cells, _cycle(len(cells)), strict=True):
         if kind == "position":
             axis.plot(time, cell.flight.position[:, index], color=colour, linewidth=1.3, label=cell.follower)
-        elif kind == "command":
+        elif kind == "cg_offset":
+            axis.plot(time, cell.flight.cg_offset, color=colour, linewidth=1.2)
+        else:
             factor = 1.0 if index == 2 else 57.29577951308232
             led, followed = cell.flight.leader_command, cell.flight.follower_command
             axis.plot(time, factor * followed[:, index], color=colour, linewidth=1.1, label=f"{cell.follower}")

@@ -14,12 +14,14 @@ from mjxball.errors import InputError
 from mjxball.evaluate.cells import REFERENCE, STANDARD, Cell, check_bounds, cross, load_policy, run_cells
 from mjxball.evaluate.report import to_json, write_report
 from mjxball.evaluate.table import table
+from mjxball.evaluate.waveform import read_waveform
 from mjxball.physics.stepper import ENGINES
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policies
 from mjxball.rollout import Scenario, check_scenario
 
 SCENARIO_FLAGS = ("omega", "amplitude", "mass", "believed_mass", "goal", "seconds")
+SCENARIO_FLAGS += ("waveform", "mass_change", "rolling")
 
 
 def parser() -> cli.Parser:
@@ -40,6 +42,16 @@ def parser() -> cli.Parser:
     result.add_argument("--wn-pitch", type=float, metavar="W", help="pitch natural frequency of both drones [rad/s]")
     result.add_argument("--goal", nargs=3, type=float, metavar=("X", "Y", "Z"), help="goal of O [m] (default 1 1 1)")
     result.add_argument("--seconds", type=float, metavar="S", help="length of each flight (default 45)")
+    result.add_argument(
+        "--waveform", type=Path, metavar="FILE", help="CG offsets from a CSV file: time [s], offset [m] per line"
+    )
+    result.add_argument("--rolling", type=float, metavar="X", help="a free ball that starts at X [m] from O")
+    result.add_argument(
+        "--mass-change",
+        nargs="+",
+        metavar="T:DM",
+        help="DM [kg] added to, or if negative dropped from, the object at T [s]",
+    )
     result.add_argument("--physics", choices=ENGINES, default="mjx", help="physics engine (default mjx)")
     result.add_argument("--json", type=Path, metavar="FILE", help="write the cells as JSON")
     result.add_argument("--out", type=Path, metavar="DIR", help="write cells.json and a figure per scenario")
@@ -63,9 +75,13 @@ def _evaluate(options: argparse.Namespace) -> int:
         cli.output_directory(options.out)
     if options.json:
         cli.output_file(options.json, ".json")
-    chosen = bool(options.policies or options.followers)
-    paths = options.policies if chosen else shipped_policies()
-    names = options.followers if chosen else list(BASELINES)
+    # `--followers copy mine.npz` reads as it looks: a file name among the followers is a policy.
+    files = [*options.policies, *(Path(name) for name in options.followers if name.endswith(".npz"))]
+    named = [name for name in options.followers if not name.endswith(".npz")]
+    paths = files if files or named else shipped_policies()
+    names = named if files or named else list(BASELINES)
+    if options.check and not paths:
+        raise InputError("--check needs a policy")
     policies = [load_policy(path, setup) for path in paths]
     followers = [*(make_baseline(name, setup) for name in dict.fromkeys(names)), *policies]
     _refuse_same_names([follower.name for follower in followers])
@@ -85,6 +101,13 @@ def _setup(options: argparse.Namespace) -> config.Config:
     if options.wn_pitch is not None:
         roll, _, yaw = setup.attitude.natural_frequency
         setup = config.replace(setup, "attitude.natural_frequency", (roll, options.wn_pitch, yaw))
+    if options.waveform and options.rolling is not None:
+        raise InputError("--waveform and --rolling exclude each other")
+    if options.waveform:
+        times, offsets = read_waveform(options.waveform)
+        setup = dataclasses.replace(setup, motion=config.Motion(kind="waveform", times=times, offsets=offsets))
+    if options.rolling is not None:
+        setup = dataclasses.replace(setup, motion=config.Motion(kind="rolling"))
     return config.validate(setup)
 
 
@@ -99,7 +122,17 @@ def _scenarios(options: argparse.Namespace) -> Sequence[Scenario]:
         believed_mass=options.believed_mass,
         goal=tuple(options.goal or REFERENCE.goal),
         seconds=REFERENCE.seconds if options.seconds is None else options.seconds,
+        mass_changes=tuple(map(_mass_change, options.mass_change or [])),
+        ball_start=options.rolling or 0.0,
     )
+
+
+def _mass_change(text: str) -> tuple[float, float]:
+    try:
+        time, mass = map(float, text.split(":"))
+    except ValueError:
+        raise InputError(f"--mass-change takes TIME:KG, for example 10:0.2, not {text!r}") from None
+    return time, mass
 
 
 def _refuse_same_names(names: list[str]) -> None:
@@ -110,9 +143,7 @@ def _refuse_same_names(names: list[str]) -> None:
 
 def _check(setup: config.Config, policies: Sequence[Policy], cells: Sequence[Cell], physics: str) -> int:
     """Hold every policy against its card on the reference scenario, flown anew if the cells lack it."""
-    if not policies:
-        raise InputError("--check needs a policy")
-    plain = dataclasses.replace(setup, attitude=config.Attitude())
+    plain = dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
     known = {cell.follower: cell for cell in cells if cell.scenario == REFERENCE} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]
     if missing:

@@ -25,7 +25,8 @@ def table(cells: Sequence[Cell]) -> str:
     rows = [head]
     for cell in cells:
         record = cell.record()
-        row = [f"{record[key]:g}" for key in ("omega", "amplitude", "mass", "believed_mass")] + [cell.follower]
+        numbers = (record[key] for key in ("omega", "amplitude", "mass", "believed_mass"))
+        row = [*("-" if number is None else f"{number:g}" for number in numbers), cell.follower]
         for name, _, factor, digits in COLUMNS:
             value = record[name]
             row.append("-" if value is None else f"{value * factor:.{digits}f}")

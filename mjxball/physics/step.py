@@ -31,7 +31,9 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
 
     Each physics step samples the attitude loop, moves the rotors' first-order lag exactly (its mean force
     acts over the step), and integrates drift-kick-drift: half a step of motion, the accelerations there,
-    the velocities, half a step of motion. Second order in the step, one evaluation of the accelerations.
+    the velocities, half a step of motion. One evaluation of the accelerations; second order in the step for
+    forces that depend on position and time, first order for the small ones that depend on velocity and for
+    the sampling of the attitude loop.
     """
     plant = config.plant
     constants = plant_constants(plant, config.attitude)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import zipfile
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from mjxball.errors import InputError
 FORMAT_VERSION = 1
 MAX_BYTES = 64 * 2**20
 MAX_LAYERS = 32
+MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
 CARD_FIELDS: dict[str, type | tuple[type, ...]] = {
     "format_version": int,
     "observation": list,
@@ -94,7 +94,7 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
     expected |= {f"{kind}_{i}" for kind in ("weight", "bias") for i in range(layers)}
     odd = sorted(set(arrays) ^ expected)
     if odd or not layers:
-        raise PolicyFileError(f"{name}: unexpected or missing array {odd[0] if odd else 'weight_0'}")
+        raise PolicyFileError(f"{name}: unexpected or missing array {odd[0] if odd else 'weight_0'!r}")
     policy = PolicyFile(
         weights=tuple(arrays[f"weight_{i}"] for i in range(layers)),
         biases=tuple(arrays[f"bias_{i}"] for i in range(layers)),
@@ -114,7 +114,7 @@ def _read_arrays(name: str) -> dict[str, np.ndarray]:
         if len(entries) > 2 * MAX_LAYERS + 4 or sum(entry.file_size for entry in entries) > MAX_BYTES:
             raise PolicyFileError(f"{name} is not a policy file: it unpacks to more than {MAX_BYTES >> 20} MiB")
         with np.load(name, allow_pickle=False) as data:
-            return {key: data[key] for key in data.files}
+            arrays = {key: data[key] for key in data.files}
     except FileNotFoundError:
         raise PolicyFileError(f"policy file {name} does not exist") from None
     except PolicyFileError:
@@ -126,6 +126,10 @@ def _read_arrays(name: str) -> dict[str, np.ndarray]:
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged bytes
         reason = "it holds a pickle" if "pickle" in str(error).lower() else "it is damaged or not an .npz"
         raise PolicyFileError(f"policy file {name} cannot be read: {reason}") from None
+    for key, array in arrays.items():
+        if not isinstance(array, np.ndarray):  # NumPy hands out an entry without the NPY magic as bytes
+            raise PolicyFileError(f"{name}: entry {key!r} is not an array")
+    return arrays
 
 
 def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
@@ -176,6 +180,8 @@ def _check_array(name: str, label: str, array: np.ndarray, shape: tuple[int, ...
         raise PolicyFileError(f"{name}: {label} must have shape {shape}, not {array.shape}")
     if not np.isfinite(array).all():
         raise PolicyFileError(f"{name}: {label} holds a value that is not finite")
+    if array.size == 0 or np.abs(array).max() > MAX_NUMBER:
+        raise PolicyFileError(f"{name}: {label} is empty or holds a value beyond {MAX_NUMBER:g}")
 
 
 def _check_card(card: dict[str, Any], name: str) -> None:
@@ -186,14 +192,16 @@ def _check_card(card: dict[str, Any], name: str) -> None:
         value = card.get(field)
         if isinstance(value, bool) and kind is not bool:
             value = None
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if not isinstance(value, kind):
+        if not isinstance(value, (int, float) if kind is float else kind):
             raise PolicyFileError(f"{name}: card field {field} is missing or not {kind.__name__}")
-    if [tuple(slot) for slot in card["observation"] if isinstance(slot, list)] != list(OBSERVATION):
+    if card["observation"] != [list(slot) for slot in OBSERVATION]:
         raise PolicyFileError(f"{name} was made for another observation than this version's 18 numbers")
-    if [tuple(slot) for slot in card["action"] if isinstance(slot, list)] != list(ACTION):
+    if card["action"] != [list(slot) for slot in ACTION]:
         raise PolicyFileError(f"{name} was made for another action than roll, pitch, vertical acceleration")
+    _check_card_numbers(card, name)
+
+
+def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     if card["action_mode"] not in ("residual", "direct"):
         raise PolicyFileError(f"{name}: action_mode must be residual or direct, not {card['action_mode']!r}")
     if not 1 <= card["history"] <= 100:
@@ -204,11 +212,11 @@ def _check_card(card: dict[str, Any], name: str) -> None:
         if len(numbers) != length or not all(_is_finite(value) and value >= 0 for value in numbers):
             raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
     for field in ("control_period", "gravity"):
-        if not (_is_finite(card[field]) and card[field] > 0):
+        if not (_is_finite(card[field]) and card[field] >= 1e-6):
             raise PolicyFileError(f"{name}: card field {field} must be positive")
     if not all(isinstance(key, str) and _is_finite(value) for key, value in card["bounds"].items()):
         raise PolicyFileError(f"{name}: card field bounds must hold finite numbers")
 
 
 def _is_finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER

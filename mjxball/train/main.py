@@ -26,11 +26,11 @@ def parser() -> cli.Parser:
         allow_abbrev=False,
     )
     names = ", ".join(config.PRESETS)
-    result.add_argument("preset", nargs="?", default="transport", metavar="PRESET", help=f"one of {names}")
-    result.add_argument("--seed", type=int, default=0, metavar="N", help="seed of everything random (default 0)")
+    result.add_argument("preset", nargs="?", metavar="PRESET", help=f"one of {names} (default transport)")
+    result.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default 0)")
     result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
-    result.add_argument("--physics", choices=PHYSICS, default="mjx", help="physics engine (default mjx)")
+    result.add_argument("--physics", choices=PHYSICS, help="physics engine (default mjx)")
     result.add_argument("--version", action="version", version=f"mjxball {__version__}")
     cli.add_config_flags(result)
     return result
@@ -45,14 +45,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _train(options: argparse.Namespace, command: str) -> int:
     resume = options.resume is not None
-    settings = cli.apply_config_flags(config.preset(options.preset), options)
-    if not -(2**31) <= options.seed < 2**31:
-        raise InputError(f"--seed must fit 32 bits, not {options.seed}")
+    name, seed = options.preset or "transport", options.seed or 0
+    settings = cli.apply_config_flags(config.preset(name), options)
+    if not 0 <= seed < 2**31:
+        raise InputError(f"--seed must be between 0 and {2**31 - 1}, not {seed}")
     if resume:
         _refuse_with_resume(options)
         out = options.resume
     else:
-        out = cli.output_directory(options.out or Path("runs") / f"{options.preset}-{time.strftime('%Y%m%d-%H%M%S')}")
+        out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
 
     from mjxball.train.checkpoint import restore_run
     from mjxball.train.run import POLICY, Run, TrainingDivergedError
@@ -60,8 +61,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
     state = None
     origin = {
         "command": command,
-        "seed": options.seed,
-        "physics": options.physics,
+        "seed": seed,
+        "physics": options.physics or "mjx",
         "package_version": __version__,
         "commit": _commit(),
     }
@@ -82,7 +83,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
 
 def _refuse_with_resume(options: argparse.Namespace) -> None:
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    given += ["--out"] if options.out else []
+    given += [f"--{name}" for name in ("out", "seed", "physics") if getattr(options, name) is not None]
+    given += [options.preset] if options.preset else []
     if given:
         raise InputError(f"--resume continues with the run's own configuration; drop {', '.join(given)}")
 

@@ -18,7 +18,7 @@ class Row:
     seconds: float  # since the start of training, compilation included
     rate: float  # environment steps per second, updates included
     episode_return: float  # mean reward x episode steps, exploring policy
-    steady_error: float  # mean |e_o| later than 8 s into an episode, exploring policy [m]
+    steady_error: float | None  # mean |e_o| later than 8 s into an episode, exploring policy [m]; None: none so old
     alpha: float
     entropy: float  # of the policy [nat]
     critic_loss: float
@@ -60,17 +60,17 @@ class Progress:
         self._writer.writerow(asdict(row))
         self._file.flush()
         left = max(self._total - row.steps, 0) / max(row.rate, 1e-9)
-        shown = row.eval_steady_error
+        evaluated = row.eval_return is not None
         metric = (
-            f"steady error {row.steady_error:.4f} m exploring"
-            if shown is None
-            else f"steady error {shown:.4f} m, peak {row.eval_peak:.4f} m"
+            f"steady error {_metres(row.eval_steady_error)}, peak {_metres(row.eval_peak)}"
+            if evaluated
+            else f"steady error {_metres(row.steady_error)} exploring"
         )
         text = (
             f"{row.steps:>9,} / {self._total:,} steps  {row.rate / 1e3:6.1f} k/s  "
             f"{int(left) // 60}:{int(left) % 60:02d} left  return {row.episode_return:9.1f}  {metric}"
         )
-        if self._live and shown is None:
+        if self._live and not evaluated:
             self._stream.write("\r" + text.ljust(self._width))
             self._stream.flush()
             self._width = len(text)
@@ -82,3 +82,7 @@ class Progress:
         if self._live and self._width:
             self._stream.write("\n")
         self._file.close()
+
+
+def _metres(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f} m"

@@ -133,7 +133,7 @@ class Run:
             seconds=round(seconds, 3),
             rate=round(rate, 1),
             episode_return=float(tally.reward) / steps * episode,
-            steady_error=float(tally.steady_error / jnp.maximum(tally.steady, 1)),
+            steady_error=_mean(tally.steady_error, tally.steady),
             alpha=float(jnp.exp(self.state.learner.log_alpha)),
             entropy=float(tally.losses.entropy),
             critic_loss=float(tally.losses.critic),
@@ -155,8 +155,8 @@ class Run:
             **{
                 **row.__dict__,
                 "eval_return": float(tally.reward) / steps * self.config.timing.episode_steps,
-                "eval_steady_error": float(tally.steady_error / jnp.maximum(tally.steady, 1)),
-                "eval_peak": float(tally.peak.mean()),
+                "eval_steady_error": _mean(tally.steady_error, tally.steady),
+                "eval_peak": float(tally.peak.mean()) if float(tally.steady) else None,
             }
         )
 
@@ -171,3 +171,8 @@ class Run:
             return False
         save_file(self.out / POLICY, policy)
         return True
+
+
+def _mean(total: jnp.ndarray, count: jnp.ndarray) -> float | None:
+    """`total` / `count`, None if there was nothing to count."""
+    return float(total) / float(count) if float(count) else None

@@ -1,0 +1,61 @@
+"""The control step on split components: the closed form becomes one fused kernel per control step on a GPU."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mjxball.config import Config
+from mjxball.physics import newton_euler
+from mjxball.physics.components import Namespace, join, split
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.step import ControlStep, Repeat, make_control_step, python_repeat
+
+Array = Any
+STATE_AXES = PlantState(1, 1, 1, 1, 2, 0, 0, 0)  # trailing axes of every leaf
+LOAD_AXES = Load(0, 0, 0, 0, 0, 1, 1)
+
+
+def split_state(state: PlantState) -> PlantState:
+    """Every leaf of `state` as `Components`."""
+    return PlantState(*map(split, state, STATE_AXES))
+
+
+def split_load(load: Load) -> Load:
+    """Every leaf of `load` as `Components`."""
+    return Load(*map(split, load, LOAD_AXES))
+
+
+def join_state(state: PlantState) -> PlantState:
+    """The inverse of `split_state`."""
+    return PlantState(*map(join, state))
+
+
+def make_split_step(config: Config, repeat: Repeat = python_repeat) -> ControlStep:
+    """Return the closed form's control step on split state, commands and load."""
+    engine = newton_euler.make_engine(config.plant, config.attitude)
+
+    def arrays_only(body: Any, count: int, value: PlantState) -> PlantState:
+        return repeat(lambda state: PlantState(*map(Namespace.asarray, body(state))), count, value)
+
+    step = make_control_step(config, engine, arrays_only)
+
+    def control_step(state: PlantState, commands: Array, load: Load) -> PlantState:
+        return PlantState(*(Namespace.asarray(leaf) for leaf in step(state, commands, load)))
+
+    return control_step
+
+
+def make_fused_step(config: Config) -> ControlStep:
+    """Return the closed form's control step for JAX arrays of any batch shape; equal to the plain one to rounding.
+
+    A waveform's table look-up does not split, so such a motion takes the plain road.
+    """
+    if config.motion.kind == "waveform":
+        engine = newton_euler.make_engine(config.plant, config.attitude)
+        return make_control_step(config, engine, python_repeat)
+    step = make_split_step(config)
+
+    def control_step(state: PlantState, commands: Array, load: Load) -> PlantState:
+        return join_state(step(split_state(state), split(commands, 2), split_load(load)))
+
+    return control_step

@@ -1,0 +1,69 @@
+"""Support for tests of the command lines: call them in this process or as a user would, and judge a refusal."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+REPOSITORY = Path(__file__).parents[1]
+TRANSPORT = REPOSITORY / "policies" / "transport.npz"
+Main = Callable[[list[str]], int]
+
+
+def call(main: Main, arguments: Sequence[object]) -> int:
+    """Exit code of `main` in this process, whether it returns or exits."""
+    try:
+        return main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+def run(arguments: Sequence[object], cwd: Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+    """Run `python ARGUMENTS` in the directory `cwd`; the scripts are given by `script`."""
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(
+        command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=timeout, check=False
+    )
+
+
+def environment() -> dict[str, str]:
+    """The environment of a child: CPU only, unbuffered."""
+    return {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+
+
+def script(name: str) -> Path:
+    """Path of train.py or eval.py."""
+    return REPOSITORY / name
+
+
+def listing(directory: Path) -> dict[str, bytes | None]:
+    """Every path below `directory` with its contents, None for a directory."""
+    paths = sorted(directory.rglob("*"))
+    return {str(path.relative_to(directory)): path.read_bytes() if path.is_file() else None for path in paths}
+
+
+def assert_one_line(errors: str) -> None:
+    """A refusal is exactly one line, and no traceback."""
+    assert errors.endswith("\n")
+    assert len(errors.splitlines()) == 1, errors
+    assert "Traceback" not in errors
+
+
+def load_arrays(path: Path = TRANSPORT) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and card of a policy file, free to be damaged."""
+    with np.load(path) as data:
+        arrays = {name: data[name] for name in data.files}
+    return arrays, json.loads(str(arrays.pop("card")))
+
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray], card: Any) -> Path:
+    """Write a policy file without any check."""
+    np.savez(path, **arrays, card=np.array(json.dumps(card)))
+    return path

@@ -1,0 +1,134 @@
+"""Shared fixtures. JAX runs on the CPU unless told otherwise; environments and networks compile once a session."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # before the first import of JAX
+
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.env import CoupledPairEnv
+from mjxball.export import policy_file
+from mjxball.policy import PolicyFile, save_file
+from mjxball.train import sac
+from mjxball.train.program import statistics
+
+# Derandomised: the same examples on every machine, so that a red build is never a matter of luck.
+hypothesis.settings.register_profile("mjxball", deadline=None, derandomize=True, database=None, max_examples=60)
+hypothesis.settings.load_profile("mjxball")
+
+
+def with_settings(config: Config, **sections: dict[str, Any]) -> Config:
+    """`config` with leaves replaced, one dictionary for each section: `scenario={"goal_reach": 0.0}`."""
+    changed = {
+        name: dataclasses.replace(getattr(config, name), **leaves) if isinstance(leaves, dict) else leaves
+        for name, leaves in sections.items()
+    }
+    return configs.validate(dataclasses.replace(config, **changed))
+
+
+class CompiledEnv(NamedTuple):
+    """One environment with its jitted functions."""
+
+    env: CoupledPairEnv
+    reset: Any  # key -> State
+    step: Any  # (State, action (3,)) -> State
+
+    def roll(self, state: Any, actions: Any) -> Any:
+        """States after each of `actions` (T, 3), stacked over T, in NumPy."""
+        states = []
+        for action in actions:
+            state = self.step(state, action)
+            states.append(state)
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+
+
+def compile_env(config: Config, physics: str) -> CompiledEnv:
+    """Environment of `config` with its functions jitted."""
+    env = CoupledPairEnv(config, physics)
+    return CompiledEnv(env, jax.jit(env.reset), jax.jit(env.step))
+
+
+@pytest.fixture(scope="session")
+def transport() -> Config:
+    return configs.preset("transport")
+
+
+@pytest.fixture(scope="session", params=["mjx", "newton-euler"])
+def engine(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def pair(transport: Config, engine: str) -> CompiledEnv:
+    """The transport environment on each engine."""
+    return compile_env(transport, engine)
+
+
+@pytest.fixture(scope="session")
+def mimic(transport: Config, engine: str) -> CompiledEnv:
+    """The transport environment with the paper's reward, on each engine."""
+    return compile_env(with_settings(transport, reward={"kind": "paper"}), engine)
+
+
+@pytest.fixture(scope="session")
+def fast_pair(transport: Config) -> CompiledEnv:
+    """The transport environment on closed-form physics, for tests that do not concern the engine."""
+    return compile_env(transport, "newton-euler")
+
+
+class Trained(NamedTuple):
+    """A learner with lived-in weights and statistics, and what is needed to run it."""
+
+    config: Config
+    networks: Any
+    learner: sac.Learner
+    contents: PolicyFile
+
+
+def make_trained(config: Config) -> Trained:
+    """A learner whose observation statistics have seen data of very different scales, as in a real run."""
+    env = CoupledPairEnv(config, "newton-euler")
+    networks = sac.make_networks(config.sac, env.input_mask, env.action_size)
+    learner = sac.create(networks, config.sac, env.observation_size, jax.random.key(3))
+    random = np.random.default_rng(4)
+    spread, centre = random.uniform(0.05, 3.0, env.observation_size), random.normal(size=env.observation_size)
+    seen = jnp.asarray(centre + spread * random.normal(size=(500, env.observation_size)), jnp.float32)
+    learner = learner._replace(normaliser=statistics.update(learner.normaliser, seen))
+    return Trained(config, networks, learner, policy_file(config, learner, steps=1234))
+
+
+@pytest.fixture(scope="session")
+def trained(transport: Config) -> Trained:
+    """Transport follower: it sees 18 numbers, remembers none, and ignores the absolute position."""
+    return make_trained(transport)
+
+
+@pytest.fixture(scope="session")
+def remembering(transport: Config) -> Trained:
+    """A follower that sees three observations and its last action."""
+    return make_trained(with_settings(transport, follower={"history": 3, "previous_action": True}))
+
+
+@pytest.fixture(scope="session")
+def remembering_pair(remembering: Trained) -> CompiledEnv:
+    """The environment that such a follower is trained in."""
+    return compile_env(remembering.config, "newton-euler")
+
+
+@pytest.fixture
+def saved(trained: Trained, tmp_path: Path) -> Path:
+    """The transport follower's policy file."""
+    path = tmp_path / "follower.npz"
+    save_file(path, trained.contents)
+    return path

@@ -1,0 +1,82 @@
+"""Plants and random states that the physics tests share."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from mjxball.config import Motion, Plant, preset
+from mjxball.physics.engine import CgState, PlantState, Wrench
+
+REFERENCE = Plant()
+# Nothing equal, nothing aligned: masses, inertias, mounts off the axis, another length and CG axis.
+VARIED = Plant(
+    leader_mass=1.3,
+    follower_mass=0.7,
+    object_mass=0.35,
+    leader_inertia=(2.0e-3, 3.1e-3, 4.2e-3),
+    follower_inertia=(1.1e-3, 2.3e-3, 3.4e-3),
+    object_size=(0.5, 0.12, 0.08),
+    leader_mount=(0.31, 0.02, 0.05),
+    follower_mount=(-0.19, -0.03, 0.04),
+    arm=0.09,
+)
+LIGHT_BALL = dataclasses.replace(VARIED, moving_fraction=0.4)
+SIDEWAYS = dataclasses.replace(
+    VARIED,
+    cg_axis="y",
+    object_size=(0.1, 0.44, 0.05),
+    leader_mount=(0.02, 0.25, 0.05),
+    follower_mount=(-0.01, -0.18, 0.04),
+    moving_fraction=0.7,
+)
+PIVOT = dataclasses.replace(SIDEWAYS, stand="pivot")
+HEAVE = dataclasses.replace(SIDEWAYS, stand="heave")
+PLANTS = {
+    "reference": REFERENCE,
+    "varied": VARIED,
+    "light_ball": LIGHT_BALL,
+    "sideways": SIDEWAYS,
+    "pivot": PIVOT,
+    "heave": HEAVE,
+}
+SAMPLES = Motion(kind="waveform", times=(0.0, 2.0, 3.0, 7.0, 12.0, 19.0), offsets=(0.0, 0.05, -0.04, 0.06, -0.05, 0.0))
+ROLLING = Motion(kind="rolling")
+
+
+def random_states(plant: Plant, count: int, random: np.random.Generator) -> PlantState:
+    """States that the plant's stand allows: any attitude, rates of a few rad/s, rotors anywhere in their range."""
+    quaternion, rates = random.normal(size=(count, 4)), random.normal(size=(count, 3)) * 2
+    position, velocity = random.normal(size=(2, count, 3))
+    if plant.stand != "free":
+        quaternion[:, 2:], rates[:, 1:] = 0, 0
+        keep = np.array([0.0, 0.0, float(plant.stand == "heave")])
+        position, velocity = position * keep, velocity * keep
+    half = plant.object_size["xy".index(plant.cg_axis)] / 2
+    return PlantState(
+        position=position,
+        quaternion=quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
+        velocity=velocity,
+        rates=rates,
+        rotor_force=random.uniform(0, plant.rotor_force_max, (count, 2, 4)),
+        time=random.uniform(0, 20, count),
+        ball_offset=random.uniform(-half, half, count),
+        ball_rate=random.normal(size=count),
+    )
+
+
+def random_motion(plant: Plant, count: int, random: np.random.Generator) -> CgState:
+    """Offsets within the object, with any rate and acceleration."""
+    reach = plant.moving_fraction * plant.object_size["xy".index(plant.cg_axis)] / 2
+    return CgState(random.uniform(-reach, reach, count), *random.normal(size=(2, count)))
+
+
+def random_wrench(count: int, random: np.random.Generator) -> Wrench:
+    """Thrust along body z, any torque."""
+    return Wrench(random.uniform(0, 40, (count, 1)) * [0, 0, 1], random.normal(size=(count, 3)))
+
+
+def paper_with(plant: Plant = REFERENCE, motion: Motion | None = None):
+    """The paper's configuration on another plant or with another motion."""
+    return dataclasses.replace(preset("paper"), plant=plant, motion=motion or Motion())

@@ -1,0 +1,279 @@
+"""`train.py` and `python -m mjxball.export` as a user meets them: files, Ctrl-C, resume, and refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import assert_one_line, call, environment, listing, load_arrays, run, script
+
+from mjxball import config as configs
+from mjxball import export
+from mjxball.policy import Policy
+from mjxball.train.main import main
+
+WORLDS = 32
+# Small enough for seconds: closed-form physics, tiny networks, one update a step.
+TINY: dict[str, Any] = {
+    "--physics": "newton-euler",
+    "--timing.episode_steps": 100,
+    "--sac.worlds": WORLDS,
+    "--sac.replay": 32_000,
+    "--sac.prefill": 1024,
+    "--sac.batch": 64,
+    "--sac.updates": 1,
+    "--sac.policy_layers": "16,16",
+    "--sac.critic_layers": "16,16",
+}
+STEPS = 4096
+LONG = 96_000  # several seconds of training, so that Ctrl-C arrives in the middle
+ROW = re.compile(r"^\s*[\d,]+ / [\d,]+ steps")
+EVALUATED = {"eval_return", "eval_steady_error", "eval_peak"}
+
+
+def command(**extra: Any) -> list[object]:
+    flags = {**TINY, **{f"--{name.replace('__', '.')}": value for name, value in extra.items()}}
+    return [script("train.py"), *(word for pair in flags.items() for word in pair)]
+
+
+def rows_of(run_directory: Path) -> list[dict[str, str]]:
+    with (run_directory / "metrics.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def checkpoint_steps(run_directory: Path) -> list[int]:
+    return sorted(int(path.name) for path in (run_directory / "checkpoints").iterdir() if path.name.isdigit())
+
+
+def command_of(policy: Path) -> np.ndarray:
+    return Policy.load(policy)(np.linspace(-0.5, 0.5, 18))
+
+
+# --- a whole run ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short run in a fresh working directory."""
+    here = tmp_path_factory.mktemp("finished")
+    done = run(command(out="run", seed=3, sac__steps=STEPS), here)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "run/policy.npz" in done.stdout
+    assert sorted(path.name for path in here.iterdir()) == ["run"]
+    return here / "run"
+
+
+def test_run_writes_every_file(finished: Path) -> None:
+    names = {path.name for path in finished.iterdir()}
+    assert names == {"config.json", "metrics.csv", "checkpoints", "policy.npz", "eval"}
+    assert (finished / "eval" / "cells.json").is_file()
+    assert len(list((finished / "eval").glob("*.png"))) == 6  # the standard scenarios
+
+
+def test_run_records_what_made_it(finished: Path) -> None:
+    record = json.loads((finished / "config.json").read_text())
+    config = configs.validate(configs.from_dict(record["config"]))
+    assert record["config_hash"] == configs.config_hash(config)
+    assert config.sac.steps == STEPS
+    assert config.sac.policy_layers == (16, 16)
+    assert (record["seed"], record["physics"]) == (3, "newton-euler")
+    _, card = load_arrays(finished / "policy.npz")
+    assert card["config_hash"] == record["config_hash"]
+    assert card["training_steps"] == STEPS
+    assert card["preset"] == "transport"
+
+
+def test_run_logs_metrics_in_order(finished: Path) -> None:
+    rows = rows_of(finished)
+    steps = [int(row["steps"]) for row in rows]
+    assert steps == sorted(set(steps))
+    assert steps[-1] == STEPS == checkpoint_steps(finished)[-1]
+    for row in rows:
+        empty = {name for name, text in row.items() if not text}
+        assert empty in (set(), EVALUATED)
+        assert all(np.isfinite(float(text)) for text in row.values() if text)
+    assert rows[-1]["eval_return"]
+
+
+def test_run_policy_flies(finished: Path) -> None:
+    assert np.isfinite(command_of(finished / "policy.npz")).all()
+
+
+def test_export_of_the_run_is_its_policy(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "exported.npz"
+    before = listing(finished)
+    assert call(export.main, [finished, out]) == 0
+    assert str(out) in capsys.readouterr().out
+    np.testing.assert_array_equal(command_of(out), command_of(finished / "policy.npz"))
+    assert load_arrays(out)[1] == load_arrays(finished / "policy.npz")[1]
+    assert listing(finished) == before
+
+
+# --- Ctrl-C and resume ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that got one Ctrl-C after its first row of progress."""
+    here = tmp_path_factory.mktemp("interrupted")
+    child = subprocess.Popen(
+        [sys.executable, *map(str, command(out="run", sac__steps=LONG))],
+        cwd=here,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    guard = threading.Timer(120, child.kill)
+    guard.start()
+    try:
+        seen = []
+        for line in child.stderr:
+            seen.append(line)
+            if ROW.match(line):
+                child.send_signal(signal.SIGINT)
+                break
+        output, errors = child.communicate()
+    finally:
+        guard.cancel()
+        child.kill()
+    assert child.returncode == 130, (seen, output, errors)
+    assert "Traceback" not in errors
+    assert "run/policy.npz" in output
+    return here / "run"
+
+
+def test_interrupted_run_keeps_policy_and_checkpoint(interrupted: Path) -> None:
+    steps = int(rows_of(interrupted)[-1]["steps"])
+    assert steps < LONG
+    assert checkpoint_steps(interrupted)[-1] == steps
+    assert load_arrays(interrupted / "policy.npz")[1]["training_steps"] == steps
+    assert np.isfinite(command_of(interrupted / "policy.npz")).all()
+    names = {path.name for path in interrupted.iterdir()}
+    assert names == {"config.json", "metrics.csv", "checkpoints", "policy.npz"}
+
+
+def test_export_of_an_interrupted_run(interrupted: Path, tmp_path: Path) -> None:
+    done = run(["-m", "mjxball.export", interrupted, "exported.npz"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_array_equal(command_of(tmp_path / "exported.npz"), command_of(interrupted / "policy.npz"))
+
+
+def test_resume_finishes_an_interrupted_run(interrupted: Path) -> None:
+    before = rows_of(interrupted)
+    recorded = (interrupted / "config.json").read_bytes()
+    done = run([script("train.py"), "--resume", "run"], interrupted.parent)
+    assert done.returncode == 0, done.stderr
+    rows = rows_of(interrupted)
+    assert rows[: len(before)] == before
+    steps = [int(row["steps"]) for row in rows]
+    assert steps == sorted(set(steps))
+    assert steps[-1] == LONG == checkpoint_steps(interrupted)[-1]
+    assert load_arrays(interrupted / "policy.npz")[1]["training_steps"] == LONG
+    assert (interrupted / "eval" / "cells.json").is_file()
+    assert (interrupted / "config.json").read_bytes() == recorded
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------
+
+BAD_ARGUMENTS = {
+    "unknown preset": ["holiday"],
+    "unknown flag": ["--frobnicate", 1],
+    "unknown setting": ["--sac.luck", 1],
+    "two presets": ["paper", "transport"],
+    "unknown engine": ["--physics", "mujoco"],
+    "output is not empty": ["--out", "full"],
+    "output is a file": ["--out", "note.txt"],
+    "output below a file": ["--out", "note.txt/new"],
+    "resume of nothing": ["--resume", "nowhere"],
+    "resume of another directory": ["--resume", "full"],
+    "resume of a damaged run": ["--resume", "damaged"],
+    "resume of a run without checkpoints": ["--resume", "unborn"],
+    "resume with a setting": ["--resume", "full", "--sac.steps", 5],
+    "resume with an output": ["--resume", "full", "--out", "new"],
+    "negative mass": ["--plant.object_mass", -1],
+    "negative drone mass": ["--plant.leader_mass", -1],
+    "mass is not a number": ["--plant.object_mass", "nan"],
+    "mass range with a negative end": ["--scenario.object_mass=-0.1,0.2"],
+    "range of one number": ["--scenario.object_mass", 0.2],
+    "range upside down": ["--scenario.cg_speed", "3,1"],
+    "goal beyond d_term": ["--scenario.goal_reach", 2],
+    "amplitude beyond the object": ["--scenario.cg_amplitude", "0,0.2"],
+    "slow physics": ["--timing.physics_steps", 1],
+    "negative steps": ["--sac.steps", -1],
+    "steps not whole": ["--sac.steps", 1.5],
+    "replay does not fit the worlds": ["--sac.replay", 1000],
+    "no layers": ["--sac.policy_layers", ""],
+    "unknown choice": ["--follower.action", "nothing"],
+    "not a switch": ["--sac.alpha_fixed", "maybe"],
+    "seed too large": ["--seed", 2**40],
+    "seed is a word": ["--seed", "lucky"],
+}
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory that holds what bad inputs point at."""
+    for name in ("full", "damaged", "unborn"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "full" / "kept.txt").write_text("kept")
+    (tmp_path / "damaged" / "config.json").write_text('{"config": {')
+    record = {"config": configs.to_dict(configs.preset("transport")), "seed": 0, "physics": "mjx"}
+    (tmp_path / "unborn" / "config.json").write_text(json.dumps(record))
+    (tmp_path / "note.txt").write_text("a note")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("arguments", BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
+def test_bad_argument_is_refused(here: Path, arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    before = listing(here)
+    code = call(main, arguments)
+    captured = capsys.readouterr()
+    assert code == 2, captured
+    assert_one_line(captured.err)
+    assert not captured.out
+    assert listing(here) == before
+
+
+BAD_EXPORTS = {
+    "nothing said": [],
+    "unknown flag": ["full", "new.npz", "--frobnicate"],
+    "no run": ["nowhere", "new.npz"],
+    "not a run": ["full", "new.npz"],
+    "damaged run": ["damaged", "new.npz"],
+    "run without checkpoints": ["unborn", "new.npz"],
+    "another ending": ["full", "new.zip"],
+    "file that exists": ["full", "old.npz"],
+}
+
+
+@pytest.mark.parametrize("arguments", BAD_EXPORTS.values(), ids=BAD_EXPORTS)
+def test_bad_export_is_refused(here: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "old.npz").write_bytes(b"old")
+    before = listing(here)
+    code = call(export.main, arguments)
+    captured = capsys.readouterr()
+    assert code == 2, captured
+    assert_one_line(captured.err)
+    assert listing(here) == before
+
+
+@pytest.mark.parametrize("arguments", [["holiday"], ["--out", "full"]], ids=["preset", "output"])
+def test_refusal_of_a_real_process(here: Path, arguments: list[str]) -> None:
+    before = listing(here)
+    done = run([script("train.py"), *arguments], here)
+    assert done.returncode == 2
+    assert_one_line(done.stderr)
+    assert not done.stdout
+    assert listing(here) == before

@@ -1,0 +1,270 @@
+"""Configuration: JSON round trip, hash, overrides from text, and everything that validation must refuse."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import pytest
+
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.errors import InputError
+
+PATHS = [path for path, _, _ in configs.leaves(Config())]
+each_preset = pytest.mark.parametrize("name", configs.PRESETS)
+each_leaf = pytest.mark.parametrize("path", PATHS)
+
+
+def value_at(config: Config, path: str) -> Any:
+    return {known: value for known, value, _ in configs.leaves(config)}[path]
+
+
+def another(value: Any) -> Any:
+    """A value of the same type that differs."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, tuple):
+        return (another(value[0]), *value[1:]) if value else (1.0,)
+    return value + 1 if isinstance(value, (int, float)) else f"{value}!"
+
+
+def text_of(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def refusal(config: Config) -> str:
+    """The one sentence with which `config` is refused."""
+    with pytest.raises(InputError) as error:
+        configs.validate(config)
+    assert str(error.value).isprintable()
+    return str(error.value)
+
+
+class TestJson:
+    @each_preset
+    def test_every_preset_is_valid_and_named(self, name):
+        assert configs.validate(configs.preset(name)).preset == name
+
+    @each_preset
+    def test_round_trip(self, name):
+        config = configs.preset(name)
+        assert configs.from_dict(json.loads(configs.to_json(config))) == config
+
+    def test_whole_numbers_for_floats_are_read_as_floats(self):
+        data = configs.to_dict(configs.preset("paper"))
+        data["plant"]["leader_mass"] = 1
+        config = configs.from_dict(json.loads(json.dumps(data)))
+        assert configs.config_hash(config) == configs.config_hash(configs.preset("paper"))
+
+    def test_unknown_preset_lists_the_known(self):
+        with pytest.raises(InputError, match="transport") as error:
+            configs.preset("papper")
+        assert "papper" in str(error.value)
+
+    @pytest.mark.parametrize(
+        ("change", "named"),
+        [
+            (lambda data: data.update(wings=2), "wings"),
+            (lambda data: data["plant"].update(wings=2), "wings"),
+            (lambda data: data["plant"].pop("arm"), "arm"),
+            (lambda data: data.pop("sac"), "sac"),
+            (lambda data: data.update(sac=3), "sac"),
+        ],
+        ids=["unknown section", "unknown leaf", "missing leaf", "missing section", "number for a section"],
+    )
+    def test_other_fields_are_named(self, change, named):
+        data = configs.to_dict(configs.preset("paper"))
+        change(data)
+        with pytest.raises(InputError, match=named):
+            configs.from_dict(data)
+
+    @pytest.mark.parametrize("data", [None, [], 3, "paper"])
+    def test_not_an_object(self, data):
+        with pytest.raises(InputError):
+            configs.from_dict(data)
+
+    @pytest.mark.parametrize(
+        ("section", "leaf", "value"),
+        [
+            ("plant", "leader_mass", "heavy"),
+            ("plant", "leader_mass", True),
+            ("plant", "leader_mass", None),
+            ("plant", "leader_mass", [1.0]),
+            ("plant", "leader_inertia", 0.01),
+            ("plant", "leader_inertia", [0.01, "x", 0.01]),
+            ("plant", "leader_inertia", [[1, 1, 1]]),
+            ("sac", "worlds", 12.5),
+            ("sac", "updates", 2.5),
+            ("sac", "policy_layers", [64, 2.5]),
+            ("sac", "policy_layers", 64),
+            ("sac", "alpha_fixed", "no"),
+            ("sac", "alpha_fixed", 0.5),
+            ("reward", "kind", 3),
+            ("reward", "kind", ["task"]),
+        ],
+    )
+    def test_wrong_type_is_refused_and_named(self, section, leaf, value):
+        """A `config.json` edited by hand: JSON holds any type anywhere."""
+        data = configs.to_dict(configs.preset("transport"))
+        data[section][leaf] = value
+        with pytest.raises(InputError, match=leaf) as error:
+            configs.validate(configs.from_dict(json.loads(json.dumps(data))))
+        assert str(error.value).isprintable()
+
+
+class TestHash:
+    @each_leaf
+    def test_changes_with_every_leaf(self, path):
+        config = Config()
+        changed = configs.replace(config, path, another(value_at(config, path)))
+        assert configs.config_hash(changed) != configs.config_hash(config)
+
+    def test_does_not_depend_on_how_the_config_was_made(self):
+        config = configs.preset("transport")
+        again = configs.from_dict(json.loads(configs.to_json(config)))
+        assert configs.config_hash(again) == configs.config_hash(config)
+
+    def test_is_sixteen_hex_digits(self):
+        text = configs.config_hash(Config())
+        assert len(text) == 16
+        int(text, 16)
+
+    def test_presets_differ(self):
+        assert len({configs.config_hash(config) for config in configs.PRESETS.values()}) == len(configs.PRESETS)
+
+
+class TestOverride:
+    @each_preset
+    @each_leaf
+    def test_text_of_every_leaf_gives_it_back(self, name, path):
+        config = configs.preset(name)
+        assert configs.override(config, path, text_of(value_at(config, path))) == config
+
+    @each_leaf
+    def test_every_leaf_can_be_changed(self, path):
+        config = Config()
+        wanted = another(value_at(config, path))
+        assert value_at(configs.override(config, path, text_of(wanted)), path) == wanted
+
+    @pytest.mark.parametrize(("text", "value"), [("true", True), ("False", False), ("1", True), ("0", False)])
+    def test_switches(self, text, value):
+        assert configs.override(Config(), "sac.alpha_fixed", text).sac.alpha_fixed is value
+
+    def test_layers_may_have_any_number(self):
+        assert configs.override(Config(), "sac.policy_layers", "32,16,8").sac.policy_layers == (32, 16, 8)
+
+    def test_original_stays(self):
+        config = Config()
+        configs.override(config, "plant.arm", "0.2")
+        assert config == Config()
+
+    @pytest.mark.parametrize("path", ["plant.wings", "plant", "arm", "", "plant.arm.x", "preset"])
+    def test_unknown_path(self, path):
+        with pytest.raises(InputError, match="not a setting"):
+            configs.override(Config(), path, "1")
+
+    @pytest.mark.parametrize(
+        ("path", "text"),
+        [
+            ("plant.arm", "long"),
+            ("plant.arm", ""),
+            ("plant.arm", "0.1,0.2"),
+            ("sac.worlds", "12.5"),
+            ("sac.worlds", "1e3"),
+            ("plant.leader_inertia", "1,2,x"),
+            ("plant.leader_inertia", "1;2;3"),
+            ("sac.policy_layers", "64,"),
+            ("sac.alpha_fixed", "maybe"),
+        ],
+    )
+    def test_text_that_does_not_parse(self, path, text):
+        with pytest.raises(InputError, match=path.replace(".", r"\.")) as error:
+            configs.override(Config(), path, text)
+        assert repr(text) in str(error.value)
+
+
+class TestValidate:
+    @pytest.mark.parametrize(
+        ("path", "value"),
+        [
+            ("plant.leader_mass", -1.0),
+            ("plant.object_mass", 0.0),
+            ("plant.leader_inertia", (1e-3, -1e-3, 1e-3)),
+            ("plant.leader_inertia", (1e-3, 1e-3)),
+            ("plant.rotor_lag", 0.0),
+            ("plant.gravity", -9.81),
+            ("leader.tilt_limit", 1.3),
+            ("leader.kp", (0.5, -0.5, 0.5)),
+            ("follower.action", "indirect"),
+            ("follower.history", 0),
+            ("timing.control_period", 0.0),
+            ("timing.episode_steps", 0),
+            ("scenario.object_mass", (0.3, 0.1)),
+            ("scenario.object_mass", (0.0, 0.1)),
+            ("scenario.cg_speed", (0.1, 0.2, 0.3)),
+            ("reward.kind", "fun"),
+            ("reward.error_scale", 0.0),
+            ("sac.discount", 1.0),
+            ("sac.batch", 0),
+            ("sac.policy_layers", ()),
+            ("sac.policy_layers", (64, 0)),
+            ("sac.alpha", 0.0),
+            ("sac.target_rate", 1.5),
+        ],
+    )
+    def test_leaf_out_of_bounds_is_named(self, path, value):
+        assert path in refusal(configs.replace(Config(), path, value))
+
+    @each_leaf
+    @pytest.mark.parametrize("number", [float("nan"), float("inf"), float("-inf")])
+    def test_every_number_must_be_finite(self, path, number):
+        value = value_at(Config(), path)
+        if isinstance(value, (bool, str)):
+            changed = number  # no number belongs here at all
+        elif isinstance(value, tuple):
+            changed = (number, *value[1:])
+        else:
+            changed = number
+        assert path in refusal(configs.replace(Config(), path, changed))
+
+    @pytest.mark.parametrize(
+        ("changes", "named"),
+        [
+            ({"scenario.cg_amplitude": (0.0, 0.18)}, "cg_amplitude"),
+            ({"plant.object_size": (0.09, 0.1, 0.05)}, "cg_amplitude"),
+            ({"scenario.goal_reach": 1.5}, "termination_distance"),
+            ({"scenario.goal_reach": 1.0, "scenario.start_position": 0.5}, "termination_distance"),
+            ({"scenario.termination_distance": 1.7}, "termination_distance"),
+            ({"plant.leader_mount": (-0.2, 0.0, 0.0)}, "leader_mount"),
+            ({"timing.physics_steps": 3}, "ms"),
+            ({"timing.control_period": 0.04}, "ms"),
+            ({"sac.worlds": 2048, "sac.replay": 1024}, "replay"),
+            ({"sac.batch": 2048, "sac.replay": 1024}, "replay"),
+            ({"sac.worlds": 100, "sac.replay": 1050}, "multiple"),
+            ({"sac.worlds": 128, "sac.replay": 256, "sac.return_steps": 3}, "replay"),
+        ],
+        ids=lambda value: value if isinstance(value, str) else ",".join(value),
+    )
+    def test_leaves_that_do_not_fit_together(self, changes, named):
+        config = Config()
+        for path, value in changes.items():
+            config = configs.replace(config, path, value)
+        assert named in refusal(config)
+
+    @pytest.mark.parametrize(
+        ("path", "value"),
+        [
+            ("scenario.cg_amplitude", (0.17, 0.17)),  # half the object's length: the sweep's widest
+            ("timing.physics_steps", 4),  # 5 ms: the slowest attitude loop
+            ("scenario.goal_reach", 1.44),  # sqrt(3) 1.44 = 2.494 m < d_term
+            ("sac.replay", 256),  # one batch
+        ],
+    )
+    def test_limits_themselves_are_allowed(self, path, value):
+        configs.validate(configs.replace(Config(), path, value))
+
+    def test_config_is_frozen(self):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            Config().plant.arm = 0.2

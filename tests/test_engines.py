@@ -1,0 +1,145 @@
+"""Closed form, MJX and C MuJoCo give the same accelerations, for every plant and every motion of the CG."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from plants import PLANTS, ROLLING, SAMPLES, paper_with, random_motion, random_states, random_wrench
+
+from mjxball.config import Attitude, Motion
+from mjxball.physics import mjx, mujoco, newton_euler
+from mjxball.physics.constants import plant_constants
+from mjxball.physics.engine import Load
+from mjxball.physics.step import make_accelerations, total_wrench
+
+STATES = 10_000
+FEWER = 300  # for plants beside the reference: one world of C MuJoCo takes 50 us
+TOLERANCE = 1e-9  # the issue's bound; float64 leaves about 1e-14
+
+
+def relative_difference(found: tuple, expected: tuple) -> float:
+    """Largest difference of any state's accelerations, relative to that state's own."""
+    worst = 0.0
+    for pair in zip(found, expected, strict=True):
+        a, b = (np.asarray(value).reshape(len(value), -1) for value in pair)
+        scale = np.maximum(np.linalg.norm(b, axis=-1), 1e-3)  # locked directions are exactly 0 on both sides
+        worst = max(worst, float((np.linalg.norm(a - b, axis=-1) / scale).max()))
+    return worst
+
+
+def engines(plant, function: str):
+    """The function of all three engines on batches of NumPy arrays."""
+    with jax.enable_x64(True):
+        batched = jax.jit(jax.vmap(getattr(mjx.make_engine(plant, Attitude()), function)))
+
+    def mjx_engine(*arguments):
+        with jax.enable_x64(True):
+            return batched(*arguments)
+
+    closed, second = newton_euler.make_engine(plant, Attitude()), mujoco.make_engine(plant, Attitude())
+    return getattr(closed, function), mjx_engine, getattr(second, function)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("function", ["prescribed", "rolling"])
+def test_engines_agree_on_every_plant(name: str, function: str) -> None:
+    plant, random = PLANTS[name], np.random.default_rng(1)
+    mass = random.uniform(0.1, 0.6, FEWER)
+    last = random_motion(plant, FEWER, random) if function == "prescribed" else random.normal(size=FEWER)
+    arguments = (random_states(plant, FEWER, random), random_wrench(FEWER, random), mass, last)
+    closed, fast, second = engines(plant, function)
+    expected = second(*arguments)
+    assert relative_difference(closed(*arguments), expected) <= TOLERANCE
+    assert relative_difference(fast(*arguments), expected) <= TOLERANCE
+
+
+@pytest.mark.parametrize(
+    ("motion", "changes"), [(Motion(), 0), (SAMPLES, 0), (ROLLING, 0), (Motion(), 2)], ids=lambda value: str(value)[:24]
+)
+def test_engines_agree_on_10_000_states_for_every_motion(motion: Motion, changes: int) -> None:
+    random, config = np.random.default_rng(2), paper_with(motion=motion)
+    state = random_states(config.plant, STATES, random)
+    load = Load(
+        object_mass=random.uniform(0.2, 0.6, STATES),
+        believed_mass=np.full(STATES, 0.2),
+        cg_amplitude=random.uniform(0, 0.17, STATES),
+        cg_speed=random.uniform(0.3, 3.1, STATES),
+        cg_phase=random.uniform(0, 6.28, STATES),
+        mass_change=random.uniform(-0.05, 0.2, (STATES, changes)),
+        mass_change_time=random.uniform(0, 20, (STATES, changes)),
+    )
+    constants = plant_constants(config.plant, config.attitude)
+    wrench = total_wrench(np, state.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust)
+
+    def accelerations(engine):
+        return make_accelerations(config, engine)(state, wrench, load)
+
+    expected = accelerations(mujoco.make_engine(config.plant, config.attitude))
+    closed = accelerations(newton_euler.make_engine(config.plant, config.attitude))
+    with jax.enable_x64(True):
+        law = make_accelerations(config, mjx.make_engine(config.plant, config.attitude))
+        fast = jax.jit(jax.vmap(law))(state, wrench, load)
+    assert relative_difference(closed, expected) <= TOLERANCE
+    assert relative_difference(fast, expected) <= TOLERANCE
+    assert np.abs(expected[1]).max() > 10  # the states are violent enough to mean something [rad/s2]
+
+
+def test_closed_form_matches_the_hand_solution_of_design_section_4() -> None:
+    plant, random = PLANTS["reference"], np.random.default_rng(3)
+    state, wrench, cg = random_states(plant, 50, random), random_wrench(50, random), random_motion(plant, 50, random)
+    state = state._replace(quaternion=np.tile([1.0, 0, 0, 0], (50, 1)), rates=np.zeros((50, 3)))
+    mass = random.uniform(0.1, 0.6, 50)
+    linear, angular = newton_euler.make_engine(plant, Attitude()).prescribed(state, wrench, mass, cg)
+    constants = plant_constants(plant, Attitude())
+    jx, jy, jz = np.diag(constants.drone_inertia)[:, None] + mass * (
+        constants.object_inertia_per_mass[:, None] + np.array([0, 1, 1])[:, None] * cg.offset**2
+    )
+    total, s, g = 2 + mass, mass * cg.offset, plant.gravity
+    fx, fy, fz = -mass * cg.acceleration, np.zeros(50), wrench.force[:, 2] - total * g
+    nx, ny, nz = wrench.torque.T + np.array([np.zeros(50), s * g, np.zeros(50)])
+    expected = [
+        fx / total,
+        (jz * fy - s * nz) / (total * jz - s * s),
+        (jy * fz + s * ny) / (total * jy - s * s),
+        nx / jx,
+        (total * ny + s * fz) / (total * jy - s * s),
+        (total * nz - s * fy) / (total * jz - s * s),
+    ]
+    # 1e-12: products of a few rounded terms
+    np.testing.assert_allclose(np.hstack([linear, angular]).T, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_locked_direction_does_not_accelerate() -> None:
+    for name, free in (("pivot", []), ("heave", [2])):
+        plant, random = PLANTS[name], np.random.default_rng(4)
+        state = random_states(plant, 20, random)
+        motion = random_motion(plant, 20, random)
+        engine = newton_euler.make_engine(plant, Attitude())
+        linear, angular = engine.prescribed(state, random_wrench(20, random), np.full(20, 0.3), motion)
+        locked = [axis for axis in range(3) if axis not in free]
+        # A heave stand's world axes come from a rotation about x, exact to rounding.
+        np.testing.assert_allclose(linear[:, locked], 0, atol=1e-12)
+        np.testing.assert_array_equal(angular[:, 1:], 0)
+        assert (np.abs(angular[:, 0]) > 0).all()
+
+
+def test_plant_is_parameters() -> None:
+    """Scaling every mass, inertia, force and torque leaves the accelerations as they are."""
+    plant, random = PLANTS["varied"], np.random.default_rng(5)
+    state, wrench, cg = random_states(plant, 30, random), random_wrench(30, random), random_motion(plant, 30, random)
+    mass = np.full(30, 0.4)
+    heavy = dataclasses.replace(
+        plant,
+        leader_mass=3 * plant.leader_mass,
+        follower_mass=3 * plant.follower_mass,
+        leader_inertia=tuple(3 * value for value in plant.leader_inertia),
+        follower_inertia=tuple(3 * value for value in plant.follower_inertia),
+    )
+    light_result = newton_euler.make_engine(plant, Attitude()).prescribed(state, wrench, mass, cg)
+    tripled = wrench._replace(force=3 * wrench.force, torque=3 * wrench.torque)
+    heavy_result = newton_euler.make_engine(heavy, Attitude()).prescribed(state, tripled, 3 * mass, cg)
+    # 1e-11: the two differ in rounding only
+    np.testing.assert_allclose(heavy_result, light_result, rtol=1e-11, atol=1e-11)

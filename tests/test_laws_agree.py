@@ -1,0 +1,132 @@
+"""One law, one home: every function in `control/` gives the same on NumPy and on JAX, jitted or not."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from mjxball.config import preset
+from mjxball.control import attitude, leader, mixer, observation, rotations
+from mjxball.control.attitude import AttitudeGains
+from mjxball.control.followers import Copy
+
+WORLDS = 64
+random = np.random.default_rng(7)
+
+
+def normal(*shape: int) -> np.ndarray:
+    return random.normal(size=(WORLDS, *shape))
+
+
+# Roll within +-1 rad: at +-pi/2 the Euler angles are singular and no two roundings agree.
+EULER = random.uniform(-1, 1, (WORLDS, 3))
+MATRIX = rotations.matrix_from_euler(EULER)
+QUATERNION = rotations.quaternion_from_euler(EULER)
+HALF = normal(3, 3)
+SYMMETRIC = HALF @ np.swapaxes(HALF, -1, -2) + 3 * np.eye(3)  # well conditioned, as inertias are
+KP, KD, KI = (0.5, 0.4, 0.3), (1.0, 0.9, 0.8), (0.1, 0.0, 0.2)
+GAINS = AttitudeGains((0.24, 3.22, 0.543), (0.0433, 0.579, 0.244))
+MOUNT = np.array([-0.17, 0.0, 0.0])
+LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
+SEEN, MEMORY, ACTION = normal(18), normal(39), random.uniform(-1, 1, (WORLDS, 3))
+COPY = Copy(preset("paper"))
+
+# name -> (law of arrays alone, its arrays). Clipping happens in some worlds and not in others.
+LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
+    "rotations.rotate": (rotations.rotate, (MATRIX, normal(3))),
+    "rotations.rotate_back": (rotations.rotate_back, (MATRIX, normal(3))),
+    "rotations.cross": (rotations.cross, (normal(3), normal(3))),
+    "rotations.matrix_from_euler": (rotations.matrix_from_euler, (EULER,)),
+    "rotations.euler_from_matrix": (rotations.euler_from_matrix, (MATRIX,)),
+    "rotations.matrix_from_quaternion": (rotations.matrix_from_quaternion, (QUATERNION,)),
+    "rotations.multiply_quaternions": (rotations.multiply_quaternions, (QUATERNION, QUATERNION[::-1])),
+    "rotations.quaternion_from_euler": (rotations.quaternion_from_euler, (EULER,)),
+    "rotations.integrate_quaternion": (rotations.integrate_quaternion, (QUATERNION, 0.2 * EULER)),
+    "rotations.solve_symmetric": (rotations.solve_symmetric, (SYMMETRIC, normal(3))),
+    "rotations.dot": (rotations.dot, (normal(3), normal(3))),
+    "rotations.point_inertia": (rotations.point_inertia, (normal(3),)),
+    "rotations.roll_of_quaternion": (rotations.roll_of_quaternion, (QUATERNION,)),
+    "leader.desired_acceleration": (
+        leader.desired_acceleration,
+        (normal(3), normal(3), normal(3), *map(np.array, (KP, KD, KI))),
+    ),
+    "leader.command": (lambda a, yaw: leader.command(a, yaw, G, *LIMITS), (8 * normal(3), EULER[:, 2])),
+    "leader.clip_command": (lambda c: leader.clip_command(c, *LIMITS), (normal(3),)),
+    "mixer.wrench_from_rotors": (lambda f: mixer.wrench_from_rotors(f, 0.12, 0.02), (normal(4),)),
+    "mixer.rotors_from_wrench": (lambda w: mixer.rotors_from_wrench(w, 0.12, 0.02), (normal(4),)),
+    "attitude.rotor_commands": (
+        lambda c, e, w, m: attitude.rotor_commands(c, e, w, m, GAINS, G, 0.12, 0.02, 5.5),
+        (ACTION, EULER, normal(3), random.uniform(0.9, 1.3, WORLDS)),
+    ),
+    "observation.observe": (
+        observation.observe,
+        (normal(3), MATRIX, normal(3), normal(3), normal(3), np.array([-0.17, 0, 0])),
+    ),
+    "observation.network_input": (observation.network_input, (SEEN, MEMORY)),
+    "observation.start_memory": (lambda s: observation.start_memory(s, 3, True), (SEEN,)),
+    "observation.next_memory": (lambda m, s, a: observation.next_memory(m, s, a, 3, True), (MEMORY, SEEN, ACTION)),
+    "observation.copy_command": (lambda s: observation.copy_command(s, KP, KD, G, *LIMITS), (3 * SEEN,)),
+    "observation.scale_action": (lambda a: observation.scale_action(a, *REACH), (ACTION,)),
+    "observation.follower_command": (
+        lambda a, s: observation.follower_command(a, s, True, REACH, KP, KD, G, LIMITS),
+        (ACTION, 3 * SEEN),
+    ),
+    "followers.Copy": (COPY, (3 * SEEN,)),
+}
+# Computed once in NumPy float64, from the config, not from arrays.
+NOT_LAWS = {"attitude.design_gains", "observation.memory_size", "observation.input_mask"}
+each_law = pytest.mark.parametrize("name", LAWS)
+
+
+def difference(first: Any, second: Any) -> float:
+    """Largest difference over the full scale of the result."""
+    first, second = np.asarray(first), np.asarray(second)
+    assert first.shape == second.shape
+    return np.abs(first - second).max() / np.abs(second).max()
+
+
+def test_every_law_is_compared():
+    public = {
+        f"{module.__name__.rsplit('.', 1)[1]}.{name}"
+        for module in (rotations, leader, mixer, attitude, observation)
+        for name, member in inspect.getmembers(module, inspect.isfunction)
+        if member.__module__ == module.__name__ and not name.startswith("_")
+    }
+    assert public - set(LAWS) == NOT_LAWS
+
+
+@each_law
+@pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
+def test_float64_agrees(name, compiled):
+    law, arrays = LAWS[name]
+    expected = law(*arrays)
+    with jax.enable_x64(True):
+        result = (jax.jit(law) if compiled else law)(*map(jax.numpy.asarray, arrays))
+        assert result.dtype == np.float64
+    # Design section 1. Both round to 1e-16; sin and cos of the two libraries differ by an ulp.
+    assert difference(result, expected) < 1e-10
+
+
+@each_law
+@pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
+def test_float32_agrees(name, compiled):
+    law, arrays = LAWS[name]
+    single = [array.astype(np.float32) for array in arrays]
+    on_numpy = law(*single)
+    on_jax = (jax.jit(law) if compiled else law)(*map(jax.numpy.asarray, single))
+    assert on_numpy.dtype == on_jax.dtype == np.float32
+    # Design section 1: float32 rounding, about 1e-5 of full scale.
+    assert difference(on_jax, on_numpy) < 1e-5
+    assert difference(on_numpy, law(*arrays)) < 1e-5
+
+
+@each_law
+def test_batch_equals_single(name):
+    law, arrays = LAWS[name]
+    batched = law(*arrays)
+    single = law(*(array[5] if len(array) == WORLDS else array for array in arrays))
+    # The same operations in the same order, but NumPy's vectorised sine may differ by an ulp.
+    np.testing.assert_allclose(batched[5], single, rtol=1e-14, atol=1e-15)

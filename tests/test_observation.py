@@ -1,0 +1,151 @@
+"""What the follower sees: order, values, memory, mask; and how its action becomes a command."""
+
+import numpy as np
+import pytest
+
+from mjxball.control import observation as layout
+from mjxball.control import rotations
+
+MOUNT = np.array([-0.17, 0.0, 0.0])
+
+
+def test_slots_are_the_eighteen_of_the_design_in_order():
+    names = [name for name, _ in layout.OBSERVATION]
+    assert names == [
+        *("follower_x", "follower_y", "follower_z"),
+        *("roll", "pitch", "yaw"),
+        *("follower_vx", "follower_vy", "follower_vz"),
+        *("rate_x", "rate_y", "rate_z"),
+        *("object_error_x", "object_error_y", "object_error_z"),
+        *("object_error_rate_x", "object_error_rate_y", "object_error_rate_z"),
+    ]
+    assert names[layout.ERROR] == names[12:15]
+    assert names[layout.ERROR_RATE] == names[15:18]
+    units = {unit for _, unit in layout.OBSERVATION}
+    assert units == {"m", "rad", "m/s", "rad/s"}
+    assert [name for name, _ in layout.ACTION] == ["roll", "pitch", "vertical_acceleration"]
+
+
+def test_slots_by_hand_at_a_quarter_turn_of_yaw():
+    """Nose to the left (+y): the follower, behind the nose, sits at -y and moves with the rotation."""
+    euler = np.array([0.0, 0.0, np.pi / 2])
+    seen = layout.observe(
+        position=np.array([1.0, 2.0, 3.0]),
+        matrix=rotations.matrix_from_euler(euler),
+        velocity=np.array([0.1, 0.2, 0.3]),
+        rates=np.array([0.0, 0.0, 2.0]),
+        goal=np.array([1.5, 1.0, 3.25]),
+        mount=MOUNT,
+    )
+    expected = [
+        *(1.0, 2.0 - 0.17, 3.0),
+        *euler,
+        *(0.1 + 2.0 * 0.17, 0.2, 0.3),  # w x r = (0, 0, 2) x (0, -0.17, 0) = (0.34, 0, 0)
+        *(0.0, 0.0, 2.0),
+        *(0.5, -1.0, 0.25),
+        *(-0.1, -0.2, -0.3),
+    ]
+    np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-15)  # cos(pi/2) is 6e-17
+
+
+def test_velocity_is_the_derivative_of_the_position():
+    """Central difference along a turning, moving assembly; independent of the product rule in `observe`."""
+    euler, rates, velocity = np.array([0.2, -0.3, 0.5]), np.array([1.0, -2.0, 0.7]), np.array([0.4, 0.1, -0.2])
+    goal, position, quaternion = np.ones(3), np.array([0.3, 0.2, 0.1]), rotations.quaternion_from_euler(euler)
+
+    def at(t: float) -> np.ndarray:
+        turned = rotations.integrate_quaternion(quaternion, rates * t)
+        matrix = rotations.matrix_from_quaternion(turned)
+        return layout.observe(position + velocity * t, matrix, velocity, rates, goal, MOUNT)
+
+    h = 1e-5
+    slope = (at(h) - at(-h)) / (2 * h)
+    seen = at(0.0)
+    # h^2 |w|^3 |r| / 6 = 4e-11 of truncation and 1e-16 / h = 1e-11 of rounding.
+    np.testing.assert_allclose(slope[0:3], seen[6:9], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(slope[layout.ERROR], seen[layout.ERROR_RATE], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("history", "previous_action", "size"), [(1, False, 0), (1, True, 3), (3, False, 36), (3, True, 39)]
+)
+def test_memory_size_is_what_the_memory_holds(history, previous_action, size):
+    seen = np.arange(18.0)
+    memory = layout.start_memory(seen, history, previous_action)
+    assert layout.memory_size(history, previous_action) == size
+    assert memory.shape == (size,)
+    assert layout.next_memory(memory, seen, np.zeros(3), history, previous_action).shape == (size,)
+    assert len(layout.input_mask(history, previous_action, ignore_position=True)) == 18 + size
+
+
+def test_memory_starts_as_the_first_observation_repeated_and_a_zero_action():
+    seen = np.arange(18.0)
+    memory = layout.start_memory(seen, history=3, previous_action=True)
+    np.testing.assert_array_equal(memory, [*seen, *seen, 0, 0, 0])
+
+
+def test_memory_keeps_the_newest_first():
+    observations = [np.full(18, float(k)) for k in range(5)]
+    actions = [np.full(3, 0.1 * k) for k in range(5)]
+    memory = layout.start_memory(observations[0], 3, True)
+    for seen, action in zip(observations, actions, strict=True):
+        memory = layout.next_memory(memory, seen, action, 3, True)
+    np.testing.assert_array_equal(memory, [*observations[4], *observations[3], *actions[4]])
+    seen = layout.network_input(np.full(18, 5.0), memory)
+    np.testing.assert_array_equal(seen, [*[5.0] * 18, *[4.0] * 18, *[3.0] * 18, *actions[4]])
+
+
+def test_memory_without_extras_is_empty_and_the_network_sees_the_observation_alone():
+    seen = np.arange(18.0)
+    memory = layout.start_memory(seen, 1, False)
+    np.testing.assert_array_equal(layout.network_input(seen, memory), seen)
+
+
+def test_memory_of_a_batch_is_the_memory_of_each():
+    random = np.random.default_rng(0)
+    seen, action, first = random.normal(size=(4, 18)), random.normal(size=(4, 3)), random.normal(size=(4, 18))
+    memory = layout.start_memory(first, 3, True)
+    batch = layout.next_memory(memory, seen, action, 3, True)
+    np.testing.assert_array_equal(batch[2], layout.next_memory(memory[2], seen[2], action[2], 3, True))
+
+
+def test_input_mask_hides_every_absolute_position_and_nothing_else():
+    mask = layout.input_mask(history=2, previous_action=True, ignore_position=True)
+    names = [name for name, _ in layout.OBSERVATION] * 2 + ["action"] * 3
+    hidden = [name for name, used in zip(names, mask, strict=True) if used == 0.0]
+    assert hidden == ["follower_x", "follower_y", "follower_z"] * 2
+    assert set(mask) == {0.0, 1.0}
+    assert layout.input_mask(history=2, previous_action=True, ignore_position=False) == [1.0] * 39
+
+
+def seen_with(error, rate):
+    seen = np.zeros(18)
+    seen[layout.ERROR], seen[layout.ERROR_RATE] = error, rate
+    return seen
+
+
+LAW = {"kp": (0.5, 0.5, 0.5), "kd": (1.0, 1.0, 1.0), "gravity": 10.0, "limits": (0.6, 6.0)}
+
+
+def test_copy_is_the_pd_law_on_the_observed_error():
+    seen = seen_with([1.0, 2.0, 3.0], [0.5, 0.0, -1.0])
+    command = layout.copy_command(seen, LAW["kp"], LAW["kd"], 10.0, 0.6, 6.0)
+    np.testing.assert_allclose(command, [-0.1, 0.1, 0.5], rtol=1e-15)
+
+
+def test_residual_adds_to_the_pd_law_and_direct_does_not():
+    seen, scaled = seen_with([1.0, 0, 0], [0, 0, 0]), np.array([0.5, -1.0, 0.25])
+    reach = (0.2, 2.0)
+    direct = layout.follower_command(scaled, seen, False, reach, **LAW)
+    residual = layout.follower_command(scaled, seen, True, reach, **LAW)
+    np.testing.assert_allclose(direct, [0.1, -0.2, 0.5], rtol=1e-15)
+    np.testing.assert_allclose(residual, [0.1, -0.2 + 0.05, 0.5], rtol=1e-14)
+
+
+def test_command_never_leaves_the_shared_limits():
+    seen = seen_with([100.0, -100.0, 100.0], [0, 0, 0])
+    for scaled in (np.ones(3), -np.ones(3)):
+        command = layout.follower_command(scaled, seen, True, (0.2, 2.0), **LAW)
+        assert (np.abs(command) <= [0.6, 0.6, 6.0]).all()
+    wide = layout.follower_command(np.ones(3), seen, False, (1.0, 20.0), **LAW)
+    np.testing.assert_array_equal(wide, [0.6, 0.6, 6.0])

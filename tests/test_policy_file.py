@@ -1,0 +1,163 @@
+"""The policy file: what is saved is what flies, and it flies what the network would."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import Trained
+
+from mjxball.control import observation as layout
+from mjxball.export import policy_file
+from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 18))
+
+
+def flax_mean(trained: Trained, learner: Any, seen: Any) -> Any:
+    """The deterministic action of the Brax network in [-1, 1]."""
+    parameters = trained.networks.policy_network.apply(learner.normaliser, learner.average, seen)
+    return trained.networks.parametric_action_distribution.mode(parameters)
+
+
+class TestRoundTrip:
+    def test_file_gives_back_what_was_saved(self, trained, saved):
+        loaded = load_file(saved)
+        for field in dataclasses.fields(PolicyFile):
+            expected, found = getattr(trained.contents, field.name), getattr(loaded, field.name)
+            if field.name == "card":
+                assert found == json.loads(json.dumps(expected))  # tuples become lists
+            else:
+                jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+    def test_second_generation_is_the_same_policy(self, saved, tmp_path):
+        again = tmp_path / "again.npz"
+        save_file(again, load_file(saved))
+        first, second = Policy.load(saved), Policy.load(again)
+        np.testing.assert_array_equal(first(OBSERVATIONS), second(OBSERVATIONS))
+
+    def test_policy_is_named_after_its_file_and_knows_its_period(self, saved, trained):
+        policy = Policy.load(saved)
+        assert policy.name == "follower"
+        assert policy.control_period == trained.config.timing.control_period
+        assert policy.card["training_steps"] == 1234
+
+    def test_saving_leaves_nothing_else_behind_and_replaces_the_old_file(self, trained, saved):
+        save_file(saved, dataclasses.replace(trained.contents, card={**trained.contents.card, "training_steps": 5}))
+        assert [path.name for path in saved.parent.iterdir()] == ["follower.npz"]
+        assert load_file(saved).card["training_steps"] == 5
+
+    @pytest.mark.parametrize("existing", [False, True], ids=["new", "over an old file"])
+    def test_unsound_policy_writes_nothing(self, trained, tmp_path, existing):
+        path = tmp_path / "follower.npz"
+        if existing:
+            path.write_bytes(b"old")
+        mean = trained.contents.observation_mean.copy()
+        mean[4] = np.nan
+        with pytest.raises(PolicyFileError, match="observation_mean"):
+            save_file(path, dataclasses.replace(trained.contents, observation_mean=mean))
+        assert [p.name for p in tmp_path.iterdir()] == (["follower.npz"] if existing else [])
+        assert not existing or path.read_bytes() == b"old"
+
+
+class TestInference:
+    def test_float32_agrees_with_flax(self, trained, saved):
+        seen = np.asarray(3 * OBSERVATIONS, np.float32)
+        with jax.default_matmul_precision("highest"):
+            expected = flax_mean(trained, trained.learner, jnp.asarray(seen))
+        found = Policy.load(saved).scaled(seen)
+        assert found.dtype == np.float32
+        assert np.ptp(found) > 0.1  # the actions differ from world to world
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)  # design section 10
+
+    def test_float64_agrees_with_flax(self, trained, saved):
+        """The file's numbers are float32, so the network is given its mean and scale; then both are exact."""
+        contents = load_file(saved)
+        with jax.enable_x64(True):
+            wide = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), trained.learner.average)
+            # A scale of 0 hides a slot: any finite deviation will do behind the network's mask.
+            scale = np.where(contents.observation_scale > 0, contents.observation_scale, 1).astype(np.float64)
+            normaliser = trained.learner.normaliser.replace(
+                mean=jnp.asarray(contents.observation_mean, jnp.float64), std=jnp.asarray(1 / scale)
+            )
+            learner = trained.learner._replace(average=wide, normaliser=normaliser)
+            expected = np.asarray(flax_mean(trained, learner, jnp.asarray(OBSERVATIONS)))
+        found = Policy(contents, "wide", np.float64).scaled(OBSERVATIONS)
+        assert found.dtype == expected.dtype == np.float64
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)  # design section 10
+
+    def test_command_is_the_scaled_action_on_top_of_the_copy_law(self, trained, saved):
+        config = trained.config
+        policy = Policy.load(saved)
+        seen = OBSERVATIONS.astype(np.float32)
+        follower, leader, gravity = config.follower, config.leader, config.plant.gravity
+        reach = np.array([follower.tilt_limit, follower.tilt_limit, follower.vertical_limit])
+        limit = np.array([leader.tilt_limit, leader.tilt_limit, leader.vertical_limit])
+        wanted = np.array(leader.kp) * seen[:, 12:15] + np.array(leader.kd) * seen[:, 15:18]
+        copied = np.stack([-wanted[:, 1] / gravity, wanted[:, 0] / gravity, wanted[:, 2]], axis=1)
+        expected = np.clip(np.clip(copied, -limit, limit) + policy.scaled(seen) * reach, -limit, limit)
+        np.testing.assert_allclose(policy(seen), expected, rtol=0, atol=1e-5)  # float32 of up to 6 m/s2
+
+    def test_ignored_position_does_not_matter(self, trained, saved):
+        policy = Policy.load(saved)
+        moved = OBSERVATIONS.copy()
+        moved[:, :3] += 100.0
+        np.testing.assert_array_equal(policy.scaled(moved), policy.scaled(OBSERVATIONS))
+
+    def test_batch_equals_single(self, saved):
+        policy = Policy.load(saved)
+        batch = policy(OBSERVATIONS)
+        single = np.stack([policy(seen) for seen in OBSERVATIONS])
+        # The matrix product may add in another order: float32 rounding of commands up to 6.
+        np.testing.assert_allclose(batch, single, rtol=0, atol=1e-5)
+
+    def test_wrong_shape_is_refused(self, saved):
+        with pytest.raises(ValueError, match="18 numbers"):
+            Policy.load(saved)(np.zeros(17))
+
+    def test_memory_inside_the_policy_is_the_environment_memory(self, remembering, remembering_pair):
+        """Two episodes flown by the environment; the policy sees only the 18 numbers of each step."""
+        policy = Policy(remembering.contents, "remembering")
+        for seed in (1, 2):
+            state = remembering_pair.reset(jax.random.key(seed))
+            policy.reset()
+            for _ in range(6):
+                with jax.default_matmul_precision("highest"):
+                    expected = flax_mean(remembering, remembering.learner, state.obs)
+                found = policy.scaled(np.asarray(state.obs[: layout.OBSERVATION_SIZE]))
+                # 1e-5 for the network (design section 10); its own rounding returns through the last action.
+                np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)
+                state = remembering_pair.step(state, jnp.asarray(expected))
+
+    def test_memory_matters_and_reset_forgets_it(self, remembering):
+        policy = Policy(remembering.contents, "remembering")
+        first = policy.scaled(OBSERVATIONS[0])
+        policy.scaled(OBSERVATIONS[1])
+        later = policy.scaled(OBSERVATIONS[0])
+        policy.reset()
+        np.testing.assert_array_equal(policy.scaled(OBSERVATIONS[0]), first)
+        assert (later != first).any()
+
+    def test_memory_of_a_batch_is_the_memory_of_each(self, remembering):
+        batch = Policy(remembering.contents, "batch")
+        single = Policy(remembering.contents, "single")
+        together = np.stack([batch.scaled(OBSERVATIONS[k : k + 4]) for k in range(5)])
+        alone = np.stack([single.scaled(OBSERVATIONS[k + 2]) for k in range(5)])
+        np.testing.assert_allclose(together[:, 2], alone, rtol=0, atol=1e-5)  # float32, other order of sums
+
+
+def test_export_masks_what_the_network_ignores(trained):
+    scale = trained.contents.observation_scale
+    np.testing.assert_array_equal(scale == 0, [True] * 3 + [False] * 15)
+    np.testing.assert_allclose(scale[3:], 1 / np.asarray(trained.learner.normaliser.std[3:]), rtol=1e-6)  # float32
+
+
+def test_export_takes_the_averaged_policy(trained):
+    learner = trained.learner._replace(policy=jax.tree.map(jnp.zeros_like, trained.learner.policy))
+    contents = policy_file(trained.config, learner, steps=1)
+    jax.tree.map(np.testing.assert_array_equal, contents.weights, trained.contents.weights)

@@ -1,0 +1,345 @@
+"""Nothing unsound is ever loaded as a policy: every kind of damage gets one error of one line."""
+
+from __future__ import annotations
+
+import io
+import json
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mjxball.errors import InputError
+from mjxball.policy import Policy, PolicyFileError
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 18))
+ARRAYS = ("weight_0", "bias_0", "weight_1", "bias_2", "observation_mean", "observation_scale", "action_scale")
+HUGE = 10**400  # an integer that JSON allows and no float holds
+
+
+def refused(path: Path, match: str | None = None) -> None:
+    """`path` is refused with one line that names the file."""
+    with pytest.raises(PolicyFileError, match=match) as error:
+        Policy.load(path)
+    message = str(error.value)
+    assert message.isprintable(), "not one line of printable text"
+    assert str(path) in message
+    assert isinstance(error.value, InputError)  # exit code 2
+
+
+def arrays_of(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as data:
+        return dict(data)
+
+
+def rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Save the arrays of `path` again after `change`."""
+    arrays = arrays_of(path)
+    change(arrays)
+    np.savez(path, **arrays)
+
+
+def rewrite_card(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Save the card of `path` again after `change`."""
+    card = json.loads(str(arrays_of(path)["card"]))
+    change(card)
+    rewrite(path, lambda arrays: arrays.update(card=np.array(json.dumps(card))))
+
+
+class Bomb:
+    """Writes a file when unpickled."""
+
+    def __init__(self, witness: Path):
+        self.witness = witness
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self.witness,))
+
+
+def copy_zip(path: Path, replaced: dict[str, bytes]) -> None:
+    """Write the zip at `path` again with the bytes of some entries replaced."""
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in {**entries, **replaced}.items():
+            archive.writestr(name, content)
+
+
+class TestDamagedContainer:
+    def test_truncated_anywhere(self, saved):
+        content = saved.read_bytes()
+        offsets = {*range(0, len(content), len(content) // 60), *range(len(content) - 30, len(content)), 1, 2, 3, 4}
+        for offset in sorted(offsets):
+            saved.write_bytes(content[:offset])
+            refused(saved)
+
+    def test_missing(self, tmp_path):
+        refused(tmp_path / "none.npz", "does not exist")
+
+    def test_directory(self, tmp_path):
+        refused(tmp_path, "directory")
+
+    @pytest.mark.parametrize("content", [b"", b"PK", b"hello, I am not a zip file\n", bytes(1000)])
+    def test_not_a_zip(self, tmp_path, content):
+        path = tmp_path / "text.npz"
+        path.write_bytes(content)
+        refused(path)
+
+    def test_pickle(self, tmp_path):
+        path = tmp_path / "pickle.npz"
+        path.write_bytes(pickle.dumps({"weights": [1, 2, 3]}))
+        refused(path)
+
+    def test_npy(self, tmp_path):
+        path = tmp_path / "array.npz"
+        with path.open("wb") as stream:
+            np.save(stream, np.zeros(3))
+        refused(path)
+
+    @pytest.mark.parametrize("name", ["weight_0", "card"])
+    def test_pickled_array_is_refused_unread(self, saved, name, tmp_path):
+        witness = tmp_path / "executed"
+        bomb = np.empty((), object)
+        bomb[()] = Bomb(witness)
+        rewrite(saved, lambda arrays: arrays.update({name: bomb}))
+        refused(saved, "pickle")
+        assert not witness.exists()
+
+    def test_entry_that_is_no_array(self, saved):
+        for name in arrays_of(saved):
+            content = saved.read_bytes()
+            copy_zip(saved, {f"{name}.npy": b"not an array at all"})
+            refused(saved)
+            saved.write_bytes(content)
+
+    def test_huge_zip_claim(self, saved):
+        """A zip bomb: 100 MB of zeros in 100 kB."""
+        rewrite(saved, lambda arrays: None)
+        with zipfile.ZipFile(saved, "a", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("bias_9.npy", bytes(100 * 2**20))
+        refused(saved, "MiB")
+
+    def test_huge_array_claim(self, saved):
+        """An array header that claims a terabyte behind which there is nothing."""
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (2**38,)})
+        copy_zip(saved, {"weight_0.npy": header.getvalue()})
+        refused(saved)
+
+    def test_too_many_entries(self, saved):
+        rewrite(
+            saved, lambda arrays: arrays.update({f"weight_{k}": np.zeros((1, 1), np.float32) for k in range(3, 200)})
+        )
+        refused(saved)
+
+
+class TestDamagedArrays:
+    @pytest.mark.parametrize("name", [*ARRAYS, "card"])
+    def test_missing(self, saved, name):
+        rewrite(saved, lambda arrays: arrays.pop(name))
+        refused(saved, name)
+
+    @pytest.mark.parametrize("name", ["weight_7", "bias_3", "extra", "a\nb"])
+    def test_extra(self, saved, name):
+        rewrite(saved, lambda arrays: arrays.update({name: np.zeros(3, np.float32)}))
+        refused(saved)
+
+    @pytest.mark.parametrize("name", ARRAYS)
+    @pytest.mark.parametrize("dtype", [np.float64, np.float16, np.int32, np.complex64, ">f4"])
+    def test_wrong_dtype(self, saved, name, dtype):
+        rewrite(saved, lambda arrays: arrays.update({name: arrays[name].astype(dtype)}))
+        refused(saved, name)
+
+    @pytest.mark.parametrize("name", ARRAYS)
+    @pytest.mark.parametrize(
+        "reshape",
+        [
+            lambda a: a[:-1],
+            lambda a: a[None],
+            lambda a: np.concatenate([a, a]),
+            lambda a: a.ravel()[0],
+            lambda a: a[:0],
+        ],
+        ids=["shorter", "another axis", "longer", "a scalar", "empty"],
+    )
+    def test_wrong_shape(self, saved, name, reshape):
+        rewrite(saved, lambda arrays: arrays.update({name: np.asarray(reshape(arrays[name]))}))
+        refused(saved)
+
+    def test_transposed_weight(self, saved):
+        rewrite(saved, lambda arrays: arrays.update(weight_0=arrays["weight_0"].T))
+        refused(saved, "weight_0")
+
+    @pytest.mark.parametrize("name", ARRAYS)
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    def test_not_finite(self, saved, name, value):
+        rewrite(saved, lambda arrays: np.put(arrays[name], 1, value))
+        refused(saved)
+
+    @pytest.mark.parametrize(
+        ("name", "value"), [("observation_scale", -1.0), ("action_scale", 0.0), ("action_scale", 9.0)]
+    )
+    def test_impossible_scale(self, saved, name, value):
+        rewrite(saved, lambda arrays: np.put(arrays[name], 0, value))
+        refused(saved, name)
+
+    @pytest.mark.parametrize("card", [np.zeros(3), np.array(["{}"]), np.array(b"{}"), np.array("{"), np.array("[1]")])
+    def test_card_is_not_one_json_object(self, saved, card):
+        rewrite(saved, lambda arrays: arrays.update(card=card))
+        refused(saved, "card")
+
+
+class TestDamagedCard:
+    @pytest.mark.parametrize("version", [0, 2, "1", None, True, [1], 1.5, HUGE], ids=lambda v: repr(v)[:5])
+    def test_unknown_format_version(self, saved, version):
+        rewrite_card(saved, lambda card: card.update(format_version=version))
+        refused(saved, "format")
+
+    def test_every_field_is_needed(self, saved, trained):
+        content = saved.read_bytes()
+        for field in ("history", "observation", "action_reach", "gravity", "control_period", "plant", "bounds"):
+            saved.write_bytes(content)
+            rewrite_card(saved, lambda card, field=field: card.pop(field))
+            refused(saved, field)
+
+    @pytest.mark.parametrize(
+        "observation",
+        [
+            lambda slots: [["height", "m"], *slots[1:]],
+            lambda slots: [["follower_x", "cm"], *slots[1:]],
+            lambda slots: slots[:-1],
+            lambda slots: [*slots, ["wind", "m/s"]],
+            lambda slots: [*slots, "wind"],
+            lambda slots: [slots[1], slots[0], *slots[2:]],
+            lambda slots: [],
+            lambda slots: "follower_x",
+        ],
+        ids=["name", "unit", "missing", "extra", "extra without unit", "order", "empty", "text"],
+    )
+    def test_other_observation(self, saved, observation):
+        rewrite_card(saved, lambda card: card.update(observation=observation(card["observation"])))
+        refused(saved, "observation")
+
+    def test_other_action(self, saved):
+        rewrite_card(saved, lambda card: card.update(action=card["action"][::-1]))
+        refused(saved, "action")
+
+    @pytest.mark.parametrize(
+        ("field", "value"),
+        [
+            ("history", 0),
+            ("history", 101),
+            ("history", 2),
+            ("history", 1.0),
+            ("history", True),
+            ("history", HUGE),
+            ("previous_action", 1),
+            ("previous_action", True),
+            ("action_mode", "both"),
+            ("action_mode", "a\nb"),
+            ("action_reach", [0.2]),
+            ("action_reach", [0.2, float("nan")]),
+            ("action_reach", [0.2, "2"]),
+            ("action_reach", [0.2, HUGE]),
+            ("command_limits", [-0.6, 6.0]),
+            ("leader_kp", [0.5, 0.5]),
+            ("leader_kp", [1e300, 0.5, 0.5]),  # no float32: the command would be NaN
+            ("leader_kd", [[1, 1, 1]]),
+            ("gravity", 0.0),
+            ("gravity", float("inf")),
+            ("gravity", HUGE),
+            ("gravity", "9.81"),
+            ("control_period", -0.02),
+            ("control_period", None),
+            ("plant", []),
+            ("bounds", {"x_peak": None}),
+            ("bounds", {"x_peak": HUGE}),
+            ("bounds", [0.05]),
+        ],
+        ids=lambda value: "huge" if value == HUGE else repr(value)[:20],
+    )
+    def test_impossible_field(self, saved, field, value):
+        rewrite_card(saved, lambda card: card.update({field: value}))
+        refused(saved)
+
+    def test_residual_policy_of_unknown_plant_still_loads(self, saved):
+        """The plant is told to the reader, not used: an unknown field of it is no damage."""
+        rewrite_card(saved, lambda card: card["plant"].update(colour="red"))
+        assert Policy.load(saved).card["plant"]["colour"] == "red"
+
+
+def loads_or_is_refused(path: Path) -> None:
+    """Either a policy that flies or the one error in one line, never another."""
+    refusal = ""
+    try:
+        policy = Policy.load(path)
+    except PolicyFileError as error:
+        refusal = str(error)
+    assert refusal.isprintable()
+    if not refusal:
+        assert np.isfinite(policy(OBSERVATIONS)).all()
+
+
+# Each example restores the file, so one fixture serves them all.
+mutations = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+places = st.one_of(
+    st.integers(0, 10**6),  # anywhere
+    st.integers(-1500, -1),  # the zip's directory: where everything is, and how long
+)
+
+
+@mutations
+@given(changes=st.lists(st.tuples(places, st.integers(0, 255)), min_size=1, max_size=4))
+def test_mutated_bytes_load_or_are_refused(saved, changes):
+    original = saved.read_bytes()
+    content = bytearray(original)
+    for place, value in changes:
+        content[place % len(content)] = value
+    saved.write_bytes(content)
+    try:
+        loads_or_is_refused(saved)
+    finally:
+        saved.write_bytes(original)
+
+
+@mutations
+@given(data=st.data())
+def test_mutated_array_header_loads_or_is_refused(saved, data):
+    """Behind an intact zip: any byte of an array's own header, where NumPy keeps dtype and shape."""
+    original = saved.read_bytes()
+    name = data.draw(st.sampled_from([*ARRAYS, "card"]))
+    with zipfile.ZipFile(saved) as archive:
+        content = bytearray(archive.read(f"{name}.npy"))
+    for place, value in data.draw(
+        st.lists(st.tuples(st.integers(0, 127), st.integers(0, 255)), min_size=1, max_size=3)
+    ):
+        content[place] = value
+    copy_zip(saved, {f"{name}.npy": bytes(content)})
+    try:
+        loads_or_is_refused(saved)
+    finally:
+        saved.write_bytes(original)
+
+
+@mutations
+@given(data=st.data())
+def test_mutated_card_loads_or_is_refused(saved, data):
+    """Any JSON value in place of any field, behind an intact zip."""
+    original = saved.read_bytes()
+    card = json.loads(str(arrays_of(saved)["card"]))
+    number = st.one_of(st.integers(), st.floats(), st.just(HUGE), st.booleans(), st.none(), st.text(max_size=5))
+    value = st.recursive(
+        number, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
+    )
+    field = data.draw(st.sampled_from(sorted(card)))
+    rewrite_card(saved, lambda card: card.update({field: data.draw(value)}))
+    try:
+        loads_or_is_refused(saved)
+    finally:
+        saved.write_bytes(original)

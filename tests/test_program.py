@@ -1,0 +1,206 @@
+"""The training program: it continues exactly, evaluates without a trace, repeats itself, and learns."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import with_settings
+
+from mjxball.train import program as programs
+from mjxball.train.program import Program, TrainState
+
+UPDATES, WORLDS = 4, 128
+
+
+class Compiled(NamedTuple):
+    """A program with its jitted functions."""
+
+    program: Program
+    create: Any  # key -> TrainState
+    advance: Any  # (TrainState, Mode) -> (TrainState, Tally)
+    fresh: Any  # key -> worlds
+
+
+@pytest.fixture(scope="module")
+def compiled(transport) -> Compiled:
+    """The transport preset, shortened to 128 000 environment steps, on closed-form physics."""
+    steps = 128_000
+    program = Program(with_settings(transport, sac={"steps": steps, "replay": steps, "worlds": WORLDS}), "newton-euler")
+    return Compiled(program, *map(jax.jit, (program.create, program.advance, program.fresh_worlds)))
+
+
+@pytest.fixture(scope="module")
+def prefilled(compiled) -> TrainState:
+    """A state with enough transitions to learn from."""
+    return compiled.advance(compiled.create(jax.random.key(0)), programs.prefill(20))[0]
+
+
+def raw(tree: Any) -> Any:
+    """`tree` with its typed random keys as plain numbers."""
+    return jax.tree.map(
+        lambda leaf: jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf, tree
+    )
+
+
+def assert_identical(first: Any, second: Any) -> None:
+    jax.tree.map(np.testing.assert_array_equal, raw(first), raw(second))
+
+
+def recorded(state: TrainState) -> np.ndarray:
+    """The replay's rows without the scratch rows behind them."""
+    return np.asarray(state.replay.rows[:-WORLDS])
+
+
+def evaluated_return(compiled: Compiled, state: TrainState, steps: int = 500) -> float:
+    """Mean reward per step on the same fresh worlds every time."""
+    worlds = compiled.fresh(jax.random.key(99))
+    _, tally = compiled.advance(state._replace(worlds=worlds), programs.evaluate(steps))
+    assert int(tally.diverged) == 0
+    return float(tally.reward) / steps
+
+
+def test_prefill_records_every_step_and_learns_nothing(compiled, prefilled):
+    fresh = compiled.create(jax.random.key(0))
+    assert int(prefilled.steps) == int(prefilled.replay.inserted) == 20 * WORLDS
+    assert_identical(prefilled.learner.policy, fresh.learner.policy)
+    assert int(prefilled.learner.updates) == 0
+    rows = recorded(prefilled)
+    assert (np.abs(rows[: 20 * WORLDS]).sum(axis=1) > 0).all()
+    np.testing.assert_array_equal(rows[20 * WORLDS :], 0)
+
+
+def test_normaliser_holds_the_statistics_of_what_was_seen(compiled, prefilled):
+    seen = recorded(prefilled)[: 20 * WORLDS, : compiled.program.sizes[0]].astype(np.float64)
+    # Float32 sums over 2560 rows, against float64.
+    np.testing.assert_allclose(prefilled.learner.normaliser.mean, seen.mean(axis=0), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(prefilled.learner.normaliser.std, seen.std(axis=0), rtol=1e-3, atol=1e-5)
+
+
+def test_training_counts_its_updates_and_changes_the_policy(compiled, prefilled):
+    after, _ = compiled.advance(prefilled, programs.train(3, UPDATES))
+    assert int(after.learner.updates) == 3 * UPDATES
+    assert int(after.steps - prefilled.steps) == 3 * WORLDS
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), after.learner.policy, prefilled.learner.policy)
+    assert min(jax.tree.leaves(moved)) > 0
+
+
+def test_two_calls_equal_one_bit_for_bit(compiled, prefilled):
+    """A resumed run is the run."""
+    whole, _ = compiled.advance(prefilled, programs.train(5, UPDATES))
+    half, _ = compiled.advance(prefilled, programs.train(2, UPDATES))
+    both, _ = compiled.advance(half, programs.train(3, UPDATES))
+    assert_identical(both, whole)
+
+
+def test_evaluation_leaves_learner_and_replay_untouched(compiled, prefilled):
+    trained, _ = compiled.advance(prefilled, programs.train(2, UPDATES))
+    after, _ = compiled.advance(trained, programs.evaluate(30))
+    assert_identical(after.learner, trained.learner)
+    np.testing.assert_array_equal(recorded(after), recorded(trained))
+    assert int(after.replay.inserted) == int(trained.replay.inserted)
+    assert int(after.steps) == int(trained.steps)
+
+
+def test_evaluation_does_not_depend_on_the_exploration_key(compiled, prefilled):
+    """The deterministic mean of the averaged policy: the key decides nothing before the first reset."""
+    keys = [prefilled._replace(key=jax.random.key(seed)) for seed in (1, 2)]
+    first, second = (evaluated_return(compiled, state, steps=50) for state in keys)
+    assert first == second
+
+
+def test_evaluation_flies_the_averaged_policy(compiled, prefilled):
+    shifted = jax.tree.map(lambda leaf: leaf + 0.1, prefilled.learner.policy)
+    base = evaluated_return(compiled, prefilled, steps=50)
+    policy = prefilled._replace(learner=prefilled.learner._replace(policy=shifted))
+    average = prefilled._replace(learner=prefilled.learner._replace(average=shifted))
+    assert evaluated_return(compiled, policy, steps=50) == base
+    assert evaluated_return(compiled, average, steps=50) != base
+
+
+def run(state: TrainState, advance: Any) -> TrainState:
+    """Ten random steps and two of training."""
+    state, _ = advance(state, programs.prefill(10))
+    return advance(state, programs.train(2, UPDATES))[0]
+
+
+def test_same_seed_same_run_and_another_seed_another(compiled):
+    first, second, other = (run(compiled.create(jax.random.key(seed)), compiled.advance) for seed in (3, 3, 4))
+    assert_identical(first, second)
+    assert (recorded(first)[:WORLDS] != recorded(other)[:WORLDS]).any(axis=1).all()
+
+
+def test_pair_of_seeds_equals_two_single_runs(compiled):
+    program = compiled.program
+    starts = [compiled.create(jax.random.key(seed)) for seed in (3, 4)]
+    pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts)
+    shapes = jax.eval_shape(jax.vmap(program.create), jax.random.split(jax.random.key(0)))
+    assert jax.tree.map(jnp.shape, shapes) == jax.tree.map(jnp.shape, pair)
+    advance = jax.jit(jax.vmap(program.advance, in_axes=(0, None)))
+    pair = run(pair, advance)
+    for index, start in enumerate(starts):
+        single = run(start, compiled.advance)
+        mine, rows = np.asarray(pair.replay.rows[index]), np.asarray(single.replay.rows)
+        # Float32 rounding of differently fused kernels over 12 steps; observations reach 10.
+        np.testing.assert_allclose(mine[: 12 * WORLDS], rows[: 12 * WORLDS], rtol=1e-5, atol=1e-5)
+        weights = (jax.tree.map(lambda leaf, index=index: leaf[index], pair.learner.policy), single.learner.policy)
+        gaps = jax.tree.map(lambda a, b: jnp.abs(a - b).ravel(), *weights)
+        gaps = np.concatenate([np.asarray(leaf) for leaf in jax.tree.leaves(gaps)])
+        # Adam divides by the gradient's size: where that is all rounding, two runs may differ by whole steps of 2e-3.
+        assert np.quantile(gaps, 0.99) < 1e-5
+
+
+class Ending(NamedTuple):
+    """What the program recorded of one step in which every world ended."""
+
+    after: TrainState
+    tally: programs.Tally
+    discount: np.ndarray  # (worlds,)
+    next_observation: np.ndarray  # (worlds, n)
+    last: np.ndarray  # (worlds,)
+
+
+def end_all_worlds(compiled: Compiled, prefilled: TrainState, **parts: Any) -> Ending:
+    """Step all worlds once after replacing `parts` of them, and read the newest rows."""
+    worlds = prefilled.worlds
+    ending = worlds.replace(pipeline_state=worlds.pipeline_state._replace(**parts))
+    after, tally = compiled.advance(prefilled._replace(worlds=ending), programs.prefill(1))
+    newest = recorded(after)[20 * WORLDS : 21 * WORLDS]
+    seen = compiled.program.sizes[0]
+    np.testing.assert_array_equal(after.worlds.pipeline_state.steps, 0)  # all start anew
+    np.testing.assert_array_equal(after.worlds.pipeline_state.plant.position, 0.0)
+    return Ending(after, tally, newest[:, seen + 4], newest[:, seen + 5 : 2 * seen + 5], newest[:, 2 * seen + 5])
+
+
+def test_lost_worlds_are_terminations(compiled, prefilled):
+    """Every world beyond d_term: nothing to bootstrap from, and the recorded next observation is the lost one."""
+    plant = prefilled.worlds.pipeline_state.plant
+    ending = end_all_worlds(compiled, prefilled, plant=plant._replace(position=plant.position + 10.0))
+    assert (int(ending.tally.ended), int(ending.tally.diverged)) == (WORLDS, 0)
+    np.testing.assert_array_equal(ending.discount, 0)
+    np.testing.assert_array_equal(ending.last, 1)
+    assert (ending.next_observation[:, :3] > 5).all()
+
+
+def test_time_limits_are_bootstrapped(compiled, prefilled):
+    """The episode ends, its value does not: the next observation is the true one, not the fresh world's."""
+    steps = prefilled.worlds.pipeline_state.steps
+    limit = compiled.program.config.timing.episode_steps
+    ending = end_all_worlds(compiled, prefilled, steps=jnp.full_like(steps, limit - 1))
+    assert int(ending.tally.ended) == 0
+    np.testing.assert_array_equal(ending.discount, 1)
+    np.testing.assert_array_equal(ending.last, 1)
+    assert (ending.next_observation != np.asarray(ending.after.worlds.obs)).any(axis=1).all()
+
+
+def test_short_training_improves_the_evaluation(compiled):
+    state, _ = compiled.advance(compiled.create(jax.random.key(0)), programs.prefill(100))
+    before = evaluated_return(compiled, state)
+    state, tally = compiled.advance(state, programs.train(900, UPDATES))
+    after = evaluated_return(compiled, state)
+    assert np.isfinite([tally.losses.critic, tally.losses.policy, tally.losses.entropy]).all()
+    # Seen: -20 before and -2 after. A quarter is far beyond the noise of 128 worlds and far from what fails.
+    assert after > before / 4

@@ -1,0 +1,72 @@
+"""Rewards: the paper's by hand, and what the task reward's shape promises near the goal and far from it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxball.config import Reward
+from mjxball.rewards import paper_reward, task_reward
+
+ZERO = np.zeros(3)
+ERROR_ONLY = Reward(error=2.0, error_scale=0.1, velocity=0, tilt=0, rates=0, effort=0, smoothness=0)
+
+
+def task(weights=ERROR_ONLY, error=ZERO, velocity=ZERO, euler=ZERO, rates=ZERO, action=ZERO, last=ZERO):
+    return task_reward(weights, *(np.asarray(v, float) for v in (error, velocity, euler, rates, action, last)))
+
+
+def test_paper_reward_is_ten_times_the_absolute_differences():
+    led, followed = np.array([0.1, -0.2, 1.0]), np.array([0.15, 0.1, 0.4])
+    assert paper_reward(led, followed) == pytest.approx(-10 * (0.05 + 0.3 + 0.6), rel=1e-15)
+    assert paper_reward(led, led) == 0
+    np.testing.assert_array_equal(
+        paper_reward(np.stack([led, led]), np.stack([followed, led])), [paper_reward(led, followed), 0]
+    )
+
+
+def test_task_reward_is_zero_at_the_goal_and_nowhere_positive():
+    assert task(Reward()) == 0
+    random = np.random.default_rng(0)
+    everything = Reward(tilt=1.0)
+    rewards = [task(everything, *random.normal(size=(6, 3))) for _ in range(20)]
+    assert max(rewards) < 0
+
+
+def test_error_cost_is_quadratic_near_the_goal():
+    distance = 1e-3
+    # w (e/s)^2 / 2; the next term of the series is smaller by (e/s)^2 / 4 = 2.5e-5.
+    assert task(error=[distance, 0, 0]) == pytest.approx(-2.0 * (distance / 0.1) ** 2 / 2, rel=5e-5)
+
+
+def test_error_cost_is_linear_far_from_the_goal():
+    far, farther = task(error=[0, 10.0, 0]), task(error=[0, 11.0, 0])
+    # Slope w/s, less by (s/e)^2 / 2 = 5e-5.
+    assert far - farther == pytest.approx(2.0 / 0.1, rel=1e-4)
+    assert far == pytest.approx(-2.0 * (10.0 / 0.1 - 1), rel=1e-4)
+
+
+def test_error_cost_depends_on_the_distance_alone():
+    assert task(error=[0.3, 0, 0]) == pytest.approx(task(error=[0.1, -0.2, 0.2]), rel=1e-14)
+
+
+def test_error_cost_has_a_finite_gradient_at_the_goal():
+    zero = jnp.zeros(3)
+    gradient = jax.grad(lambda e: task_reward(Reward(), e, zero, zero, zero, zero, zero))(zero)
+    np.testing.assert_array_equal(gradient, zero)
+
+
+@pytest.mark.parametrize(
+    ("weights", "values", "expected"),
+    [
+        ({"velocity": 3.0}, {"velocity": [1.0, 2.0, -2.0]}, -27.0),
+        ({"tilt": 3.0}, {"euler": [1.0, 2.0, 100.0]}, -15.0),  # yaw is no tilt
+        ({"rates": 3.0}, {"rates": [1.0, 2.0, -2.0]}, -27.0),
+        ({"effort": 3.0}, {"action": [1.0, 0.0, -1.0], "last": [1.0, 0.0, -1.0]}, -6.0),
+        ({"smoothness": 3.0}, {"action": [1.0, 0.5, 0.0], "last": [0.0, 0.5, -1.0]}, -6.0),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+)
+def test_each_weight_scales_its_own_square(weights, values, expected):
+    off = {"error": 0.0, "velocity": 0.0, "tilt": 0.0, "rates": 0.0, "effort": 0.0, "smoothness": 0.0}
+    assert task(Reward(**{**off, **weights}), **values) == pytest.approx(expected, rel=1e-15)
