@@ -1,0 +1,177 @@
+"""Motions of the CG: consistent derivatives, the object's ends, the rolling ball, mass changes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from plants import ROLLING, SAMPLES, paper_with
+
+from mjxball import config as configs
+from mjxball.config import Attitude, Motion, Plant
+from mjxball.control.followers import Copy
+from mjxball.errors import InputError
+from mjxball.evaluate.waveform import read_waveform
+from mjxball.physics import motion, newton_euler
+from mjxball.physics.engine import PlantState, Wrench
+from mjxball.rollout import Scenario, simulate
+from mjxball.train.main import main as train
+
+GAP = 1e-4  # [s] of the central differences below
+
+
+@pytest.mark.parametrize("kind", ["sine", "waveform"])
+def test_rate_and_acceleration_are_the_offsets_derivatives(kind: str) -> None:
+    time = np.linspace(0.013, 18.9, 400)
+    if kind == "sine":
+        curve = lambda t: motion.sine(t, 0.1, 2.7, 0.4)  # noqa: E731
+    else:
+        spline = motion.fit_spline(SAMPLES.times, SAMPLES.offsets)
+        curve = lambda t: motion.follow_spline(spline, t)  # noqa: E731
+    here, before, after = curve(time), curve(time - GAP), curve(time + GAP)
+    # Central differences: an error of GAP^2 times the third derivative (about 2 m/s3), and near a spline's
+    # knot GAP times the jump of c''' (below 1 m/s3).
+    np.testing.assert_allclose((after.offset - before.offset) / (2 * GAP), here.rate, atol=1e-6)
+    np.testing.assert_allclose((after.rate - before.rate) / (2 * GAP), here.acceleration, atol=2e-4)
+
+
+def test_spline_passes_its_samples_and_stands_still_outside() -> None:
+    spline = motion.fit_spline(SAMPLES.times, SAMPLES.offsets)
+    at = motion.follow_spline(spline, np.array(SAMPLES.times))
+    np.testing.assert_allclose(at.offset, SAMPLES.offsets, atol=1e-15)
+    assert at.rate[0] == pytest.approx(0, abs=1e-15)
+    outside = motion.follow_spline(spline, np.array([-5.0, 30.0]))
+    np.testing.assert_allclose(outside.offset, [SAMPLES.offsets[0], SAMPLES.offsets[-1]], atol=1e-15)
+    assert not outside.rate.any()
+    assert not outside.acceleration.any()
+
+
+@pytest.mark.parametrize(
+    ("times", "offsets", "word"),
+    [
+        ((0.0, 1.0), (0.0, 0.2), "leave the object"),
+        ((0.0, 1.0), (0.0, float("nan")), "finite"),
+        ((0.0, 2.0, 1.0), (0.0, 0.1, 0.0), "increase"),
+        ((0.0, 1.0, 1.0), (0.0, 0.1, 0.0), "increase"),
+        ((0.0, 1.0), (0.0,), "same number"),
+        ((0.0,), (0.0,), "two or more"),
+    ],
+)
+def test_unsound_waveforms_are_refused(times: tuple, offsets: tuple, word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        configs.validate(paper_with(motion=Motion(kind="waveform", times=times, offsets=offsets)))
+
+
+def test_waveform_that_swings_out_between_its_samples_is_refused() -> None:
+    times, offsets = (0.0, 1.0, 1.2, 2.2), (-0.16, 0.165, 0.165, -0.16)
+    config = configs.validate(paper_with(motion=Motion(kind="waveform", times=times, offsets=offsets)))
+    with pytest.raises(InputError, match="between its samples"):
+        simulate(config, Copy(config), Scenario(seconds=1), "newton-euler")
+
+
+@pytest.mark.parametrize(
+    ("text", "word"), [("", "no samples"), ("t,c\n0,0\n1,x\n", "line 3"), ("0,0,0\n1,1\n2\n", "line 2|line 3")]
+)
+def test_waveform_files_that_make_no_sense_are_refused(text: str, word: str, tmp_path) -> None:
+    path = tmp_path / "wave.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=word):
+        read_waveform(path)
+
+
+def test_waveform_file_may_have_a_header(tmp_path) -> None:
+    path = tmp_path / "wave.csv"
+    path.write_text("time,offset\n0,0\n2.5,0.05\n")
+    assert read_waveform(path) == ((0.0, 2.5), (0.0, 0.05))
+
+
+def test_training_refuses_a_bad_waveform_and_writes_nothing(tmp_path, capsys) -> None:
+    out = tmp_path / "run"
+    flags = ["--motion.kind", "waveform", "--motion.times", "0,2,1", "--motion.offsets", "0,0.1,0"]
+    assert train([*flags, "--out", str(out)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not out.exists()
+
+
+def ball_alone(plant: Plant, offset: float, rate: float = 0.0, tilt: float = 0.0) -> PlantState:
+    half = tilt / 2
+    return PlantState(
+        np.zeros((1, 3)),
+        np.array([[np.cos(half), np.sin(half), 0, 0]]),
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+        np.zeros((1, 2, 4)),
+        np.zeros(1),
+        np.array([offset]),
+        np.array([rate]),
+    )
+
+
+def test_ball_rolls_down_a_held_slope_with_five_sevenths_of_g() -> None:
+    """On a pivot too heavy to turn, a solid ball rolls with 5/7 g sin(slope)."""
+    plant = Plant(
+        stand="pivot",
+        cg_axis="y",
+        object_size=(0.1, 0.34, 0.05),
+        leader_mount=(0.0, 0.17, 0.0),
+        follower_mount=(0.0, -0.17, 0.0),
+        leader_inertia=(1e9, 1e9, 1e9),
+    )
+    engine = newton_euler.make_engine(plant, Attitude())
+    state = ball_alone(plant, 0.0, tilt=0.3)
+    zero = np.zeros((1, 3))
+    _, _, ball = engine.rolling(state, Wrench(zero, zero), np.array([0.2]), np.zeros(1))
+    assert ball[0] == pytest.approx(-5 / 7 * 9.81 * np.sin(0.3), rel=1e-6)  # the pivot yields by 1e-9
+
+
+def test_rolling_friction_opposes_and_stops_push_inwards() -> None:
+    force = motion.make_rolling_force(paper_with(motion=ROLLING))
+    end = 0.17 - 0.02
+    mass = np.full(5, 0.2)
+    offset = np.array([0.0, 0.0, end + 0.01, -end - 0.01, end + 0.001])
+    rate = np.array([0.5, -0.5, 0.0, 0.0, -5.0])
+    pushed = force(offset, rate, mass)
+    assert pushed[0] == pytest.approx(-0.005 * 0.2 * 9.81)
+    assert pushed[1] == pytest.approx(0.005 * 0.2 * 9.81)
+    assert pushed[2] < -1
+    assert pushed[3] > 1
+    assert pushed[4] == pytest.approx(0.005 * 0.2 * 9.81)  # leaving the stop: it never pulls
+
+
+def test_ball_stays_between_the_stops_and_comes_to_rest() -> None:
+    """On a tilting beam that nobody balances the ball runs into a stop and stays near it."""
+    plant = Plant(
+        stand="pivot",
+        cg_axis="y",
+        object_size=(0.1, 0.34, 0.05),
+        leader_mount=(0.0, 0.17, 0.0),
+        follower_mount=(0.0, -0.17, 0.0),
+    )
+    config = paper_with(plant, ROLLING)
+    flight = simulate(config, Copy(config), Scenario(goal=(0, 0, 0), ball_start=0.05, seconds=30), "newton-euler")
+    end = 0.17 - 0.02
+    # 10 mm: the stop's spring gives (its natural frequency is 60 rad/s, the ball arrives with up to 0.6 m/s)
+    assert np.abs(flight.cg_offset).max() < end + 0.01
+    assert np.abs(flight.cg_offset).max() > end - 0.001
+    assert np.ptp(flight.cg_offset[-100:]) < 1e-3
+
+
+def test_object_mass_changes_at_its_times() -> None:
+    config = paper_with()
+    scenario = Scenario(seconds=4, mass_changes=((1.0, 0.3), (2.5, -0.4)))
+    flight = simulate(config, Copy(config), scenario, "newton-euler")
+    for time, mass in ((0.98, 0.2), (1.0, 0.5), (2.48, 0.5), (2.5, 0.1), (4.0, 0.1)):
+        assert flight.object_mass[round(time / 0.02)] == pytest.approx(mass)
+
+
+def test_ball_larger_than_the_rod_is_refused() -> None:
+    with pytest.raises(InputError, match="larger than the object"):
+        configs.validate(paper_with(dataclasses.replace(Plant(), ball_radius=0.2)))
+
+
+def test_zero_inertia_and_too_large_a_step_are_refused() -> None:
+    with pytest.raises(InputError, match="leader_inertia"):
+        configs.validate(paper_with(dataclasses.replace(Plant(), leader_inertia=(0.0, 1e-3, 1e-3))))
+    with pytest.raises(InputError, match="200 Hz"):
+        configs.validate(configs.replace(paper_with(), "timing.physics_steps", 3))
