@@ -193,6 +193,8 @@ class Sac:
     alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
     return_steps: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
+    policy_delay: int = setting(1, "critic updates for each update of policy and temperature", low=1, high=1000)
+    gradient_clip: float = setting(0.0, "largest global norm of a gradient, 0: not clipped", low=0)
     target_rate: float = setting(0.02, "tau of the target critics", above=0, high=1)
     alpha: float = setting(0.02, "temperature at the start", above=0)
     alpha_fixed: bool = setting(False, "keep the temperature at its start")

@@ -28,8 +28,10 @@ def make_stepper(config: Config, physics: str) -> ControlStep:
 def _jax_stepper(config: Config, physics: str) -> ControlStep:
     import jax
 
+    from mjxball.cache import enable_compilation_cache
     from mjxball.physics import mjx, newton_euler
 
+    enable_compilation_cache()
     make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
     with jax.enable_x64(True):
         step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)

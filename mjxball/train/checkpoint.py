@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,20 +41,23 @@ class Checkpoints:
             arrays = {name: np.array(leaf) for name, leaf in _named_leaves(state).items()}
             self._manager.save(step, args=ocp.args.StandardSave(arrays))
 
-    def newest(self) -> int | None:
-        """Environment steps of the newest complete checkpoint, None if there is none."""
-        return self._manager.latest_step()
+    def steps(self) -> list[int]:
+        """Environment steps of every complete checkpoint, newest first."""
+        return sorted(self._manager.all_steps(), reverse=True)
 
-    def restore(self, template: TrainState) -> TrainState:
-        """The newest state, shaped like `template` (arrays or `jax.ShapeDtypeStruct`)."""
+    def restore(self, template: TrainState, warn: Callable[[str], None]) -> TrainState | None:
+        """The newest sound state, shaped like `template` (arrays or `jax.ShapeDtypeStruct`); None if there is none.
+
+        Half-written checkpoints never count as complete; one that cannot be read is skipped and `warn`ed of.
+        """
         wanted = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in _named_leaves(template).items()}
-        arrays = self._manager.restore(self._manager.latest_step(), args=ocp.args.StandardRestore(wanted))
-        leaves, structure = jax.tree_util.tree_flatten_with_path(template)
-        restored = [
-            jnp.asarray(arrays[_name(path)]) if leaf.size else jnp.zeros(leaf.shape, leaf.dtype)
-            for path, leaf in leaves
-        ]
-        return jax.tree_util.tree_unflatten(structure, restored)
+        for step in self.steps():
+            try:
+                arrays = self._manager.restore(step, args=ocp.args.StandardRestore(wanted))
+                return _rebuild(template, arrays)
+            except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
+                warn(f"checkpoint {step} cannot be read and is skipped: {str(error).splitlines()[0][:200]}")
+        return None
 
     def close(self) -> None:
         """Wait until everything is on disk."""
@@ -64,6 +69,17 @@ def _name(path: Any) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
+def _rebuild(template: TrainState, arrays: dict[str, Any]) -> TrainState:
+    leaves, structure = jax.tree_util.tree_flatten_with_path(template)
+    restored = [
+        jnp.asarray(arrays[_name(path)]) if leaf.size else jnp.zeros(leaf.shape, leaf.dtype) for path, leaf in leaves
+    ]
+    for (path, leaf), value in zip(leaves, restored, strict=True):
+        if value.shape != leaf.shape or value.dtype != leaf.dtype:
+            raise ValueError(f"{_name(path)} has shape {value.shape} instead of {leaf.shape}")
+    return jax.tree_util.tree_unflatten(structure, restored)
+
+
 def _named_leaves(state: Any) -> dict[str, Any]:
     """Leaves by their path, without empty arrays, which Orbax cannot store."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
@@ -73,7 +89,9 @@ def _named_leaves(state: Any) -> dict[str, Any]:
 def write_config(run: Path, config: Config, origin: dict[str, Any]) -> None:
     """Write the run's `config.json`: configuration, its hash, and `origin` (seed, physics, command, commit)."""
     record = {"config": configs.to_dict(config), "config_hash": configs.config_hash(config), **origin}
-    (run / CONFIG_FILE).write_text(json.dumps(record, indent=2) + "\n")
+    partial = run / f".{CONFIG_FILE}.partial"
+    partial.write_text(json.dumps(record, indent=2) + "\n")
+    partial.replace(run / CONFIG_FILE)
 
 
 def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
@@ -88,7 +106,9 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} cannot be read: {error}") from None
-    record.pop("config_hash", None)
+    recorded = record.pop("config_hash", None)
+    if recorded != configs.config_hash(config):
+        raise InputError(f"the configuration in {path} was changed after the run began; restore it, or start a new run")
     return configs.validate(config), record
 
 
@@ -97,12 +117,12 @@ def restore_run(run: Path) -> tuple[Config, TrainState, dict[str, Any]]:
     config, origin = read_config(run)
     if not (run / CHECKPOINTS).is_dir():
         raise InputError(f"{run} has no checkpoints")
-    checkpoints = Checkpoints(run)
-    with contextlib.closing(checkpoints):
-        if checkpoints.newest() is None:
-            raise InputError(f"{run} has no complete checkpoint")
+    with contextlib.closing(Checkpoints(run)) as checkpoints:
         template = jax.eval_shape(Program(config, origin["physics"]).create, jax.random.PRNGKey(0))
-        return config, checkpoints.restore(template), origin
+        state = checkpoints.restore(template, lambda text: print(f"warning: {text}", file=sys.stderr))  # noqa: T201
+    if state is None:
+        raise InputError(f"{run} has no complete checkpoint")
+    return config, state, origin
 
 
 def restore_policy(run: Path) -> tuple[Config, Any, int, dict[str, Any]]:

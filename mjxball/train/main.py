@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import shlex
-import subprocess
 import sys
 import time
 from pathlib import Path
 
 from mjxball import __version__, cli, config
+from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError
+from mjxball.train.provenance import commit, differences, source_hash, versions
 
 PHYSICS = ("mjx", "newton-euler")
 
@@ -55,6 +56,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
     else:
         out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
 
+    enable_compilation_cache()
+
     from mjxball.train.checkpoint import restore_run
     from mjxball.train.run import POLICY, Run, TrainingDivergedError
 
@@ -64,10 +67,15 @@ def _train(options: argparse.Namespace, command: str) -> int:
         "seed": seed,
         "physics": options.physics or "mjx",
         "package_version": __version__,
-        "commit": _commit(),
+        "commit": commit(),
+        "source_hash": source_hash(),
+        "versions": versions(),
     }
     if resume:
         settings, state, origin = restore_run(out)
+        changed = differences(origin)
+        if changed:
+            raise InputError(f"{out} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
     run = Run(settings, origin["seed"], origin["physics"], out, origin, state)
     started = time.monotonic()
     try:
@@ -106,13 +114,3 @@ def _evaluate(settings: config.Config, out: Path, policy: Path) -> int:
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
     print(f"{policy} {verdict}; figures in {out / 'eval'}")  # noqa: T201
     return 0
-
-
-def _commit() -> str:
-    """The commit of the source tree, marked if it has changes, or 'unknown' outside a repository."""
-    here = Path(__file__).parent
-    try:
-        command = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"

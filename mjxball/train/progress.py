@@ -31,19 +31,23 @@ class Row:
 
 
 class Progress:
-    """Prints one line that is overwritten on a terminal, and appends rows to `metrics.csv`."""
+    """Prints one line that is overwritten on a terminal, and appends rows to `metrics.csv`.
 
-    def __init__(self, path: Path, total: int, stream: TextIO = sys.stderr):
+    Of a run that is resumed at `resumed_at` steps, rows beyond are dropped: they will come again.
+    """
+
+    def __init__(self, path: Path, total: int, resumed_at: int = 0, stream: TextIO = sys.stderr):
         self._total = total
         self._stream = stream
         self._live = stream.isatty()
         self._start = time.monotonic()
         self._width = 0
-        new = not path.exists()
-        self._file = path.open("a", newline="")
+        kept = _rows_until(path, resumed_at)
+        self._file = path.open("w", newline="")
         self._writer = csv.DictWriter(self._file, [item.name for item in fields(Row)])
-        if new:
-            self._writer.writeheader()
+        self._writer.writeheader()
+        self._writer.writerows(kept)
+        self._file.flush()
 
     def elapsed(self) -> float:
         """Seconds since this object was made."""
@@ -86,3 +90,12 @@ class Progress:
 
 def _metres(value: float | None) -> str:
     return "-" if value is None else f"{value:.4f} m"
+
+
+def _rows_until(path: Path, steps: int) -> list[dict[str, str]]:
+    if not steps or not path.exists():
+        return []
+    names = [item.name for item in fields(Row)]
+    with path.open(newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if set(row) == set(names) and (row["steps"] or "").isdigit()]
+    return [row for row in rows if int(row["steps"]) <= steps]

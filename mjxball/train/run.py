@@ -69,7 +69,7 @@ class Run:
         out.mkdir(parents=True, exist_ok=True)
         if resumed is None:
             write_config(out, config, origin)
-        self.progress = Progress(out / METRICS, config.sac.steps)
+        self.progress = Progress(out / METRICS, config.sac.steps, int(resumed.steps) if resumed else 0)
         self.checkpoints = Checkpoints(out)
         self.state: TrainState | None = resumed
 

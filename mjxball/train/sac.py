@@ -98,44 +98,65 @@ def make_update(networks: Any, config: Sac, action_size: int) -> Any:
     distribution = networks.parametric_action_distribution
     target_entropy = config.target_entropy * action_size
 
-    def log_probability(policy: Any, normaliser: Any, seen: Array, key: Array) -> Array:
-        parameters = networks.policy_network.apply(normaliser, policy, seen)
-        return distribution.log_prob(parameters, distribution.sample_no_postprocessing(parameters, key))
+    def entropy_of(learner: Learner, seen: Array, key: Array) -> Array:
+        parameters = networks.policy_network.apply(learner.normaliser, learner.policy, seen)
+        return -jnp.mean(distribution.log_prob(parameters, distribution.sample_no_postprocessing(parameters, key)))
 
-    def update(learner: Learner, batch: Transitions, key: Array, rate: Array) -> tuple[Learner, Losses]:
-        alpha_key, critic_key, policy_key = jax.random.split(key, 3)
-        transitions = _brax_transitions(batch)
+    def critic_step(learner: Learner, batch: Any, key: Array, step: Array) -> tuple[Learner, Array]:
         alpha = jnp.exp(learner.log_alpha)
-        entropy = -jnp.mean(log_probability(learner.policy, learner.normaliser, batch.observation, alpha_key))
-        critic_value, critic_gradient = jax.value_and_grad(critic_loss)(
-            learner.critic, learner.policy, learner.normaliser, learner.target, alpha, transitions, critic_key
+        value, gradient = jax.value_and_grad(critic_loss)(
+            learner.critic, learner.policy, learner.normaliser, learner.target, alpha, batch, key
         )
-        policy_value, policy_gradient = jax.value_and_grad(policy_loss)(
-            learner.policy, learner.normaliser, learner.critic, alpha, transitions, policy_key
+        critic, adam = _descend(learner.critic, _clip(gradient, config), learner.critic_adam, step)
+        target = optax.incremental_update(critic, learner.target, config.target_rate)
+        return learner._replace(critic=critic, critic_adam=adam, target=target), value
+
+    def policy_step(before: Learner, learner: Learner, batch: Any, key: Array, rate: Array) -> tuple[Learner, Losses]:
+        """Policy and temperature move against the critic `before` the batch's own critic step, as in Brax."""
+        alpha_key, policy_key = jax.random.split(key)
+        alpha, entropy = jnp.exp(before.log_alpha), entropy_of(before, batch.observation, alpha_key)
+        value, gradient = jax.value_and_grad(policy_loss)(
+            before.policy, before.normaliser, before.critic, alpha, batch, policy_key
         )
         step = rate * config.learning_rate
-        critic, critic_adam = _descend(learner.critic, critic_gradient, learner.critic_adam, step)
-        policy, policy_adam = _descend(learner.policy, policy_gradient, learner.policy_adam, step)
+        policy, policy_adam = _descend(before.policy, _clip(gradient, config), before.policy_adam, step)
         # d(alpha loss)/d(log alpha) of SAC's eq. 18: alpha (H - target).
-        alpha_gradient = 0.0 * alpha if config.alpha_fixed else alpha * (entropy - target_entropy)
-        log_alpha, alpha_adam = _descend(
-            learner.log_alpha, alpha_gradient, learner.alpha_adam, rate * config.alpha_learning_rate
-        )
-        moved = Learner(
+        slope = 0.0 * alpha if config.alpha_fixed else alpha * (entropy - target_entropy)
+        log_alpha, alpha_adam = _descend(before.log_alpha, slope, before.alpha_adam, rate * config.alpha_learning_rate)
+        moved = learner._replace(
             policy=policy,
-            critic=critic,
-            target=optax.incremental_update(critic, learner.target, config.target_rate),
             log_alpha=log_alpha,
             policy_adam=policy_adam,
-            critic_adam=critic_adam,
             alpha_adam=alpha_adam,
-            normaliser=learner.normaliser,
             average=optax.incremental_update(policy, learner.average, config.policy_average),
-            updates=learner.updates + 1,
         )
-        return moved, Losses(critic_value, policy_value, entropy)
+        return moved, Losses(jnp.zeros(()), value, entropy)
+
+    def update(learner: Learner, batch: Transitions, key: Array, rate: Array) -> tuple[Learner, Losses]:
+        critic_key, policy_key = jax.random.split(key)
+        transitions = _brax_transitions(batch)
+        moved, critic_value = critic_step(learner, transitions, critic_key, rate * config.learning_rate)
+
+        def due(moved: Learner) -> tuple[Learner, Losses]:
+            return policy_step(learner, moved, transitions, policy_key, rate)
+
+        def not_due(moved: Learner) -> tuple[Learner, Losses]:
+            return moved, Losses(*jnp.zeros(3))
+
+        if config.policy_delay == 1:
+            moved, losses = due(moved)
+        else:
+            moved, losses = jax.lax.cond(learner.updates % config.policy_delay == 0, due, not_due, moved)
+        return moved._replace(updates=learner.updates + 1), losses._replace(critic=critic_value)
 
     return update
+
+
+def _clip(gradient: Any, config: Sac) -> Any:
+    """`gradient` scaled to a global norm of at most `config.gradient_clip`, 0: untouched."""
+    if not config.gradient_clip:
+        return gradient
+    return optax.clip_by_global_norm(config.gradient_clip).update(gradient, optax.EmptyState())[0]
 
 
 def _descend(value: Any, gradient: Any, adam: Any, step: Array) -> tuple[Any, Any]:

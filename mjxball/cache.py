@@ -1,0 +1,34 @@
+"""JAX's persistent compilation cache: on by default, in the user's cache directory."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+VARIABLE = "MJXBALL_CACHE"
+
+
+def cache_directory() -> Path | None:
+    """Where compiled programs are kept: $MJXBALL_CACHE, else the user's cache directory; None if it is `off`."""
+    chosen = os.environ.get(VARIABLE)
+    if chosen is not None:
+        return None if chosen.lower() in ("", "off", "0") else Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "mjxball" / "jax"
+
+
+def enable_compilation_cache() -> Path | None:
+    """Turn the cache on, unless JAX was told of one or it is switched off; return its directory if it is ours."""
+    import jax
+
+    place = cache_directory()
+    if place is None or jax.config.jax_compilation_cache_dir:
+        return None
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None  # a read-only home is no reason not to train
+    jax.config.update("jax_compilation_cache_dir", str(place))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    return place

@@ -1,0 +1,127 @@
+"""A run that is continued ends exactly as one that was never interrupted; what cannot be continued is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjxball.train.checkpoint import CHECKPOINTS
+from mjxball.train.main import main as train
+
+REPOSITORY = Path(__file__).parents[1]
+TINY = [
+    *("--physics", "newton-euler", "--sac.steps", "24000", "--sac.worlds", "32", "--sac.replay", "3200"),
+    *("--sac.prefill", "1024", "--sac.updates", "2", "--timing.episode_steps", "120", "--sac.policy_layers", "16,16"),
+    *("--sac.critic_layers", "16,16"),
+]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A compilation cache of this module's own, so that its runs compile once."""
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+    """A run that was never interrupted. Its replay has wrapped around several times."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    launch(["--out", str(out), *TINY], cache).wait(timeout=240)
+    return out
+
+
+def launch(arguments: list[str], cache: Path) -> subprocess.Popen:
+    environment = {**os.environ, "MJXBALL_CACHE": str(cache), "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, str(REPOSITORY / "train.py"), *arguments]
+    return subprocess.Popen(
+        command, cwd=REPOSITORY, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def arrays(run: Path) -> dict[str, np.ndarray]:
+    with np.load(run / "policy.npz") as data:
+        return {name: data[name] for name in data.files if name != "card"}
+
+
+def complete(run: Path) -> list[int]:
+    place = run / CHECKPOINTS
+    return sorted(int(path.name) for path in place.iterdir() if path.name.isdigit()) if place.is_dir() else []
+
+
+def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: Path, cache: Path) -> None:
+    run = tmp_path / "killed"
+    child = launch(["--out", str(run), *TINY], cache)
+    deadline = time.monotonic() + 120
+    while not complete(run) and child.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    child.kill()
+    child.wait(timeout=30)
+    assert child.returncode == -signal.SIGKILL, "the run ended before it could be killed"
+    kept = complete(run)
+    assert kept
+    assert kept[-1] < 24000
+    (run / CHECKPOINTS / f"{kept[-1] + 32}.orbax-checkpoint-tmp").mkdir()  # as a write cut short leaves it
+    again = launch(["--resume", str(run)], cache)
+    output = again.communicate(timeout=240)[0]
+    assert again.returncode == 0, output
+    for name, value in arrays(whole).items():
+        np.testing.assert_array_equal(arrays(run)[name], value, err_msg=name)
+    steps = [line.split(",")[0] for line in (run / "metrics.csv").read_text().splitlines()]
+    assert steps == [line.split(",")[0] for line in (whole / "metrics.csv").read_text().splitlines()]
+
+
+def test_damaged_checkpoint_is_skipped_with_a_warning(whole: Path, tmp_path: Path, cache: Path) -> None:
+    run = tmp_path / "damaged"
+    shutil.copytree(whole, run)
+    newest = complete(run)[-1]
+    for path in (run / CHECKPOINTS / str(newest)).rglob("*"):
+        if path.is_file() and path.stat().st_size > 200:
+            path.write_bytes(path.read_bytes()[:100])
+    again = launch(["--resume", str(run)], cache)
+    output = again.communicate(timeout=240)[0]
+    assert again.returncode == 0, output
+    assert f"checkpoint {newest} cannot be read and is skipped" in output
+    for name, value in arrays(whole).items():
+        np.testing.assert_array_equal(arrays(run)[name], value, err_msg=name)
+
+
+def test_changed_configuration_is_refused(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run = tmp_path / "changed"
+    shutil.copytree(whole, run)
+    record = json.loads((run / "config.json").read_text())
+    record["config"]["sac"]["discount"] = 0.9
+    (run / "config.json").write_text(json.dumps(record))
+    before = (run / "policy.npz").read_bytes()
+    assert train(["--resume", str(run)]) == 2
+    assert "changed" in capsys.readouterr().err
+    assert (run / "policy.npz").read_bytes() == before
+
+
+def test_changed_program_is_refused_with_the_differences(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    run = tmp_path / "older"
+    shutil.copytree(whole, run)
+    record = json.loads((run / "config.json").read_text())
+    record["source_hash"] = "0123456789abcdef"
+    record["versions"]["jax"] = "0.0.1"
+    (run / "config.json").write_text(json.dumps(record))
+    assert train(["--resume", str(run)]) == 2
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "source 0123456789abcdef" in message
+    assert "jax 0.0.1 is now" in message
+
+
+def test_compilation_cache_is_filled(whole: Path, cache: Path) -> None:
+    assert whole.is_dir()
+    assert any(cache.rglob("*"))
