@@ -18,7 +18,9 @@ import orbax.checkpoint as ocp
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.train.program import Program, TrainState
+from mjxball.train.members import best_member, read_members
+from mjxball.train.population import Population
+from mjxball.train.program import TrainState
 
 KEEP = 2
 CONFIG_FILE = "config.json"
@@ -35,7 +37,7 @@ class Checkpoints:
 
     def save(self, state: TrainState) -> None:
         """Start writing `state`; a step that is already there is not written again."""
-        step = int(state.steps)
+        step = int(np.ravel(np.asarray(state.steps))[0])  # the same for every member of a population
         if step not in self._manager.all_steps():
             # Copies: the next chunk of training reuses the buffers while the files are still being written.
             arrays = {name: np.array(leaf) for name, leaf in _named_leaves(state).items()}
@@ -118,7 +120,7 @@ def restore_run(run: Path) -> tuple[Config, TrainState, dict[str, Any]]:
     if not (run / CHECKPOINTS).is_dir():
         raise InputError(f"{run} has no checkpoints")
     with contextlib.closing(Checkpoints(run)) as checkpoints:
-        template = jax.eval_shape(Program(config, origin["physics"]).create, jax.random.PRNGKey(0))
+        template = _population(config, origin).template()
         state = checkpoints.restore(template, lambda text: print(f"warning: {text}", file=sys.stderr))  # noqa: T201
     if state is None:
         raise InputError(f"{run} has no complete checkpoint")
@@ -126,6 +128,13 @@ def restore_run(run: Path) -> tuple[Config, TrainState, dict[str, Any]]:
 
 
 def restore_policy(run: Path) -> tuple[Config, Any, int, dict[str, Any]]:
-    """Configuration, learner, environment steps and origin of a run's newest checkpoint."""
+    """Configuration, learner, environment steps and origin of a run's newest checkpoint; of a population the best's."""
     config, state, origin = restore_run(run)
-    return config, state.learner, int(state.steps), origin
+    population, best = _population(config, origin), best_member(read_members(run))
+    chosen = population.member(state, best)
+    origin = {**origin, "seed": origin["seed"] + best}
+    return population.member_config(best), chosen.learner, int(chosen.steps), origin
+
+
+def _population(config: Config, origin: dict[str, Any]) -> Population:
+    return Population(config, origin["physics"], origin["seeds"], origin["sweep"])

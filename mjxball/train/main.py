@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import shlex
+import statistics
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from mjxball import __version__, cli, config
 from mjxball.cache import enable_compilation_cache
@@ -15,13 +18,15 @@ from mjxball.errors import InputError
 from mjxball.train.provenance import commit, differences, source_hash, versions
 
 PHYSICS = ("mjx", "newton-euler")
+MOST_MEMBERS = 4096
 
 
 def parser() -> cli.Parser:
     """The argument parser; configuration flags are generated from `mjxball.config`."""
     result = cli.Parser(
         prog="train.py",
-        usage="train.py [PRESET] [--seed N] [--out DIR] [--resume DIR] [--physics ENGINE] [--<config path> VALUE ...]",
+        usage="train.py [PRESET] [--seed N] [--seeds K] [--sweep FILE] [--out DIR] [--resume DIR] [--physics ENGINE]\n"
+        "                [--<config path> VALUE ...]",
         description="Train a follower with soft actor-critic, export it to NumPy and judge it against `copy`.",
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
         allow_abbrev=False,
@@ -29,6 +34,8 @@ def parser() -> cli.Parser:
     names = ", ".join(config.PRESETS)
     result.add_argument("preset", nargs="?", metavar="PRESET", help=f"one of {names} (default transport)")
     result.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default 0)")
+    result.add_argument("--seeds", type=int, metavar="K", help="train K followers at once, seeds N, N + 1, ...")
+    result.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
     result.add_argument("--physics", choices=PHYSICS, help="physics engine (default mjx)")
@@ -56,7 +63,11 @@ def _train(options: argparse.Namespace, command: str) -> int:
     else:
         out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
 
+    members = 1 if options.seeds is None else options.seeds
+    if not 1 <= members <= MOST_MEMBERS:
+        raise InputError(f"--seeds must be between 1 and {MOST_MEMBERS}, not {members}")
     enable_compilation_cache()
+    sweep = _read_sweep(options.sweep, members, settings)
 
     from mjxball.train.checkpoint import restore_run
     from mjxball.train.run import POLICY, Run, TrainingDivergedError
@@ -66,6 +77,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
         "command": command,
         "seed": seed,
         "physics": options.physics or "mjx",
+        "seeds": members,
+        "sweep": sweep,
         "package_version": __version__,
         "commit": commit(),
         "source_hash": source_hash(),
@@ -76,7 +89,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
         changed = differences(origin)
         if changed:
             raise InputError(f"{out} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
-    run = Run(settings, origin["seed"], origin["physics"], out, origin, state)
+    run = Run(settings, out, origin, state)
     started = time.monotonic()
     try:
         finished = run.train()
@@ -86,12 +99,46 @@ def _train(options: argparse.Namespace, command: str) -> int:
     print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)  # noqa: T201
     if not finished:
         return 130
+    if origin["seeds"] > 1:
+        _compare_members(settings, out, origin)
     return _evaluate(settings, out, out / POLICY)
+
+
+def _read_sweep(path: Path | None, members: int, settings: config.Config) -> dict[str, list[float]] | None:
+    if path is None:
+        return None
+    from mjxball.train.population import read_sweep
+
+    return read_sweep(path, members, settings)
+
+
+def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) -> None:
+    """Print every member on the reference scenario and their median, and draw them over training."""
+    from mjxball.evaluate.cells import REFERENCE, load_policy, run_cells
+    from mjxball.evaluate.table import table
+    from mjxball.train.members import POLICIES, draw_members
+
+    setup = dataclasses.replace(settings, scenario=config.Scenario())
+    policies = [load_policy(path, setup) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
+    cells = run_cells(setup, policies, [REFERENCE], origin["physics"])
+    print(table(cells))  # noqa: T201
+    for name in ("rmse", "settling_time", "x_peak", "overshoot"):
+        values = sorted(math.inf if (v := getattr(cell.metrics, name)) is None else v for cell in cells)
+        low, middle, high = values[0], statistics.median(values), values[-1]
+        print(f"{name}: median {middle:.4g}, best {low:.4g}, worst {high:.4g} of {len(values)}")  # noqa: T201
+    (out / "eval").mkdir(exist_ok=True)
+    draw_members(out, out / "eval" / "members.png")
+
+
+def _seed_of(path: Path) -> int:
+    return int(path.stem.removeprefix("seed"))
 
 
 def _refuse_with_resume(options: argparse.Namespace) -> None:
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    given += [f"--{name}" for name in ("out", "seed", "physics") if getattr(options, name) is not None]
+    given += [
+        f"--{name}" for name in ("out", "seed", "seeds", "sweep", "physics") if getattr(options, name) is not None
+    ]
     given += [options.preset] if options.preset else []
     if given:
         raise InputError(f"--resume continues with the run's own configuration; drop {', '.join(given)}")

@@ -9,6 +9,10 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TextIO
 
+from tensorboardX import SummaryWriter
+
+EVENTS = "tensorboard"  # directory beside metrics.csv
+
 
 @dataclass(frozen=True)
 class Row:
@@ -16,7 +20,7 @@ class Row:
 
     steps: int  # environment steps so far
     seconds: float  # since the start of training, compilation included
-    rate: float  # environment steps per second, updates included
+    rate: float  # environment steps per second of all members together, updates included
     episode_return: float  # mean reward x episode steps, exploring policy
     steady_error: float | None  # mean |e_o| later than 8 s into an episode, exploring policy [m]; None: none so old
     alpha: float
@@ -31,13 +35,13 @@ class Row:
 
 
 class Progress:
-    """Prints one line that is overwritten on a terminal, and appends rows to `metrics.csv`.
+    """Prints one line that is overwritten on a terminal; appends rows to `metrics.csv` and to TensorBoard's events.
 
     Of a run that is resumed at `resumed_at` steps, rows beyond are dropped: they will come again.
     """
 
-    def __init__(self, path: Path, total: int, resumed_at: int = 0, stream: TextIO = sys.stderr):
-        self._total = total
+    def __init__(self, path: Path, total: int, resumed_at: int = 0, members: int = 1, stream: TextIO = sys.stderr):
+        self._total, self._members = total, members
         self._stream = stream
         self._live = stream.isatty()
         self._start = time.monotonic()
@@ -48,6 +52,7 @@ class Progress:
         self._writer.writeheader()
         self._writer.writerows(kept)
         self._file.flush()
+        self._events = SummaryWriter(str(path.with_name(EVENTS)), purge_step=resumed_at or None)
 
     def elapsed(self) -> float:
         """Seconds since this object was made."""
@@ -63,7 +68,10 @@ class Progress:
         """Record `row` and show it."""
         self._writer.writerow(asdict(row))
         self._file.flush()
-        left = max(self._total - row.steps, 0) / max(row.rate, 1e-9)
+        for name, value in asdict(row).items():
+            if value is not None and name != "steps":
+                self._events.add_scalar(name, value, row.steps)
+        left = max(self._total - row.steps, 0) * self._members / max(row.rate, 1e-9)
         evaluated = row.eval_return is not None
         metric = (
             f"steady error {_metres(row.eval_steady_error)}, peak {_metres(row.eval_peak)}"
@@ -72,7 +80,8 @@ class Progress:
         )
         text = (
             f"{row.steps:>9,} / {self._total:,} steps  {row.rate / 1e3:6.1f} k/s  "
-            f"{int(left) // 60}:{int(left) % 60:02d} left  return {row.episode_return:9.1f}  {metric}"
+            f"{int(left) // 60}:{int(left) % 60:02d} left  return {row.episode_return:9.1f}  {metric}  "
+            f"alpha {row.alpha:.3f}"
         )
         if self._live and not evaluated:
             self._stream.write("\r" + text.ljust(self._width))
@@ -86,6 +95,7 @@ class Progress:
         if self._live and self._width:
             self._stream.write("\n")
         self._file.close()
+        self._events.close()
 
 
 def _metres(value: float | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import signal
 from collections.abc import Iterator
@@ -12,13 +13,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjxball.config import Config
 from mjxball.export import is_sound, policy_file
 from mjxball.policy import save_file
 from mjxball.train import program as programs
 from mjxball.train.checkpoint import Checkpoints, write_config
-from mjxball.train.program import Program, Tally, TrainState
+from mjxball.train.members import MemberLog
+from mjxball.train.population import Population
+from mjxball.train.program import Tally, TrainState
 from mjxball.train.progress import Progress, Row
 
 CHUNKS = 50  # rows of metrics.csv in a run
@@ -58,18 +62,18 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
 
 
 class Run:
-    """One follower being trained into a run directory. `train()` returns False if it was interrupted."""
+    """Followers being trained into a run directory. `train()` returns False if it was interrupted."""
 
-    def __init__(
-        self, config: Config, seed: int, physics: str, out: Path, origin: dict[str, Any], resumed: TrainState | None
-    ):
-        self.config, self.seed, self.out, self.origin = config, seed, out, origin
-        self.program = Program(config, physics)
-        self._resumed = resumed
+    def __init__(self, config: Config, out: Path, origin: dict[str, Any], resumed: TrainState | None):
+        """`origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name."""
+        self.config, self.out, self.origin = config, out, origin
+        self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"])
         out.mkdir(parents=True, exist_ok=True)
         if resumed is None:
             write_config(out, config, origin)
-        self.progress = Progress(out / METRICS, config.sac.steps, int(resumed.steps) if resumed else 0)
+        done = self._count(resumed) if resumed else 0
+        self.progress = Progress(out / METRICS, config.sac.steps, done, origin["seeds"])
+        self.members = MemberLog(out, origin["seed"], done)
         self.checkpoints = Checkpoints(out)
         self.state: TrainState | None = resumed
 
@@ -85,14 +89,17 @@ class Run:
                 self._save()
             return not stop.requested
 
+    def _count(self, state: TrainState) -> int:
+        return int(np.ravel(np.asarray(state.steps))[0])
+
     def _start(self) -> None:
         self.progress.say(f"compiling the training program for {jax.devices()[0].device_kind} ...")
         if self.state is None:
-            self.state = jax.jit(self.program.create)(jax.random.PRNGKey(self.seed))
+            self.state = self.population.create(self.origin["seed"])
             self._export()
-        advance = jax.jit(self.program.advance, donate_argnums=0)
+        advance = jax.jit(self.population.advance, donate_argnums=0)
         self._advance = advance.lower(self.state, programs.prefill(1)).compile()
-        self._fresh = jax.jit(self.program.fresh_worlds)
+        self._fresh = jax.jit(self.population.fresh_worlds)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
 
     def _loop(self, stop: Stop) -> None:
@@ -100,7 +107,7 @@ class Run:
         total = math.ceil(sac.steps / sac.worlds)
         # At least one batch and one n-step window must be recorded before the first update.
         first = max(math.ceil(sac.prefill / sac.worlds), math.ceil(sac.batch / sac.worlds), sac.return_steps)
-        done = int(self.state.steps) // sac.worlds
+        done = self._count(self.state) // sac.worlds
         if done < first and not stop.requested:
             self.state, _ = self._advance(self.state, programs.prefill(first - done))
             done = first
@@ -121,29 +128,30 @@ class Run:
         self.state, tally = self._advance(self.state, programs.train(steps, self.config.sac.updates))
         self.state = jax.block_until_ready(self.state)
         after = self.progress.elapsed()
-        row = self._row(tally, steps, after, steps * self.config.sac.worlds / max(after - before, 1e-9))
+        worlds = steps * self.config.sac.worlds * self.population.members
+        row = self._row(tally, steps, after, worlds / max(after - before, 1e-9))
         if not all(map(math.isfinite, (row.critic_loss, row.policy_loss, row.alpha))):
             raise TrainingDivergedError(f"a loss is not finite after {row.steps:,} steps")
         return row
 
     def _row(self, tally: Tally, steps: int, seconds: float, rate: float) -> Row:
-        episode = self.config.timing.episode_steps
+        each, losses = self.population.each, tally.losses
         return Row(
-            steps=int(self.state.steps),
+            steps=self._count(self.state),
             seconds=round(seconds, 3),
             rate=round(rate, 1),
-            episode_return=float(tally.reward) / steps * episode,
-            steady_error=_mean(tally.steady_error, tally.steady),
-            alpha=float(jnp.exp(self.state.learner.log_alpha)),
-            entropy=float(tally.losses.entropy),
-            critic_loss=float(tally.losses.critic),
-            policy_loss=float(tally.losses.policy),
-            terminated=int(tally.ended),
-            diverged=int(tally.diverged),
+            episode_return=_middle(each(tally.reward)) / steps * self.config.timing.episode_steps,
+            steady_error=_mean(each(tally.steady_error), each(tally.steady)),
+            alpha=_middle(np.exp(each(self.state.learner.log_alpha))),
+            entropy=_middle(each(losses.entropy)),
+            critic_loss=_middle(each(losses.critic)),
+            policy_loss=_middle(each(losses.policy)),
+            terminated=int(each(tally.ended).sum()),
+            diverged=int(each(tally.diverged).sum()),
         )
 
     def _evaluated(self, row: Row) -> Row:
-        """Add the evaluation of the averaged policy, on the same fresh worlds every time."""
+        """Add the evaluation of the averaged policies, on the same fresh worlds every time."""
         steps = min(round(EVALUATION_SECONDS / self.config.timing.control_period), self.config.timing.episode_steps)
         kept = self.state
         worlds = self._fresh(jax.random.PRNGKey(0))
@@ -151,13 +159,18 @@ class Run:
         kept_worlds, kept_key = jax.tree.map(jnp.copy, (kept.worlds, kept.key))
         after, tally = self._advance(kept._replace(worlds=worlds), programs.evaluate(steps))
         self.state = after._replace(worlds=kept_worlds, key=kept_key)
-        return Row(
-            **{
-                **row.__dict__,
-                "eval_return": float(tally.reward) / steps * self.config.timing.episode_steps,
-                "eval_steady_error": _mean(tally.steady_error, tally.steady),
-                "eval_peak": float(tally.peak.mean()) if float(tally.steady) else None,
-            }
+        each = self.population.each
+        returns = each(tally.reward) / steps * self.config.timing.episode_steps
+        peaks = each(tally.peak).mean(axis=-1)
+        errors = each(tally.steady_error) / np.maximum(each(tally.steady), 1)
+        if self.population.members > 1:
+            self.members.add(row.steps, returns, errors, peaks)
+        seen = bool(each(tally.steady).any())
+        return dataclasses.replace(
+            row,
+            eval_return=_middle(returns),
+            eval_steady_error=_middle(errors) if seen else None,
+            eval_peak=_middle(peaks) if seen else None,
         )
 
     def _save(self) -> None:
@@ -165,14 +178,29 @@ class Run:
             self.checkpoints.save(self.state)
 
     def _export(self) -> bool:
-        """Write the policy file, unless a value is not finite."""
-        policy = policy_file(self.config, self.state.learner, int(self.state.steps), self.origin)
-        if not is_sound(policy):
-            return False
-        save_file(self.out / POLICY, policy)
-        return True
+        """Write the policy file, of a population every member's and the best one's; False if none is sound."""
+        steps, exported = self._count(self.state), False
+        best = self.members.best()
+        for member in range(self.population.members):
+            learner = self.population.member(self.state.learner, member)
+            origin = {**self.origin, "seed": self.origin["seed"] + member}
+            policy = policy_file(self.population.member_config(member), learner, steps, origin)
+            if not is_sound(policy):
+                continue
+            exported = True
+            if self.population.members > 1:
+                save_file(self.members.policy_path(member), policy)
+            if member == best:
+                save_file(self.out / POLICY, policy)
+        return exported
 
 
-def _mean(total: jnp.ndarray, count: jnp.ndarray) -> float | None:
-    """`total` / `count`, None if there was nothing to count."""
-    return float(total) / float(count) if float(count) else None
+def _middle(values: np.ndarray) -> float:
+    """Median over the members whose value is finite; NaN if none is."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else math.nan
+
+
+def _mean(total: np.ndarray, count: np.ndarray) -> float | None:
+    """Median over the members of `total` / `count`, None if there was nothing to count."""
+    return _middle(total / np.maximum(count, 1)) if count.any() else None

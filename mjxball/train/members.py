@@ -1,0 +1,85 @@
+"""What becomes of each member of a population: evaluations, policies, table and picture."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+LOG = "members.csv"
+POLICIES = "members"
+COLUMNS = ("steps", "seed", "eval_return", "eval_steady_error", "eval_peak")
+
+
+class MemberLog:
+    """`members.csv` of a run: one row for each member and evaluation."""
+
+    def __init__(self, out: Path, seed: int, resumed_at: int = 0):
+        self._out, self._seed = out, seed
+        self._rows = [row for row in read_members(out) if row["steps"] <= resumed_at]
+
+    def add(self, steps: int, returns: np.ndarray, errors: np.ndarray, peaks: np.ndarray) -> None:
+        """Append one evaluation; every array is (members,)."""
+        for member, values in enumerate(zip(returns, errors, peaks, strict=True)):
+            row = (steps, self._seed + member, *map(float, values))
+            self._rows.append(dict(zip(COLUMNS, row, strict=True)))
+        partial = self._out / f".{LOG}.partial"
+        with partial.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, COLUMNS)
+            writer.writeheader()
+            writer.writerows(self._rows)
+        partial.replace(self._out / LOG)
+
+    def best(self) -> int:
+        """The member with the highest return at the last evaluation; 0 before the first."""
+        return best_member(self._rows)
+
+    def policy_path(self, member: int) -> Path:
+        """Where a member's policy is written."""
+        place = self._out / POLICIES
+        place.mkdir(exist_ok=True)
+        return place / f"seed{self._seed + member}.npz"
+
+
+def read_members(run: Path) -> list[dict[str, float]]:
+    """Rows of a run's `members.csv`; none if it has no such file."""
+    path = run / LOG
+    if not path.exists():
+        return []
+    with path.open(newline="") as stream:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
+    return [{**row, "steps": int(row["steps"]), "seed": int(row["seed"])} for row in rows]
+
+
+def best_member(rows: list[dict[str, float]]) -> int:
+    """Index of the member with the highest finite return among the last evaluation's rows; 0 if there are none."""
+    last = [row for row in rows if row["steps"] == rows[-1]["steps"]]
+    returns = [row["eval_return"] if np.isfinite(row["eval_return"]) else -np.inf for row in last]
+    return int(np.argmax(returns)) if returns else 0
+
+
+def draw_members(run: Path, path: Path) -> None:
+    """Picture of all members over training: steady-state error and return, each one, their median and quartiles."""
+    from mjxball.evaluate.figures import pyplot
+
+    rows = read_members(run)
+    steps = sorted({row["steps"] for row in rows})
+    plt = pyplot()
+    figure, axes = plt.subplots(2, 1, sharex=True, figsize=(8, 7), constrained_layout=True)
+    labels = (("eval_steady_error", "steady-state error [m]"), ("eval_return", "return of an episode"))
+    for axis, (name, label) in zip(axes, labels, strict=True):
+        table = np.array([[row[name] for row in rows if row["steps"] == step] for step in steps])
+        low, middle, high = np.nanpercentile(table, [25, 50, 75], axis=1)
+        axis.plot(steps, table, color="#9bb7cc", linewidth=0.8)
+        axis.fill_between(steps, low, high, color="#1b6ca8", alpha=0.2, label="quartiles")
+        axis.plot(steps, middle, color="#1b6ca8", linewidth=2, label="median")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.25)
+    if any(row["eval_steady_error"] > 0 for row in rows):  # short episodes have no steady state
+        axes[0].set_yscale("log")
+    axes[0].legend()
+    axes[1].set_xlabel("environment steps of each member")
+    figure.suptitle(f"{table.shape[1]} followers")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,160 @@
+"""Several followers in one program: each is its own run, the best is exported, settings may differ."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from conftest import with_settings
+
+from mjxball.config import Config
+from mjxball.errors import InputError
+from mjxball.policy import Policy
+from mjxball.train import program as programs
+from mjxball.train.main import main as train
+from mjxball.train.members import best_member, read_members
+from mjxball.train.population import Population, read_sweep
+
+REPOSITORY = Path(__file__).parents[1]
+SMALL = {
+    "worlds": 8,
+    "replay": 800,
+    "batch": 16,
+    "policy_layers": (8,),
+    "critic_layers": (8,),
+    "updates": 1,
+    "steps": 4000,
+    "prefill": 100,
+}
+FLAGS = [word for name, value in SMALL.items() for word in (f"--sac.{name}", str(value).strip("(),"))]
+FLAGS += ["--physics", "newton-euler", "--timing.episode_steps", "60"]
+
+
+@pytest.fixture(scope="module")
+def small(transport: Config) -> Config:
+    return with_settings(transport, sac=SMALL)
+
+
+def trained(population: Population) -> object:
+    state = population.create(5)
+    advance = jax.jit(population.advance)
+    state, _ = advance(state, programs.prefill(10))
+    return advance(state, programs.train(20, 1))[0]
+
+
+def test_members_are_the_runs_of_their_seeds(small: Config) -> None:
+    population, single = Population(small, "newton-euler", 2), Population(small, "newton-euler")
+    together, advance = trained(population), jax.jit(single.advance)
+    for member in range(2):
+        state, _ = advance(single.create(5 + member), programs.prefill(10))
+        alone, _ = advance(state, programs.train(20, 1))
+        mine = population.member(together, member)
+        for a, b in zip(jax.tree.leaves(mine.learner.policy), jax.tree.leaves(alone.learner.policy), strict=True):
+            # Batched matrix products may round differently; 20 updates amplify that a little.
+            np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_swept_settings_differ_between_members(small: Config) -> None:
+    rates = [1e-6, 1e-2]
+    population = Population(small, "newton-euler", 2, {"sac.learning_rate": rates})
+    assert [population.member_config(k).sac.learning_rate for k in (0, 1)] == rates
+    before, after = population.create(5), trained(population)
+    moved = [
+        max(
+            float(abs(a - b).max())
+            for a, b in zip(
+                jax.tree.leaves(population.member(before, k).learner.policy),
+                jax.tree.leaves(population.member(after, k).learner.policy),
+                strict=True,
+            )
+        )
+        for k in (0, 1)
+    ]
+    assert moved[0] < 1e-4  # 20 steps of 1e-6
+    assert moved[1] > 1e-2  # 20 steps of 1e-2
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [
+        ("{", "cannot be read"),
+        ("[]", "object"),
+        ("{}", "object"),
+        ('{"sac.batch": [1, 2]}', "cannot differ"),
+        ('{"sac.discount": [0.9]}', "2 numbers"),
+        ('{"sac.discount": [0.9, 1.5]}', "at most"),
+        ('{"sac.discount": [0.9, "x"]}', "numbers"),
+    ],
+)
+def test_unsound_sweeps_are_refused(small: Config, tmp_path: Path, content: str, word: str) -> None:
+    path = tmp_path / "sweep.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=word):
+        read_sweep(path, 2, small)
+
+
+def test_best_member_has_the_highest_finite_return_of_the_last_evaluation() -> None:
+    rows = [
+        {"steps": 1, "eval_return": 9.0},
+        {"steps": 1, "eval_return": 0.0},
+        {"steps": 2, "eval_return": float("nan")},
+        {"steps": 2, "eval_return": -5.0},
+    ]
+    assert best_member(rows) == 1
+    assert best_member([]) == 0
+
+
+def test_population_run_exports_every_member_and_the_best(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out, sweep = tmp_path / "run", tmp_path / "sweep.json"
+    sweep.write_text(json.dumps({"follower.tilt_limit": [0.1, 0.2]}))
+    assert train([*FLAGS, "--seeds", "2", "--seed", "7", "--sweep", str(sweep), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "seed7" in printed
+    assert "x_peak: median" in printed
+    members = [Policy.load(out / "members" / f"seed{seed}.npz") for seed in (7, 8)]
+    assert [member.card["action_reach"][0] for member in members] == [0.1, 0.2]
+    best = best_member(read_members(out))
+    assert (out / "policy.npz").read_bytes() == (out / "members" / f"seed{7 + best}.npz").read_bytes()
+    assert (out / "eval" / "members.png").stat().st_size > 10_000
+    assert train(["--resume", str(out)]) == 0
+
+
+def test_members_are_spread_over_devices() -> None:
+    """Two CPU devices in a process of their own: the same members as on one, up to rounding."""
+    code = f"""
+import jax, numpy as np
+from mjxball import config as C
+from mjxball.train.population import Population
+from mjxball.train import program as P
+config = C.preset("transport")
+for name, value in {SMALL!r}.items():
+    config = C.replace(config, "sac." + name, value)
+population = Population(config, "newton-euler", 2)
+assert population.devices == jax.local_device_count() == 2
+state, _ = jax.jit(population.advance)(population.create(5), P.prefill(10))
+state, _ = jax.jit(population.advance)(state, P.train(5, 1))
+leaves = jax.tree.leaves(state.learner.policy)
+assert len(leaves[0].sharding.device_set) == 2
+population.devices = 1
+alone, _ = jax.jit(population.advance)(population.create(5), P.prefill(10))
+alone, _ = jax.jit(population.advance)(alone, P.train(5, 1))
+for a, b in zip(leaves, jax.tree.leaves(alone.learner.policy)):
+    np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=1e-5)
+"""
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        check=False,
+        cwd=REPOSITORY,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
+    assert done.returncode == 0, done.stderr
