@@ -35,18 +35,24 @@ class Cell:
     motion: str = "sine"  # how the CG moved: sine, waveform or rolling
 
     def record(self) -> dict[str, Any]:
-        """The cell as `eval.py --json` writes it; omega and amplitude are None unless the CG moves in a sine."""
+        """The cell as `eval.py --json` writes it (design section 9).
+
+        Flights beyond that contract say so: another motion than a sine (omega and amplitude are then None) and
+        mass changes have keys of their own.
+        """
         s = self.scenario
         believed = s.mass if s.believed_mass is None else s.believed_mass
         sine = self.motion == "sine"
-        keys = {
-            "motion": self.motion,
+        keys: dict[str, Any] = {
             "omega": s.omega if sine else None,
             "amplitude": s.amplitude if sine else None,
             "mass": s.mass,
             "believed_mass": believed,
-            "mass_changes": [list(change) for change in s.mass_changes],
         }
+        if not sine:
+            keys["motion"] = self.motion
+        if s.mass_changes:
+            keys["mass_changes"] = [list(change) for change in s.mass_changes]
         return {"follower": self.follower, **keys, **dataclasses.asdict(self.metrics)}
 
 
