@@ -36,8 +36,8 @@ def run_command(command: Callable[[], int]) -> int:
 
 def output_directory(path: Path) -> Path:
     """Return `path` if it does not exist or is an empty directory, else raise InputError. Creates nothing."""
-    if path.exists() and not path.is_dir():
-        raise InputError(f"output directory {path} exists and is a file")
+    if (path.exists() or path.is_symlink()) and not path.is_dir():
+        raise InputError(f"output directory {path} exists and is no directory")
     above = next(parent for parent in path.absolute().parents if parent.exists())
     if not above.is_dir():
         raise InputError(f"output directory {path} would lie below the file {above}")
@@ -56,6 +56,8 @@ def output_file(path: Path, suffix: str) -> Path:
         raise InputError(f"output file {path} exists; choose another name")
     if not path.absolute().parent.is_dir():
         raise InputError(f"directory {path.absolute().parent} does not exist")
+    if path.is_symlink() or not os.access(path.absolute().parent, os.W_OK):
+        raise InputError(f"output file {path} cannot be written")
     return path
 
 

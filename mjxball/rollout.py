@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjxball.config import Config, Plant, cg_reach, preset
+from mjxball.config import Config, Plant, ball_reach, cg_reach, preset, validate
 from mjxball.control import leader, observation, rotations
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
@@ -99,6 +99,7 @@ def simulate_batch(
 
     All scenarios must last equally long. Each follower is called once per control step for its own part.
     """
+    validate(config)
     scenarios = [scenario for _, part in flights for scenario in part]
     for scenario in scenarios:
         check_scenario(config, scenario)
@@ -140,8 +141,10 @@ def check_scenario(config: Config, scenario: Scenario) -> None:
     reach = cg_reach(config.plant)
     if config.motion.kind == "sine" and scenario.amplitude > reach + 1e-12:
         raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object: the CG reaches {reach:.4g} m")
-    if abs(scenario.ball_start) > reach / config.plant.moving_fraction + 1e-12:
-        raise InputError(f"ball start {scenario.ball_start:g} m lies beyond the object's end")
+    if abs(scenario.ball_start) > ball_reach(config.plant) + 1e-12:
+        raise InputError(
+            f"ball start {scenario.ball_start:g} m lies beyond the end stop at {ball_reach(config.plant):.4g} m"
+        )
     limit = config.scenario.termination_distance
     if np.linalg.norm(scenario.goal) > limit:
         raise InputError(

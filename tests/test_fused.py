@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plants import HEAVE, LIGHT_BALL, REFERENCE, ROLLING, SAMPLES, paper_with
+from plants import HEAVE, LIGHT_BALL, REFERENCE, ROLLING, paper_with
 
 from mjxball.config import Config, Motion, Plant
 from mjxball.physics import fused, newton_euler
@@ -22,7 +22,6 @@ CASES = {
     "sine": (REFERENCE, Motion()),
     "rolling": (LIGHT_BALL, ROLLING),
     "heave": (HEAVE, Motion()),
-    "waveform": (REFERENCE, SAMPLES),
 }
 
 

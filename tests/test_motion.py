@@ -71,7 +71,14 @@ def test_waveform_that_swings_out_between_its_samples_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "word"), [("", "no samples"), ("t,c\n0,0\n1,x\n", "line 3"), ("0,0,0\n1,1\n2\n", "line 2|line 3")]
+    ("text", "word"),
+    [
+        ("", "no samples"),
+        ("t,c\n0,0\n1,x\n", "line 3"),
+        ("0,0,0\n1,1\n", "line 1"),
+        ("0,0.05x\n1,1\n", "line 1"),
+        ("0,0\n2\n", "line 2"),
+    ],
 )
 def test_waveform_files_that_make_no_sense_are_refused(text: str, word: str, tmp_path) -> None:
     path = tmp_path / "wave.csv"

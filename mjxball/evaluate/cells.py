@@ -75,8 +75,8 @@ def run_cells(config: Config, followers: Sequence[Follower], scenarios: Sequence
     return cells
 
 
-def load_policy(path: Path, config: Config) -> Policy:
-    """Load a policy and refuse one that was made for another plant or rate."""
+def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy:
+    """Load a policy and refuse one that was made for another plant or rate, or for other control laws."""
     policy = Policy.load(path)
     period = config.timing.control_period
     if abs(policy.control_period - period) > 1e-9:
@@ -86,13 +86,26 @@ def load_policy(path: Path, config: Config) -> Policy:
     for key, value in expected.items():
         if key != "object_mass" and made_for.get(key, getattr(Plant(), key)) != value:
             raise InputError(f"{path} was made for another plant: {key} is {made_for[key]}, not {value}")
+    if compare_laws:
+        _refuse_other_laws(path, policy.card, config)
     return policy
+
+
+def _refuse_other_laws(path: Path, card: dict[str, Any], config: Config) -> None:
+    """Refuse a policy whose leader or attitude loop was another than the one that it would fly with."""
+    trained = card.get("config")
+    if not isinstance(trained, dict):
+        return
+    for section in ("leader", "attitude"):
+        for key, value in dataclasses.asdict(getattr(config, section)).items():
+            made_for = (trained.get(section) or {}).get(key, value)
+            made_for = tuple(made_for) if isinstance(made_for, list) else made_for
+            if made_for != value:
+                raise InputError(f"{path} was trained with {section}.{key} {made_for}, not {value}")
 
 
 def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
     """What of the card's bounds a policy misses on the reference scenario, one phrase each."""
-    if not policy.card["bounds"]:
-        raise InputError(f"the card of policy {policy.name} has no bounds to check")
     misses = ["the flight failed"] if metrics.failed else []
     for name, bound in sorted(policy.card["bounds"].items()):
         value = getattr(metrics, name, None)

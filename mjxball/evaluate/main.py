@@ -82,7 +82,11 @@ def _evaluate(options: argparse.Namespace) -> int:
     names = named if files or named else list(BASELINES)
     if options.check and not paths:
         raise InputError("--check needs a policy")
-    policies = [load_policy(path, setup) for path in paths]
+    # A pitch frequency that was asked for is an experiment, not a mistake.
+    policies = [load_policy(path, setup, compare_laws=options.wn_pitch is None) for path in paths]
+    unbounded = [policy.name for policy in policies if options.check and not policy.card["bounds"]]
+    if unbounded:
+        raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
     followers = [*(make_baseline(name, setup) for name in dict.fromkeys(names)), *policies]
     _refuse_same_names([follower.name for follower in followers])
 

@@ -27,8 +27,8 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
         try:
             time, offset = map(float, line)
         except ValueError:
-            if number == 1:
-                continue
+            if number == 1 and not any(field.strip()[:1] in set("+-.0123456789") for field in line):
+                continue  # a header: none of its fields begins like a number
             raise InputError(f"waveform {path}, line {number}: expected two numbers, time and offset") from None
         samples.append((time, offset))
     if not samples:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.config import Config, cg_reach
+from mjxball.config import Config, ball_reach, cg_reach
 from mjxball.errors import InputError
 from mjxball.physics.engine import CgState, Load
 
@@ -87,7 +87,7 @@ def make_rolling_force(config: Config) -> Callable[[Array, Array, Array], Array]
     inertia against it is 7/5 m_b, that of a solid ball that rolls.
     """
     plant, motion = config.plant, config.motion
-    end = plant.object_size["xy".index(plant.cg_axis)] / 2 - plant.ball_radius
+    end = ball_reach(plant)
     stiffness = 1.4 * motion.stop_frequency**2
     damping = 1.4 * 2 * motion.stop_damping * motion.stop_frequency
 

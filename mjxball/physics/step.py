@@ -135,6 +135,7 @@ def hover_rotor_force(config: Config, believed_mass: Array) -> Array:
     constants = plant_constants(config.plant, config.attitude)
     own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (constants.drone_mass, constants.share))
     per_rotor = (own + share * believed_mass[..., None]) * config.plant.gravity / 4
+    per_rotor = xp.clip(per_rotor, 0.0, config.plant.rotor_force_max)
     return xp.stack([per_rotor] * 4, axis=-1)
 
 

@@ -17,6 +17,8 @@ from mjxball.errors import InputError
 FORMAT_VERSION = 1
 MAX_BYTES = 64 * 2**20
 MAX_LAYERS = 32
+# Metrics that a card may bound, all of them the better the smaller.
+BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
 MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
 CARD_FIELDS: dict[str, type | tuple[type, ...]] = {
     "format_version": int,
@@ -214,8 +216,11 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     for field in ("control_period", "gravity"):
         if not (_is_finite(card[field]) and card[field] >= 1e-6):
             raise PolicyFileError(f"{name}: card field {field} must be positive")
-    if not all(isinstance(key, str) and _is_finite(value) for key, value in card["bounds"].items()):
+    if not all(_is_finite(value) for value in card["bounds"].values()):
         raise PolicyFileError(f"{name}: card field bounds must hold finite numbers")
+    odd = sorted(set(card["bounds"]) - set(BOUNDED))
+    if odd:
+        raise PolicyFileError(f"{name}: card field bounds names {odd[0]!r}; known are {', '.join(BOUNDED)}")
 
 
 def _is_finite(value: Any) -> bool:

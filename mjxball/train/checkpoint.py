@@ -25,6 +25,7 @@ from mjxball.train.program import TrainState
 KEEP = 2
 CONFIG_FILE = "config.json"
 CHECKPOINTS = "checkpoints"
+ORIGIN = ("seed", "physics", "seeds", "sweep")  # what config.json must say beside the configuration
 logging.getLogger("absl").setLevel(logging.ERROR)
 
 
@@ -41,7 +42,8 @@ class Checkpoints:
         if step not in self._manager.all_steps():
             # Copies: the next chunk of training reuses the buffers while the files are still being written.
             arrays = {name: np.array(leaf) for name, leaf in _named_leaves(state).items()}
-            self._manager.save(step, args=ocp.args.StandardSave(arrays))
+            if not self._manager.save(step, args=ocp.args.StandardSave(arrays)):
+                raise RuntimeError(f"Orbax refused to save checkpoint {step}")
 
     def steps(self) -> list[int]:
         """Environment steps of every complete checkpoint, newest first."""
@@ -59,6 +61,7 @@ class Checkpoints:
                 return _rebuild(template, arrays)
             except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
                 warn(f"checkpoint {step} cannot be read and is skipped: {str(error).splitlines()[0][:200]}")
+                self._manager.delete(step)  # else Orbax would refuse to save the same steps again
         return None
 
     def close(self) -> None:
@@ -108,6 +111,9 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path} cannot be read: {error}") from None
+    lost = [name for name in ORIGIN if name not in record]
+    if lost:
+        raise InputError(f"{path} lacks {', '.join(lost)}")
     recorded = record.pop("config_hash", None)
     if recorded != configs.config_hash(config):
         raise InputError(f"the configuration in {path} was changed after the run began; restore it, or start a new run")

@@ -15,6 +15,8 @@ from typing import Any
 from mjxball import __version__, cli, config
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError
+from mjxball.evaluate.cells import REFERENCE, STANDARD
+from mjxball.rollout import Scenario, check_scenario
 from mjxball.train.provenance import commit, differences, source_hash, versions
 
 PHYSICS = ("mjx", "newton-euler")
@@ -63,6 +65,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     else:
         out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
 
+    _scenarios(settings)
     members = 1 if options.seeds is None else options.seeds
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--seeds must be between 1 and {MOST_MEMBERS}, not {members}")
@@ -101,7 +104,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
         return 130
     if origin["seeds"] > 1:
         _compare_members(settings, out, origin)
-    return _evaluate(settings, out, out / POLICY)
+    return _evaluate(settings, origin["physics"], out, out / POLICY)
 
 
 def _read_sweep(path: Path | None, members: int, settings: config.Config) -> dict[str, list[float]] | None:
@@ -114,13 +117,12 @@ def _read_sweep(path: Path | None, members: int, settings: config.Config) -> dic
 
 def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) -> None:
     """Print every member on the reference scenario and their median, and draw them over training."""
-    from mjxball.evaluate.cells import REFERENCE, load_policy, run_cells
+    from mjxball.evaluate.cells import load_policy, run_cells
     from mjxball.evaluate.table import table
     from mjxball.train.members import POLICIES, draw_members
 
-    setup = dataclasses.replace(settings, scenario=config.Scenario())
-    policies = [load_policy(path, setup) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
-    cells = run_cells(setup, policies, [REFERENCE], origin["physics"])
+    policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
+    cells = run_cells(settings, policies, _scenarios(settings)[-1:], origin["physics"])
     print(table(cells))  # noqa: T201
     for name in ("rmse", "settling_time", "x_peak", "overshoot"):
         values = sorted(math.inf if (v := getattr(cell.metrics, name)) is None else v for cell in cells)
@@ -144,20 +146,47 @@ def _refuse_with_resume(options: argparse.Namespace) -> None:
         raise InputError(f"--resume continues with the run's own configuration; drop {', '.join(given)}")
 
 
-def _evaluate(settings: config.Config, out: Path, policy: Path) -> int:
-    """Judge the exported policy against `copy` on the standard scenarios of its plant; figures go to DIR/eval."""
+def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) -> int:
+    """Judge the exported policy against `copy` on its own plant and physics; figures go to DIR/eval."""
     from mjxball.control.followers import make_baseline
-    from mjxball.evaluate.cells import STANDARD, check_bounds, load_policy, run_cells
+    from mjxball.evaluate.cells import check_bounds, load_policy, run_cells
     from mjxball.evaluate.report import write_report
     from mjxball.evaluate.table import table
 
-    setup = dataclasses.replace(settings, scenario=config.Scenario())
-    trained = load_policy(policy, setup)
-    cells = run_cells(setup, [make_baseline("copy", setup), trained], STANDARD, "mjx")
+    scenarios = _scenarios(settings)
+    trained = load_policy(policy, settings)
+    cells = run_cells(settings, [make_baseline("copy", settings), trained], scenarios, physics)
     print(table(cells))  # noqa: T201
     write_report(cells, out / "eval")
-    reference = next(cell for cell in cells if cell.follower == trained.name and cell.scenario == STANDARD[1])
+    reference = next(cell for cell in cells if cell.follower == trained.name and cell.scenario == scenarios[-1])
     misses = check_bounds(trained, reference.metrics)
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
     print(f"{policy} {verdict}; figures in {out / 'eval'}")  # noqa: T201
     return 0
+
+
+def _scenarios(settings: config.Config) -> tuple[Scenario, ...]:
+    """The standard scenarios as far as the plant allows them, the reference one last; checked before training.
+
+    The object has the plant's mass, the CG stays on the object, a stand's locked axes have goal 0, and the goal
+    is drawn in to what training may draw. A waveform or a rolling ball makes one scenario.
+    """
+    plant = settings.plant
+    reach = min(REFERENCE.goal[0], settings.scenario.goal_reach)
+    free = {"free": (1, 1, 1), "pivot": (0, 0, 0), "heave": (0, 0, 1)}[plant.stand]
+    common = {"mass": plant.object_mass, "goal": tuple(reach * float(axis) for axis in free)}
+    reference = dataclasses.replace(
+        REFERENCE,
+        amplitude=min(REFERENCE.amplitude, config.cg_reach(plant)),
+        ball_start=min(settings.scenario.ball_start, config.ball_reach(plant)),
+        **common,
+    )
+    others = [
+        dataclasses.replace(reference, omega=s.omega, amplitude=min(s.amplitude, reference.amplitude))
+        for s in STANDARD
+        if s != REFERENCE and settings.motion.kind == "sine"
+    ]
+    scenarios = (*others, reference)
+    for scenario in scenarios:
+        check_scenario(settings, scenario)
+    return scenarios

@@ -16,6 +16,7 @@ from mjxball.train import replay, sac
 
 Array = Any
 statistics = import_brax_training().running_statistics
+MATMUL_PRECISION = "highest"  # float32 throughout: GPUs would else round products to TF32
 
 
 class Mode(NamedTuple):
@@ -114,7 +115,8 @@ class Program:
             state, tally = self._collect(*carry, mode)
             return self._learn(state, tally, mode)
 
-        return jax.lax.fori_loop(0, mode.steps, body, (state, tally))
+        with jax.default_matmul_precision(MATMUL_PRECISION):
+            return jax.lax.fori_loop(0, mode.steps, body, (state, tally))
 
     def _act(self, learner: sac.Learner, seen: Array, key: Array, mode: Mode) -> Array:
         sample_key, random_key = jax.random.split(key)
@@ -176,7 +178,10 @@ class Program:
         def update(number: Array, carry: tuple[sac.Learner, sac.Losses]) -> tuple[sac.Learner, sac.Losses]:
             sample_key, update_key = jax.random.split(jax.random.fold_in(keys[1], number))
             batch = self._sample(state.replay, sample_key)
-            return self._update(carry[0], batch, update_key, rate)
+            moved, losses = self._update(carry[0], batch, update_key, rate)
+            due, last = carry[0].updates % limits.policy_delay == 0, carry[1]
+            policy, entropy = (jnp.where(due, *pair) for pair in zip(losses[1:], last[1:], strict=True))
+            return moved, sac.Losses(losses.critic, policy, entropy)
 
         learner, losses = jax.lax.fori_loop(0, mode.updates, update, (state.learner, tally.losses))
         return state._replace(learner=learner, key=keys[0]), tally._replace(losses=losses)

@@ -47,11 +47,15 @@ class Progress:
         self._start = time.monotonic()
         self._width = 0
         kept = _rows_until(path, resumed_at)
-        self._file = path.open("w", newline="")
-        self._writer = csv.DictWriter(self._file, [item.name for item in fields(Row)])
-        self._writer.writeheader()
-        self._writer.writerows(kept)
-        self._file.flush()
+        names = [item.name for item in fields(Row)]
+        partial = path.with_name(f".{path.name}.partial")
+        with partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, names)
+            writer.writeheader()
+            writer.writerows(kept)
+        partial.replace(path)
+        self._file = path.open("a", newline="")
+        self._writer = csv.DictWriter(self._file, names)
         self._events = SummaryWriter(str(path.with_name(EVENTS)), purge_step=resumed_at or None)
 
     def elapsed(self) -> float:

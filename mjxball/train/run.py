@@ -27,6 +27,8 @@ from mjxball.train.progress import Progress, Row
 
 CHUNKS = 50  # rows of metrics.csv in a run
 EVALUATIONS = 5
+SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
+EVALUATION_DRAW = 20_261_121  # tells the evaluation's worlds from those of any seed
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
 POLICY = "policy.npz"
 METRICS = "metrics.csv"
@@ -76,16 +78,14 @@ class Run:
         self.members = MemberLog(out, origin["seed"], done)
         self.checkpoints = Checkpoints(out)
         self.state: TrainState | None = resumed
+        self._saved_at = 0.0
 
     def train(self) -> bool:
         """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk."""
         with contextlib.closing(self.checkpoints), contextlib.closing(self.progress):
             with graceful_interrupt(self.progress) as stop:
-                try:
-                    self._start()
-                    self._loop(stop)
-                except KeyboardInterrupt:
-                    stop.requested = True
+                self._start()
+                self._loop(stop)
                 self._save()
             return not stop.requested
 
@@ -121,6 +121,8 @@ class Run:
             if number % every == 0 or done >= total:
                 row = self._evaluated(row)
                 self._save()
+            elif self.progress.elapsed() - self._saved_at > SAVE_EVERY:
+                self._save()
             self.progress.show(row)
 
     def _chunk(self, steps: int) -> Row:
@@ -154,7 +156,7 @@ class Run:
         """Add the evaluation of the averaged policies, on the same fresh worlds every time."""
         steps = min(round(EVALUATION_SECONDS / self.config.timing.control_period), self.config.timing.episode_steps)
         kept = self.state
-        worlds = self._fresh(jax.random.PRNGKey(0))
+        worlds = self._fresh(jax.random.fold_in(jax.random.PRNGKey(0), EVALUATION_DRAW))
         # Donation hands the buffers over: worlds and key are copied so that training goes on from them unchanged.
         kept_worlds, kept_key = jax.tree.map(jnp.copy, (kept.worlds, kept.key))
         after, tally = self._advance(kept._replace(worlds=worlds), programs.evaluate(steps))
@@ -174,6 +176,7 @@ class Run:
         )
 
     def _save(self) -> None:
+        self._saved_at = self.progress.elapsed()
         if self.state is not None and self._export():
             self.checkpoints.save(self.state)
 

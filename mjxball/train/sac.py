@@ -111,9 +111,9 @@ def make_update(networks: Any, config: Sac, action_size: int) -> Any:
         target = optax.incremental_update(critic, learner.target, config.target_rate)
         return learner._replace(critic=critic, critic_adam=adam, target=target), value
 
-    def policy_step(before: Learner, learner: Learner, batch: Any, key: Array, rate: Array) -> tuple[Learner, Losses]:
+    def policy_step(before: Learner, learner: Learner, batch: Any, keys: Any, rate: Array) -> tuple[Learner, Losses]:
         """Policy and temperature move against the critic `before` the batch's own critic step, as in Brax."""
-        alpha_key, policy_key = jax.random.split(key)
+        alpha_key, policy_key = keys
         alpha, entropy = jnp.exp(before.log_alpha), entropy_of(before, batch.observation, alpha_key)
         value, gradient = jax.value_and_grad(policy_loss)(
             before.policy, before.normaliser, before.critic, alpha, batch, policy_key
@@ -133,12 +133,12 @@ def make_update(networks: Any, config: Sac, action_size: int) -> Any:
         return moved, Losses(jnp.zeros(()), value, entropy)
 
     def update(learner: Learner, batch: Transitions, key: Array, rate: Array) -> tuple[Learner, Losses]:
-        critic_key, policy_key = jax.random.split(key)
+        alpha_key, critic_key, policy_key = jax.random.split(key, 3)
         transitions = _brax_transitions(batch)
         moved, critic_value = critic_step(learner, transitions, critic_key, rate * config.learning_rate)
 
         def due(moved: Learner) -> tuple[Learner, Losses]:
-            return policy_step(learner, moved, transitions, policy_key, rate)
+            return policy_step(learner, moved, transitions, (alpha_key, policy_key), rate)
 
         def not_due(moved: Learner) -> tuple[Learner, Losses]:
             return moved, Losses(*jnp.zeros(3))

@@ -1,0 +1,47 @@
+"""Typed, frozen configuration: one source for defaults, validation, JSON, hashes and the command line.
+
+Importing it needs the standard library only.
+"""
+
+from mjxball.config._presets import PRESETS, preset
+from mjxball.config._settings import (
+    Attitude,
+    Bounds,
+    Config,
+    Follower,
+    Leader,
+    Motion,
+    Plant,
+    Reward,
+    Sac,
+    Scenario,
+    Timing,
+)
+from mjxball.config._tree import config_hash, from_dict, leaves, override, replace, to_dict, to_json
+from mjxball.config._validate import ball_reach, cg_reach, validate
+
+__all__ = [
+    "PRESETS",
+    "Attitude",
+    "Bounds",
+    "Config",
+    "Follower",
+    "Leader",
+    "Motion",
+    "Plant",
+    "Reward",
+    "Sac",
+    "Scenario",
+    "Timing",
+    "ball_reach",
+    "cg_reach",
+    "config_hash",
+    "from_dict",
+    "leaves",
+    "override",
+    "preset",
+    "replace",
+    "to_dict",
+    "to_json",
+    "validate",
+]

@@ -1,0 +1,64 @@
+"""The named presets."""
+
+from __future__ import annotations
+
+import types
+
+from mjxball.config._settings import Config, Follower, Reward, Sac, Scenario
+from mjxball.errors import InputError
+
+
+def _paper() -> Config:
+    return Config(
+        preset="paper",
+        follower=Follower(action="direct", tilt_limit=0.6, vertical_limit=6.0, ignore_position=False),
+        reward=Reward(kind="paper", termination=0.0),
+        sac=Sac(
+            steps=1_000_000,
+            worlds=16,
+            replay=1_000_000,
+            batch=256,
+            updates=16,
+            prefill=10_000,
+            policy_layers=(256, 256),
+            critic_layers=(256, 256),
+            learning_rate=3e-4,
+            learning_rate_end=1.0,
+            discount=0.99,
+            target_rate=0.005,
+            alpha=0.3,
+            alpha_fixed=True,
+        ),
+    )
+
+
+def _transport() -> Config:
+    return Config(
+        preset="transport",
+        scenario=Scenario(
+            cg_speed=(0.2, 3.2),
+            cg_amplitude=(0.0, 0.10),
+            object_mass=(0.1, 0.3),
+            start_velocity=0.2,
+            start_tilt=0.05,
+        ),
+        reward=Reward(error_scale=0.05),
+        sac=Sac(
+            steps=768_000,
+            replay=768_000,
+            discount=0.97,
+            return_steps=5,
+            learning_rate=2e-3,
+            learning_rate_end=0.02,
+        ),
+    )
+
+
+PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType({"transport": _transport(), "paper": _paper()})
+
+
+def preset(name: str) -> Config:
+    """Return the named preset; raise InputError for an unknown name."""
+    if name not in PRESETS:
+        raise InputError(f"unknown preset {name!r}; choose from {', '.join(PRESETS)}")
+    return PRESETS[name]

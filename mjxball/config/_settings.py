@@ -1,0 +1,221 @@
+"""Every setting: frozen dataclasses whose leaves carry their help text and bounds. SI units throughout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Vector3 = tuple[float, float, float]
+Range = tuple[float, float]
+
+
+def setting(
+    default: Any,
+    about: str,
+    *,
+    above: float | None = None,
+    low: float | None = None,
+    high: float | None = None,
+    ordered: bool = False,
+) -> Any:
+    """Declare a leaf: default, help text, and bounds that hold for each of its numbers.
+
+    `above` is exclusive, `low` and `high` are inclusive, `ordered` asks for low <= high in a range.
+    """
+    bounds = {"about": about, "above": above, "low": low, "high": high, "ordered": ordered}
+    return field(default=default, metadata=bounds)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The rigid assembly: two drones, one object. Defaults are the `paper` plant (design section 3)."""
+
+    leader_mass: float = setting(1.0, "mass of the leader [kg]", above=0)
+    follower_mass: float = setting(1.0, "mass of the follower [kg]", above=0)
+    object_mass: float = setting(0.2, "nominal mass of the object, all of it moving with the CG [kg]", above=0)
+    leader_inertia: Vector3 = setting(
+        (2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the leader about its centre [kg m2]", above=0
+    )
+    follower_inertia: Vector3 = setting(
+        (2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the follower about its centre [kg m2]", above=0
+    )
+    object_size: Vector3 = setting((0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", above=0)
+    moving_fraction: float = setting(
+        1.0,
+        "share of the object's mass that moves, m_b / m_o; the rest is a fixed shell, a box about O",
+        above=0,
+        high=1,
+    )
+    ball_radius: float = setting(0.02, "radius of the moving ball [m]", above=0)
+    cg_axis: Literal["x", "y"] = setting("x", "body axis along which the CG moves and the drones are mounted")
+    stand: Literal["free", "pivot", "heave"] = setting(
+        "free", "free flight; pivot: O fixed, only roll free; heave: roll and height free"
+    )
+    leader_mount: Vector3 = setting((0.17, 0.0, 0.0), "centre of the leader from O, body axes [m]")
+    follower_mount: Vector3 = setting((-0.17, 0.0, 0.0), "centre of the follower from O, body axes [m]")
+    arm: float = setting(0.12, "centre of a drone to each rotor, plus layout [m]", above=0)
+    rotor_force_max: float = setting(5.5, "largest force of one rotor [N]", above=0)
+    rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", above=0)
+    yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", above=0)
+    gravity: float = setting(9.81, "gravitational acceleration [m/s2]", above=0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the centre of gravity moves along `plant.cg_axis`."""
+
+    kind: Literal["sine", "waveform", "rolling"] = setting(
+        "sine", "sine: drawn or given per flight; waveform: the samples below; rolling: a free ball with end stops"
+    )
+    times: tuple[float, ...] = setting((), "waveform: increasing sample times [s]")
+    offsets: tuple[float, ...] = setting(
+        (), "waveform: CG offsets at those times, a C2 spline between, held outside [m]"
+    )
+    rolling_friction: float = setting(0.005, "rolling: friction over the normal force", low=0, high=1)
+    stop_frequency: float = setting(60.0, "rolling: natural frequency of the ball against an end stop [rad/s]", above=0)
+    stop_damping: float = setting(0.4, "rolling: damping ratio of an end stop, 1 does not bounce", low=0, high=2)
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """The PD attitude loop that each drone runs once per physics step (design section 3, ours)."""
+
+    natural_frequency: Vector3 = setting(
+        (10.0, 10.0, 4.0), "closed-loop roll, pitch, yaw natural frequency [rad/s]", above=0
+    )
+    damping: float = setting(0.9, "damping ratio", above=0)
+    design_object_mass: float = setting(
+        0.2, "object mass that the gains are computed for, with the CG at O [kg]", low=0
+    )
+
+
+@dataclass(frozen=True)
+class Leader:
+    """The leader's PID law (paper eq. 5) and its command limits."""
+
+    kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0)
+    kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0)
+    ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0)
+    tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", above=0, high=1.2)
+    vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", above=0)
+
+
+@dataclass(frozen=True)
+class Follower:
+    """What the follower sees and what it commands."""
+
+    action: Literal["residual", "direct"] = setting(
+        "residual", "residual: added to the PD law on its own observation; direct: the command itself"
+    )
+    tilt_limit: float = setting(0.2, "reach of the network's roll and pitch action [rad]", above=0, high=1.2)
+    vertical_limit: float = setting(2.0, "reach of the network's vertical action [m/s2]", above=0)
+    history: int = setting(1, "observations that the network sees, the newest included", low=1, high=100)
+    ignore_position: bool = setting(
+        True, "the network's input omits the absolute position: the dynamics do not depend on it"
+    )
+    previous_action: bool = setting(False, "the network also sees its last action, scaled to [-1, 1]")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Clock rates."""
+
+    control_period: float = setting(0.02, "time between two commands [s]", above=0)
+    physics_steps: int = setting(4, "physics and attitude-loop steps in a control period", low=1)
+    episode_steps: int = setting(1000, "control steps of a training episode, then truncated", low=1)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What every reset draws anew, uniformly from each range."""
+
+    goal_reach: float = setting(1.0, "each coordinate of the goal is drawn from +- this [m]", low=0)
+    start_position: float = setting(0.0, "each coordinate of the start is drawn from +- this [m]", low=0)
+    start_velocity: float = setting(0.0, "each start velocity is drawn from +- this [m/s]", low=0)
+    start_tilt: float = setting(0.0, "start roll and pitch are drawn from +- this [rad]", low=0, high=1.0)
+    cg_speed: Range = setting((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0, ordered=True)
+    cg_amplitude: Range = setting((0.05, 0.05), "amplitude of the CG's sine [m]", low=0, ordered=True)
+    object_mass: Range = setting((0.2, 0.2), "true mass of the object [kg]", above=0, ordered=True)
+    mass_change: Range = setting(
+        (0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]", ordered=True
+    )
+    mass_change_time: Range = setting((5.0, 15.0), "when the object's mass changes [s]", low=0, ordered=True)
+    ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0)
+    mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
+    termination_distance: float = setting(2.5, "an episode ends when |e_o| exceeds this, d_term [m]", above=0)
+
+
+@dataclass(frozen=True)
+class Reward:
+    """Reward of one control step. `paper` mimics the leader; `task` (ours) scores what the user wants."""
+
+    kind: Literal["paper", "task"] = setting("task", "paper (leader mimicry) or task (balance)")
+    error: float = setting(1.0, "weight of |e_o| over error_scale, saturating [1]", low=0)
+    error_scale: float = setting(0.1, "|e_o| at which the error's cost turns from square to linear [m]", above=0)
+    velocity: float = setting(0.1, "weight of |de_o/dt|^2 [s2/m2]", low=0)
+    tilt: float = setting(0.0, "weight of roll^2 + pitch^2 [1/rad2]", low=0)
+    rates: float = setting(0.05, "weight of the squared body rates [s2/rad2]", low=0)
+    effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0)
+    smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0)
+    termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0)
+
+
+@dataclass(frozen=True)
+class Sac:
+    """Soft actor-critic and the loop around it."""
+
+    steps: int = setting(1_000_000, "environment steps in all", low=1)
+    worlds: int = setting(128, "worlds that are stepped at once", low=1)
+    batch: int = setting(256, "transitions in an update", low=1)
+    updates: int = setting(4, "gradient updates after each step of all worlds", low=1)
+    prefill: int = setting(12_800, "environment steps with random actions before the first update", low=0)
+    replay: int = setting(1_024_000, "transitions kept, a multiple of worlds", low=1)
+    policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
+    critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1)
+    critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
+    learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", above=0)
+    alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
+    discount: float = setting(0.99, "gamma", low=0, high=0.99999)
+    return_steps: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
+    policy_delay: int = setting(1, "critic updates for each update of policy and temperature", low=1, high=1000)
+    gradient_clip: float = setting(0.0, "largest global norm of a gradient, 0: not clipped", low=0)
+    target_rate: float = setting(0.02, "tau of the target critics", above=0, high=1)
+    alpha: float = setting(0.02, "temperature at the start", above=0)
+    alpha_fixed: bool = setting(False, "keep the temperature at its start")
+    target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]")
+    reward_scale: float = setting(1.0, "factor on the reward inside the critic", above=0)
+    policy_average: float = setting(
+        0.002, "rate of the running average of the policy that is exported", above=0, high=1
+    )
+    learning_rate_end: float = setting(0.1, "rate at the end of the run over the rate at its start", above=0, high=1)
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """What `eval.py --check` enforces for the exported policy on the reference scenario."""
+
+    x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", above=0)
+    settling_time: float = setting(4.0, "2 % settling time [s]", above=0)
+    rmse: float = setting(0.36, "root mean square of |e_o| over 20 s [m]", above=0)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that determines a run, its seed aside."""
+
+    preset: str = "paper"
+    plant: Plant = Plant()
+    motion: Motion = Motion()
+    attitude: Attitude = Attitude()
+    leader: Leader = Leader()
+    follower: Follower = Follower()
+    timing: Timing = Timing()
+    scenario: Scenario = Scenario()
+    reward: Reward = Reward()
+    sac: Sac = Sac()
+    bounds: Bounds = Bounds()
+
+    @property
+    def physics_step(self) -> float:
+        """Time of one physics step [s]."""
+        return self.timing.control_period / self.timing.physics_steps

@@ -1,0 +1,104 @@
+"""Walk, change, parse, serialise and hash a configuration."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+from mjxball.config._settings import Config
+from mjxball.errors import InputError
+
+MAX_LISTED = 6
+
+
+def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field]]:
+    """Yield (dotted path, value, field) of every leaf of a configuration, in declaration order."""
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        path = f"{prefix}{item.name}"
+        if dataclasses.is_dataclass(value):
+            yield from leaves(value, f"{path}.")
+        elif item.metadata:
+            yield path, value, item
+
+
+def replace(config: Any, path: str, value: Any) -> Any:
+    """Return a copy of `config` with the leaf at the dotted `path` replaced, unchecked."""
+    head, _, rest = path.partition(".")
+    if rest:
+        value = replace(getattr(config, head), rest, value)
+    return dataclasses.replace(config, **{head: value})
+
+
+def override(config: Config, path: str, text: str) -> Config:
+    """Return a copy of `config` with the leaf at `path` parsed from `text` (tuples: comma-separated).
+
+    Raises InputError for an unknown path or a text that does not parse to the leaf's type.
+    """
+    for known, value, _ in leaves(config):
+        if known == path:
+            return replace(config, path, _parse(path, text, value))
+    raise InputError(f"--{path} is not a setting; run with --help for the list")
+
+
+def _parse(path: str, text: str, example: Any) -> Any:
+    try:
+        if isinstance(example, bool):
+            return {"true": True, "false": False, "1": True, "0": False}[text.lower()]
+        if isinstance(example, tuple):
+            kind = type(example[0]) if example else float
+            return tuple(kind(part) for part in text.split(",")) if text else ()
+        return type(example)(text)
+    except (ValueError, KeyError):
+        kind = "comma-separated numbers" if isinstance(example, tuple) else type(example).__name__
+        raise InputError(f"--{path} takes {kind}, not {text!r}") from None
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """Nested plain dictionary of a configuration (tuples become lists in JSON)."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
+    """Rebuild a configuration from `to_dict`'s output or parsed JSON; raise InputError on any mismatch."""
+    if not isinstance(data, dict):
+        raise InputError(f"configuration {path or 'root'} must be an object")
+    hints = typing.get_type_hints(kind)
+    names = [item.name for item in dataclasses.fields(kind)]
+    unknown = sorted(set(data) - set(names))
+    missing = sorted(set(names) - set(data))
+    if unknown or missing:
+        where = f" in {path}" if path else ""
+        what = ", ".join([f"unknown {n}" for n in unknown] + [f"missing {n}" for n in missing][:MAX_LISTED])
+        raise InputError(f"configuration does not fit this version{where}: {what}")
+    values = {}
+    for name in names:
+        value = data[name]
+        if dataclasses.is_dataclass(hints[name]):
+            value = from_dict(value, hints[name], f"{path}.{name}".lstrip("."))
+        elif isinstance(value, list):
+            value = tuple(map(float, value)) if _is_float_tuple(hints[name], value) else tuple(value)
+        elif hints[name] is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        values[name] = value
+    return kind(**values)
+
+
+def _is_float_tuple(hint: Any, value: list[Any]) -> bool:
+    plain = all(isinstance(number, (int, float)) and not isinstance(number, bool) for number in value)
+    return plain and typing.get_args(hint)[:1] == (float,)
+
+
+def to_json(config: Any) -> str:
+    """Canonical JSON text of a configuration, indented, keys sorted."""
+    return json.dumps(to_dict(config), indent=2, sort_keys=True)
+
+
+def config_hash(config: Any) -> str:
+    """First 16 hex digits of the SHA-256 of the configuration's canonical JSON."""
+    compact = json.dumps(to_dict(config), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(compact.encode()).hexdigest()[:16]

@@ -1,0 +1,132 @@
+"""Refuse configurations that make no sense, in one sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import typing
+from typing import Any, Literal
+
+from mjxball.config._settings import Config, Plant
+from mjxball.config._tree import leaves
+from mjxball.errors import InputError
+
+LARGEST = 1e12  # of any number in a configuration
+
+
+def _types_of(owner: Any) -> dict[str, Any]:
+    return typing.get_type_hints(type(owner))
+
+
+def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> None:
+    if typing.get_origin(hint) is Literal:
+        if value not in typing.get_args(hint):
+            allowed = " or ".join(str(choice) for choice in typing.get_args(hint))
+            raise InputError(f"{path} must be {allowed}, not {value!r}")
+        return
+    if hint is bool:
+        if not isinstance(value, bool):
+            raise InputError(f"{path} must be true or false, not {value!r}")
+        return
+    if typing.get_origin(hint) is not tuple:
+        _check_number(path, value, hint, item.metadata)
+        return
+    kinds = typing.get_args(hint)
+    if not isinstance(value, tuple) or (Ellipsis not in kinds and len(value) != len(kinds)):
+        count = "several" if Ellipsis in kinds else str(len(kinds))
+        raise InputError(f"{path} takes {count} numbers, not {value!r}")
+    if not value and item.default:
+        raise InputError(f"{path} must hold at least one number")
+    for number in value:
+        _check_number(path, number, kinds[0], item.metadata)
+    if item.metadata["ordered"] and value[0] > value[1]:
+        raise InputError(f"{path} must be low,high with low <= high, not {value[0]:g},{value[1]:g}")
+
+
+def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
+    allowed = (int,) if kind is int else (int, float)
+    if isinstance(number, bool) or not isinstance(number, allowed):
+        raise InputError(f"{path} takes {'whole numbers' if kind is int else 'numbers'}, not {number!r}")
+    if not abs(number) <= LARGEST:
+        raise InputError(f"{path} must be finite and at most {LARGEST:g}, not {number!r}")
+    if bounds["above"] is not None and number <= bounds["above"]:
+        raise InputError(f"{path} must be greater than {bounds['above']:g}, not {number:g}")
+    if bounds["low"] is not None and number < bounds["low"]:
+        raise InputError(f"{path} must be at least {bounds['low']:g}, not {number:g}")
+    if bounds["high"] is not None and number > bounds["high"]:
+        raise InputError(f"{path} must be at most {bounds['high']:g}, not {number:g}")
+
+
+def validate(config: Config) -> Config:
+    """Return `config` if every leaf and every relation between leaves is sound, else raise InputError."""
+    for path, value, item in leaves(config):
+        owner: Any = config
+        for part in path.split(".")[:-1]:
+            owner = getattr(owner, part)
+        _check_leaf(path, value, item, _types_of(owner)[item.name])
+    _validate_plant(config.plant)
+    _validate_motion(config)
+    start, goal = config.scenario.start_position, config.scenario.goal_reach
+    farthest = math.sqrt(3) * (start + goal)
+    if farthest >= config.scenario.termination_distance:
+        raise InputError(
+            f"scenario.goal_reach and start_position allow |e_o| = {farthest:.3g} m at the start, "
+            f"beyond termination_distance {config.scenario.termination_distance:g} m"
+        )
+    if config.physics_step > 0.005 + 1e-12:
+        raise InputError(
+            f"timing gives physics steps of {config.physics_step * 1e3:.3g} ms, but the attitude loop "
+            "runs once a physics step and needs 5 ms or less (200 Hz)"
+        )
+    if config.sac.replay < max(config.sac.worlds * config.sac.return_steps, config.sac.batch):
+        raise InputError("sac.replay must hold at least return_steps steps of all worlds and one batch")
+    if config.sac.steps <= config.sac.prefill:
+        raise InputError(f"sac.steps {config.sac.steps} leaves nothing to learn after sac.prefill {config.sac.prefill}")
+    if config.sac.replay % config.sac.worlds:
+        raise InputError("sac.replay must be a multiple of sac.worlds")
+    return config
+
+
+def _validate_plant(plant: Plant) -> None:
+    along = "xy".index(plant.cg_axis)
+    if plant.leader_mount[along] <= plant.follower_mount[along]:
+        raise InputError(f"plant.leader_mount must lie ahead of plant.follower_mount along {plant.cg_axis}")
+    if 2 * plant.ball_radius > plant.object_size[along]:
+        raise InputError(
+            f"plant.ball_radius {plant.ball_radius:g} m makes a ball larger than the object, "
+            f"which is {plant.object_size[along]:g} m long"
+        )
+
+
+def cg_reach(plant: Plant) -> float:
+    """Largest offset of the CG from O that keeps the moving mass on the object [m]."""
+    return plant.moving_fraction * plant.object_size["xy".index(plant.cg_axis)] / 2
+
+
+def ball_reach(plant: Plant) -> float:
+    """Offset of a rolling ball at which it touches an end stop [m]."""
+    return plant.object_size["xy".index(plant.cg_axis)] / 2 - plant.ball_radius
+
+
+def _validate_motion(config: Config) -> None:
+    reach = cg_reach(config.plant) + 1e-12
+    scenario, motion = config.scenario, config.motion
+    if motion.kind == "sine" and scenario.cg_amplitude[1] > reach:
+        raise InputError(
+            f"scenario.cg_amplitude {scenario.cg_amplitude[1]:g} m leaves the object: the CG reaches {reach:.4g} m"
+        )
+    if scenario.object_mass[0] + scenario.mass_change[0] <= 0:
+        raise InputError(f"scenario.mass_change {scenario.mass_change[0]:g} kg would leave no object mass")
+    if motion.kind == "rolling" and scenario.ball_start > ball_reach(config.plant):
+        end = ball_reach(config.plant)
+        raise InputError(f"scenario.ball_start {scenario.ball_start:g} m lies beyond the end stop at {end:.4g} m")
+    if motion.kind == "waveform":
+        if len(motion.times) != len(motion.offsets) or len(motion.times) < 2:
+            raise InputError("motion.times and motion.offsets must hold the same number of samples, two or more")
+        if not all(map(math.isfinite, (*motion.times, *motion.offsets))):
+            raise InputError("motion.times and motion.offsets must be finite")
+        if any(later <= earlier for earlier, later in itertools.pairwise(motion.times)):
+            raise InputError("motion.times must increase from sample to sample")
+        if max(map(abs, motion.offsets)) > reach:
+            raise InputError(f"motion.offsets leave the object: the CG reaches {reach:.4g} m")
