@@ -119,7 +119,7 @@ def time_mj_step(config: configs.Config, steps: int = 20_000) -> dict[str, float
 def main() -> None:
     """Print the table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", type=int, nargs="+", default=[256, 1024, 8192, 65536])
+    parser.add_argument("--worlds", type=int, nargs="+", default=[256, 1024, 8192, 65536, 1048576])
     parser.add_argument("--engines", nargs="+", choices=[*ENGINES, "mujoco"], default=[*ENGINES, "mujoco"])
     parser.add_argument("--roads", nargs="+", choices=ROADS["newton-euler"], default=ROADS["newton-euler"])
     parser.add_argument("--work", type=float, default=2e7, help="physics steps in a timed call, at most")
@@ -141,7 +141,7 @@ def main() -> None:
             if road == "kernel" and jax.default_backend() != "gpu":
                 continue
             for worlds in options.worlds:
-                steps = max(20, min(500, int(options.work / worlds / config.timing.physics_steps)))
+                steps = max(2, min(500, int(options.work / worlds / config.timing.physics_steps)))
                 report(name, road, worlds, time_jax(config, name, worlds, steps, road))
     if "mujoco" in options.engines:
         report("mujoco (ours)", "-", 1, time_mujoco(config, 500))

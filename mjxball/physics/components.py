@@ -1,4 +1,4 @@
-"""Arrays split into their components, so that XLA fuses a whole control step into one kernel.
+"""Arrays split into their components, so that XLA fuses a control step into few large kernels.
 
 The laws are written once against the array namespace of their inputs: they stack, index and concatenate along
 trailing axes. On ordinary JAX arrays every `stack` is a concatenation in memory, which ends a fused kernel. A

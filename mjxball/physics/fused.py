@@ -1,4 +1,4 @@
-"""The control step on split components: the closed form becomes one fused kernel per control step on a GPU."""
+"""The control step on split components: XLA fuses the closed form into few large kernels on a GPU."""
 
 from __future__ import annotations
 
