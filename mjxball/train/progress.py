@@ -40,10 +40,10 @@ class Progress:
     Of a run that is resumed at `resumed_at` steps, rows beyond are dropped: they will come again.
     """
 
-    def __init__(self, path: Path, total: int, resumed_at: int = 0, members: int = 1, stream: TextIO = sys.stderr):
+    def __init__(self, path: Path, total: int, resumed_at: int = 0, members: int = 1, stream: TextIO | None = None):
         self._total, self._members = total, members
-        self._stream = stream
-        self._live = stream.isatty()
+        self._stream = stream or sys.stderr
+        self._live = self._stream.isatty()
         self._start = time.monotonic()
         self._width = 0
         kept = _rows_until(path, resumed_at)
