@@ -1,10 +1,17 @@
-"""Leader, object, ball and follower as one MuJoCo model, built with MjSpec from the typed config."""
+"""Leader, object, ball and follower as one MuJoCo model, built with MjSpec from the typed config.
+
+`python -m mjxball.assembly OUT.xml` writes the reference plant as MJCF, for any MuJoCo viewer.
+"""
 
 from __future__ import annotations
+
+import sys
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from mjxball.cli import Parser, output_file, run_command
 from mjxball.config import Attitude, Plant
 from mjxball.physics.constants import plant_constants
 from mjxball.physics.engine import ROLLING_INERTIA
@@ -141,3 +148,20 @@ def _add_drone(
         motor.gear[:] = [0, 0, 1, 0, 0, spin * plant.yaw_per_thrust]
         motor.ctrllimited = True
         motor.ctrlrange[:] = [0, plant.rotor_force_max]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line of `python -m mjxball.assembly`; returns the exit code."""
+    parser = Parser(prog="python -m mjxball.assembly", description="Write the reference plant as MJCF.")
+    parser.add_argument("out", metavar="OUT.xml", type=Path, help="file to write; must not exist")
+    options = parser.parse_args(arguments)
+
+    def command() -> int:
+        output_file(options.out, ".xml").write_text(to_mjcf(Plant()))
+        return 0
+
+    return run_command(command)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

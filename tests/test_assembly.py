@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from plants import PLANTS
 
-from mjxball.assembly import BALL, BALL_JOINT, FOLLOWER, LEADER, build_model, to_mjcf
+from mjxball.assembly import BALL, BALL_JOINT, FOLLOWER, LEADER, build_model, main, to_mjcf
 from mjxball.config import Attitude
 from mjxball.physics.constants import plant_constants
 
@@ -84,3 +84,11 @@ def test_bare_mujoco_hovers_with_the_motors_at_their_share() -> None:
     data.ctrl[:] = (plant.leader_mass + plant.object_mass / 2) * plant.gravity / 4
     mujoco.mj_step(model, data, 500)
     assert np.abs(data.qpos[:3]).max() < 1e-9  # one second at rest, rounding only
+
+
+def test_command_line_writes_mjcf_once(tmp_path, capsys) -> None:
+    path = tmp_path / "pair.xml"
+    assert main([str(path)]) == 0
+    assert mujoco.MjModel.from_xml_path(str(path)).nu == 8
+    assert main([str(path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
