@@ -21,11 +21,14 @@ class Parser(argparse.ArgumentParser):
 
 
 def run_command(command: Callable[[], int]) -> int:
-    """Run `command`; an InputError or a package that is not installed becomes one line on stderr and exit code 2."""
+    """Run `command`; bad input, a failing file or a missing package becomes one line on stderr and exit code 2."""
     try:
         return command()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+    except OSError as error:
+        print(f"error: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)  # noqa: T201
         return 2
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("mjxball"):

@@ -114,6 +114,9 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
     lost = [name for name in ORIGIN if name not in record]
     if lost:
         raise InputError(f"{path} lacks {', '.join(lost)}")
+    whole = all(isinstance(record[name], int) and not isinstance(record[name], bool) for name in ("seed", "seeds"))
+    if record["physics"] not in ("mjx", "newton-euler") or not whole or record["seeds"] < 1:
+        raise InputError(f"{path} has no sound seed, seeds or physics")
     recorded = record.pop("config_hash", None)
     if recorded != configs.config_hash(config):
         raise InputError(f"the configuration in {path} was changed after the run began; restore it, or start a new run")
