@@ -14,12 +14,12 @@ from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.fused import make_fused_step
 from mjxball.physics.mjx import jax_repeat, make_engine
 from mjxball.physics.step import ControlStep, make_control_step, start_state
+from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.quiet import import_brax_env
 from mjxball.rewards import paper_reward, task_reward
 
 Array = Any
 Env, State = import_brax_env()
-PHYSICS = ("mjx", "newton-euler")
 STEADY_AFTER = 8.0  # [s] of an episode, after which its error counts as steady state in the metrics
 RATE_BOUND = 50.0  # [rad/s] beyond which a world has diverged
 
@@ -46,8 +46,8 @@ class CoupledPairEnv(Env):
     """
 
     def __init__(self, config: Config, physics: str = "mjx"):
-        if physics not in PHYSICS:
-            raise ValueError(f"physics must be one of {PHYSICS}, not {physics!r}")
+        if physics not in TRAINING_ENGINES:
+            raise ValueError(f"physics must be one of {TRAINING_ENGINES}, not {physics!r}")
         self.config = config
         self._backend = physics
         self._control_step = _make_step(config, physics)

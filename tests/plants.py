@@ -33,6 +33,14 @@ SIDEWAYS = dataclasses.replace(
 )
 PIVOT = dataclasses.replace(SIDEWAYS, stand="pivot")
 HEAVE = dataclasses.replace(SIDEWAYS, stand="heave")
+# The reference plant turned by 90 degrees onto the pivot: a level beam.
+BEAM = Plant(
+    stand="pivot",
+    cg_axis="y",
+    object_size=(0.1, 0.34, 0.05),
+    leader_mount=(0.0, 0.17, 0.0),
+    follower_mount=(0.0, -0.17, 0.0),
+)
 PLANTS = {
     "reference": REFERENCE,
     "varied": VARIED,

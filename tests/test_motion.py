@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from plants import ROLLING, SAMPLES, paper_with
+from plants import BEAM, ROLLING, SAMPLES, paper_with
 
 from mjxball import config as configs
 from mjxball.config import Attitude, Motion, Plant
@@ -117,14 +117,7 @@ def ball_alone(plant: Plant, offset: float, rate: float = 0.0, tilt: float = 0.0
 
 def test_ball_rolls_down_a_held_slope_with_five_sevenths_of_g() -> None:
     """On a pivot too heavy to turn, a solid ball rolls with 5/7 g sin(slope)."""
-    plant = Plant(
-        stand="pivot",
-        cg_axis="y",
-        object_size=(0.1, 0.34, 0.05),
-        leader_mount=(0.0, 0.17, 0.0),
-        follower_mount=(0.0, -0.17, 0.0),
-        leader_inertia=(1e9, 1e9, 1e9),
-    )
+    plant = dataclasses.replace(BEAM, leader_inertia=(1e9, 1e9, 1e9))
     engine = newton_euler.make_engine(plant, Attitude())
     state = ball_alone(plant, 0.0, tilt=0.3)
     zero = np.zeros((1, 3))
@@ -148,14 +141,7 @@ def test_rolling_friction_opposes_and_stops_push_inwards() -> None:
 
 def test_ball_stays_between_the_stops_and_comes_to_rest() -> None:
     """On a tilting beam that nobody balances the ball runs into a stop and stays near it."""
-    plant = Plant(
-        stand="pivot",
-        cg_axis="y",
-        object_size=(0.1, 0.34, 0.05),
-        leader_mount=(0.0, 0.17, 0.0),
-        follower_mount=(0.0, -0.17, 0.0),
-    )
-    config = paper_with(plant, ROLLING)
+    config = paper_with(BEAM, ROLLING)
     flight = simulate(config, Copy(config), Scenario(goal=(0, 0, 0), ball_start=0.05, seconds=30), "newton-euler")
     end = 0.17 - 0.02
     # 10 mm: the stop's spring gives (its natural frequency is 60 rad/s, the ball arrives with up to 0.6 m/s)

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from plants import HEAVE, LIGHT_BALL, PIVOT, ROLLING, SAMPLES, VARIED, paper_with
+from plants import BEAM, HEAVE, LIGHT_BALL, PIVOT, ROLLING, SAMPLES, VARIED, paper_with
 
-from mjxball.config import Plant, replace
+from mjxball.config import replace
 from mjxball.control.followers import Copy
 from mjxball.errors import InputError
 from mjxball.physics.stepper import ENGINES
@@ -80,9 +80,7 @@ def test_believed_mass_moves_the_hover_thrust_only() -> None:
 
 def test_a_ball_off_the_pivot_rolls_the_beam() -> None:
     """With rotors that carry the drones alone, a CG on the leader's side (+y) turns roll by -m g c / J_x."""
-    mounts = {"leader_mount": (0.0, 0.17, 0.0), "follower_mount": (0.0, -0.17, 0.0)}
-    plant = Plant(stand="pivot", cg_axis="y", object_size=(0.1, 0.34, 0.05), **mounts)
-    config = paper_with(plant)
+    config = paper_with(BEAM)
     scenario = Scenario(goal=(0, 0, 0), amplitude=0.05, omega=0.0, phase=np.pi / 2, seconds=0.02)
     flight = simulate(config, Copy(config), scenario, "newton-euler")
     inertia = 2 * 2.3e-3 + 2 * 0.17**2 + 0.2 * ((0.34**2 + 0.05**2) / 12 + 0.05**2)

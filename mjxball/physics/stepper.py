@@ -11,7 +11,8 @@ from mjxball.errors import InputError
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import ControlStep, make_control_step
 
-ENGINES = ("mjx", "newton-euler", "mujoco")
+TRAINING_ENGINES = ("mjx", "newton-euler")  # on JAX
+ENGINES = (*TRAINING_ENGINES, "mujoco")
 
 
 def make_stepper(config: Config, physics: str) -> ControlStep:

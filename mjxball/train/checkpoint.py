@@ -18,6 +18,7 @@ import orbax.checkpoint as ocp
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.train.members import best_member, read_members
 from mjxball.train.population import Population
 from mjxball.train.program import TrainState
@@ -115,7 +116,7 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
     if lost:
         raise InputError(f"{path} lacks {', '.join(lost)}")
     whole = all(isinstance(record[name], int) and not isinstance(record[name], bool) for name in ("seed", "seeds"))
-    if record["physics"] not in ("mjx", "newton-euler") or not whole or record["seeds"] < 1:
+    if record["physics"] not in TRAINING_ENGINES or not whole or record["seeds"] < 1:
         raise InputError(f"{path} has no sound seed, seeds or physics")
     recorded = record.pop("config_hash", None)
     if recorded != configs.config_hash(config):

@@ -16,10 +16,10 @@ from mjxball import __version__, cli, config
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError
 from mjxball.evaluate.cells import REFERENCE, STANDARD
+from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.rollout import Scenario, check_scenario
 from mjxball.train.provenance import commit, differences, source_hash, versions
 
-PHYSICS = ("mjx", "newton-euler")
 MOST_MEMBERS = 4096
 
 
@@ -40,7 +40,7 @@ def parser() -> cli.Parser:
     result.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
-    result.add_argument("--physics", choices=PHYSICS, help="physics engine (default mjx)")
+    result.add_argument("--physics", choices=TRAINING_ENGINES, help="physics engine (default mjx)")
     result.add_argument("--version", action="version", version=f"mjxball {__version__}")
     cli.add_config_flags(result)
     return result
