@@ -124,7 +124,8 @@ class CoupledPairEnv(Env):
             steps=jnp.zeros((), jnp.int32),
         )
         zero = jnp.zeros(())
-        metrics = {"error": zero, "steady_error": zero, "steady": zero, "diverged": zero}
+        names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
+        metrics = dict.fromkeys(names, zero)
         return State(world, observation.network_input(first, world.memory), zero, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Array) -> State:
@@ -168,6 +169,8 @@ class CoupledPairEnv(Env):
                 "steady_error": distance * steady,
                 "steady": steady,
                 "diverged": diverged.astype(jnp.float32),
+                "tilt_error": jnp.mean((followed - led)[:2] ** 2),
+                "vertical_error": (followed - led)[2] ** 2,
             },
             info={**state.info, "truncation": truncated.astype(jnp.float32)},
         )

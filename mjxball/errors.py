@@ -3,3 +3,7 @@
 
 class InputError(ValueError):
     """Bad input: printed as one line on stderr, exit code 2, nothing written."""
+
+
+class TrainingDivergedError(RuntimeError):
+    """A loss or a weight is not finite any more."""

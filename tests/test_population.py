@@ -141,9 +141,10 @@ state, _ = jax.jit(population.advance)(population.create(5), P.prefill(10))
 state, _ = jax.jit(population.advance)(state, P.train(5, 1))
 leaves = jax.tree.leaves(state.learner.policy)
 assert len(leaves[0].sharding.device_set) == 2
-population.devices = 1
-alone, _ = jax.jit(population.advance)(population.create(5), P.prefill(10))
-alone, _ = jax.jit(population.advance)(alone, P.train(5, 1))
+single = Population(config, "newton-euler", 2, devices=jax.local_devices()[:1])
+assert single.devices == 1
+alone, _ = jax.jit(single.advance)(single.create(5), P.prefill(10))
+alone, _ = jax.jit(single.advance)(alone, P.train(5, 1))
 for a, b in zip(leaves, jax.tree.leaves(alone.learner.policy)):
     np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=1e-5)
 """

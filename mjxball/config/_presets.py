@@ -28,6 +28,9 @@ def _paper() -> Config:
             target_rate=0.005,
             alpha=0.3,
             alpha_fixed=True,
+            critics=1,
+            state_value=True,
+            evaluations=25,
         ),
     )
 

@@ -173,17 +173,22 @@ class Sac:
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1)
     critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
+    critics: int = setting(2, "Q networks, of which the smallest value counts", low=1, high=2)
+    state_value: bool = setting(
+        False, "a state-value network with a slow copy gives the targets (the paper's eqs. 6-8), not slow Q networks"
+    )
     learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", above=0)
     alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
     return_steps: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
     policy_delay: int = setting(1, "critic updates for each update of policy and temperature", low=1, high=1000)
     gradient_clip: float = setting(0.0, "largest global norm of a gradient, 0: not clipped", low=0)
-    target_rate: float = setting(0.02, "tau of the target critics", above=0, high=1)
+    target_rate: float = setting(0.02, "tau of the slow copies that give the targets", above=0, high=1)
     alpha: float = setting(0.02, "temperature at the start", above=0)
     alpha_fixed: bool = setting(False, "keep the temperature at its start")
     target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]")
     reward_scale: float = setting(1.0, "factor on the reward inside the critic", above=0)
+    evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
     policy_average: float = setting(
         0.002, "rate of the running average of the policy that is exported", above=0, high=1
     )

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -21,6 +20,7 @@ from mjxball.errors import InputError
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.train.members import best_member, read_members
 from mjxball.train.population import Population
+from mjxball.train.processes import is_writer
 from mjxball.train.program import TrainState
 
 KEEP = 2
@@ -34,17 +34,27 @@ class Checkpoints:
     """The checkpoints of one run directory, numbered by environment steps."""
 
     def __init__(self, run: Path, keep: int = KEEP):
-        options = ocp.CheckpointManagerOptions(max_to_keep=keep, enable_async_checkpointing=True)
-        self._manager = ocp.CheckpointManager((run / CHECKPOINTS).absolute(), options=options)
+        # Of several processes each acts for itself: process 0 writes, all read.
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=jax.process_index(),
+            active_processes={jax.process_index()},
+            barrier_sync_key_prefix=str(jax.process_index()),
+        )
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep, enable_async_checkpointing=True, multiprocessing_options=alone, create=False
+        )
+        place = (run / CHECKPOINTS).absolute()
+        place.mkdir(parents=True, exist_ok=True)
+        self._manager = ocp.CheckpointManager(place, options=options)
 
     def save(self, state: TrainState) -> None:
-        """Start writing `state`; a step that is already there is not written again."""
+        """Start writing `state`, NumPy arrays; a step that is already there is not written again."""
         step = int(np.ravel(np.asarray(state.steps))[0])  # the same for every member of a population
-        if step not in self._manager.all_steps():
-            # Copies: the next chunk of training reuses the buffers while the files are still being written.
-            arrays = {name: np.array(leaf) for name, leaf in _named_leaves(state).items()}
-            if not self._manager.save(step, args=ocp.args.StandardSave(arrays)):
-                raise RuntimeError(f"Orbax refused to save checkpoint {step}")
+        if step in self._manager.all_steps():
+            return
+        arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(state).items()}
+        if not self._manager.save(step, args=ocp.args.StandardSave(arrays)):
+            raise RuntimeError(f"Orbax refused to save checkpoint {step}")
 
     def steps(self) -> list[int]:
         """Environment steps of every complete checkpoint, newest first."""
@@ -62,7 +72,8 @@ class Checkpoints:
                 return _rebuild(template, arrays)
             except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
                 warn(f"checkpoint {step} cannot be read and is skipped: {str(error).splitlines()[0][:200]}")
-                self._manager.delete(step)  # else Orbax would refuse to save the same steps again
+                if is_writer():
+                    self._manager.delete(step)  # else Orbax would refuse to save the same steps again
         return None
 
     def close(self) -> None:
@@ -78,7 +89,7 @@ def _name(path: Any) -> str:
 def _rebuild(template: TrainState, arrays: dict[str, Any]) -> TrainState:
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     restored = [
-        jnp.asarray(arrays[_name(path)]) if leaf.size else jnp.zeros(leaf.shape, leaf.dtype) for path, leaf in leaves
+        np.asarray(arrays[_name(path)]) if leaf.size else np.zeros(leaf.shape, leaf.dtype) for path, leaf in leaves
     ]
     for (path, leaf), value in zip(leaves, restored, strict=True):
         if value.shape != leaf.shape or value.dtype != leaf.dtype:
@@ -124,23 +135,39 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
     return configs.validate(config), record
 
 
-def restore_run(run: Path) -> tuple[Config, TrainState, dict[str, Any]]:
-    """Configuration, newest state and origin of a run directory; raise InputError if there is none."""
-    config, origin = read_config(run)
+def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> TrainState | None:
+    """The newest state of the run directory that `read_config` describes, as NumPy; None if none was ever saved.
+
+    Raises InputError if every checkpoint is damaged or the worlds were cut otherwise than now.
+    """
+    population, parts = _population(config, origin), origin.get("parts", 1)
+    if population.parts != parts:
+        raise InputError(
+            f"{run} was trained with every follower's worlds on {parts} device(s), not {population.parts}; "
+            "continue it with as many processes as before"
+        )
+    return _restore(run, population)
+
+
+def _restore(run: Path, population: Population) -> TrainState | None:
     if not (run / CHECKPOINTS).is_dir():
-        raise InputError(f"{run} has no checkpoints")
+        return None
     with contextlib.closing(Checkpoints(run)) as checkpoints:
-        template = _population(config, origin).template()
-        state = checkpoints.restore(template, lambda text: print(f"warning: {text}", file=sys.stderr))  # noqa: T201
+        if not checkpoints.steps():
+            return None
+        state = checkpoints.restore(population.template(), lambda text: print(f"warning: {text}", file=sys.stderr))  # noqa: T201
     if state is None:
-        raise InputError(f"{run} has no complete checkpoint")
-    return config, state, origin
+        raise InputError(f"{run} has no checkpoint that can be read")
+    return state
 
 
 def restore_policy(run: Path) -> tuple[Config, Any, int, dict[str, Any]]:
     """Configuration, learner, environment steps and origin of a run's newest checkpoint; of a population the best's."""
-    config, state, origin = restore_run(run)
+    config, origin = read_config(run)
     population, best = _population(config, origin), best_member(read_members(run))
+    state = _restore(run, population)
+    if state is None:
+        raise InputError(f"{run} has no complete checkpoint")
     chosen = population.member(state, best)
     origin = {**origin, "seed": origin["seed"] + best}
     return population.member_config(best), chosen.learner, int(chosen.steps), origin

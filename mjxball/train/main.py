@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import math
 import shlex
@@ -12,15 +13,21 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mjxball import __version__, cli, config
 from mjxball.cache import enable_compilation_cache
-from mjxball.errors import InputError
+from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.cells import REFERENCE, STANDARD
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.rollout import Scenario, check_scenario
+from mjxball.train import processes
+from mjxball.train.curves import draw_training
 from mjxball.train.provenance import commit, differences, source_hash, versions
 
 MOST_MEMBERS = 4096
+POLICY = "policy.npz"
+CELLS = "cells.json"
 
 
 def parser() -> cli.Parser:
@@ -28,6 +35,7 @@ def parser() -> cli.Parser:
     result = cli.Parser(
         prog="train.py",
         usage="train.py [PRESET] [--seed N] [--seeds K] [--sweep FILE] [--out DIR] [--resume DIR] [--physics ENGINE]\n"
+        "                [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
         "                [--<config path> VALUE ...]",
         description="Train a follower with soft actor-critic, export it to NumPy and judge it against `copy`.",
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
@@ -41,6 +49,10 @@ def parser() -> cli.Parser:
     result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
     result.add_argument("--physics", choices=TRAINING_ENGINES, help="physics engine (default mjx)")
+    result.add_argument("--distributed", action="store_true", help="train with the other processes of this job")
+    result.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
+    result.add_argument("--processes", type=int, metavar="N", help="how many processes there are, with --coordinator")
+    result.add_argument("--process", type=int, metavar="I", help="this process's number, 0 .. N - 1")
     result.add_argument("--version", action="version", version=f"mjxball {__version__}")
     cli.add_config_flags(result)
     return result
@@ -54,57 +66,98 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _train(options: argparse.Namespace, command: str) -> int:
-    resume = options.resume is not None
+    meeting, started = _meeting(options), time.monotonic()
+    if options.resume is not None:
+        _refuse_with_resume(options)
+        out, (settings, origin) = options.resume, _recorded(options.resume)
+    else:
+        settings, origin, out = _new_run(options, command)
+    enable_compilation_cache()
+    with processes.ends_with_the_others(f"--resume {out}") if meeting else contextlib.nullcontext():
+        if meeting:
+            processes.join(meeting)
+        writes = processes.is_writer()
+        code = _run(settings, origin, out, options.resume is not None)
+        if meeting:
+            processes.leave()
+    if code is None and (out / "eval" / CELLS).exists():
+        print(f"{out} was finished and evaluated before; nothing is left to do")  # noqa: T201
+        return 0
+    if not writes or code == 1:
+        return code or 0
+    print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)  # noqa: T201
+    if code:
+        return code
+    draw_training(out, settings, out / "eval" / "training.png")
+    if origin["seeds"] > 1:
+        _compare_members(settings, out, origin)
+    return _evaluate(settings, origin["physics"], out, out / POLICY)
+
+
+def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: bool) -> int | None:
+    """Train; return 0, 1 if training diverged, 130 if it was interrupted, None if nothing was left to train."""
+    from mjxball.train.checkpoint import restore_state
+    from mjxball.train.run import Run
+
+    state = restore_state(out, settings, origin) if resume else None
+    if resume and processes.is_writer():
+        steps = 0 if state is None else int(np.ravel(state.steps)[0])
+        print(f"continuing {out} after {steps:,} of {settings.sac.steps:,} steps", file=sys.stderr)  # noqa: T201
+    if state is not None and int(np.ravel(state.steps)[0]) >= settings.sac.steps:
+        return None
+    try:
+        return 0 if Run(settings, out, origin, state).train() else 130
+    except TrainingDivergedError as error:
+        if processes.is_writer():
+            kept = (out / POLICY).exists()
+            where = f"the last good policy and checkpoint are in {out}" if kept else "no good policy came before"
+            print(f"training diverged: {error}; {where}", file=sys.stderr)  # noqa: T201
+        return 1
+
+
+def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:
+    given = (options.coordinator, options.processes, options.process)
+    if options.distributed:
+        return processes.Rendezvous(*given)
+    if any(value is not None for value in given):
+        raise InputError("--coordinator, --processes and --process need --distributed")
+    return None
+
+
+def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, dict[str, Any], Path]:
+    """Configuration, origin and directory of a new run; everything that can be refused is refused here."""
     name, seed = options.preset or "transport", options.seed or 0
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed < 2**31:
         raise InputError(f"--seed must be between 0 and {2**31 - 1}, not {seed}")
-    if resume:
-        _refuse_with_resume(options)
-        out = options.resume
-    else:
-        out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
-
+    out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     _scenarios(settings)
     members = 1 if options.seeds is None else options.seeds
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--seeds must be between 1 and {MOST_MEMBERS}, not {members}")
-    enable_compilation_cache()
-    sweep = _read_sweep(options.sweep, members, settings)
-
-    from mjxball.train.checkpoint import restore_run
-    from mjxball.train.run import POLICY, Run, TrainingDivergedError
-
-    state = None
     origin = {
         "command": command,
         "seed": seed,
         "physics": options.physics or "mjx",
         "seeds": members,
-        "sweep": sweep,
+        "sweep": _read_sweep(options.sweep, members, settings),
         "package_version": __version__,
         "commit": commit(),
         "source_hash": source_hash(),
         "versions": versions(),
     }
-    if resume:
-        settings, state, origin = restore_run(out)
-        changed = differences(origin)
-        if changed:
-            raise InputError(f"{out} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
-    run = Run(settings, out, origin, state)
-    started = time.monotonic()
-    try:
-        finished = run.train()
-    except TrainingDivergedError as error:
-        print(f"training diverged: {error}; the last good policy and checkpoint are in {out}", file=sys.stderr)  # noqa: T201
-        return 1
-    print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)  # noqa: T201
-    if not finished:
-        return 130
-    if origin["seeds"] > 1:
-        _compare_members(settings, out, origin)
-    return _evaluate(settings, origin["physics"], out, out / POLICY)
+    return settings, origin, out
+
+
+def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
+    """Configuration and origin of the run to be continued; InputError if this program is not the one that made it."""
+    from mjxball.train.checkpoint import read_config
+
+    settings, origin = read_config(run)
+    changed = differences(origin)
+    if changed:
+        raise InputError(f"{run} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
+    return settings, origin
 
 
 def _read_sweep(path: Path | None, members: int, settings: config.Config) -> dict[str, list[float]] | None:
@@ -138,9 +191,8 @@ def _seed_of(path: Path) -> int:
 
 def _refuse_with_resume(options: argparse.Namespace) -> None:
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    given += [
-        f"--{name}" for name in ("out", "seed", "seeds", "sweep", "physics") if getattr(options, name) is not None
-    ]
+    own = ("out", "seed", "seeds", "sweep", "physics")
+    given += [f"--{name}" for name in own if getattr(options, name) is not None]
     given += [options.preset] if options.preset else []
     if given:
         raise InputError(f"--resume continues with the run's own configuration; drop {', '.join(given)}")

@@ -9,21 +9,31 @@ import numpy as np
 
 LOG = "members.csv"
 POLICIES = "members"
-COLUMNS = ("steps", "seed", "eval_return", "eval_steady_error", "eval_peak")
+COLUMNS = (
+    "steps",
+    "seed",
+    "eval_return",
+    "eval_steady_error",
+    "eval_peak",
+    "eval_tilt_error",
+    "eval_vertical_error",
+)
 
 
 class MemberLog:
-    """`members.csv` of a run: one row for each member and evaluation."""
+    """`members.csv` of a run: one row for each member and evaluation; without `out` nothing is written."""
 
-    def __init__(self, out: Path, seed: int, resumed_at: int = 0):
+    def __init__(self, out: Path | None, seed: int, resumed_at: int = 0):
         self._out, self._seed = out, seed
-        self._rows = [row for row in read_members(out) if row["steps"] <= resumed_at]
+        self._rows = [row for row in read_members(out) if row["steps"] <= resumed_at] if out else []
 
-    def add(self, steps: int, returns: np.ndarray, errors: np.ndarray, peaks: np.ndarray) -> None:
-        """Append one evaluation; every array is (members,)."""
-        for member, values in enumerate(zip(returns, errors, peaks, strict=True)):
+    def add(self, steps: int, *columns: np.ndarray) -> None:
+        """Append one evaluation: every array is (members,), in the order of `COLUMNS` after the seed."""
+        for member, values in enumerate(zip(*columns, strict=True)):
             row = (steps, self._seed + member, *map(float, values))
             self._rows.append(dict(zip(COLUMNS, row, strict=True)))
+        if self._out is None:
+            return
         partial = self._out / f".{LOG}.partial"
         with partial.open("w", newline="") as stream:
             writer = csv.DictWriter(stream, COLUMNS)

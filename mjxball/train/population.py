@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.train.program import Mode, Program, Tally, TrainState
+from mjxball.train.program import Mode, Program, Shards, Tally, TrainState, prefill
+from mjxball.train.replay import Replay
 
 Array = Any
 # Settings that enter the compiled program as numbers, and may therefore differ between members.
@@ -55,21 +58,48 @@ def read_sweep(path: Path, members: int, config: Config) -> dict[str, list[float
     return sweep
 
 
+class Executables(NamedTuple):
+    """A population's compiled functions."""
+
+    create: Callable[[Any, Any], TrainState]  # (swept values, keys) -> state
+    advance: Callable[[TrainState, Mode], tuple[TrainState, Tally]]  # gives away the state's memory
+    fresh_worlds: Callable[[Any, Array], Any]  # (swept values, key) -> worlds
+
+
 class Population:
     """`Program` for `members` followers at once, with a leading member axis unless there is only one.
 
-    Member k has seed `seed + k` and the k-th value of every swept setting. The members are spread over all
-    local devices if their number divides evenly, else they share the first.
+    Member k has seed `seed + k` and the k-th value of every swept setting. In one process the members are spread
+    over all its devices if their number divides evenly, else they share the first. Over several processes (see
+    `processes`) members and, where there are fewer members than devices, each member's worlds are spread over all.
     """
 
-    def __init__(self, config: Config, physics: str, members: int = 1, sweep: Sweep | None = None):
+    def __init__(
+        self,
+        config: Config,
+        physics: str,
+        members: int = 1,
+        sweep: Sweep | None = None,
+        devices: Sequence[Any] | None = None,
+    ):
         self.config, self.members, self._physics = config, members, physics
         self._sweep = dict(sweep or {})
         self._single = members == 1 and not self._sweep
-        self._values = {name: jnp.asarray(values, jnp.float32) for name, values in self._sweep.items()}
-        devices = jax.local_device_count()
-        self.devices = devices if members % devices == 0 and not self._single else 1
-        self.program = Program(config, physics)
+        self._values = {name: np.asarray(values, np.float32) for name, values in self._sweep.items()}
+        if devices is None:
+            devices = jax.devices() if jax.process_count() > 1 else jax.local_devices()
+        groups, parts = grid(members, len(devices), split=jax.process_count() > 1)
+        check_parts(config, parts)
+        spread = groups * parts > 1
+        self.mesh = _mesh(devices, groups, parts) if spread else None
+        self.devices, self.parts = groups * parts, parts
+        self._shards = Shards("worlds", parts) if parts > 1 else Shards()
+        self.program = Program(config, physics, shards=self._shards)
+        whole = PartitionSpec() if self._single else PartitionSpec("members")
+        split = PartitionSpec(*whole, "worlds")
+        self._whole, self._split = whole, split
+        self._state_spec = TrainState(whole, Replay(rows=split, inserted=whole), split, whole, whole)
+        self._tally_spec = Tally(**{name: split if name == "peak" else whole for name in Tally._fields})
 
     def member_config(self, member: int) -> Config:
         """The configuration of one member."""
@@ -89,37 +119,149 @@ class Population:
 
     def create(self, seed: int) -> TrainState:
         """Fresh training states."""
-        if self._single:
-            return jax.jit(self.program.create)(jax.random.PRNGKey(seed))
-        keys = jnp.stack([jax.random.PRNGKey(seed + member) for member in range(self.members)])
-        return jax.jit(jax.vmap(lambda values, key: self._of(values).create(key)))(self._values, keys)
+        return jax.jit(self._create)(*self._starts(seed))
 
     def template(self) -> TrainState:
         """Shapes of what `create` returns, without computing it."""
-        return jax.eval_shape(self.create, 0)
-
-    def fresh_worlds(self, key: Array) -> Any:
-        """Newly reset worlds, the same draw for every member."""
-        if self._single:
-            return self.program.fresh_worlds(key)
-        return jax.vmap(lambda values: self._of(values).fresh_worlds(key), axis_size=self.members)(self._values)
+        return jax.eval_shape(self._create, self._values, self._keys(0))
 
     def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
         """See `Program.advance`."""
-        if self._single:
-            return self.program.advance(state, mode)
 
-        def together(values: Any, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
-            one = lambda own, state: self._of(own).advance(state, mode)  # noqa: E731
-            return jax.vmap(one)(values, state)
+        def one(program: Program, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
+            return program.advance(state, mode)
 
-        if self.devices == 1:
-            return together(self._values, state, mode)
-        mesh = jax.make_mesh((self.devices,), ("members",), axis_types=(AxisType.Auto,))
-        spread, whole = PartitionSpec("members"), PartitionSpec()
-        return jax.shard_map(together, mesh=mesh, in_specs=(spread, spread, whole), out_specs=spread, check_vma=False)(
-            self._values, state, mode
+        results = (self._state_spec, self._tally_spec)
+        return self._on_mesh(one, (self._state_spec, PartitionSpec()), results, (0, None))(self._values, state, mode)
+
+    def compile(self, creating: bool) -> Executables:
+        """Compile everything a run needs, side by side; `create` only if `creating`."""
+        values, keys = self._starts(0)
+        key = self.place(np.asarray(jax.random.PRNGKey(0)), PartitionSpec())
+        state = self._placed_shapes(self.template(), self._state_spec)
+        mode = self.mode(prefill(1))
+        lowered = [
+            jax.jit(self.advance, donate_argnums=0, **self._results(self._state_spec, self._tally_spec)).lower(
+                state, mode
+            ),
+            jax.jit(self._fresh, **self._results(self._split)).lower(values, key),
+            *([jax.jit(self._create, **self._results(self._state_spec)).lower(values, keys)] if creating else []),
+        ]
+        with ThreadPoolExecutor(len(lowered)) as pool:  # XLA compiles outside Python's lock
+            advance, fresh, *create = pool.map(lambda work: work.compile(), lowered)
+        return Executables(create[0] if create else self._create, advance, fresh)
+
+    def start(self, executables: Executables, seed: int) -> TrainState:
+        """`create(seed)` with a compiled program."""
+        return executables.create(*self._starts(seed))
+
+    def fresh_worlds(self, executables: Executables, key: Array) -> Any:
+        """Newly reset worlds, the same draw for every member."""
+        values, _ = self._starts(0)
+        return executables.fresh_worlds(values, self.place(np.asarray(key), PartitionSpec()))
+
+    def place_state(self, state: TrainState) -> TrainState:
+        """A whole state of NumPy arrays, the same in every process, spread over the devices."""
+        return jax.tree.map(lambda spec, part: self.place(part, spec), self._state_spec, state, is_leaf=_is_spec)
+
+    def place_keys(self, keys: np.ndarray) -> Array:
+        """The members' keys, the same in every process, on their devices."""
+        return self.place(keys, self._whole)
+
+    def mode(self, mode: Mode) -> Mode:
+        """`mode` where every device sees it."""
+        return self.place(mode, PartitionSpec())
+
+    def place(self, tree: Any, spec: PartitionSpec) -> Any:
+        """Arrays that every process holds alike, cut over the devices as `spec` says."""
+        if self.mesh is None:
+            return jax.tree.map(jnp.asarray, tree)
+        sharding = NamedSharding(self.mesh, spec)
+
+        def cut(leaf: Any) -> Array:
+            leaf = np.asarray(leaf)
+            return jax.make_array_from_callback(leaf.shape, sharding, lambda index: leaf[index])
+
+        return jax.tree.map(cut, tree)
+
+    def _keys(self, seed: int) -> np.ndarray:
+        keys = np.stack([np.asarray(jax.random.PRNGKey(seed + member)) for member in range(self.members)])
+        return keys[0] if self._single else keys
+
+    def _starts(self, seed: int) -> tuple[Any, Array]:
+        return self.place(self._values, self._whole), self.place(self._keys(seed), self._whole)
+
+    def _create(self, values: Any, keys: Array) -> TrainState:
+        return self._on_mesh(lambda program, key: program.create(key), (self._whole,), self._state_spec, (0,))(
+            values, keys
         )
 
+    def _fresh(self, values: Any, key: Array) -> Any:
+        draw = lambda program, key: program.fresh_worlds(key)  # noqa: E731
+        return self._on_mesh(draw, (PartitionSpec(),), self._split, (None,))(values, key)
+
+    def _on_mesh(self, one: Callable[..., Any], specs: Any, results: Any, axes: tuple[int | None, ...]) -> Any:
+        """`one(program, *arguments)` for all members over the mesh, as a function of (values, *arguments)."""
+
+        def every(values: Any, *arguments: Any) -> Any:
+            if self._single:
+                return one(self.program, *arguments)
+            each = lambda own, *arguments: one(self._of(own), *arguments)  # noqa: E731
+            return jax.vmap(each, in_axes=(0, *axes), axis_size=self._members_here)(values, *arguments)
+
+        if self.mesh is None:
+            return every
+        return jax.shard_map(every, mesh=self.mesh, in_specs=(self._whole, *specs), out_specs=results, check_vma=False)
+
+    @property
+    def _members_here(self) -> int:
+        return self.members // (self.mesh.shape["members"] if self.mesh else 1)
+
+    def _results(self, *specs: Any) -> dict[str, Any]:
+        """Where `jax.jit` shall leave its results; said, because else arrays without elements end up anywhere."""
+        if self.mesh is None:
+            return {}
+        places = jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), specs, is_leaf=_is_spec)
+        return {"out_shardings": places if len(places) > 1 else places[0]}
+
+    def _placed_shapes(self, template: Any, specs: Any) -> Any:
+        """`template` with the shardings that `place_state` gives."""
+        if self.mesh is None:
+            return template
+
+        def placed(spec: PartitionSpec, part: Any) -> Any:
+            sharding = NamedSharding(self.mesh, spec)
+            return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), part)
+
+        return jax.tree.map(placed, specs, template, is_leaf=_is_spec)
+
     def _of(self, values: Mapping[str, Array]) -> Program:
-        return Program(self.config, self._physics, values) if values else self.program
+        return Program(self.config, self._physics, values, self._shards) if values else self.program
+
+
+def grid(members: int, devices: int, split: bool) -> tuple[int, int]:
+    """(groups of members, parts of each member's worlds) that the devices are arranged in.
+
+    Without `split` a member stays on one device, and members that do not divide evenly share the first.
+    """
+    groups = math.gcd(members, devices)
+    if split:
+        return groups, devices // groups
+    return (devices, 1) if groups == devices else (1, 1)
+
+
+def check_parts(config: Config, parts: int) -> None:
+    """Raise InputError unless worlds, batch and replay can be cut into `parts`."""
+    for name in ("worlds", "batch", "replay"):
+        size = getattr(config.sac, name)
+        whole = parts * (config.sac.worlds // parts if name == "replay" else 1)
+        if size % whole:
+            raise InputError(f"sac.{name} = {size} cannot be split over {parts} devices evenly; make it a multiple")
+
+
+def _mesh(devices: Sequence[Any], groups: int, parts: int) -> Mesh:
+    return jax.make_mesh((groups, parts), ("members", "worlds"), axis_types=(AxisType.Auto,) * 2, devices=devices)
+
+
+def _is_spec(value: Any) -> bool:
+    return isinstance(value, PartitionSpec)

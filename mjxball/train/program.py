@@ -68,23 +68,49 @@ class Tally(NamedTuple):
     peak: Array  # (worlds,) largest |e_o| in steady state [m]
     ended: Array  # episodes terminated
     diverged: Array  # worlds that diverged
+    tilt_error: Array  # mean square of the roll and pitch commands' difference to the leader's, summed [rad2]
+    vertical_error: Array  # the same of the vertical accelerations [m2/s4]
     losses: sac.Losses  # of the last update
+
+
+class Shards(NamedTuple):
+    """One follower's worlds, replay and batches cut into `count` equal parts along a mapped axis (data parallel)."""
+
+    axis: str | None = None
+    count: int = 1
+
+    def own(self, key: Array) -> Array:
+        """A key of this shard alone, from one that all shards share."""
+        return jax.random.fold_in(key, jax.lax.axis_index(self.axis)) if self.axis else key
+
+    def mean(self, value: Any) -> Any:
+        """Mean over the shards."""
+        return jax.lax.pmean(value, self.axis) if self.axis else value
+
+    def total(self, value: Any) -> Any:
+        """Sum over the shards."""
+        return jax.lax.psum(value, self.axis) if self.axis else value
 
 
 class Program:
     """`create(key)` makes the state, `advance(state, mode)` moves it on; both jittable and vmappable.
 
-    `overrides` maps config paths to values, arrays included, so that a population can differ in them.
+    `overrides` maps config paths to values, arrays included, so that a population can differ in them. With
+    `shards` every function works on one part and must run under `jax.shard_map` over their axis.
     """
 
-    def __init__(self, config: Config, physics: str, overrides: Mapping[str, Any] | None = None):
+    def __init__(
+        self, config: Config, physics: str, overrides: Mapping[str, Any] | None = None, shards: Shards | None = None
+    ):
         for path, value in (overrides or {}).items():
             config = configs.replace(config, path, value)
         self.config = config
         self.env = CoupledPairEnv(config, physics)
         self.sizes = (self.env.observation_size, self.env.action_size)
         self.networks = sac.make_networks(config.sac, self.env.input_mask, self.sizes[1])
-        self._update = sac.make_update(self.networks, config.sac, self.sizes[1])
+        self._shards = shards or Shards()
+        self._worlds = config.sac.worlds // self._shards.count
+        self._update = sac.make_update(self.networks, config.sac, self.sizes[1], self._shards.mean)
         self._reset, self._step = jax.vmap(self.env.reset), jax.vmap(self.env.step)
 
     def create(self, key: Array) -> TrainState:
@@ -92,11 +118,11 @@ class Program:
         learner_key, world_key, stagger_key, key = jax.random.split(key, 4)
         limits = self.config.sac
         worlds = self.fresh_worlds(world_key)
-        spread = jax.random.randint(stagger_key, (limits.worlds,), 0, self.config.timing.episode_steps)
+        spread = jax.random.randint(self._shards.own(stagger_key), (self._worlds,), 0, self.config.timing.episode_steps)
         worlds = worlds.replace(pipeline_state=worlds.pipeline_state._replace(steps=spread))
         return TrainState(
             learner=sac.create(self.networks, limits, self.sizes[0], learner_key),
-            replay=replay.create(limits.replay, limits.worlds, *self.sizes),
+            replay=replay.create(limits.replay // self._shards.count, self._worlds, *self.sizes),
             worlds=worlds,
             key=key,
             steps=jnp.zeros((), jnp.int32),
@@ -104,19 +130,35 @@ class Program:
 
     def fresh_worlds(self, key: Array) -> Any:
         """All worlds, newly reset."""
-        return self._reset(jax.random.split(key, self.config.sac.worlds))
+        return self._reset(jax.random.split(self._shards.own(key), self._worlds))
 
     def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
         """Step all worlds `mode.steps` times, with `mode.updates` gradient updates after each."""
         zero = jnp.zeros(())
-        tally = Tally(zero, zero, zero, jnp.zeros(self.config.sac.worlds), zero, zero, sac.Losses(zero, zero, zero))
+        losses = sac.Losses(zero, zero, zero)
+        tally = Tally(zero, zero, zero, jnp.zeros(self._worlds), zero, zero, zero, zero, losses)
 
         def body(_: Array, carry: tuple[TrainState, Tally]) -> tuple[TrainState, Tally]:
             state, tally = self._collect(*carry, mode)
             return self._learn(state, tally, mode)
 
         with jax.default_matmul_precision(MATMUL_PRECISION):
-            return jax.lax.fori_loop(0, mode.steps, body, (state, tally))
+            state, tally = jax.lax.fori_loop(0, mode.steps, body, (state, tally))
+        return state, self._over_shards(tally)
+
+    def _over_shards(self, tally: Tally) -> Tally:
+        """The tally of all shards together; `peak` stays each shard's own worlds."""
+        mean, total = self._shards.mean, self._shards.total
+        return tally._replace(
+            reward=mean(tally.reward),
+            steady_error=total(tally.steady_error),
+            steady=total(tally.steady),
+            ended=total(tally.ended),
+            diverged=total(tally.diverged),
+            tilt_error=mean(tally.tilt_error),
+            vertical_error=mean(tally.vertical_error),
+            losses=mean(tally.losses),
+        )
 
     def _act(self, learner: sac.Learner, seen: Array, key: Array, mode: Mode) -> Array:
         sample_key, random_key = jax.random.split(key)
@@ -133,7 +175,7 @@ class Program:
     def _collect(self, state: TrainState, tally: Tally, mode: Mode) -> tuple[TrainState, Tally]:
         act_key, reset_key, key = jax.random.split(state.key, 3)
         worlds = state.worlds
-        action = self._act(state.learner, worlds.obs, act_key, mode)
+        action = self._act(state.learner, worlds.obs, self._shards.own(act_key), mode)
         after = self._step(worlds, action)
         terminated = after.done * (1 - after.info["truncation"])
         transitions = replay.Transitions(worlds.obs, action, after.reward, 1 - terminated, after.obs, after.done)
@@ -143,7 +185,7 @@ class Program:
             done = after.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
             return jnp.where(done, new, old)
 
-        normaliser = statistics.update(state.learner.normaliser, worlds.obs)
+        normaliser = statistics.update(state.learner.normaliser, worlds.obs, pmap_axis_name=self._shards.axis)
         normaliser = jax.tree.map(
             lambda new, old: jnp.where(mode.record, new, old), normaliser, state.learner.normaliser
         )
@@ -162,21 +204,25 @@ class Program:
             peak=jnp.maximum(tally.peak, metrics["steady_error"]),
             ended=tally.ended + terminated.sum(),
             diverged=tally.diverged + metrics["diverged"].sum(),
+            tilt_error=tally.tilt_error + metrics["tilt_error"].mean(),
+            vertical_error=tally.vertical_error + metrics["vertical_error"].mean(),
         )
 
     def _sample(self, buffer: replay.Replay, key: Array) -> replay.Transitions:
         limits = self.config.sac
         steps, discount = limits.return_steps, limits.discount
-        return replay.sample(buffer, key, limits.batch, limits.worlds, *self.sizes, steps, discount)
+        batch = limits.batch // self._shards.count
+        return replay.sample(buffer, key, batch, self._worlds, *self.sizes, steps, discount)
 
     def _learn(self, state: TrainState, tally: Tally, mode: Mode) -> tuple[TrainState, Tally]:
         limits = self.config.sac
         progress = jnp.minimum(state.steps / limits.steps, 1.0)
         rate = 1.0 + (limits.learning_rate_end - 1.0) * progress
         keys = jax.random.split(state.key)
+        own_key = self._shards.own(keys[1])
 
         def update(number: Array, carry: tuple[sac.Learner, sac.Losses]) -> tuple[sac.Learner, sac.Losses]:
-            sample_key, update_key = jax.random.split(jax.random.fold_in(keys[1], number))
+            sample_key, update_key = jax.random.split(jax.random.fold_in(own_key, number))
             batch = self._sample(state.replay, sample_key)
             moved, losses = self._update(carry[0], batch, update_key, rate)
             due, last = carry[0].updates % limits.policy_delay == 0, carry[1]

@@ -19,7 +19,7 @@ class Row:
     """One row of `metrics.csv`. Evaluation columns are empty between evaluations."""
 
     steps: int  # environment steps so far
-    seconds: float  # since the start of training, compilation included
+    seconds: float  # of training, compilation included; of a resumed run what came before its checkpoint too
     rate: float  # environment steps per second of all members together, updates included
     episode_return: float  # mean reward x episode steps, exploring policy
     steady_error: float | None  # mean |e_o| later than 8 s into an episode, exploring policy [m]; None: none so old
@@ -32,21 +32,31 @@ class Row:
     eval_return: float | None = None  # the same for the averaged policy's mean
     eval_steady_error: float | None = None  # [m]
     eval_peak: float | None = None  # mean over worlds of the largest steady |e_o| [m]
+    eval_tilt_error: float | None = None  # rms difference of the roll and pitch commands to the leader's [rad]
+    eval_vertical_error: float | None = None  # the same of the vertical accelerations [m/s2]
 
 
 class Progress:
     """Prints one line that is overwritten on a terminal; appends rows to `metrics.csv` and to TensorBoard's events.
 
-    Of a run that is resumed at `resumed_at` steps, rows beyond are dropped: they will come again.
+    Of a run that is resumed at `resumed_at` steps, rows beyond are dropped: they will come again. Without a `path`
+    nothing is printed or written.
     """
 
-    def __init__(self, path: Path, total: int, resumed_at: int = 0, members: int = 1, stream: TextIO | None = None):
+    def __init__(
+        self, path: Path | None, total: int, resumed_at: int = 0, members: int = 1, stream: TextIO | None = None
+    ):
         self._total, self._members = total, members
         self._stream = stream or sys.stderr
         self._live = self._stream.isatty()
         self._start = time.monotonic()
         self._width = 0
+        self._before = 0.0
+        self._silent = path is None
+        if path is None:
+            return
         kept = _rows_until(path, resumed_at)
+        self._before = float(kept[-1]["seconds"]) if kept else 0.0
         names = [item.name for item in fields(Row)]
         partial = path.with_name(f".{path.name}.partial")
         with partial.open("w", newline="") as file:
@@ -62,14 +72,22 @@ class Progress:
         """Seconds since this object was made."""
         return time.monotonic() - self._start
 
+    def seconds(self) -> float:
+        """The same, and what the run took before it was resumed."""
+        return self._before + self.elapsed()
+
     def say(self, text: str) -> None:
         """Print a line of its own."""
+        if self._silent:
+            return
         clear = "\r" + " " * self._width + "\r" if self._live and self._width else ""
         self._width = 0
         print(clear + text, file=self._stream, flush=True)
 
     def show(self, row: Row) -> None:
         """Record `row` and show it."""
+        if self._silent:
+            return
         self._writer.writerow(asdict(row))
         self._file.flush()
         for name, value in asdict(row).items():
@@ -96,6 +114,8 @@ class Progress:
 
     def close(self) -> None:
         """End the line and close the file."""
+        if self._silent:
+            return
         if self._live and self._width:
             self._stream.write("\n")
         self._file.close()

@@ -12,30 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mjxball.config import Config
+from mjxball.errors import TrainingDivergedError
 from mjxball.export import is_sound, policy_file
 from mjxball.policy import save_file
+from mjxball.train import processes
 from mjxball.train import program as programs
-from mjxball.train.checkpoint import Checkpoints, write_config
+from mjxball.train.checkpoint import CONFIG_FILE, Checkpoints, write_config
 from mjxball.train.members import MemberLog
 from mjxball.train.population import Population
-from mjxball.train.program import Tally, TrainState
+from mjxball.train.program import Mode, Tally, TrainState
 from mjxball.train.progress import Progress, Row
 
 CHUNKS = 50  # rows of metrics.csv in a run
-EVALUATIONS = 5
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
 EVALUATION_DRAW = 20_261_121  # tells the evaluation's worlds from those of any seed
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
 POLICY = "policy.npz"
 METRICS = "metrics.csv"
-
-
-class TrainingDivergedError(RuntimeError):
-    """A loss or a weight is not finite any more."""
 
 
 @dataclass
@@ -47,91 +43,112 @@ class Stop:
 
 @contextlib.contextmanager
 def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
-    """Turn the first Ctrl-C into a request to stop; a second one interrupts at once."""
+    """Turn the first Ctrl-C or SIGTERM into a request to stop; a second one interrupts at once."""
     stop = Stop()
-    default = signal.getsignal(signal.SIGINT)
+    defaults = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def restore() -> None:
+        for number, default in defaults.items():
+            signal.signal(number, default)
 
     def handler(number: int, frame: Any) -> None:
         stop.requested = True
-        signal.signal(signal.SIGINT, default)
+        restore()
         progress.say("stopping: saving the policy and a checkpoint (Ctrl-C again to quit at once)")
 
-    signal.signal(signal.SIGINT, handler)
+    for number in defaults:
+        signal.signal(number, handler)
     try:
         yield stop
     finally:
-        signal.signal(signal.SIGINT, default)
+        restore()
 
 
 class Run:
-    """Followers being trained into a run directory. `train()` returns False if it was interrupted."""
+    """Followers being trained into a run directory. `train()` returns False if it was interrupted.
+
+    Of several processes each makes the same `Run`; only the first writes and prints.
+    """
 
     def __init__(self, config: Config, out: Path, origin: dict[str, Any], resumed: TrainState | None):
-        """`origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name."""
+        """`resumed` is None for a run that starts.
+
+        `origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name.
+        """
         self.config, self.out, self.origin = config, out, origin
         self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"])
-        out.mkdir(parents=True, exist_ok=True)
-        if resumed is None:
-            write_config(out, config, origin)
-        done = self._count(resumed) if resumed else 0
-        self.progress = Progress(out / METRICS, config.sac.steps, done, origin["seeds"])
-        self.members = MemberLog(out, origin["seed"], done)
-        self.checkpoints = Checkpoints(out)
+        self._writes = processes.is_writer()
+        done = _count(resumed) if resumed else 0
+        if self._writes:
+            out.mkdir(parents=True, exist_ok=True)
+            if not (out / CONFIG_FILE).exists():
+                write_config(out, config, {**origin, "parts": self.population.parts})
+        self.progress = Progress(out / METRICS if self._writes else None, config.sac.steps, done, origin["seeds"])
+        self.members = MemberLog(out if self._writes else None, origin["seed"], done)
+        self.checkpoints = Checkpoints(out) if self._writes else None
         self.state: TrainState | None = resumed
         self._saved_at = 0.0
 
     def train(self) -> bool:
         """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk."""
-        with contextlib.closing(self.checkpoints), contextlib.closing(self.progress):
+        with contextlib.closing(self.checkpoints or contextlib.ExitStack()), contextlib.closing(self.progress):
             with graceful_interrupt(self.progress) as stop:
                 self._start()
                 self._loop(stop)
                 self._save()
             return not stop.requested
 
-    def _count(self, state: TrainState) -> int:
-        return int(np.ravel(np.asarray(state.steps))[0])
-
     def _start(self) -> None:
-        self.progress.say(f"compiling the training program for {jax.devices()[0].device_kind} ...")
-        if self.state is None:
-            self.state = self.population.create(self.origin["seed"])
+        devices = self.population.devices
+        self.progress.say(f"compiling the training program for {devices} x {jax.devices()[0].device_kind} ...")
+        creating = self.state is None
+        self._compiled = self.population.compile(creating)
+        if creating:
+            self.state = self.population.start(self._compiled, self.origin["seed"])
             self._export()
-        advance = jax.jit(self.population.advance, donate_argnums=0)
-        self._advance = advance.lower(self.state, programs.prefill(1)).compile()
-        self._fresh = jax.jit(self.population.fresh_worlds)
+        else:
+            self.state = self.population.place_state(self.state)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
+
+    def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
+        """See `Program.advance`; the tally comes back whole, as NumPy."""
+        state, tally = self._compiled.advance(state, self.population.mode(mode))
+        return state, processes.gather(tally)
 
     def _loop(self, stop: Stop) -> None:
         sac = self.config.sac
         total = math.ceil(sac.steps / sac.worlds)
         # At least one batch and one n-step window must be recorded before the first update.
         first = max(math.ceil(sac.prefill / sac.worlds), math.ceil(sac.batch / sac.worlds), sac.return_steps)
-        done = self._count(self.state) // sac.worlds
+        done = self._steps() // sac.worlds
         if done < first and not stop.requested:
             self.state, _ = self._advance(self.state, programs.prefill(first - done))
             done = first
         chunk = max(1, math.ceil(total / CHUNKS))
-        every = max(1, CHUNKS // EVALUATIONS)
+        every = max(1, CHUNKS // sac.evaluations)
         while done < total and not stop.requested:
             number = done // chunk + 1
             steps = min(number * chunk, total) - done
             row = self._chunk(steps)
             done += steps
+            late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
+            stop.requested, late = processes.any_of((stop.requested, late))
             if number % every == 0 or done >= total:
                 row = self._evaluated(row)
                 self._save()
-            elif self.progress.elapsed() - self._saved_at > SAVE_EVERY:
+            elif late:
                 self._save()
             self.progress.show(row)
+
+    def _steps(self) -> int:
+        return _count(self.state)
 
     def _chunk(self, steps: int) -> Row:
         before = self.progress.elapsed()
         self.state, tally = self._advance(self.state, programs.train(steps, self.config.sac.updates))
-        self.state = jax.block_until_ready(self.state)
         after = self.progress.elapsed()
         worlds = steps * self.config.sac.worlds * self.population.members
-        row = self._row(tally, steps, after, worlds / max(after - before, 1e-9))
+        row = self._row(tally, steps, self.progress.seconds(), worlds / max(after - before, 1e-9))
         if not all(map(math.isfinite, (row.critic_loss, row.policy_loss, row.alpha))):
             raise TrainingDivergedError(f"a loss is not finite after {row.steps:,} steps")
         return row
@@ -139,12 +156,12 @@ class Run:
     def _row(self, tally: Tally, steps: int, seconds: float, rate: float) -> Row:
         each, losses = self.population.each, tally.losses
         return Row(
-            steps=self._count(self.state),
+            steps=self._steps(),
             seconds=round(seconds, 3),
             rate=round(rate, 1),
             episode_return=_middle(each(tally.reward)) / steps * self.config.timing.episode_steps,
             steady_error=_mean(each(tally.steady_error), each(tally.steady)),
-            alpha=_middle(np.exp(each(self.state.learner.log_alpha))),
+            alpha=_middle(np.exp(each(processes.gather(self.state.learner.log_alpha)))),
             entropy=_middle(each(losses.entropy)),
             critic_loss=_middle(each(losses.critic)),
             policy_loss=_middle(each(losses.policy)),
@@ -156,36 +173,48 @@ class Run:
         """Add the evaluation of the averaged policies, on the same fresh worlds every time."""
         steps = min(round(EVALUATION_SECONDS / self.config.timing.control_period), self.config.timing.episode_steps)
         kept = self.state
-        worlds = self._fresh(jax.random.fold_in(jax.random.PRNGKey(0), EVALUATION_DRAW))
-        # Donation hands the buffers over: worlds and key are copied so that training goes on from them unchanged.
-        kept_worlds, kept_key = jax.tree.map(jnp.copy, (kept.worlds, kept.key))
-        after, tally = self._advance(kept._replace(worlds=worlds), programs.evaluate(steps))
-        self.state = after._replace(worlds=kept_worlds, key=kept_key)
+        draw = jax.random.fold_in(jax.random.PRNGKey(0), EVALUATION_DRAW)
+        worlds = self.population.fresh_worlds(self._compiled, draw)
+        keys = processes.gather(kept.key)
+        lent = kept._replace(worlds=worlds, key=self.population.place_keys(keys))
+        after, tally = self._advance(lent, programs.evaluate(steps))
+        self.state = after._replace(worlds=kept.worlds, key=self.population.place_keys(keys))
         each = self.population.each
         returns = each(tally.reward) / steps * self.config.timing.episode_steps
         peaks = each(tally.peak).mean(axis=-1)
         errors = each(tally.steady_error) / np.maximum(each(tally.steady), 1)
+        tilts, verticals = (np.sqrt(each(sum_) / steps) for sum_ in (tally.tilt_error, tally.vertical_error))
         if self.population.members > 1:
-            self.members.add(row.steps, returns, errors, peaks)
+            self.members.add(row.steps, returns, errors, peaks, tilts, verticals)
         seen = bool(each(tally.steady).any())
         return dataclasses.replace(
             row,
             eval_return=_middle(returns),
             eval_steady_error=_middle(errors) if seen else None,
             eval_peak=_middle(peaks) if seen else None,
+            eval_tilt_error=_middle(tilts),
+            eval_vertical_error=_middle(verticals),
         )
 
     def _save(self) -> None:
         self._saved_at = self.progress.elapsed()
-        if self.state is not None and self._export():
-            self.checkpoints.save(self.state)
+        if self.state is None:
+            return
+        exported = self._export()
+        # Whole, and a copy: the next chunk of training reuses the buffers while the files are still being written.
+        arrays = processes.gather(self.state)
+        if exported and self.checkpoints:
+            self.checkpoints.save(arrays)
 
     def _export(self) -> bool:
         """Write the policy file, of a population every member's and the best one's; False if none is sound."""
-        steps, exported = self._count(self.state), False
+        steps, exported = self._steps(), False
         best = self.members.best()
+        learners = processes.gather(self.state.learner)
+        if not self._writes:
+            return False
         for member in range(self.population.members):
-            learner = self.population.member(self.state.learner, member)
+            learner = self.population.member(learners, member)
             origin = {**self.origin, "seed": self.origin["seed"] + member}
             policy = policy_file(self.population.member_config(member), learner, steps, origin)
             if not is_sound(policy):
@@ -196,6 +225,11 @@ class Run:
             if member == best:
                 save_file(self.out / POLICY, policy)
         return exported
+
+
+def _count(state: TrainState) -> int:
+    """Environment steps so far, the same for every member of a population."""
+    return int(np.ravel(processes.gather(state.steps))[0])
 
 
 def _middle(values: np.ndarray) -> float:

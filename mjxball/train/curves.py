@@ -1,0 +1,56 @@
+"""The picture of a training run: return and accuracy over environment steps (the paper's Fig. 2)."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from mjxball.config import Config
+
+PANELS = {
+    "task": (("steady_error", "eval_steady_error", "steady-state error [m]"),),
+    "paper": (
+        (None, "eval_tilt_error", "roll and pitch off the leader's [rad rms]"),
+        (None, "eval_vertical_error", "vertical command off the leader's [m/s² rms]"),
+    ),
+}
+BLUE, GREY = "#1b6ca8", "#9a9a9a"
+
+
+def draw_training(run: Path, config: Config, path: Path) -> None:
+    """Draw `metrics.csv` of the directory `run` to `path`, whose directory is made."""
+    from mjxball.evaluate.figures import pyplot
+
+    with (run / "metrics.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+
+    def column(name: str) -> tuple[np.ndarray, np.ndarray]:
+        kept = [(int(row["steps"]), float(row[name])) for row in rows if row[name]]
+        return np.array([k for k, _ in kept]), np.array([v for _, v in kept])
+
+    below = PANELS[config.reward.kind]
+    plt = pyplot()
+    figure, axes = plt.subplots(
+        1 + len(below), 1, sharex=True, figsize=(8, 3 + 2.2 * len(below)), constrained_layout=True
+    )
+    for axis, (exploring, evaluated, label) in zip(
+        axes, (("episode_return", "eval_return", "return of an episode"), *below), strict=True
+    ):
+        if exploring:
+            axis.plot(*column(exploring), color=GREY, linewidth=1, label="exploring")
+        axis.plot(*column(evaluated), color=BLUE, marker="o", markersize=3.5, label="evaluated, deterministic")
+        axis.set_ylabel(label, fontsize="small")
+        axis.grid(alpha=0.25)
+    for axis in axes[1:]:
+        if (column(below[0][1])[1] > 0).any():
+            axis.set_yscale("log")
+    if config.reward.kind == "paper":
+        axes[0].axhline(0.0, color="black", linestyle=":", linewidth=1, label="optimum: copy the leader")
+    axes[0].legend(fontsize="small")
+    axes[-1].set_xlabel("environment steps")
+    figure.suptitle(f"training of preset {config.preset}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

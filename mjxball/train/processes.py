@@ -1,0 +1,145 @@
+"""Several processes that train together over JAX's own multi-process runtime; process 0 writes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mjxball.errors import InputError, TrainingDivergedError
+
+HEARTBEAT = 20  # [s] after which a process that does not answer counts as dead
+PATIENCE = 120  # [s] for all processes to come together at the start
+
+
+@dataclass(frozen=True)
+class Rendezvous:
+    """Where the processes meet. Without a coordinator JAX asks SLURM, Open MPI or Kubernetes."""
+
+    coordinator: str | None = None  # HOST:PORT of process 0
+    processes: int | None = None
+    process: int | None = None
+
+    def __post_init__(self) -> None:
+        given = [value is not None for value in (self.coordinator, self.processes, self.process)]
+        if any(given) and not all(given):
+            raise InputError("--coordinator, --processes and --process belong together: give all three or none")
+        if not all(given):
+            return
+        port = self.coordinator.rpartition(":")[2]
+        if ":" not in self.coordinator or not port.isdigit() or not 0 < int(port) < 65536:
+            raise InputError(f"--coordinator must be HOST:PORT, not {self.coordinator!r}")
+        if self.processes < 1 or not 0 <= self.process < self.processes:
+            raise InputError(f"--process must be 0 .. {max(self.processes - 1, 0)}, not {self.process}")
+
+
+def join(meeting: Rendezvous) -> None:
+    """Join the other processes. Must come before anything else asks JAX for its devices."""
+    import jax
+
+    try:
+        jax.distributed.initialize(
+            meeting.coordinator,
+            meeting.processes,
+            meeting.process,
+            initialization_timeout=PATIENCE,
+            heartbeat_timeout_seconds=HEARTBEAT,
+        )
+    except (ValueError, RuntimeError) as error:
+        why = str(error).splitlines()[0][:200]
+        raise InputError(f"the processes cannot come together: {why}") from None
+
+
+def leave() -> None:
+    """Part from the other processes; this one may go on alone."""
+    import jax
+
+    jax.distributed.shutdown()
+
+
+def is_writer() -> bool:
+    """True in the one process that writes files and prints."""
+    import jax
+
+    return jax.process_index() == 0
+
+
+def gather(tree: Any) -> Any:
+    """The whole of every array as NumPy, copied, in every process; all must call it."""
+    import jax
+    from jax.sharding import NamedSharding, PartitionSpec
+
+    leaves, structure = jax.tree.flatten(tree)
+    spread = [k for k, leaf in enumerate(leaves) if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable]
+    if spread:
+        mesh = next(leaves[k].sharding.mesh for k in spread if leaves[k].size)
+        whole = NamedSharding(mesh, PartitionSpec())
+        wanted = [k for k in spread if leaves[k].size]
+        together = jax.jit(lambda arrays: arrays, out_shardings=whole)([leaves[k] for k in wanted])
+        for k in spread:
+            leaves[k] = np.zeros(leaves[k].shape, leaves[k].dtype)
+        for k, leaf in zip(wanted, together, strict=True):
+            leaves[k] = leaf.addressable_data(0)
+    return jax.tree.unflatten(structure, [np.array(leaf) for leaf in leaves])
+
+
+def any_of(flags: tuple[bool, ...]) -> tuple[bool, ...]:
+    """Each flag, true if it is true in any process; all must call it."""
+    import jax
+    from jax.experimental import multihost_utils
+
+    if jax.process_count() == 1:
+        return flags
+    everywhere = multihost_utils.process_allgather(np.array(flags, np.int32))
+    return tuple(bool(flag) for flag in np.max(everywhere, axis=0))
+
+
+@contextlib.contextmanager
+def ends_with_the_others(resume: str) -> Iterator[None]:
+    """If this or another process fails, say so, name `resume` as the way on, and end with a non-zero exit code.
+
+    A lost process shows in two ways: a collective operation raises, or JAX's runtime aborts this process. For the
+    second a small watcher process prints the sentence.
+    """
+    advice = f"Start all of them again with {resume}"
+    watcher = _watcher(f"\nthis process was ended, because another one of the run was lost. {advice}")
+    try:
+        yield
+    except (InputError, TrainingDivergedError):
+        raise
+    except Exception as error:
+        import jax
+
+        if not isinstance(error, jax.errors.JaxRuntimeError):
+            traceback.print_exc()
+        _dismiss(watcher)
+        why = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        print(  # noqa: T201
+            f"process {jax.process_index()} cannot go on, because it or another one failed: {why}. {advice}",
+            file=sys.stderr,
+            flush=True,
+        )
+        os._exit(1)  # the runtime's own farewell would wait for the lost process
+    finally:
+        _dismiss(watcher)
+
+
+WATCH = "import sys; sys.stdin.read(1) or print(sys.argv[1], file=sys.stderr)"
+
+
+def _watcher(text: str) -> subprocess.Popen[bytes]:
+    """A process that prints `text` if this one ends without `_dismiss`."""
+    command = [sys.executable, "-I", "-S", "-c", WATCH, text]
+    return subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)
+
+
+def _dismiss(watcher: subprocess.Popen[bytes]) -> None:
+    if watcher.poll() is None:
+        watcher.communicate(b".", timeout=10)
