@@ -17,6 +17,14 @@ def cache_directory() -> Path | None:
     return (Path(base) if base else Path.home() / ".cache") / "mjxball" / "jax"
 
 
+def traced_directory() -> Path | None:
+    """Where traced programs are kept: in the compilation cache's directory; None if there is no such cache."""
+    import jax
+
+    place = jax.config.jax_compilation_cache_dir
+    return Path(place) / "traced" if place and "://" not in place else None
+
+
 def enable_compilation_cache() -> Path | None:
     """Turn the cache on, unless JAX was told of one or it is switched off; return its directory if it is ours."""
     import jax

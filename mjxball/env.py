@@ -11,7 +11,6 @@ from mjxball.config import Config
 from mjxball.control import leader, observation, rotations
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.fused import make_fused_step
 from mjxball.physics.mjx import jax_repeat, make_engine
 from mjxball.physics.step import ControlStep, make_control_step, start_state
 from mjxball.physics.stepper import TRAINING_ENGINES
@@ -21,6 +20,7 @@ from mjxball.rewards import paper_reward, task_reward
 Array = Any
 Env, State = import_brax_env()
 STEADY_AFTER = 8.0  # [s] of an episode, after which its error counts as steady state in the metrics
+DRAWS = 18  # random numbers of a reset
 RATE_BOUND = 50.0  # [rad/s] beyond which a world has diverged
 
 
@@ -83,35 +83,35 @@ class CoupledPairEnv(Env):
     def reset(self, rng: Array) -> State:
         """A fresh world at rest or nearly so, drawn from `config.scenario`."""
         scenario = self.config.scenario
-        keys = jax.random.split(rng, 11)
+        # One draw for everything: a reset runs beside every training step, and each draw is kernels to launch.
+        drawn = iter(jnp.split(jax.random.uniform(rng, (DRAWS,)), DRAWS))
 
-        def symmetric(key: Array, reach: Any, shape: tuple[int, ...] = (3,)) -> Array:
-            return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) * reach
+        def between(low: float, high: float) -> Array:
+            return low + (high - low) * next(drawn)[0]
 
-        def between(key: Array, bounds: tuple[float, float]) -> Array:
-            return bounds[0] + (bounds[1] - bounds[0]) * jax.random.uniform(key)
+        def symmetric(reach: float, size: int = 3) -> Array:
+            return reach * (2.0 * jnp.concatenate([next(drawn) for _ in range(size)]) - 1.0)
 
-        mass = between(keys[0], scenario.object_mass)
+        mass = between(*scenario.object_mass)
         nominal = jnp.full_like(mass, self.config.plant.object_mass)
         load = Load(
             object_mass=mass,
             believed_mass=mass if scenario.mass_known else nominal,
-            cg_amplitude=between(keys[1], scenario.cg_amplitude),
-            cg_speed=between(keys[2], scenario.cg_speed),
-            cg_phase=between(keys[3], (0.0, 2 * jnp.pi)),
-            mass_change=between(keys[8], scenario.mass_change)[None],
-            mass_change_time=between(keys[9], scenario.mass_change_time)[None],
+            cg_amplitude=between(*scenario.cg_amplitude),
+            cg_speed=between(*scenario.cg_speed),
+            cg_phase=between(0.0, 2 * jnp.pi),
+            mass_change=between(*scenario.mass_change)[None],
+            mass_change_time=between(*scenario.mass_change_time)[None],
         )
-        tilt = symmetric(keys[4], scenario.start_tilt) * jnp.array([1.0, 1.0, 0.0])
         plant = start_state(
             self.config,
-            position=symmetric(keys[5], scenario.start_position),
-            euler=tilt,
-            velocity=symmetric(keys[6], scenario.start_velocity),
+            euler=jnp.append(symmetric(scenario.start_tilt, 2), 0.0),
+            position=symmetric(scenario.start_position),
+            velocity=symmetric(scenario.start_velocity),
             believed_mass=load.believed_mass,
-            ball_offset=symmetric(keys[10], scenario.ball_start, ()),
+            ball_offset=symmetric(scenario.ball_start, 1)[0],
         )
-        goal = symmetric(keys[7], scenario.goal_reach)
+        goal = symmetric(scenario.goal_reach)
         follower = self.config.follower
         first = self._observe(plant, goal)
         world = World(
@@ -216,8 +216,5 @@ class CoupledPairEnv(Env):
 
 
 def _make_step(config: Config, physics: str) -> ControlStep:
-    """The control step that is fastest here: on a GPU the closed form's components are split, see `fused`."""
-    if physics == "newton-euler" and jax.default_backend() == "gpu":
-        return make_fused_step(config)
     make = make_engine if physics == "mjx" else newton_euler.make_engine
     return make_control_step(config, make(config.plant, config.attitude), jax_repeat)

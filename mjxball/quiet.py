@@ -1,25 +1,46 @@
-"""Import MJX without the note that it prints when NVIDIA Warp is absent (harmless, and noise to a user)."""
+"""Imports of libraries that would otherwise print notes of no use to a user, or load what is not needed."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import io
+import sys
+from collections.abc import Iterator
 from types import ModuleType
 from typing import NamedTuple
 
 
 def import_mjx() -> ModuleType:
-    """Return `mujoco.mjx`, imported silently."""
+    """Return `mujoco.mjx`, without the note that it prints when NVIDIA Warp is absent."""
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         return importlib.import_module("mujoco.mjx")
 
 
 def import_brax_env() -> tuple[type, type]:
-    """Return Brax's `Env` and `State`; Brax imports MJX, hence silently."""
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    """Return Brax's `Env` and `State`; Brax imports MJX, hence silently, and jaxopt, which needs no Numba for it."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()), _without("numba"):
         base = importlib.import_module("brax.envs.base")
     return base.Env, base.State
+
+
+def import_tensorboard_writer() -> type:
+    """Return tensorboardX's `SummaryWriter`, without PyTorch, which it would load (5 s) where that is installed."""
+    with _without("torch"):
+        return importlib.import_module("tensorboardX").SummaryWriter
+
+
+@contextlib.contextmanager
+def _without(name: str) -> Iterator[None]:
+    """Let imports take the optional package `name` for not installed, unless it is loaded already."""
+    if name in sys.modules:
+        yield
+        return
+    sys.modules[name] = None  # type: ignore[assignment]  # what Python raises ImportError for
+    try:
+        yield
+    finally:
+        del sys.modules[name]
 
 
 class BraxTraining(NamedTuple):

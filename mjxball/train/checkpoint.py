@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import sys
 from collections.abc import Callable
@@ -14,19 +13,16 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.train.members import best_member, read_members
 from mjxball.train.population import Population
 from mjxball.train.processes import is_writer
 from mjxball.train.program import TrainState
+from mjxball.train.record import read_config
 
 KEEP = 2
-CONFIG_FILE = "config.json"
 CHECKPOINTS = "checkpoints"
-ORIGIN = ("seed", "physics", "seeds", "sweep")  # what config.json must say beside the configuration
 logging.getLogger("absl").setLevel(logging.ERROR)
 
 
@@ -101,38 +97,6 @@ def _named_leaves(state: Any) -> dict[str, Any]:
     """Leaves by their path, without empty arrays, which Orbax cannot store."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
     return {_name(path): leaf for path, leaf in leaves if leaf.size}
-
-
-def write_config(run: Path, config: Config, origin: dict[str, Any]) -> None:
-    """Write the run's `config.json`: configuration, its hash, and `origin` (seed, physics, command, commit)."""
-    record = {"config": configs.to_dict(config), "config_hash": configs.config_hash(config), **origin}
-    partial = run / f".{CONFIG_FILE}.partial"
-    partial.write_text(json.dumps(record, indent=2) + "\n")
-    partial.replace(run / CONFIG_FILE)
-
-
-def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
-    """Configuration and origin of a run directory; raise InputError if it is none."""
-    path = run / CONFIG_FILE
-    try:
-        record = json.loads(path.read_text())
-        config = configs.from_dict(record.pop("config"))
-    except FileNotFoundError:
-        raise InputError(f"{run} is not a run directory: it has no {CONFIG_FILE}") from None
-    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} cannot be read: {error}") from None
-    lost = [name for name in ORIGIN if name not in record]
-    if lost:
-        raise InputError(f"{path} lacks {', '.join(lost)}")
-    whole = all(isinstance(record[name], int) and not isinstance(record[name], bool) for name in ("seed", "seeds"))
-    if record["physics"] not in TRAINING_ENGINES or not whole or record["seeds"] < 1:
-        raise InputError(f"{path} has no sound seed, seeds or physics")
-    recorded = record.pop("config_hash", None)
-    if recorded != configs.config_hash(config):
-        raise InputError(f"the configuration in {path} was changed after the run began; restore it, or start a new run")
-    return configs.validate(config), record
 
 
 def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> TrainState | None:

@@ -9,6 +9,7 @@ import math
 import shlex
 import statistics
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -96,9 +97,11 @@ def _train(options: argparse.Namespace, command: str) -> int:
 
 def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: bool) -> int | None:
     """Train; return 0, 1 if training diverged, 130 if it was interrupted, None if nothing was left to train."""
-    from mjxball.train.checkpoint import restore_state
+    _wake_devices()
     from mjxball.train.run import Run
 
+    if resume:
+        from mjxball.train.checkpoint import restore_state
     state = restore_state(out, settings, origin) if resume else None
     if resume and processes.is_writer():
         steps = 0 if state is None else int(np.ravel(state.steps)[0])
@@ -113,6 +116,13 @@ def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: boo
             where = f"the last good policy and checkpoint are in {out}" if kept else "no good policy came before"
             print(f"training diverged: {error}; {where}", file=sys.stderr)  # noqa: T201
         return 1
+
+
+def _wake_devices() -> None:
+    """Start the accelerator's runtime (2 s of waiting on a GPU) beside the imports that follow."""
+    import jax
+
+    threading.Thread(target=lambda: jax.numpy.zeros(1).block_until_ready(), daemon=True).start()
 
 
 def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:
@@ -151,7 +161,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
 
 def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
     """Configuration and origin of the run to be continued; InputError if this program is not the one that made it."""
-    from mjxball.train.checkpoint import read_config
+    from mjxball.train.record import read_config
 
     settings, origin = read_config(run)
     changed = differences(origin)

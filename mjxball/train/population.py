@@ -18,7 +18,10 @@ from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.train.program import Mode, Program, Shards, Tally, TrainState, prefill
+from mjxball.train.provenance import source_hash, versions
 from mjxball.train.replay import Replay
+from mjxball.train.sac import Losses
+from mjxball.train.traced import Traced
 
 Array = Any
 # Settings that enter the compiled program as numbers, and may therefore differ between members.
@@ -36,6 +39,8 @@ SWEEPABLE = (
     "follower.vertical_limit",
     *(f"reward.{name}" for name in ("error", "error_scale", "velocity", "tilt", "rates", "effort", "smoothness")),
 )
+# Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
+GPU_OPTIONS = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
 Sweep = Mapping[str, Sequence[float]]
 
 
@@ -136,20 +141,48 @@ class Population:
 
     def compile(self, creating: bool) -> Executables:
         """Compile everything a run needs, side by side; `create` only if `creating`."""
+        lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
+        options = GPU_OPTIONS if jax.default_backend() == "gpu" else None
+        with ThreadPoolExecutor(len(lowered)) as pool:  # XLA compiles outside Python's lock
+            advance, fresh, *create = pool.map(lambda work: work.compile(compiler_options=options), lowered)
+        return Executables(create[0] if create else self._create, advance, fresh)
+
+    def _lower_here(self, creating: bool) -> list[Any]:
+        """advance, fresh worlds and, if `creating`, create on one device; traced programs come from the cache."""
+        key = {
+            "config": configs.to_dict(self.config),
+            "physics": self._physics,
+            "members": self.members,
+            "swept": sorted(self._values),
+            "source": source_hash(),
+            "versions": versions(),
+        }
+        values, keys = jax.tree.map(_shape, self._starts(0))
+        mode, state = jax.tree.map(_shape, prefill(1)), self.template()
+        tally = Tally(*[0] * (len(Tally._fields) - 1), Losses(*[0] * len(Losses._fields)))
+        one_key = _shape(jax.random.PRNGKey(0))
+        lowered = [
+            Traced("advance", key, self.advance, (state, mode), (state, tally)).lower(donate=0),
+            Traced("fresh", key, self._fresh, (values, one_key), state.worlds).lower(),
+        ]
+        if creating:
+            lowered.append(Traced("create", key, self._create, (values, keys), state).lower())
+        return lowered
+
+    def _lower_on_mesh(self, creating: bool) -> list[Any]:
+        """The same on several devices."""
         values, keys = self._starts(0)
         key = self.place(np.asarray(jax.random.PRNGKey(0)), PartitionSpec())
         state = self._placed_shapes(self.template(), self._state_spec)
         mode = self.mode(prefill(1))
+        results = self._results(self._state_spec, self._tally_spec)
         lowered = [
-            jax.jit(self.advance, donate_argnums=0, **self._results(self._state_spec, self._tally_spec)).lower(
-                state, mode
-            ),
+            jax.jit(self.advance, donate_argnums=0, **results).lower(state, mode),
             jax.jit(self._fresh, **self._results(self._split)).lower(values, key),
-            *([jax.jit(self._create, **self._results(self._state_spec)).lower(values, keys)] if creating else []),
         ]
-        with ThreadPoolExecutor(len(lowered)) as pool:  # XLA compiles outside Python's lock
-            advance, fresh, *create = pool.map(lambda work: work.compile(), lowered)
-        return Executables(create[0] if create else self._create, advance, fresh)
+        if creating:
+            lowered.append(jax.jit(self._create, **self._results(self._state_spec)).lower(values, keys))
+        return lowered
 
     def start(self, executables: Executables, seed: int) -> TrainState:
         """`create(seed)` with a compiled program."""
@@ -237,6 +270,10 @@ class Population:
 
     def _of(self, values: Mapping[str, Array]) -> Program:
         return Program(self.config, self._physics, values, self._shards) if values else self.program
+
+
+def _shape(array: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(array.shape, array.dtype)
 
 
 def grid(members: int, devices: int, split: bool) -> tuple[int, int]:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TextIO
 
-from tensorboardX import SummaryWriter
+from mjxball.quiet import import_tensorboard_writer
 
 EVENTS = "tensorboard"  # directory beside metrics.csv
 
@@ -66,7 +66,7 @@ class Progress:
         partial.replace(path)
         self._file = path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, names)
-        self._events = SummaryWriter(str(path.with_name(EVENTS)), purge_step=resumed_at or None)
+        self._events = import_tensorboard_writer()(str(path.with_name(EVENTS)), purge_step=resumed_at or None)
 
     def elapsed(self) -> float:
         """Seconds since this object was made."""

@@ -7,6 +7,7 @@ import dataclasses
 import math
 import signal
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,11 @@ from mjxball.export import is_sound, policy_file
 from mjxball.policy import save_file
 from mjxball.train import processes
 from mjxball.train import program as programs
-from mjxball.train.checkpoint import CONFIG_FILE, Checkpoints, write_config
 from mjxball.train.members import MemberLog
 from mjxball.train.population import Population
 from mjxball.train.program import Mode, Tally, TrainState
 from mjxball.train.progress import Progress, Row
+from mjxball.train.record import CONFIG_FILE, write_config
 
 CHUNKS = 50  # rows of metrics.csv in a run
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
@@ -85,18 +86,24 @@ class Run:
                 write_config(out, config, {**origin, "parts": self.population.parts})
         self.progress = Progress(out / METRICS if self._writes else None, config.sac.steps, done, origin["seeds"])
         self.members = MemberLog(out if self._writes else None, origin["seed"], done)
-        self.checkpoints = Checkpoints(out) if self._writes else None
+        # Orbax takes half a second to load: beside the compilation, not before it.
+        self._checkpoints = ThreadPoolExecutor(1).submit(_open_checkpoints, out) if self._writes else None
         self.state: TrainState | None = resumed
         self._saved_at = 0.0
 
     def train(self) -> bool:
         """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk."""
-        with contextlib.closing(self.checkpoints or contextlib.ExitStack()), contextlib.closing(self.progress):
+        with contextlib.closing(self), contextlib.closing(self.progress):
             with graceful_interrupt(self.progress) as stop:
                 self._start()
                 self._loop(stop)
                 self._save()
             return not stop.requested
+
+    def close(self) -> None:
+        """Wait until every checkpoint is on disk."""
+        if self._checkpoints:
+            self._checkpoints.result().close()
 
     def _start(self) -> None:
         devices = self.population.devices
@@ -203,8 +210,8 @@ class Run:
         exported = self._export()
         # Whole, and a copy: the next chunk of training reuses the buffers while the files are still being written.
         arrays = processes.gather(self.state)
-        if exported and self.checkpoints:
-            self.checkpoints.save(arrays)
+        if exported and self._checkpoints:
+            self._checkpoints.result().save(arrays)
 
     def _export(self) -> bool:
         """Write the policy file, of a population every member's and the best one's; False if none is sound."""
@@ -225,6 +232,12 @@ class Run:
             if member == best:
                 save_file(self.out / POLICY, policy)
         return exported
+
+
+def _open_checkpoints(out: Path) -> Any:
+    from mjxball.train.checkpoint import Checkpoints
+
+    return Checkpoints(out)
 
 
 def _count(state: TrainState) -> int:

@@ -1,0 +1,77 @@
+"""Traced programs, kept beside XLA's compilation cache: a second run need not trace physics and learner again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from mjxball.cache import traced_directory
+
+OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
+
+
+class Traced:
+    """One function of arrays, traced or found in the cache. `lower(donate)` readies it for compilation."""
+
+    def __init__(self, name: str, key: Mapping[str, Any], function: Callable[..., Any], shapes: Any, result: Any):
+        """`shapes` are the arguments' `ShapeDtypeStruct`s, `result` any tree with the structure of what it returns.
+
+        `key` must hold everything that the traced program depends on.
+        """
+        self._shapes, self._structure = shapes, jax.tree.structure(result)
+        path = _path(name, key)
+        exported = _read(path)
+        if exported is None:
+            leaves, structure = jax.tree.flatten(shapes)
+
+            def flat(*arrays: Any) -> Any:
+                return jax.tree.leaves(function(*jax.tree.unflatten(structure, arrays)))
+
+            exported = jax.export.export(jax.jit(flat))(*leaves)
+            _write(path, exported)
+        self._exported = exported
+
+    def lower(self, donate: int | None = None) -> Any:
+        """`jax.stages.Lowered`; argument number `donate` gives its memory away."""
+
+        def call(*arguments: Any) -> Any:
+            return jax.tree.unflatten(self._structure, self._exported.call(*jax.tree.leaves(arguments)))
+
+        return jax.jit(call, donate_argnums=() if donate is None else donate).lower(*self._shapes)
+
+
+def _path(name: str, key: Mapping[str, Any]) -> Path | None:
+    place = traced_directory()
+    if place is None:
+        return None
+    settings = {option: str(getattr(jax.config, option)) for option in OPTIONS}
+    text = json.dumps({**key, **settings, "platform": jax.default_backend()}, sort_keys=True)
+    return place / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:32]}.stablehlo"
+
+
+def _read(path: Path | None) -> Any:
+    """The exported program in `path`, None if there is none that can be read."""
+    if path is None:
+        return None
+    try:
+        return jax.export.deserialize(bytearray(path.read_bytes()))
+    except Exception:  # absent, cut short, or of another JAX: traced anew
+        return None
+
+
+def _write(path: Path | None, exported: Any) -> None:
+    if path is None:
+        return
+    partial = path.with_suffix(f".{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(exported.serialize())
+        partial.replace(path)
+    except OSError:  # a full or read-only cache is no reason not to train
+        partial.unlink(missing_ok=True)
