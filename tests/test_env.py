@@ -241,3 +241,55 @@ class TestBraxWrappers:
         limited = with_settings(transport, timing={"episode_steps": self.EPISODE})
         steps = self.rolled(CoupledPairEnv(limited, "newton-euler"))
         np.testing.assert_array_equal(steps.info["truncation"][self.EPISODE - 1], 1.0)
+
+
+class TestStockBrax:
+    """Brax's own trainers run on the environment, given the function that JAX has removed."""
+
+    @pytest.fixture(autouse=True)
+    def put_replicated(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def copies(tree: Any, devices: list[Any]) -> Any:
+            return jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * len(devices)), tree)
+
+        monkeypatch.setattr(jax, "device_put_replicated", copies, raising=False)
+
+    def test_ppo_trains(self, transport):
+        from brax.training.agents.ppo import train as ppo
+
+        seen = []
+        _, parameters, _ = ppo.train(
+            CoupledPairEnv(transport, "newton-euler"),
+            num_timesteps=1024,
+            episode_length=40,
+            num_envs=16,
+            num_eval_envs=4,
+            batch_size=8,
+            num_minibatches=4,
+            unroll_length=8,
+            num_updates_per_batch=1,
+            num_evals=2,
+            normalize_observations=True,
+            max_devices_per_host=1,
+            progress_fn=lambda steps, metrics: seen.append((steps, float(metrics["eval/episode_reward"]))),
+        )
+        assert [steps for steps, _ in seen] == [0, 1024]
+        assert all(np.isfinite(reward) and reward < 0 for _, reward in seen)
+        assert finite(parameters)
+
+    def test_sac_trains(self, transport):
+        from brax.training.agents.sac import train as sac
+
+        _, parameters, _ = sac.train(
+            CoupledPairEnv(transport, "newton-euler"),
+            num_timesteps=512,
+            episode_length=40,
+            num_envs=8,
+            num_eval_envs=4,
+            batch_size=8,
+            min_replay_size=64,
+            max_replay_size=512,
+            normalize_observations=True,
+            max_devices_per_host=1,
+        )
+        assert finite(parameters)
+        assert float(jnp.abs(parameters[0].mean).max()) > 0

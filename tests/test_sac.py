@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxball.config import Sac
+from mjxball.config import Sac, preset
 from mjxball.train import sac
 from mjxball.train.replay import Transitions
 
 SMALL = Sac(policy_layers=(16,), critic_layers=(32, 32), learning_rate=3e-3, alpha_fixed=True)
+PAPER = dataclasses.replace(SMALL, state_value=True, critics=1)  # the paper's V, Q and pi
 ADAPTIVE = dataclasses.replace(SMALL, alpha_fixed=False)
 BATCH, UPDATES = 256, 3000
 STATE = jnp.zeros((1, 1))  # the only state of every problem here
@@ -73,17 +74,19 @@ def one_update(rate: float = 1.0, config: Sac = ADAPTIVE, **changes: float) -> t
     return before, after, float(losses.entropy[0])
 
 
-def learn(loop: Loop, alpha: float, discount: float = 0.0, reward_scale: float = 1.0) -> sac.Learner:
+def learn(
+    loop: Loop, alpha: float, discount: float = 0.0, reward_scale: float = 1.0, config: Sac = SMALL
+) -> sac.Learner:
     """The learner after `UPDATES` updates with a fixed temperature `alpha`."""
     changes = {"discount": jnp.asarray(discount), "reward_scale": jnp.asarray(reward_scale), "target_rate": RATE * 0.1}
-    learner = parts(SMALL)[1]._replace(log_alpha=jnp.log(jnp.asarray(alpha)))
+    learner = parts(config)[1]._replace(log_alpha=jnp.log(jnp.asarray(alpha)))
     loop = Loop(*(jnp.asarray(number) for number in loop))
-    return compiled(SMALL, UPDATES)(changes, learner, loop, RATE)[0]
+    return compiled(config, UPDATES)(changes, learner, loop, RATE)[0]
 
 
-def soft_values(learner: sac.Learner) -> np.ndarray:
-    """Q (5, 2) of both critics at five actions."""
-    network = parts(SMALL)[0].q_network
+def soft_values(learner: sac.Learner, config: Sac = SMALL) -> np.ndarray:
+    """Q (5, critics) at five actions."""
+    network = parts(config)[0].q_network
     actions = jnp.linspace(-0.8, 0.8, 5)[:, None]
     return np.asarray(network.apply(learner.normaliser, learner.critic, jnp.zeros((5, 1)), actions))
 
@@ -130,11 +133,12 @@ def test_rate_scales_every_learning_rate(rate):
     assert float(before.log_alpha - after.log_alpha) == pytest.approx(rate * 1e-3, rel=1e-3)  # ulp of log 0.02: 2e-4
 
 
-def test_bandit_policy_is_entropy_optimal():
+@pytest.mark.parametrize("config", [SMALL, PAPER], ids=["twin critics", "state value"])
+def test_bandit_policy_is_entropy_optimal(config):
     """Reward -w (a - a0)^2: the optimum exp(Q / alpha) is a Gaussian at a0 with variance alpha / 2w."""
     best, weight, alpha = 0.3, 2.0, 0.04
-    learner = learn(Loop(weight=weight, best=best), alpha)
-    networks = parts(SMALL)[0]
+    learner = learn(Loop(weight=weight, best=best), alpha, config=config)
+    networks = parts(config)[0]
     parameters = networks.policy_network.apply(learner.normaliser, learner.policy, STATE)
     distribution = networks.parametric_action_distribution
     mean = float(distribution.mode(parameters)[0, 0])
@@ -145,24 +149,67 @@ def test_bandit_policy_is_entropy_optimal():
     assert deviation == pytest.approx(math.sqrt(alpha / (2 * weight)), rel=0.15)
 
 
-def test_critic_learns_the_soft_value_of_a_loop():
+@pytest.mark.parametrize("config", [SMALL, PAPER], ids=["twin critics", "state value"])
+def test_critic_learns_the_soft_value_of_a_loop(config):
     """Reward r for ever, actions without effect: Q = (r + gamma alpha log 2) / (1 - gamma), the policy uniform."""
     reward, gamma, alpha = 0.1, 0.5, 0.5
-    values = soft_values(learn(Loop(reward=reward, continues=1.0), alpha, discount=gamma))
+    learner = learn(Loop(reward=reward, continues=1.0), alpha, discount=gamma, config=config)
+    values = soft_values(learner, config)
     soft = (reward + gamma * alpha * math.log(2)) / (1 - gamma)
     # A tanh-Gaussian misses log 2 by 0.02 nat at its best; the rest is the noise of 256 samples.
     np.testing.assert_allclose(values, soft, rtol=0, atol=0.04)
     assert soft - reward / (1 - gamma) > 4 * 0.04  # the entropy bonus is far larger than the tolerance
 
 
-def test_termination_is_not_bootstrapped():
-    values = soft_values(learn(Loop(reward=-0.4, continues=0.0), alpha=0.5, discount=0.9))
+def test_state_value_is_the_soft_value():
+    """V = Q + alpha H: with the actions of the loop above without effect, (r + alpha log 2) / (1 - gamma)."""
+    reward, gamma, alpha = 0.1, 0.5, 0.5
+    learner = learn(Loop(reward=reward, continues=1.0), alpha, discount=gamma, config=PAPER)
+    network = parts(PAPER)[0].value_network
+    for value in (learner.value, learner.target):
+        found = float(network.apply(learner.normaliser, value, STATE)[0])
+        assert found == pytest.approx((reward + alpha * math.log(2)) / (1 - gamma), abs=0.04)
+
+
+def test_paper_preset_has_one_critic_and_a_state_value():
+    config = preset("paper").sac
+    assert (config.state_value, config.critics, config.alpha_fixed, config.alpha) == (True, 1, True, 0.3)
+    networks = sac.make_networks(config, (1.0,), 1)
+    learner = sac.create(networks, config, 1, jax.random.key(0))
+    assert networks.q_network.apply(learner.normaliser, learner.critic, STATE, STATE).shape == (1, 1)
+    assert jax.tree.structure(learner.value) == jax.tree.structure(learner.target)
+    assert parts(SMALL)[1].value == ()
+
+
+@pytest.mark.parametrize("config", [SMALL, PAPER], ids=["twin critics", "state value"])
+def test_termination_is_not_bootstrapped(config):
+    values = soft_values(learn(Loop(reward=-0.4, continues=0.0), alpha=0.5, discount=0.9, config=config), config)
     np.testing.assert_allclose(values, -0.4, rtol=0, atol=0.02)  # a regression on a constant; with bootstrap +2.6
 
 
 def test_reward_scale_multiplies_the_reward_in_the_critic():
     values = soft_values(learn(Loop(reward=0.2), alpha=0.5, reward_scale=3.0))
     np.testing.assert_allclose(values, 0.6, rtol=0, atol=0.02)  # a regression on a constant
+
+
+def test_two_halves_of_a_batch_make_the_update_of_the_whole():
+    """Data parallel: gradients averaged over an axis. With gamma = 0 the critic's update has no noise of its own."""
+    networks, before = parts(SMALL)
+    config = dataclasses.replace(SMALL, discount=0.0)
+    batch = Loop(weight=2.0, best=0.3).batch(jax.random.key(1))
+    key = jax.random.key(2)
+    whole = jax.jit(sac.make_update(networks, config, 1))(before, batch, key, RATE)[0]
+    update = sac.make_update(networks, config, 1, lambda tree: jax.lax.pmean(tree, "parts"))
+    halves = jax.tree.map(lambda leaf: leaf.reshape(2, BATCH // 2, *leaf.shape[1:]), batch)
+    split = jax.vmap(lambda half, key: update(before, half, key, RATE)[0], axis_name="parts")
+    after = jax.jit(split)(halves, jax.random.split(key))
+    for leaf in jax.tree.leaves(after.policy):
+        np.testing.assert_array_equal(leaf[0], leaf[1])  # both stay the same learner, noise included
+    first = jax.tree.map(lambda leaf: leaf[0], after.critic)
+    # Adam divides by the gradient's size: rounding can turn the sign of a gradient that is zero but for it.
+    moved = jax.tree.map(lambda a, b, c: (jnp.abs(a - b) > 1e-6) & (jnp.abs(c) > 1e-6), first, whole.critic, first)
+    assert sum(int(leaf.sum()) for leaf in jax.tree.leaves(moved)) <= 3
+    assert largest_difference(first, before.critic) > 1e-3
 
 
 def test_mask_hides_its_slots_from_policy_and_critic():

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import resource
 import signal
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -89,7 +91,7 @@ class Run:
         # Orbax takes half a second to load: beside the compilation, not before it.
         self._checkpoints = ThreadPoolExecutor(1).submit(_open_checkpoints, out) if self._writes else None
         self.state: TrainState | None = resumed
-        self._saved_at = 0.0
+        self._saved_at = self._saving = 0.0  # [s]
 
     def train(self) -> bool:
         """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk."""
@@ -98,12 +100,20 @@ class Run:
                 self._start()
                 self._loop(stop)
                 self._save()
+                self.progress.say(self._cost())
             return not stop.requested
 
     def close(self) -> None:
         """Wait until every checkpoint is on disk."""
         if self._checkpoints:
             self._checkpoints.result().close()
+
+    def _cost(self) -> str:
+        """What the run took, for people and for `benchmarks/training.py`."""
+        host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+        device = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+        more = f", {device / 1e6:.0f} MB on each device" if device else ""
+        return f"peak memory {host:.0f} MB{more}; saving took {self._saving:.2f} of {self.progress.elapsed():.1f} s"
 
     def _start(self) -> None:
         devices = self.population.devices
@@ -204,7 +214,7 @@ class Run:
         )
 
     def _save(self) -> None:
-        self._saved_at = self.progress.elapsed()
+        began = self.progress.elapsed()
         if self.state is None:
             return
         exported = self._export()
@@ -212,6 +222,8 @@ class Run:
         arrays = processes.gather(self.state)
         if exported and self._checkpoints:
             self._checkpoints.result().save(arrays)
+        self._saved_at = self.progress.elapsed()
+        self._saving += self._saved_at - began
 
     def _export(self) -> bool:
         """Write the policy file, of a population every member's and the best one's; False if none is sound."""

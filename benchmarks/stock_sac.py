@@ -1,0 +1,118 @@
+"""Train a follower with Brax's own `sac.train` on the environment of a preset, and export it as a policy file.
+
+`python benchmarks/stock_sac.py OUT.npz [--seed N] [--steps N] [--worlds N] ... [--physics mjx|newton-euler]`
+
+The other side of `benchmarks/training.py`. Brax 0.14.2 calls `jax.device_put_replicated`, which JAX has removed; it is
+supplied here. Brax's closing evaluation is left out, which makes it faster. What the networks see, how actions are
+bounded and what is rewarded are the preset's, exactly as in `train.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import types
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjxball import config as configs
+from mjxball.cache import enable_compilation_cache
+from mjxball.env import CoupledPairEnv
+from mjxball.export import policy_file
+from mjxball.policy import save_file
+from mjxball.quiet import import_brax_env
+
+
+def replicated(tree: Any, devices: list[Any]) -> Any:
+    """What `jax.device_put_replicated` did: a copy for every device along a new leading axis."""
+    return jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * len(devices)), tree)
+
+
+class Masked:
+    """An environment whose observation has zeros where the preset's networks look away."""
+
+    def __init__(self, env: CoupledPairEnv):
+        self._env, self._mask = env, jnp.asarray(env.input_mask, jnp.float32)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+    def reset(self, key: Any) -> Any:
+        """See `CoupledPairEnv.reset`."""
+        state = self._env.reset(key)
+        return state.replace(obs=state.obs * self._mask)
+
+    def step(self, state: Any, action: Any) -> Any:
+        """See `CoupledPairEnv.step`."""
+        state = self._env.step(state, action)
+        return state.replace(obs=state.obs * self._mask)
+
+
+def train(config: configs.Config, options: argparse.Namespace) -> Any:
+    """(observation statistics, policy parameters) after `options.steps` environment steps."""
+    import_brax_env()
+    from brax.envs.wrappers import training as wrappers
+    from brax.training import acting
+    from brax.training.agents.sac import networks, train
+
+    jax.device_put_replicated = replicated
+    acting.Evaluator.run_evaluation = lambda self, params, training_metrics, **_: dict(training_metrics)
+    layers = tuple(int(size) for size in options.layers.split(","))
+    with jax.default_matmul_precision("highest"):
+        _, parameters, _ = train.train(
+            environment=Masked(CoupledPairEnv(config, options.physics)),
+            wrap_env_fn=wrappers.wrap,
+            num_timesteps=options.steps,
+            episode_length=config.timing.episode_steps,
+            num_envs=options.worlds,
+            learning_rate=options.learning_rate,
+            discounting=options.discount,
+            seed=options.seed,
+            batch_size=options.batch,
+            num_evals=1,
+            normalize_observations=True,
+            max_devices_per_host=1,
+            reward_scaling=options.reward_scale,
+            tau=options.target_rate,
+            min_replay_size=config.sac.prefill,
+            max_replay_size=options.replay,
+            grad_updates_per_step=options.updates,
+            network_factory=functools.partial(
+                networks.make_sac_networks, hidden_layer_sizes=layers, activation=jax.nn.relu
+            ),
+        )
+    return parameters
+
+
+def main() -> None:
+    """Train and export."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("out", type=Path, metavar="OUT.npz")
+    parser.add_argument("--preset", default="transport")
+    parser.add_argument("--physics", default="mjx")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=768_000)
+    parser.add_argument("--worlds", type=int, default=128)
+    parser.add_argument("--updates", type=int, default=4)
+    parser.add_argument("--batch", type=int, default=256)
+    parser.add_argument("--replay", type=int, default=768_000)
+    parser.add_argument("--layers", default="64,64")
+    parser.add_argument("--learning-rate", type=float, default=1e-3)
+    parser.add_argument("--discount", type=float, default=0.97)
+    parser.add_argument("--target-rate", type=float, default=0.02)
+    parser.add_argument("--reward-scale", type=float, default=50.0)
+    options = parser.parse_args()
+    enable_compilation_cache()
+    config = configs.preset(options.preset)
+    statistics, policy = train(config, options)
+    learner = types.SimpleNamespace(average=policy, normaliser=statistics)
+    card = {"trainer": "brax.training.agents.sac.train", "seed": options.seed, "physics": options.physics}
+    save_file(options.out, policy_file(config, learner, options.steps, card))
+    print(f"policy: {options.out}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""Two CPU processes on loopback train together; a lost one ends the other, and the run goes on from its checkpoint."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mjxball.errors import InputError
+from mjxball.policy import Policy
+from mjxball.train.checkpoint import CHECKPOINTS
+from mjxball.train.main import main as train
+from mjxball.train.population import check_parts, grid
+from mjxball.train.processes import Rendezvous
+
+REPOSITORY = Path(__file__).parents[1]
+SMALL = [
+    *("--physics", "newton-euler", "--sac.worlds", "8", "--sac.replay", "800", "--sac.batch", "16"),
+    *("--sac.prefill", "100", "--sac.updates", "1", "--timing.episode_steps", "60"),
+    *("--sac.policy_layers", "8", "--sac.critic_layers", "8"),
+]
+LIMIT = 240  # [s] for a pair of processes
+
+
+def launch(arguments: list[str], cache: Path) -> list[subprocess.Popen[str]]:
+    """Two processes that meet on a free port of loopback."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    meeting = ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--processes", "2", "--process"]
+    environment = {**os.environ, "MJXBALL_CACHE": str(cache), "JAX_PLATFORMS": "cpu"}
+    return [
+        subprocess.Popen(
+            [sys.executable, "train.py", *arguments, *meeting, str(process)],
+            cwd=REPOSITORY,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for process in range(2)
+    ]
+
+
+def finish(children: list[subprocess.Popen[str]]) -> list[str]:
+    """Outputs of both, which must end within the limit."""
+    try:
+        return [child.communicate(timeout=LIMIT)[0] for child in children]
+    finally:
+        for child in children:
+            child.kill()
+
+
+def checkpoints(run: Path) -> list[int]:
+    place = run / CHECKPOINTS
+    return sorted(int(path.name) for path in place.iterdir() if path.name.isdigit()) if place.is_dir() else []
+
+
+def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None:
+    """Two members, one on each process."""
+    run, cache = tmp_path / "run", tmp_path / "cache"
+    children = launch([*SMALL, "--seeds", "2", "--sac.steps", "200000", "--out", str(run)], cache)
+    try:
+        deadline = time.monotonic() + LIMIT
+        while not checkpoints(run) and children[0].poll() is None and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert checkpoints(run), "no checkpoint came before the limit"
+        children[1].send_signal(signal.SIGKILL)
+        output = children[0].communicate(timeout=60)[0]
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+    assert children[0].returncode != 0, output
+    assert f"Start all of them again with --resume {run}" in output
+    kept = checkpoints(run)[-1]
+    assert kept < 200_000
+
+    # What is left to do is cut short, so that the test is: the first chunk after the checkpoint, then Ctrl-C for all.
+    children = launch(["--resume", str(run)], cache)
+    deadline = time.monotonic() + LIMIT
+    while checkpoints(run)[-1] == kept and children[0].poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for child in children:
+        child.send_signal(signal.SIGINT)
+    outputs = finish(children)
+    assert [child.returncode for child in children] in ([130, 130], [0, 0]), outputs
+    assert f"continuing {run} after" in outputs[0]
+    assert checkpoints(run)[-1] > kept
+    for seed in (0, 1):
+        assert Policy.load(run / "members" / f"seed{seed}.npz").card["training_steps"] >= kept
+
+
+def test_worlds_of_one_follower_are_split_over_the_processes(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    children = launch([*SMALL, "--sac.steps", "2400", "--out", str(run)], tmp_path / "cache")
+    outputs = finish(children)
+    assert [child.returncode for child in children] == [0, 0], outputs
+    assert Policy.load(run / "policy.npz").card["training_steps"] == 2400
+    assert "policy:" not in outputs[1]  # one process writes and prints
+    assert (run / "eval" / "training.png").stat().st_size > 10_000
+    assert train(["--resume", str(run)]) == 2  # one process cannot take over halves of a replay
+
+
+@pytest.mark.parametrize(
+    ("members", "devices", "together", "expected"),
+    [
+        (1, 4, False, (1, 1)),
+        (8, 4, False, (4, 1)),
+        (3, 4, False, (1, 1)),
+        (1, 4, True, (1, 4)),
+        (8, 4, True, (4, 1)),
+        (6, 4, True, (2, 2)),
+    ],
+)
+def test_devices_are_arranged_by_members_first(members, devices, together, expected) -> None:
+    assert grid(members, devices, split=together) == expected
+
+
+@pytest.mark.parametrize(
+    ("meeting", "word"),
+    [
+        (("127.0.0.1:1234", 2, None), "belong together"),
+        (("127.0.0.1", 2, 0), "HOST:PORT"),
+        (("127.0.0.1:99999", 2, 0), "HOST:PORT"),
+        (("127.0.0.1:1234", 2, 2), "0 .. 1"),
+        (("127.0.0.1:1234", 0, 0), "--process"),
+    ],
+)
+def test_unsound_meetings_are_refused(meeting, word) -> None:
+    with pytest.raises(InputError, match=word):
+        Rendezvous(*meeting)
+
+
+def test_sizes_that_cannot_be_split_are_refused(transport) -> None:
+    check_parts(transport, 4)
+    with pytest.raises(InputError, match=r"sac\.worlds = 128"):
+        check_parts(transport, 3)
+
+
+def test_meeting_flags_need_distributed(capsys: pytest.CaptureFixture) -> None:
+    assert train(["--coordinator", "127.0.0.1:1234", "--processes", "2", "--process", "0"]) == 2
+    assert "--distributed" in capsys.readouterr().err
