@@ -13,7 +13,7 @@ import numpy as np
 
 from mjxball.cli import Parser, output_file, run_command
 from mjxball.config import Attitude, Plant
-from mjxball.physics.constants import plant_constants
+from mjxball.control.constants import plant_constants
 from mjxball.physics.engine import ROLLING_INERTIA
 
 ASSEMBLY = "assembly"

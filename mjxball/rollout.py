@@ -10,17 +10,18 @@ import numpy as np
 
 from mjxball.config import Config, Plant, ball_reach, cg_reach, preset, validate
 from mjxball.control import leader, observation, rotations
-from mjxball.control.followers import Follower
+from mjxball.control.baselines.law import Brief
+from mjxball.control.constants import plant_constants
+from mjxball.control.followers import Baseline, Follower
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
-from mjxball.physics.constants import plant_constants
 from mjxball.physics.contact import contact_wrenches
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.motion import object_mass
+from mjxball.physics.motion import make_prescribed, object_mass
 from mjxball.physics.step import make_accelerations, make_cg_offset, start_state, total_wrench
 from mjxball.physics.stepper import make_stepper
 
-Act = Callable[[np.ndarray], np.ndarray]  # observations (n, 18) -> commands (n, 3)
+Act = Callable[[np.ndarray, Brief], np.ndarray]  # observations (n, 18), what is known -> commands (n, 3)
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,12 @@ def simulate_batch(
     for follower in followers:
         follower.reset()
 
-    def act(seen: np.ndarray) -> np.ndarray:
-        commands = [np.asarray(f(seen[part]), float) for f, part in zip(followers, parts, strict=True)]
+    def act(seen: np.ndarray, brief: Brief) -> np.ndarray:
+        commands = []
+        for follower, part in zip(followers, parts, strict=True):
+            if isinstance(follower, Baseline):
+                follower.brief = Brief(*(leaf[part] for leaf in brief))
+            commands.append(np.asarray(follower(seen[part]), float))
         return np.concatenate(commands)
 
     return _fly(config, scenarios, act, physics)
@@ -155,7 +160,7 @@ def check_scenario(config: Config, scenario: Scenario) -> None:
 
 
 def _fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Trajectory:
-    step, cg_offset = make_stepper(config, physics), make_cg_offset(config)
+    step, cg_offset, brief = make_stepper(config, physics), make_cg_offset(config), make_brief(config)
     period = config.timing.control_period
     count = round(scenarios[0].seconds / period)
     load, goal = _load(scenarios), np.array([scenario.goal for scenario in scenarios], float)
@@ -169,7 +174,7 @@ def _fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) 
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         seen = observation.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
         led = _leader_command(config, goal, state, integral)
-        followed = act(seen)
+        followed = act(seen, brief(state, load))
         states.append(state)
         others.append((rotations.euler_from_matrix(matrix), led, followed, seen, cg_offset(state, load)))
         if number < count:
@@ -200,6 +205,28 @@ def _fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) 
         goal=goal,
         diverged=diverged,
     )
+
+
+def make_brief(config: Config) -> Callable[[PlantState, Load], Brief]:
+    """Return `brief(state, load)`: what a classical follower is told, the truth half a step and a rotor lag ahead.
+
+    Of a rolling ball nobody can know the future: the oracle is told where it is.
+    """
+    plant = config.plant
+    ahead = 0.5 * config.timing.control_period + plant.rotor_lag
+    drones = plant.leader_mass + plant.follower_mass
+    prescribed = None if config.motion.kind == "rolling" else make_prescribed(config)
+
+    def brief(state: PlantState, load: Load) -> Brief:
+        xp = state.time.__array_namespace__()
+        mass = object_mass(state.time, load)
+        if prescribed is None:
+            offset, acceleration = plant.moving_fraction * state.ball_offset, xp.zeros_like(state.ball_offset)
+        else:
+            offset, _, acceleration = prescribed(state.time + ahead, load)
+        return Brief(load.believed_mass, mass * offset, mass * acceleration, drones + mass)
+
+    return brief
 
 
 def flown_contact_wrenches(

@@ -9,7 +9,7 @@ from plants import PLANTS
 
 from mjxball.assembly import BALL, BALL_JOINT, FOLLOWER, LEADER, build_model, main, to_mjcf
 from mjxball.config import Attitude
-from mjxball.physics.constants import plant_constants
+from mjxball.control.constants import plant_constants
 
 DOFS = {"free": 6, "pivot": 1, "heave": 2}
 

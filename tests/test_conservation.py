@@ -8,9 +8,9 @@ from plants import LIGHT_BALL, REFERENCE, VARIED, paper_with
 
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
+from mjxball.control.constants import plant_constants
 from mjxball.control.followers import Copy
 from mjxball.physics import mujoco, newton_euler
-from mjxball.physics.constants import plant_constants
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
 from mjxball.physics.motion import sine
 from mjxball.rollout import Scenario, simulate

@@ -10,8 +10,8 @@ import pytest
 from plants import PLANTS, ROLLING, SAMPLES, paper_with, random_motion, random_states, random_wrench
 
 from mjxball.config import Attitude, Motion
+from mjxball.control.constants import plant_constants
 from mjxball.physics import mjx, mujoco, newton_euler
-from mjxball.physics.constants import plant_constants
 from mjxball.physics.engine import Load
 from mjxball.physics.step import make_accelerations, total_wrench
 

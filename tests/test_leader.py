@@ -6,7 +6,7 @@ import pytest
 from mjxball.config import Attitude, Plant
 from mjxball.control import leader
 from mjxball.control.attitude import AttitudeGains, design_gains, rotor_commands
-from mjxball.physics.constants import plant_constants
+from mjxball.control.constants import plant_constants
 
 G = 9.81
 TILT, VERTICAL = 0.6, 6.0

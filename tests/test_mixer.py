@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from mjxball.assembly import build_model
 from mjxball.config import Attitude, Plant
 from mjxball.control import mixer, rotations
-from mjxball.physics.constants import plant_constants
+from mjxball.control.constants import plant_constants
 from mjxball.physics.step import total_wrench
 
 ARM, YAW = 0.12, 0.02

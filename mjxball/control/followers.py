@@ -1,4 +1,4 @@
-"""Follower baselines: `follower(observation) -> command`, on NumPy or JAX arrays of any batch shape."""
+"""Followers that fly: `follower(observation) -> command`, on NumPy or JAX arrays of any batch shape."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from mjxball.config import Config
-from mjxball.control.observation import copy_command
+from mjxball.control.baselines import Adaptive, Copy, Lqg, Memoryless, Oracle, Random, Stay
+from mjxball.control.baselines.law import Brief, Law
 from mjxball.errors import InputError
 
 Array = Any
@@ -24,28 +25,56 @@ class Follower(Protocol):
         """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18)."""
 
 
-class Copy:
-    """The leader's PD law on the follower's own observation: the optimum of the paper's reward (design section 5)."""
+class Baseline:
+    """A `Law` that remembers. Whoever flies it may set `brief` before a call; else the plant's own mass is believed."""
 
-    name = "copy"
-
-    def __init__(self, config: Config):
-        law = config.leader
-        self._law = (law.kp, law.kd, config.plant.gravity, law.tilt_limit, law.vertical_limit)
+    def __init__(self, law: Law, config: Config):
+        self.law, self.name = law, law.name
+        self.brief: Brief | None = None
+        self._believed_mass = config.plant.object_mass
+        self._memory: Any = None
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """See `Follower.reset`."""
+        self._memory, self.brief = None, None
 
     def __call__(self, observation: Array) -> Array:
         """See `Follower.__call__`."""
-        return copy_command(observation, *self._law)
+        if self._memory is None:
+            self._memory = self.law.start(observation)
+        brief = self.brief or self._plain(observation)
+        self._memory, command = self.law.step(self._memory, observation, brief)
+        return command
+
+    def _plain(self, observation: Array) -> Brief:
+        if self.law.needs_truth:
+            raise InputError(f"follower {self.name!r} must be told where the CG is; it flies in simulation only")
+        zero = observation.__array_namespace__().zeros_like(observation[..., 0])
+        return Brief(zero + self._believed_mass, zero, zero, zero)
 
 
-BASELINES: dict[str, Callable[[Config], Follower]] = {"copy": Copy}
+LAWS: dict[str, Callable[[Config], Law]] = {
+    "stay": Stay,
+    "random": Random,
+    "copy": Copy,
+    "adaptive": Adaptive,
+    "adaptive-mass": lambda config: Adaptive(config, adapts_mass=True),
+    "oracle": Oracle,
+    "memoryless": Memoryless,
+    "lqg": Lqg,
+}
 
 
-def make_baseline(name: str, config: Config) -> Follower:
-    """The baseline called `name` with the gains that follow from `config`; raise InputError if unknown."""
-    if name not in BASELINES:
-        raise InputError(f"unknown follower {name!r}; baselines are {', '.join(BASELINES)}")
-    return BASELINES[name](config)
+def make_law(name: str, config: Config) -> Law:
+    """The classical follower called `name` with the gains that follow from `config`; raise InputError if unknown."""
+    if name not in LAWS:
+        raise InputError(f"unknown follower {name!r}; baselines are {', '.join(LAWS)}")
+    return LAWS[name](config)
+
+
+def make_baseline(name: str, config: Config) -> Baseline:
+    """`make_law`, ready to fly."""
+    return Baseline(make_law(name, config), config)
+
+
+BASELINES = tuple(LAWS)

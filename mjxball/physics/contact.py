@@ -6,7 +6,7 @@ from typing import Any
 
 from mjxball.config import Plant
 from mjxball.control import mixer, rotations
-from mjxball.physics.constants import PlantConstants
+from mjxball.control.constants import PlantConstants
 from mjxball.physics.engine import PlantState
 
 Array = Any

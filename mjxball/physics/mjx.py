@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mjxball.assembly import ASSEMBLY, BALL, build_model
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.physics.constants import plant_constants
+from mjxball.control.constants import plant_constants
 from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, PlantState, Wrench
 from mjxball.quiet import import_mjx
 

@@ -11,8 +11,8 @@ import numpy as np
 from mjxball.assembly import ASSEMBLY, BALL, FOLLOWER, LEADER, build_model
 from mjxball.config import Attitude, Config, Plant
 from mjxball.control import mixer, rotations
+from mjxball.control.constants import plant_constants
 from mjxball.physics import motion
-from mjxball.physics.constants import plant_constants
 from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, Load, PlantState, Wrench
 
 Array = Any

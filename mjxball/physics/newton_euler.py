@@ -7,7 +7,7 @@ from typing import Any
 
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.physics.constants import PlantConstants, plant_constants
+from mjxball.control.constants import PlantConstants, plant_constants
 from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, PlantState, Wrench
 
 Array = Any

@@ -8,8 +8,8 @@ from typing import Any
 
 from mjxball.config import Config
 from mjxball.control import attitude, mixer, rotations
+from mjxball.control.constants import plant_constants
 from mjxball.physics import motion
-from mjxball.physics.constants import plant_constants
 from mjxball.physics.engine import Engine, Load, PlantState, Wrench
 
 Array = Any
