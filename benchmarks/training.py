@@ -3,7 +3,7 @@
 `python benchmarks/training.py [--parts ours stock population scaling] [--seeds K] [--json FILE] ...`
 
 - `ours`: `train.py transport` with the settings below, seed 0 with an empty compilation cache (cold), then every seed
-  with that cache (warm). The clock starts before the process and stops when it prints that its policy is written.
+  with that cache (warm). The clock starts before the process and stops when its policy file is written.
 - `stock`: Brax's `sac.train` on the same environment (`benchmarks/stock_sac.py`), timed the same way: seed 0 cold,
   then the other seeds with its cache, `--together` of them at once, which gives their quality but not their time.
 - `population`: training rate of 1 and of `--members` followers in one program, compilation left out, and memory.
@@ -49,16 +49,15 @@ def launch(command: list[str], cache: Path, **environment: str) -> subprocess.Po
     )
 
 
-def until_policy(child: subprocess.Popen[str], started: float) -> tuple[float, str]:
-    """(seconds since `started`, output) when `child` says that its policy is written; it is ended then."""
+def until_policy(child: subprocess.Popen[str], started: float, policy: Path) -> tuple[float, str]:
+    """(seconds from `started` until `policy` was written last, output); `child` is ended when it says so."""
     lines = []
     for line in child.stdout or ():
         lines.append(line)
         if line.startswith("policy:"):
-            seconds = time.monotonic() - started
             child.kill()
             child.wait()
-            return seconds, "".join(lines)
+            return policy.stat().st_mtime - started, "".join(lines)
     raise RuntimeError(f"training failed with code {child.wait()}:\n{''.join(lines)[-3000:]}")
 
 
@@ -67,10 +66,12 @@ def ours(options: argparse.Namespace, place: Path) -> list[dict[str, Any]]:
     rows = []
     for number, seed in enumerate([0, *range(options.seeds)]):
         out = place / f"ours{number}"
-        flags = ["--sac.steps", options.steps, "--sac.learning_rate", options.learning_rate, "--sac.evaluations", 1]
+        flags = ["--sac.steps", options.steps, "--sac.replay", options.steps, "--sac.evaluations", 1]
+        flags += ["--sac.learning_rate", options.learning_rate]
         command = ["train.py", "transport", "--seed", seed, "--out", out, "--physics", options.physics, *flags]
-        started = time.monotonic()
-        seconds, output = until_policy(launch([str(word) for word in command], place / "cache"), started)
+        started = time.time()
+        child = launch([str(word) for word in command], place / "cache")
+        seconds, output = until_policy(child, started, out / "policy.npz")
         found = re.search(
             r"peak memory (\d+) MB(?:, (\d+) MB on each device)?; saving took ([\d.]+) of ([\d.]+)", output
         )
@@ -87,7 +88,7 @@ def stock(options: argparse.Namespace, place: Path) -> list[dict[str, Any]]:
     rows, seeds = [], list(range(options.seeds))
     groups = [seeds[:1]] + [seeds[k : k + options.together] for k in range(1, len(seeds), options.together)]
     for group in groups:
-        started, children = time.monotonic(), []
+        started, children = time.time(), []
         for seed in group:
             command = ["benchmarks/stock_sac.py", place / f"stock{seed}.npz", "--seed", seed]
             command += ["--physics", options.physics, *options.stock]
@@ -95,7 +96,7 @@ def stock(options: argparse.Namespace, place: Path) -> list[dict[str, Any]]:
                 launch([str(word) for word in command], place / "stock", XLA_PYTHON_CLIENT_PREALLOCATE="false")
             )
         for seed, child in zip(group, children, strict=True):
-            seconds, _ = until_policy(child, started)
+            seconds, _ = until_policy(child, started, place / f"stock{seed}.npz")
             cache = "cold" if seed == 0 else "shared"
             row = {"trainer": "stock", "cache": cache, "seed": seed, "seconds": seconds}
             rows.append(row | {"policy": place / f"stock{seed}.npz"})
@@ -196,7 +197,7 @@ def distributed(options: argparse.Namespace, place: Path, count: int) -> dict[st
     children = [
         launch([*command, "--process", str(k)], place / f"cache{k}", CUDA_VISIBLE_DEVICES=str(k)) for k in range(count)
     ]
-    until_policy(children[0], time.monotonic())
+    until_policy(children[0], time.time(), out / "policy.npz")
     for child in children[1:]:
         child.communicate(timeout=PATIENCE)
     with (out / "metrics.csv").open(newline="") as stream:

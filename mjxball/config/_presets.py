@@ -18,7 +18,7 @@ def _paper() -> Config:
             worlds=16,
             replay=1_000_000,
             batch=256,
-            updates=16,
+            updates=8,
             prefill=10_000,
             policy_layers=(256, 256),
             critic_layers=(256, 256),
@@ -30,7 +30,7 @@ def _paper() -> Config:
             alpha_fixed=True,
             critics=1,
             state_value=True,
-            evaluations=25,
+            evaluations=10,
         ),
     )
 

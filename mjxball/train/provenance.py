@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.metadata
+import os
 import platform
 import subprocess
 from collections.abc import Mapping
@@ -38,12 +39,15 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """The commit of the source tree, marked `-dirty` if it has changes, 'unknown' outside a repository."""
+    """The commit of the source tree, marked `-dirty` if it has changes.
+
+    Outside a repository (a container, a copied tree) what `MJXBALL_COMMIT` says, else 'unknown'.
+    """
     command = ["git", "-C", str(PACKAGE), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
     except (OSError, subprocess.SubprocessError):
-        return "unknown"
+        return os.environ.get("MJXBALL_COMMIT", "unknown")
 
 
 def differences(recorded: Mapping[str, Any]) -> list[str]:

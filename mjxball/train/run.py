@@ -92,6 +92,7 @@ class Run:
         self._checkpoints = ThreadPoolExecutor(1).submit(_open_checkpoints, out) if self._writes else None
         self.state: TrainState | None = resumed
         self._saved_at = self._saving = 0.0  # [s]
+        self._saved_steps = -1
 
     def train(self) -> bool:
         """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk."""
@@ -215,8 +216,9 @@ class Run:
 
     def _save(self) -> None:
         began = self.progress.elapsed()
-        if self.state is None:
+        if self.state is None or self._saved_steps == self._steps():
             return
+        self._saved_steps = self._steps()
         exported = self._export()
         # Whole, and a copy: the next chunk of training reuses the buffers while the files are still being written.
         arrays = processes.gather(self.state)
