@@ -37,7 +37,7 @@ TINY: dict[str, Any] = {
 STEPS = 4096
 LONG = 96_000  # several seconds of training, so that Ctrl-C arrives in the middle
 ROW = re.compile(r"^\s*[\d,]+ / [\d,]+ steps")
-EVALUATED = {"eval_return", "eval_steady_error", "eval_peak"}
+EVALUATED = {"eval_return", "eval_steady_error", "eval_peak", "eval_tilt_error", "eval_vertical_error"}
 
 
 def command(**extra: Any) -> list[object]:
@@ -77,7 +77,8 @@ def test_run_writes_every_file(finished: Path) -> None:
     names = {path.name for path in finished.iterdir()}
     assert names == {"config.json", "metrics.csv", "tensorboard", "checkpoints", "policy.npz", "eval"}
     assert (finished / "eval" / "cells.json").is_file()
-    assert len(list((finished / "eval").glob("*.png"))) == 6  # the standard scenarios
+    assert len(list((finished / "eval").glob("omega*.png"))) == 6  # the standard scenarios
+    assert (finished / "eval" / "training.png").stat().st_size > 10_000
 
 
 def test_run_records_what_made_it(finished: Path) -> None:

@@ -11,7 +11,8 @@ import pytest
 from mjxball.config import preset
 from mjxball.control import attitude, leader, mixer, observation, rotations
 from mjxball.control.attitude import AttitudeGains
-from mjxball.control.followers import Copy
+from mjxball.control.baselines.law import Brief
+from mjxball.control.followers import BASELINES, make_law
 
 WORLDS = 64
 random = np.random.default_rng(7)
@@ -32,7 +33,23 @@ GAINS = AttitudeGains((0.24, 3.22, 0.543), (0.0433, 0.579, 0.244))
 MOUNT = np.array([-0.17, 0.0, 0.0])
 LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
 SEEN, MEMORY, ACTION = normal(18), normal(39), random.uniform(-1, 1, (WORLDS, 3))
-COPY = Copy(preset("paper"))
+BRIEF = Brief(random.uniform(0.1, 0.3, WORLDS), 0.01 * normal(), 0.01 * normal(), random.uniform(2.1, 2.3, WORLDS))
+FLIGHT = 0.1 * normal(4, 18)  # four observations in a row
+
+
+def flown(name: str) -> Callable[..., Any]:
+    """The commands (WORLDS, 4, 3) of a classical follower that is shown `FLIGHT`."""
+    law = make_law(name, preset("paper"))
+
+    def commands(flight: Any, *brief: Any) -> Any:
+        memory, given = law.start(flight[..., 0, :]), []
+        for step in range(4):
+            memory, command = law.step(memory, flight[..., step, :], Brief(*brief))
+            given.append(command)
+        return flight.__array_namespace__().stack(given, axis=-2)
+
+    return commands
+
 
 # name -> (law of arrays alone, its arrays). Clipping happens in some worlds and not in others.
 LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
@@ -74,7 +91,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
         lambda a, s: observation.follower_command(a, s, True, REACH, KP, KD, G, LIMITS),
         (ACTION, 3 * SEEN),
     ),
-    "followers.Copy": (COPY, (3 * SEEN,)),
+    **{f"baseline {name}": (flown(name), (FLIGHT, *BRIEF)) for name in BASELINES},
 }
 # Computed once in NumPy float64, from the config, not from arrays.
 NOT_LAWS = {"attitude.design_gains", "observation.memory_size", "observation.input_mask"}
@@ -85,7 +102,7 @@ def difference(first: Any, second: Any) -> float:
     """Largest difference over the full scale of the result."""
     first, second = np.asarray(first), np.asarray(second)
     assert first.shape == second.shape
-    return np.abs(first - second).max() / np.abs(second).max()
+    return np.abs(first - second).max() / (np.abs(second).max() or 1.0)  # `stay` commands nothing
 
 
 def test_every_law_is_compared():

@@ -78,14 +78,15 @@ class Run:
 
         `origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name.
         """
-        self.config, self.out, self.origin = config, out, origin
+        self.config, self.out = config, out
         self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"])
+        self.origin = {**origin, "parts": self.population.parts}
         self._writes = processes.is_writer()
         done = _count(resumed) if resumed else 0
         if self._writes:
             out.mkdir(parents=True, exist_ok=True)
             if not (out / CONFIG_FILE).exists():
-                write_config(out, config, {**origin, "parts": self.population.parts})
+                write_config(out, config, self.origin)
         self.progress = Progress(out / METRICS if self._writes else None, config.sac.steps, done, origin["seeds"])
         self.members = MemberLog(out if self._writes else None, origin["seed"], done)
         # Orbax takes half a second to load: beside the compilation, not before it.

@@ -28,9 +28,9 @@ THETA_NOISE, RATE_NOISE = 2e-3, 2e-2  # deviations of a measurement [rad], [rad/
 class Gains(NamedTuple):
     """Feedback of one axis on (position, velocity, angle, rate), or on (position, velocity) of the height."""
 
-    roll: np.ndarray
-    pitch: np.ndarray
-    height: np.ndarray
+    roll: tuple[float, ...]
+    pitch: tuple[float, ...]
+    height: tuple[float, ...]
 
 
 class Filter(NamedTuple):
@@ -141,32 +141,35 @@ class Lqg(Takeover):
 def feedback(plant: PitchGains) -> Gains:
     """LQR of both tilt axes, each with its closed attitude loop, and of the height."""
 
-    def tilt(frequency: float, sign: float) -> np.ndarray:
+    def tilt(frequency: float, sign: float) -> tuple[float, ...]:
         a = np.zeros((4, 4))
         a[0, 1] = a[2, 3] = 1.0
         a[1, 2] = sign * plant.gravity
         a[3, 2], a[3, 3] = -(frequency**2), -2.0 * plant.damping * frequency
         b = np.array([[0.0], [0.0], [0.0], [frequency**2]])
-        return lqr(a, b, np.diag([POSITION**-2, VELOCITY**-2, 0.0, 0.0]), np.array([[TILT**-2]]))[0]
+        return lqr(a, b, np.diag([POSITION**-2, VELOCITY**-2, 0.0, 0.0]), np.array([[TILT**-2]]))
 
     height = lqr(
         np.array([[0.0, 1.0], [0.0, 0.0]]),
         np.array([[0.0], [1.0]]),
         np.diag([POSITION**-2, VELOCITY**-2]),
         np.array([[VERTICAL**-2]]),
-    )[0]
+    )
     roll, pitch = plant.natural_frequency
     return Gains(tilt(roll, -1.0), tilt(pitch, 1.0), height)
 
 
-def lqr(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """K of u = -K x that minimises the integral of x'Qx + u'Ru for x' = A x + B u, from the Hamiltonian matrix."""
+def lqr(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> tuple[float, ...]:
+    """K of u = -K x, one input, that minimises the integral of x'Qx + u'Ru for x' = A x + B u.
+
+    From the stable invariant subspace of the Hamiltonian matrix.
+    """
     n = len(a)
     hamiltonian = np.block([[a, -b @ np.linalg.solve(r, b.T)], [-q, -a.T]])
     values, vectors = np.linalg.eig(hamiltonian)
     stable = vectors[:, values.real < 0]
     cost = np.real(stable[n:] @ np.linalg.inv(stable[:n]))
-    return np.linalg.solve(r, b.T @ cost)
+    return tuple(map(float, np.linalg.solve(r, b.T @ cost)[0]))
 
 
 def kalman(plant: PitchGains) -> Filter:
