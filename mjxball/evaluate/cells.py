@@ -71,7 +71,15 @@ def run_cells(config: Config, followers: Sequence[Follower], scenarios: Sequence
     cells = []
     for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
         flight = flights.world(j * len(scenarios) + i)
-        cells.append(Cell(follower.name, scenario, measure(flight, limit), flight, config.motion.kind))
+        cells.append(
+            Cell(
+                follower.name,
+                scenario,
+                measure(flight, limit, config.plant.rotor_force_max),
+                flight,
+                config.motion.kind,
+            )
+        )
     return cells
 
 

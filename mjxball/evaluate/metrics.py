@@ -6,11 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mjxball.rewards import paper_reward
 from mjxball.rollout import Trajectory
 
 RMSE_UNTIL = 20.0  # [s]
+PAPER_STEPS = 1000  # of an episode, over which the paper's reward is summed
 STEADY_AFTER = 20.0  # [s]
 SETTLED_WITHIN = 0.02  # of the initial error
+NEARLY_SETTLED_WITHIN = 0.10
+SATURATED_WITHIN = 1e-6  # of the largest rotor force
 NEVER_WITHIN = 0.1  # [s] of the end: not settled
 
 
@@ -26,32 +30,45 @@ class Metrics:
     z_peak: float | None  # [m]
     max_tilt: float | None  # largest hypot(roll, pitch) [rad]
     action_error: float | None  # rms over time and (roll, pitch, az) of follower minus leader command
+    settling_time_10: float | None  # the same for 10 % [s]
+    paper_return: float | None  # the paper's reward, summed over the first 1000 steps (20 s)
+    effort: float | None  # rms deviation of the follower's rotor forces from those at the start, hover [N]
+    smoothness: float | None  # rms change of the follower's pitch and roll command from step to step [rad]
+    saturation: float | None  # share of all rotors and steps at 0 or the largest force
     failed: bool  # |e_o| beyond d_term, or a value that is not finite
 
 
-def measure(flight: Trajectory, termination_distance: float) -> Metrics:
+def measure(flight: Trajectory, termination_distance: float, rotor_force_max: float = 5.5) -> Metrics:
     """Metrics of one flight (no batch axis)."""
     error = flight.error
     distance = np.linalg.norm(error, axis=-1)
     failed = bool(flight.diverged) or not np.isfinite(distance).all() or bool((distance > termination_distance).any())
     steady = flight.time >= STEADY_AFTER - 1e-9
     peaks = np.abs(error[steady]).max(axis=0) if flight.time[-1] > STEADY_AFTER + 1e-9 else [None] * 3
+    rotors = flight.rotor_force[:, 1]
+    changes = np.diff(flight.follower_command[:, :2], axis=0)
+    at_a_limit = (rotors <= SATURATED_WITHIN * rotor_force_max) | (rotors >= (1 - SATURATED_WITHIN) * rotor_force_max)
     difference = flight.follower_command - flight.leader_command
     return Metrics(
         rmse=_number(np.sqrt(np.mean(distance[flight.time <= RMSE_UNTIL + 1e-9] ** 2))),
-        settling_time=_settling_time(flight.time, distance),
+        settling_time=_settling_time(flight.time, distance, SETTLED_WITHIN),
         overshoot=_overshoot(flight.position, flight.goal),
         x_peak=_number(peaks[0]),
         y_peak=_number(peaks[1]),
         z_peak=_number(peaks[2]),
         max_tilt=_number(np.hypot(flight.euler[:, 0], flight.euler[:, 1]).max()),
         action_error=_number(np.sqrt(np.mean(difference**2))),
+        settling_time_10=_settling_time(flight.time, distance, NEARLY_SETTLED_WITHIN),
+        paper_return=_number(paper_reward(flight.leader_command, flight.follower_command)[:PAPER_STEPS].sum()),
+        effort=_number(np.sqrt(np.mean((rotors - rotors[0]) ** 2))),
+        smoothness=_number(np.sqrt(np.mean(changes**2))),
+        saturation=_number(at_a_limit.mean()),
         failed=failed,
     )
 
 
-def _settling_time(time: np.ndarray, distance: np.ndarray) -> float | None:
-    outside = np.flatnonzero(~(distance <= SETTLED_WITHIN * distance[0]))
+def _settling_time(time: np.ndarray, distance: np.ndarray, share: float) -> float | None:
+    outside = np.flatnonzero(~(distance <= share * distance[0]))
     if not outside.size:
         return 0.0
     last = float(time[outside[-1]])

@@ -1,0 +1,135 @@
+"""The classical followers reproduce an independent simulation, and rest on gains that are right by themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
+
+from mjxball.config import preset, replace
+from mjxball.control.baselines import lqg
+from mjxball.control.baselines.gains import pitch_gains
+from mjxball.control.followers import BASELINES, make_baseline, make_law
+from mjxball.errors import InputError
+from mjxball.evaluate.cells import REFERENCE, Cell, cross, run_cells
+from mjxball.rollout import Scenario, simulate
+
+SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
+# Design section 6: settling [s], RMSE [m], x-peak [m] at SPEEDS, largest tilt [deg], paper return (first speed).
+REFERENCE_NUMBERS = {
+    "copy": (None, 0.520, (0.296, 0.258, 0.163, 0.050, 0.023), 3.7, 0),
+    "adaptive": (8.2, 0.484, (0.002, 0.007, 0.011, 0.011, 0.010), 3.8, -211),
+    "oracle": (8.0, 0.479, (0.000, 0.000, 0.001, 0.002, 0.002), 3.6, -197),
+    "lqg": (2.84, 0.330, (0.000, 0.001, 0.002, 0.005, 0.007), 12.6, -1927),
+    "memoryless": (2.96, 0.333, (0.013, 0.013, 0.013, 0.014, 0.012), 11.8, -1961),
+}
+
+
+@pytest.fixture(scope="module")
+def cells() -> dict[tuple[str, float], Cell]:
+    """Every baseline at every speed, closed-form physics."""
+    config = preset("paper")
+    followers = [make_baseline(name, config) for name in BASELINES]
+    flown = run_cells(config, followers, cross(SPEEDS, [0.05], [0.2]), "newton-euler")
+    return {(cell.follower, cell.scenario.omega): cell for cell in flown}
+
+
+@pytest.mark.parametrize("name", REFERENCE_NUMBERS)
+def test_reproduces_the_independent_simulation(cells, name: str) -> None:
+    """Within 10 %, or 2 mm where values are that small."""
+    settling, rmse, peaks, tilt, paper_return = REFERENCE_NUMBERS[name]
+    metrics = cells[name, 0.31].metrics
+    assert metrics.settling_time == (None if settling is None else pytest.approx(settling, rel=0.1))
+    assert metrics.rmse == pytest.approx(rmse, rel=0.1)
+    assert np.degrees(metrics.max_tilt) == pytest.approx(tilt, rel=0.1)
+    assert metrics.paper_return == pytest.approx(paper_return, rel=0.1, abs=1e-6)
+    for speed, peak in zip(SPEEDS, peaks, strict=True):
+        assert cells[name, speed].metrics.x_peak == pytest.approx(peak, rel=0.1, abs=0.002), speed
+
+
+def test_floors_are_worse_than_copying(cells) -> None:
+    for name in ("stay", "random"):
+        assert cells[name, 0.31].metrics.rmse > cells["copy", 0.31].metrics.rmse
+
+
+def test_mass_adaptation_finds_an_unknown_mass() -> None:
+    """Kept at 0.2 kg of belief the pair sags by dm g / (2 m kp); with adaptation the height comes back."""
+    config = preset("paper")
+    scenario = Scenario(mass=0.3, believed_mass=0.2, seconds=40.0)
+    sags = {}
+    for name in ("adaptive", "adaptive-mass"):
+        flight = simulate(config, make_baseline(name, config), scenario, "newton-euler")
+        sags[name] = float(flight.error[-1, 2])
+    expected = 0.1 * 9.81 / (2 * 1.1 * 0.5)
+    assert sags["adaptive"] == pytest.approx(expected, rel=0.05)
+    assert abs(sags["adaptive-mass"]) < 0.02
+
+
+def test_feedback_is_the_riccati_solution_of_scipy() -> None:
+    plant = pitch_gains(preset("paper"), "lqg")
+    wn, zeta, g = 10.0, 0.9, 9.81
+    a = np.array([[0, 1, 0, 0], [0, 0, g, 0], [0, 0, 0, 1], [0, 0, -wn * wn, -2 * zeta * wn]])
+    b = np.array([[0.0], [0], [0], [wn * wn]])
+    q, r = np.diag([16.0, 1.0, 0.0, 0.0]), np.array([[0.15**-2]])
+    expected = np.linalg.solve(r, b.T @ solve_continuous_are(a, b, q, r))[0]
+    np.testing.assert_allclose(lqg.feedback(plant).pitch, expected, rtol=1e-8)
+
+
+def test_filter_is_the_steady_kalman_filter_of_scipy() -> None:
+    plant = pitch_gains(preset("paper"), "lqg")
+    found = lqg.kalman(plant)
+    a = np.zeros((6, 6))
+    a[0, 1] = a[2, 3] = 1
+    a[1, 2] = a[1, 4] = 1 / plant.inertia
+    a[4, [0, 1, 4, 5]] = np.array([-2 * plant.kp, -2 * plant.kd, -1, 1]) / plant.lag
+    whole = expm(a * plant.period)
+    np.testing.assert_allclose(found.transition, whole[:5, :5], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.drive, whole[:5, 5], rtol=1e-9, atol=1e-12)
+    noise, seen = np.zeros((5, 5)), np.eye(2, 5)
+    noise[3, 3] = 9 * plant.period
+    measurement = np.diag([2e-3**2, 2e-2**2])
+    predicted = solve_discrete_are(found.transition.T, seen.T, noise, measurement)
+    gain = predicted @ seen.T @ np.linalg.inv(seen @ predicted @ seen.T + measurement)
+    np.testing.assert_allclose(found.gain, gain, rtol=1e-6)
+
+
+def test_adaptive_polynomial_is_stable_as_designed() -> None:
+    """J p^3 + K p^2 + K w p + K w^2 r / 2 is Hurwitz iff 2 K > J w r."""
+    from mjxball.control.baselines.adaptive import BANDWIDTH, RATIO
+
+    plant = pitch_gains(preset("paper"), "adaptive")
+    k = 2 * plant.kd
+    roots = np.roots([plant.inertia, k, k * BANDWIDTH, k * BANDWIDTH**2 * RATIO / 2])
+    assert roots.real.max() < -1
+    assert 2 * k > plant.inertia * BANDWIDTH * RATIO
+
+
+def test_gains_follow_the_plant() -> None:
+    """Section 3: per-drone Kp 3.22, Kd 0.579 in pitch; they move with the attitude loop's frequency."""
+    config = preset("paper")
+    plant = pitch_gains(config, "lqg")
+    assert (plant.kp, plant.kd, plant.inertia) == pytest.approx((3.22, 0.579, 0.0644), rel=2e-3)
+    slower = pitch_gains(replace(config, "attitude.natural_frequency", (10.0, 5.0, 4.0)), "lqg")
+    assert slower.kp == pytest.approx(plant.kp / 4)
+
+
+def test_stands_are_refused_in_one_sentence() -> None:
+    with pytest.raises(InputError, match="free pair along x"):
+        make_law("lqg", replace(preset("paper"), "plant.stand", "heave"))
+
+
+def test_oracle_refuses_to_fly_without_being_told() -> None:
+    follower = make_baseline("oracle", preset("paper"))
+    follower.reset()
+    with pytest.raises(InputError, match="simulation only"):
+        follower(np.zeros(18))
+
+
+def test_every_baseline_commands_within_its_limits(cells) -> None:
+    for (name, _), cell in cells.items():
+        largest = np.abs(cell.flight.follower_command).max(axis=0)
+        assert (largest <= np.array([0.6, 1.0 if name in ("lqg", "memoryless") else 0.6, 6.0]) + 1e-12).all(), name
+
+
+def test_reference_scenario_is_the_first_cell(cells) -> None:
+    assert cells["copy", 0.31].scenario == REFERENCE
