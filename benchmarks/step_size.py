@@ -13,7 +13,8 @@ import numpy as np
 
 from mjxball import config
 from mjxball.control.followers import make_baseline
-from mjxball.rollout import Scenario, Trajectory, simulate_batch
+from mjxball.rollout import Trajectory, simulate_batch
+from mjxball.scenario import Scenario
 
 OMEGAS = (0.31, 0.62, 1.0, 2.0, 3.1)  # [rad/s]
 REFERENCE_STEPS = 100  # physics steps in a control period of 20 ms: 0.2 ms

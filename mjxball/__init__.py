@@ -7,11 +7,12 @@ __all__ = ["Policy", "Scenario", "Trajectory", "__version__", "simulate"]
 
 if TYPE_CHECKING:
     from mjxball.policy import Policy
-    from mjxball.rollout import Scenario, Trajectory, simulate
+    from mjxball.rollout import Trajectory, simulate
+    from mjxball.scenario import Scenario
 
 _HOMES = {
     "Policy": "mjxball.policy",
-    "Scenario": "mjxball.rollout",
+    "Scenario": "mjxball.scenario",
     "Trajectory": "mjxball.rollout",
     "simulate": "mjxball.rollout",
 }

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjxball.config import Config, Plant, ball_reach, cg_reach, preset, validate
+from mjxball.config import Config, Plant, preset, validate
 from mjxball.control import leader, observation, rotations
 from mjxball.control.baselines.law import Brief
 from mjxball.control.constants import plant_constants
@@ -18,28 +18,12 @@ from mjxball.physics import newton_euler
 from mjxball.physics.contact import contact_wrenches
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.motion import make_prescribed, object_mass
-from mjxball.physics.step import make_accelerations, make_cg_offset, start_state, total_wrench
+from mjxball.physics.step import make_accelerations, make_cg_offset, pushed, start_state, total_wrench
 from mjxball.physics.stepper import make_stepper
+from mjxball.scenario import Scenario, check_scenario
+from mjxball.sensing import Senses
 
 Act = Callable[[np.ndarray, Brief], np.ndarray]  # observations (n, 18), what is known -> commands (n, 3)
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal (design section 9).
-
-    How the CG moves (sine, waveform, rolling ball) is the configuration's `motion`; a sine's numbers are here.
-    """
-
-    omega: float = 0.31  # angular speed of the CG's sine [rad/s]
-    amplitude: float = 0.05  # of the CG's sine [m]
-    mass: float = 0.2  # true mass of the object [kg]
-    believed_mass: float | None = None  # mass that the hover thrust assumes, None: the true one [kg]
-    goal: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of O [m]
-    seconds: float = 45.0
-    phase: float = 0.0  # of the CG's sine [rad]
-    mass_changes: tuple[tuple[float, float], ...] = ()  # (time [s], mass added or, if negative, dropped [kg])
-    ball_start: float = 0.0  # of a rolling ball from O along the CG axis [m]
 
 
 @dataclass(frozen=True)
@@ -64,13 +48,14 @@ class Trajectory:
     object_mass: np.ndarray  # (T, ...) [kg]
     contact_force: np.ndarray  # (T, ..., 2, 3) of leader, follower on the object, body axes [N]
     contact_torque: np.ndarray  # (T, ..., 2, 3) likewise, about each drone's centre [N m]
-    goal: np.ndarray  # (..., 3) of O [m]
+    goal: np.ndarray  # (..., 3) of O, the last one of a sequence of waypoints [m]
+    target: np.ndarray  # (T, ..., 3) goal of O at every step [m]
     diverged: np.ndarray  # (...) bool
 
     @property
     def error(self) -> np.ndarray:
-        """e_o = goal - position (T, ..., 3) [m]."""
-        return self.goal - self.position
+        """e_o = target - position (T, ..., 3) [m]."""
+        return self.target - self.position
 
     def world(self, index: int) -> Trajectory:
         """Flight `index` of a batch."""
@@ -83,14 +68,14 @@ class Trajectory:
 
 
 def simulate(
-    plant: Plant | Config, follower: Follower, scenario: Scenario = Scenario(), physics: str = "mjx"
+    plant: Plant | Config, follower: Follower, scenario: Scenario | None = None, physics: str = "mjx"
 ) -> Trajectory:
     """Fly `follower` through `scenario` on `plant` (or on a whole `Config`: gains, limits and rates too).
 
     `physics` is mjx, newton-euler or mujoco. Raises InputError for an unsound scenario.
     """
     config = plant if isinstance(plant, Config) else dataclasses.replace(preset("paper"), plant=plant)
-    return simulate_batch(config, [(follower, [scenario])], physics).world(0)
+    return simulate_batch(config, [(follower, [scenario or Scenario()])], physics).world(0)
 
 
 def simulate_batch(
@@ -123,69 +108,41 @@ def simulate_batch(
     return _fly(config, scenarios, act, physics)
 
 
-def check_scenario(config: Config, scenario: Scenario) -> None:
-    """Raise InputError with one sentence if `scenario` makes no sense on `config`'s plant."""
-    if len(scenario.goal) != 3:
-        raise InputError(f"goal takes 3 numbers, not {len(scenario.goal)}")
-    plain = dataclasses.replace(scenario, goal=(), mass_changes=(), believed_mass=scenario.believed_mass or 0.0)
-    numbers = [value for value in dataclasses.astuple(plain) if value != ()]
-    changes = [number for change in scenario.mass_changes for number in change]
-    if not np.isfinite([*numbers, *scenario.goal, *changes]).all():
-        raise InputError("every number of a scenario must be finite")
-    if scenario.mass <= 0:
-        raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
-    if scenario.believed_mass is not None and scenario.believed_mass < 0:
-        raise InputError(f"believed mass must not be negative, but is {scenario.believed_mass:g} kg")
-    if scenario.omega < 0 or scenario.amplitude < 0:
-        raise InputError("omega and amplitude must not be negative")
-    left = scenario.mass + np.cumsum([mass for _, mass in sorted(scenario.mass_changes)])
-    if (left <= 0).any():
-        raise InputError(f"the mass changes would leave {left.min():.3g} kg of object; it must stay positive")
-    if any(time < 0 for time, _ in scenario.mass_changes):
-        raise InputError("the time of a mass change must not be negative")
-    reach = cg_reach(config.plant)
-    if config.motion.kind == "sine" and scenario.amplitude > reach + 1e-12:
-        raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object: the CG reaches {reach:.4g} m")
-    if abs(scenario.ball_start) > ball_reach(config.plant) + 1e-12:
-        raise InputError(
-            f"ball start {scenario.ball_start:g} m lies beyond the end stop at {ball_reach(config.plant):.4g} m"
-        )
-    limit = config.scenario.termination_distance
-    if np.linalg.norm(scenario.goal) > limit:
-        raise InputError(
-            f"goal {scenario.goal} is {np.linalg.norm(scenario.goal):.3g} m away, beyond d_term = {limit:g} m"
-        )
-    if scenario.seconds < config.timing.control_period or scenario.seconds > 86_400:
-        raise InputError(f"seconds must be between one control period and a day, not {scenario.seconds:g}")
-
-
 def _fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Trajectory:
     step, cg_offset, brief = make_stepper(config, physics), make_cg_offset(config), make_brief(config)
     period = config.timing.control_period
     count = round(scenarios[0].seconds / period)
-    load, goal = _load(scenarios), np.array([scenario.goal for scenario in scenarios], float)
-    zero = np.zeros_like(goal)
+    load, target = _load(scenarios), _targets(scenarios, count, period)
     start = np.array([scenario.ball_start for scenario in scenarios], float)
-    state = start_state(config, zero, zero, zero, load.believed_mass, start)
-    integral, diverged = zero.copy(), np.zeros(len(scenarios), bool)
+    position, velocity = (
+        np.array([getattr(s, f"start_{what}") for s in scenarios]) for what in ("position", "velocity")
+    )
+    tilt = np.array([(*scenario.start_tilt, 0.0) for scenario in scenarios])
+    state = start_state(config, position, tilt, velocity, load.believed_mass, start)
+    senses = Senses([scenario.disturbance for scenario in scenarios], count, period)
+    integral, diverged = np.zeros_like(position), np.zeros(len(scenarios), bool)
     mount = np.array(config.plant.follower_mount)
     states, others = [], []
     for number in range(count + 1):
+        goal = target[number]
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         seen = observation.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
         led = _leader_command(config, goal, state, integral)
+        seen = senses.observe(number, seen)
         followed = act(seen, brief(state, load))
         states.append(state)
         others.append((rotations.euler_from_matrix(matrix), led, followed, seen, cg_offset(state, load)))
         if number < count:
             integral = integral + period * (goal - state.position)
-            moved = step(state, np.stack([led, followed], axis=1), load)
+            acting = load if senses.pushes is None else load._replace(push=senses.pushes[number])
+            moved = step(state, np.stack([led, followed], axis=1), acting)
             diverged |= _diverged(moved)
             state = PlantState(*(_keep(diverged, old, new) for old, new in zip(state, moved, strict=True)))
     flown = PlantState(*(np.stack(leaves) for leaves in zip(*states, strict=True)))
     grid = np.arange(count + 1) * period  # exact, so that a mass change falls on the same row for every engine
     flown = flown._replace(time=np.broadcast_to(grid[:, None], flown.time.shape))
     euler, led, followed, seen, offset = (np.stack(column) for column in zip(*others, strict=True))
+    load = load._replace(push=senses.pushes)
     force, torque = flown_contact_wrenches(config, flown, load, physics)
     return Trajectory(
         time=grid,
@@ -202,7 +159,8 @@ def _fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) 
         object_mass=object_mass(flown.time, load),
         contact_force=force,
         contact_torque=torque,
-        goal=goal,
+        goal=target[-1],
+        target=target,
         diverged=diverged,
     )
 
@@ -234,20 +192,31 @@ def flown_contact_wrenches(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Contact forces and torques (T, n, 2, 3) of recorded states (T, n, ...), see `physics.contact`.
 
-    `mujoco` reads MuJoCo's own internal forces; the other engines share the closed form.
+    `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with a push, share the closed form.
     """
-    if physics == "mujoco":
+    if physics == "mujoco" and load.push is None:
         from mjxball.physics.mujoco import flown_contact_wrenches as measured
 
         return measured(config, flown, load)
     constants = plant_constants(config.plant, config.attitude)
     accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
     wrench = total_wrench(np, flown.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust)
-    linear, angular, _ = accelerate(flown, wrench, load)
+    linear, angular, _ = accelerate(flown, pushed(wrench, flown, load), load)
     return contact_wrenches(config.plant, constants, flown, linear, angular)
 
 
 DIVERGED_POSITION, DIVERGED_RATE = 1e3, 1e2  # [m], [rad/s]
+
+
+def _targets(scenarios: Sequence[Scenario], count: int, period: float) -> np.ndarray:
+    """Goal of O (count + 1, n, 3) at every control step."""
+    time = np.arange(count + 1) * period
+    target = np.empty((count + 1, len(scenarios), 3))
+    for number, scenario in enumerate(scenarios):
+        target[:, number] = scenario.goal
+        for when, goal in scenario.waypoints:
+            target[time >= when - 1e-9, number] = goal
+    return target
 
 
 def _load(scenarios: Sequence[Scenario]) -> Load:

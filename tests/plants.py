@@ -6,7 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from mjxball.config import Motion, Plant, preset
+from mjxball.config import Config, Motion, Plant, preset
+from mjxball.control.followers import Baseline, make_baseline
 from mjxball.physics.engine import CgState, PlantState, Wrench
 
 REFERENCE = Plant()
@@ -88,3 +89,8 @@ def random_wrench(count: int, random: np.random.Generator) -> Wrench:
 def paper_with(plant: Plant = REFERENCE, motion: Motion | None = None):
     """The paper's configuration on another plant or with another motion."""
     return dataclasses.replace(preset("paper"), plant=plant, motion=motion or Motion())
+
+
+def copying(config: Config) -> Baseline:
+    """The follower that copies its leader."""
+    return make_baseline("copy", config)

@@ -12,7 +12,8 @@ from mjxball.control.baselines.gains import pitch_gains
 from mjxball.control.followers import BASELINES, make_baseline, make_law
 from mjxball.errors import InputError
 from mjxball.evaluate.cells import REFERENCE, Cell, cross, run_cells
-from mjxball.rollout import Scenario, simulate
+from mjxball.rollout import simulate
+from mjxball.scenario import Scenario
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 # Design section 6: settling [s], RMSE [m], x-peak [m] at SPEEDS, largest tilt [deg], paper return (first speed).

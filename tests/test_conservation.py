@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import LIGHT_BALL, REFERENCE, VARIED, paper_with
+from plants import LIGHT_BALL, REFERENCE, VARIED, copying, paper_with
 
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
 from mjxball.control.constants import plant_constants
-from mjxball.control.followers import Copy
 from mjxball.physics import mujoco, newton_euler
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
 from mjxball.physics.motion import sine
-from mjxball.rollout import Scenario, simulate
+from mjxball.rollout import simulate
+from mjxball.scenario import Scenario
 
 WORLDS = 4
 STEP = 0.001  # [s], classical Runge-Kutta of order 4
@@ -110,7 +110,7 @@ def test_objects_own_equations_hold_with_the_contact_wrenches(physics: str) -> N
     """Newton at the moving CG and Euler about it, from differences of the flown trajectory's own accelerations."""
     config = paper_with(VARIED)
     plant, constants = config.plant, plant_constants(config.plant, config.attitude)
-    flight = simulate(config, Copy(config), Scenario(omega=2.0, amplitude=0.1, mass=0.3, seconds=4.0), physics)
+    flight = simulate(config, copying(config), Scenario(omega=2.0, amplitude=0.1, mass=0.3, seconds=4.0), physics)
     matrix = rotations.matrix_from_quaternion(flight.quaternion)
     state = PlantState(
         flight.position, flight.quaternion, flight.velocity, flight.rates, flight.rotor_force, flight.time, *[None] * 2

@@ -6,16 +6,16 @@ import dataclasses
 
 import numpy as np
 import pytest
-from plants import BEAM, ROLLING, SAMPLES, paper_with
+from plants import BEAM, ROLLING, SAMPLES, copying, paper_with
 
 from mjxball import config as configs
 from mjxball.config import Attitude, Motion, Plant
-from mjxball.control.followers import Copy
 from mjxball.errors import InputError
 from mjxball.evaluate.waveform import read_waveform
 from mjxball.physics import motion, newton_euler
 from mjxball.physics.engine import PlantState, Wrench
-from mjxball.rollout import Scenario, simulate
+from mjxball.rollout import simulate
+from mjxball.scenario import Scenario
 from mjxball.train.main import main as train
 
 GAP = 1e-4  # [s] of the central differences below
@@ -67,7 +67,7 @@ def test_waveform_that_swings_out_between_its_samples_is_refused() -> None:
     times, offsets = (0.0, 1.0, 1.2, 2.2), (-0.16, 0.165, 0.165, -0.16)
     config = configs.validate(paper_with(motion=Motion(kind="waveform", times=times, offsets=offsets)))
     with pytest.raises(InputError, match="between its samples"):
-        simulate(config, Copy(config), Scenario(seconds=1), "newton-euler")
+        simulate(config, copying(config), Scenario(seconds=1), "newton-euler")
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_rolling_friction_opposes_and_stops_push_inwards() -> None:
 def test_ball_stays_between_the_stops_and_comes_to_rest() -> None:
     """On a tilting beam that nobody balances the ball runs into a stop and stays near it."""
     config = paper_with(BEAM, ROLLING)
-    flight = simulate(config, Copy(config), Scenario(goal=(0, 0, 0), ball_start=0.05, seconds=30), "newton-euler")
+    flight = simulate(config, copying(config), Scenario(goal=(0, 0, 0), ball_start=0.05, seconds=30), "newton-euler")
     end = 0.17 - 0.02
     # 10 mm: the stop's spring gives (its natural frequency is 60 rad/s, the ball arrives with up to 0.6 m/s)
     assert np.abs(flight.cg_offset).max() < end + 0.01
@@ -153,7 +153,7 @@ def test_ball_stays_between_the_stops_and_comes_to_rest() -> None:
 def test_object_mass_changes_at_its_times() -> None:
     config = paper_with()
     scenario = Scenario(seconds=4, mass_changes=((1.0, 0.3), (2.5, -0.4)))
-    flight = simulate(config, Copy(config), scenario, "newton-euler")
+    flight = simulate(config, copying(config), scenario, "newton-euler")
     for time, mass in ((0.98, 0.2), (1.0, 0.5), (2.48, 0.5), (2.5, 0.1), (4.0, 0.1)):
         assert flight.object_mass[round(time / 0.02)] == pytest.approx(mass)
 

@@ -6,13 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from plants import BEAM, HEAVE, LIGHT_BALL, PIVOT, ROLLING, SAMPLES, VARIED, paper_with
+from plants import BEAM, HEAVE, LIGHT_BALL, PIVOT, ROLLING, SAMPLES, VARIED, copying, paper_with
 
 from mjxball.config import replace
-from mjxball.control.followers import Copy
 from mjxball.errors import InputError
 from mjxball.physics.stepper import ENGINES
-from mjxball.rollout import Scenario, simulate, simulate_batch
+from mjxball.rollout import simulate, simulate_batch
+from mjxball.scenario import Scenario
 
 CASES = {
     "sine": (paper_with(), Scenario(omega=1.0, seconds=20)),
@@ -29,7 +29,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_engines_fly_the_same_trajectory(name: str) -> None:
     config, scenario = CASES[name]
-    flights = {physics: simulate(config, Copy(config), scenario, physics) for physics in ENGINES}
+    flights = {physics: simulate(config, copying(config), scenario, physics) for physics in ENGINES}
     for physics in ("mjx", "mujoco"):
         # The issue asks for 1 mm; they differ by rounding alone (1e-13), which the closed loop does not amplify.
         distance = np.abs(flights[physics].position - flights["newton-euler"].position).max()
@@ -47,15 +47,15 @@ def test_default_step_has_converged() -> None:
     config = paper_with()
     scenarios = [Scenario(omega=omega, seconds=20) for omega in (0.31, 1.0, 3.1)]
     fine = replace(config, "timing.physics_steps", 100)  # 0.2 ms
-    coarse, exact = (simulate_batch(c, [(Copy(c), scenarios)], "newton-euler").position for c in (config, fine))
+    coarse, exact = (simulate_batch(c, [(copying(c), scenarios)], "newton-euler").position for c in (config, fine))
     assert config.physics_step == 0.005
     assert np.abs(coarse - exact).max() <= 1e-3  # [m], the issue's bound
 
 
 def test_a_mass_change_is_impulse_free() -> None:
     config = paper_with()
-    plain = simulate(config, Copy(config), Scenario(seconds=6), "newton-euler")
-    changed = simulate(config, Copy(config), Scenario(seconds=6, mass_changes=((5.0, 0.2),)), "newton-euler")
+    plain = simulate(config, copying(config), Scenario(seconds=6), "newton-euler")
+    changed = simulate(config, copying(config), Scenario(seconds=6, mass_changes=((5.0, 0.2),)), "newton-euler")
     until = plain.time <= 5.0 + 1e-9
     np.testing.assert_array_equal(changed.position[until], plain.position[until])
     np.testing.assert_array_equal(changed.velocity[until], plain.velocity[until])
@@ -69,7 +69,10 @@ def test_believed_mass_moves_the_hover_thrust_only() -> None:
     config = paper_with()
     right, wrong = (
         simulate(
-            config, Copy(config), Scenario(amplitude=0, goal=(0, 0, 0), seconds=40, believed_mass=m), "newton-euler"
+            config,
+            copying(config),
+            Scenario(amplitude=0, goal=(0, 0, 0), seconds=40, believed_mass=m),
+            "newton-euler",
         )
         for m in (0.2, 0.1)
     )
@@ -82,7 +85,7 @@ def test_a_ball_off_the_pivot_rolls_the_beam() -> None:
     """With rotors that carry the drones alone, a CG on the leader's side (+y) turns roll by -m g c / J_x."""
     config = paper_with(BEAM)
     scenario = Scenario(goal=(0, 0, 0), amplitude=0.05, omega=0.0, phase=np.pi / 2, seconds=0.02)
-    flight = simulate(config, Copy(config), scenario, "newton-euler")
+    flight = simulate(config, copying(config), scenario, "newton-euler")
     inertia = 2 * 2.3e-3 + 2 * 0.17**2 + 0.2 * ((0.34**2 + 0.05**2) / 12 + 0.05**2)
     # 5 %: within 20 ms the attitude loop, behind a rotor lag of 30 ms, has only begun to answer
     assert flight.rates[-1, 0] == pytest.approx(-0.2 * 9.81 * 0.05 / inertia * 0.02, rel=0.05)
@@ -106,7 +109,7 @@ def test_a_ball_off_the_pivot_rolls_the_beam() -> None:
 def test_unsound_scenarios_are_refused(change: dict, word: str) -> None:
     config = paper_with()
     with pytest.raises(InputError, match=word):
-        simulate(config, Copy(config), dataclasses.replace(Scenario(), **change), "newton-euler")
+        simulate(config, copying(config), dataclasses.replace(Scenario(), **change), "newton-euler")
 
 
 def test_a_flight_that_diverges_is_marked_and_harms_no_neighbour() -> None:
@@ -120,8 +123,8 @@ def test_a_flight_that_diverges_is_marked_and_harms_no_neighbour() -> None:
 
     config = paper_with()
     scenario = Scenario(seconds=2)
-    both = simulate_batch(config, [(Reckless(), [scenario]), (Copy(config), [scenario])], "newton-euler")
-    alone = simulate(config, Copy(config), scenario, "newton-euler")
+    both = simulate_batch(config, [(Reckless(), [scenario]), (copying(config), [scenario])], "newton-euler")
+    alone = simulate(config, copying(config), scenario, "newton-euler")
     assert both.diverged.tolist() == [True, False]
     assert np.isfinite(both.position).all()
     # 1e-12 m: another batch size may round differently
@@ -141,10 +144,10 @@ def test_a_flight_that_diverges_is_marked_and_harms_no_neighbour() -> None:
 def test_unsound_plants_are_refused(section: str, leaf: str, value: object, word: str) -> None:
     config = replace(paper_with(), f"{section}.{leaf}", value)
     with pytest.raises(InputError, match=word):
-        simulate(config, Copy(config), Scenario(seconds=1), "newton-euler")
+        simulate(config, copying(config), Scenario(seconds=1), "newton-euler")
 
 
 def test_hover_thrust_of_an_object_too_heavy_stays_within_the_rotors_range() -> None:
     config = paper_with()
-    flight = simulate(config, Copy(config), Scenario(mass=3.0, seconds=0.02), "newton-euler")
+    flight = simulate(config, copying(config), Scenario(mass=3.0, seconds=0.02), "newton-euler")
     assert flight.rotor_force.max() == config.plant.rotor_force_max

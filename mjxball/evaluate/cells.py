@@ -14,7 +14,8 @@ from mjxball.control.followers import Follower
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics, measure
 from mjxball.policy import Policy
-from mjxball.rollout import Scenario, Trajectory, simulate_batch
+from mjxball.rollout import Trajectory, simulate_batch
+from mjxball.scenario import Scenario
 
 REFERENCE = Scenario()
 # Design section 6: copy without CG motion, then five speeds of the CG.

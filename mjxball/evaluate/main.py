@@ -18,7 +18,7 @@ from mjxball.evaluate.waveform import read_waveform
 from mjxball.physics.stepper import ENGINES
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policies
-from mjxball.rollout import Scenario, check_scenario
+from mjxball.scenario import Scenario, check_scenario
 
 SCENARIO_FLAGS = ("omega", "amplitude", "mass", "believed_mass", "goal", "seconds")
 SCENARIO_FLAGS += ("waveform", "mass_change", "rolling")

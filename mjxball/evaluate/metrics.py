@@ -43,6 +43,9 @@ def measure(flight: Trajectory, termination_distance: float, rotor_force_max: fl
     error = flight.error
     distance = np.linalg.norm(error, axis=-1)
     failed = bool(flight.diverged) or not np.isfinite(distance).all() or bool((distance > termination_distance).any())
+    changed = np.flatnonzero(np.diff(flight.target, axis=0).any(axis=1))
+    leg = int(changed[-1]) + 1 if changed.size else 0  # the step at which the last waypoint became the goal
+    since = flight.time[leg:] - flight.time[leg]
     steady = flight.time >= STEADY_AFTER - 1e-9
     peaks = np.abs(error[steady]).max(axis=0) if flight.time[-1] > STEADY_AFTER + 1e-9 else [None] * 3
     rotors = flight.rotor_force[:, 1]
@@ -51,14 +54,14 @@ def measure(flight: Trajectory, termination_distance: float, rotor_force_max: fl
     difference = flight.follower_command - flight.leader_command
     return Metrics(
         rmse=_number(np.sqrt(np.mean(distance[flight.time <= RMSE_UNTIL + 1e-9] ** 2))),
-        settling_time=_settling_time(flight.time, distance, SETTLED_WITHIN),
-        overshoot=_overshoot(flight.position, flight.goal),
+        settling_time=_settling_time(since, distance[leg:], SETTLED_WITHIN),
+        overshoot=_overshoot(flight.position, flight.goal) if leg == 0 else None,
         x_peak=_number(peaks[0]),
         y_peak=_number(peaks[1]),
         z_peak=_number(peaks[2]),
         max_tilt=_number(np.hypot(flight.euler[:, 0], flight.euler[:, 1]).max()),
         action_error=_number(np.sqrt(np.mean(difference**2))),
-        settling_time_10=_settling_time(flight.time, distance, NEARLY_SETTLED_WITHIN),
+        settling_time_10=_settling_time(since, distance[leg:], NEARLY_SETTLED_WITHIN),
         paper_return=_number(paper_reward(flight.leader_command, flight.follower_command)[:PAPER_STEPS].sum()),
         effort=_number(np.sqrt(np.mean((rotors - rotors[0]) ** 2))),
         smoothness=_number(np.sqrt(np.mean(changes**2))),

@@ -40,6 +40,7 @@ class Load(NamedTuple):
     cg_phase: Array  # (...) of a sine [rad]
     mass_change: Array  # (..., k) mass added, or dropped if negative [kg]
     mass_change_time: Array  # (..., k) when [s]
+    push: Array | None = None  # (..., 3) force on O in the world, held over a control step [N]; None: none
 
 
 class Wrench(NamedTuple):

@@ -22,7 +22,9 @@ def split_state(state: PlantState) -> PlantState:
 
 def split_load(load: Load) -> Load:
     """Every leaf of `load` as `Components`."""
-    return Load(*map(split, load, LOAD_AXES))
+    if load.push is not None:
+        raise ValueError("the split road knows no push")
+    return Load(*map(split, load[:-1], LOAD_AXES[:-1]))
 
 
 def join_state(state: PlantState) -> PlantState:

@@ -46,8 +46,9 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
         xp = commands.__array_namespace__()
         target = rotor_targets(config, constants, state, commands, load.believed_mass)
         acting = target + mean * (state.rotor_force - target)
-        wrench = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust)
         middle = _drift(state, h / 2)
+        rotors = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust)
+        wrench = pushed(rotors, middle, load)
         linear, angular, ball = accelerate(middle, wrench, load)
         kicked = middle._replace(
             velocity=state.velocity + h * linear,
@@ -123,6 +124,14 @@ def total_wrench(xp: Any, rotor_force: Array, mounts: Array, arm: float, yaw_per
     torque = drones[..., 0, 1:] + drones[..., 1, 1:]
     levers = xp.stack([_total(lever_y * thrust), -_total(lever_x * thrust), zero], axis=-1)
     return Wrench(xp.stack([zero, zero, _total(thrust)], axis=-1), torque + levers)
+
+
+def pushed(wrench: Wrench, state: PlantState, load: Load) -> Wrench:
+    """`wrench` with the force on O that the world exerts."""
+    if load.push is None:
+        return wrench
+    matrix = rotations.matrix_from_quaternion(state.quaternion)
+    return wrench._replace(force=wrench.force + rotations.rotate_back(matrix, load.push))
 
 
 def _total(pair: Array) -> Array:

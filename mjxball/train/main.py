@@ -21,7 +21,7 @@ from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.cells import REFERENCE, STANDARD
 from mjxball.physics.stepper import TRAINING_ENGINES
-from mjxball.rollout import Scenario, check_scenario
+from mjxball.scenario import Scenario, check_scenario
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
 from mjxball.train.provenance import commit, differences, source_hash, versions
