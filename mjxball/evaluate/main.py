@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +13,9 @@ from pathlib import Path
 from mjxball import __version__, cli, config
 from mjxball.control.followers import BASELINES, make_baseline
 from mjxball.errors import InputError
+from mjxball.evaluate import families
 from mjxball.evaluate.cells import REFERENCE, STANDARD, Cell, check_bounds, cross, load_policy, run_cells
+from mjxball.evaluate.judging import judge_families, scores_of, write_judgement
 from mjxball.evaluate.report import to_json, write_report
 from mjxball.evaluate.table import table
 from mjxball.evaluate.waveform import read_waveform
@@ -19,6 +23,7 @@ from mjxball.physics.stepper import ENGINES
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policies
 from mjxball.scenario import Scenario, check_scenario
+from mjxball.train.provenance import versions
 
 SCENARIO_FLAGS = ("omega", "amplitude", "mass", "believed_mass", "goal", "seconds")
 SCENARIO_FLAGS += ("waveform", "mass_change", "rolling")
@@ -54,8 +59,11 @@ def parser() -> cli.Parser:
     )
     result.add_argument("--physics", choices=ENGINES, default="mjx", help="physics engine (default mjx)")
     result.add_argument("--json", type=Path, metavar="FILE", help="write the cells as JSON")
-    result.add_argument("--out", type=Path, metavar="DIR", help="write cells.json and a figure per scenario")
+    result.add_argument("--out", type=Path, metavar="DIR", help="write report.html, JSON and figures")
     result.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its card")
+    result.add_argument("--families", nargs="+", metavar="NAME", help="scenario families, or all; see --list")
+    result.add_argument("--seeds", type=int, metavar="N", help="seeds of each level of a family (default 3)")
+    result.add_argument("--list", action="store_true", help="list the scenario families and stop")
     result.add_argument("--version", action="version", version=f"mjxball {__version__}")
     return result
 
@@ -63,11 +71,29 @@ def parser() -> cli.Parser:
 def main(arguments: list[str] | None = None) -> int:
     """Evaluate; return the exit code."""
     options = parser().parse_args(arguments)
-    return cli.run_command(lambda: _evaluate(options))
+    return cli.run_command(lambda: _evaluate(options, sys.argv[1:] if arguments is None else arguments))
 
 
-def _evaluate(options: argparse.Namespace) -> int:
+def _families(options: argparse.Namespace) -> list[families.Family]:
+    if options.families is None:
+        if options.seeds is not None:
+            raise InputError("--seeds belongs to --families")
+        return []
+    given = [name for name in SCENARIO_FLAGS if getattr(options, name) is not None]
+    if given or options.check:
+        flag = "check" if options.check else given[0].replace("_", "-")
+        raise InputError(f"--families fly their own scenarios; drop --{flag}")
+    if options.seeds is not None and not 1 <= options.seeds <= 1000:
+        raise InputError(f"--seeds must be between 1 and 1000, not {options.seeds}")
+    return families.find(options.families)
+
+
+def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    if options.list:
+        print(families.listing())  # noqa: T201
+        return 0
     setup = _setup(options)
+    chosen = _families(options)
     scenarios = _scenarios(options)
     for scenario in scenarios:
         check_scenario(setup, scenario)
@@ -90,13 +116,25 @@ def _evaluate(options: argparse.Namespace) -> int:
     followers = [*(make_baseline(name, setup) for name in dict.fromkeys(names)), *policies]
     _refuse_same_names([follower.name for follower in followers])
 
+    command = shlex.join(["python", "eval.py", *arguments])
+    if chosen:
+        seeds = 3 if options.seeds is None else options.seeds
+        scores = judge_families(setup, followers, chosen, seeds, options.physics)
+        if options.json:
+            options.json.write_text(json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
+        if options.out:
+            write_judgement(options.out, setup, scores, chosen, policies, command, versions())
+            print(f"the report is {options.out / 'report.html'}")  # noqa: T201
+        return 0
     cells = run_cells(setup, followers, scenarios, options.physics)
     print(table(cells))  # noqa: T201
     if options.json:
         options.json.write_text(to_json(cells))
     if options.out:
         write_report(cells, options.out)
-        print(f"figures and cells.json are in {options.out}")  # noqa: T201
+        scores, shown = scores_of(cells)
+        write_judgement(options.out, setup, scores, shown, policies, command, versions())
+        print(f"report.html, figures and cells.json are in {options.out}")  # noqa: T201
     return _check(setup, policies, cells, options.physics) if options.check else 0
 
 

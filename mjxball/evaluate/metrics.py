@@ -12,6 +12,7 @@ from mjxball.rollout import Trajectory
 RMSE_UNTIL = 20.0  # [s]
 PAPER_STEPS = 1000  # of an episode, over which the paper's reward is summed
 STEADY_AFTER = 20.0  # [s]
+WAYPOINT_SECONDS = 10.0  # [s] after the last waypoint became the goal, before which nothing is steady
 SETTLED_WITHIN = 0.02  # of the initial error
 NEARLY_SETTLED_WITHIN = 0.10
 SATURATED_WITHIN = 1e-6  # of the largest rotor force
@@ -46,8 +47,8 @@ def measure(flight: Trajectory, termination_distance: float, rotor_force_max: fl
     changed = np.flatnonzero(np.diff(flight.target, axis=0).any(axis=1))
     leg = int(changed[-1]) + 1 if changed.size else 0  # the step at which the last waypoint became the goal
     since = flight.time[leg:] - flight.time[leg]
-    steady = flight.time >= STEADY_AFTER - 1e-9
-    peaks = np.abs(error[steady]).max(axis=0) if flight.time[-1] > STEADY_AFTER + 1e-9 else [None] * 3
+    steady = flight.time >= max(STEADY_AFTER, flight.time[leg] + WAYPOINT_SECONDS if leg else 0.0) - 1e-9
+    peaks = np.abs(error[steady]).max(axis=0) if steady[:-1].any() else [None] * 3
     rotors = flight.rotor_force[:, 1]
     changes = np.diff(flight.follower_command[:, :2], axis=0)
     at_a_limit = (rotors <= SATURATED_WITHIN * rotor_force_max) | (rotors >= (1 - SATURATED_WITHIN) * rotor_force_max)

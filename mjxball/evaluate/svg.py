@@ -1,0 +1,137 @@
+"""Figures of the report as SVG text, self-contained and small enough to stand in one page by the dozen."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mjxball.evaluate.figures import pyplot
+from mjxball.evaluate.judge import Score
+
+POINTS = 240  # of a curve over time
+COLOURS = {
+    "copy": "#8a8a8a",
+    "adaptive": "#d1495b",
+    "adaptive-mass": "#edae49",
+    "oracle": "#222222",
+    "lqg": "#2e933c",
+    "memoryless": "#8d6a4f",
+    "stay": "#b9a7c7",
+    "random": "#d9c9b0",
+}
+POLICY_COLOURS = ("#1b6ca8", "#6f4a8e", "#00798c", "#c2571a", "#7a9e1f")
+FLOORS = ("stay", "random")  # so far off that they would flatten every scale
+
+
+def colours(names: Sequence[str]) -> dict[str, str]:
+    """A colour for each follower: fixed for the baselines, in order for policies."""
+    policies = [name for name in dict.fromkeys(names) if name not in COLOURS]
+    chosen = {name: POLICY_COLOURS[k % len(POLICY_COLOURS)] for k, name in enumerate(policies)}
+    return {**COLOURS, **chosen}
+
+
+def level_curves(scores: Sequence[Score], axis: str) -> str:
+    """Steady-state peak and settling over the levels of one family, every follower with its interval."""
+    plt, names = pyplot(), list(dict.fromkeys(score.follower for score in scores))
+    levels = list(dict.fromkeys(score.level for score in scores))
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), constrained_layout=True)
+    shade = colours(names)
+    for panel, (metric, label) in zip(axes, (("peak", "steady-state peak [m]"), ("rmse", "RMSE [m]")), strict=True):
+        for name in names:
+            if name in FLOORS:
+                continue
+            mine = {score.level: score.summary(metric) for score in scores if score.follower == name}
+            rows = np.array([[mine[k].median, mine[k].low, mine[k].high] for k in levels])
+            rows[~np.isfinite(rows)] = np.nan
+            panel.plot(range(len(levels)), rows[:, 0], marker="o", markersize=3, color=shade[name], label=name)
+            panel.fill_between(range(len(levels)), rows[:, 1], rows[:, 2], color=shade[name], alpha=0.15, linewidth=0)
+        panel.set_yscale("log" if metric == "peak" else "linear")
+        panel.set_ylabel(label)
+        panel.set_xticks(range(len(levels)), levels, fontsize=8, rotation=15 if max(map(len, levels)) > 9 else 0)
+        panel.set_xlabel(axis)
+        panel.grid(alpha=0.25)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncol=6, fontsize=8)
+    return _text(figure)
+
+
+def flight_curves(scores: Sequence[Score]) -> str:
+    """One level's flights of seed 0: object position along x and z, and the follower's pitch command."""
+    plt, names = pyplot(), [score.follower for score in scores]
+    figure, axes = plt.subplots(3, 1, sharex=True, figsize=(10, 5.6), constrained_layout=True)
+    shade, first = colours(names), scores[0].shown.flight
+    rows = np.unique(np.linspace(0, len(first.time) - 1, POINTS).astype(int))
+    for axis, k in zip(axes[:2], (0, 2), strict=True):
+        axis.plot(first.time[rows], first.target[rows, k], color="black", linestyle=":", linewidth=1)
+        axis.set_ylabel(f"{'xyz'[k]} [m]")
+    for score in scores:
+        if score.follower in FLOORS:
+            continue
+        flight, style = score.shown.flight, {"color": shade[score.follower], "linewidth": 1.1}
+        for axis, k in zip(axes[:2], (0, 2), strict=True):
+            axis.plot(flight.time[rows], flight.position[rows, k], label=score.follower, **style)
+        axes[2].plot(flight.time[rows], np.degrees(flight.follower_command[rows, 1]), **style)
+    axes[2].set_ylabel("pitch command [deg]")
+    axes[2].set_xlabel("time [s]")
+    for axis in axes:
+        axis.grid(alpha=0.25)
+        axis.margins(x=0)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncol=6, fontsize=8)
+    return _text(figure)
+
+
+def heat_maps(scores: Sequence[Score]) -> str:
+    """Steady-state peak over (CG speed, object mass), one map for each follower, all on one logarithmic scale."""
+    speeds = sorted({score.shown.scenario.omega for score in scores})
+    masses = sorted({score.shown.scenario.mass for score in scores})
+    peaks: dict[str, np.ndarray] = {}
+    for score in scores:
+        table = peaks.setdefault(score.follower, np.full((len(masses), len(speeds)), np.nan))
+        place = masses.index(score.shown.scenario.mass), speeds.index(score.shown.scenario.omega)
+        table[place] = score.summary("peak").median
+    plt = pyplot()
+    from matplotlib.colors import LogNorm
+
+    columns = min(4, len(peaks))
+    rows = math.ceil(len(peaks) / columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(2.9 * columns, 2.5 * rows), squeeze=False, layout="constrained")
+    image = None
+    for axis, (name, table) in zip(axes.flat, peaks.items(), strict=False):
+        shown = np.where(np.isfinite(table), table, np.nan)
+        image = axis.imshow(shown, norm=LogNorm(1e-3, 1.0), cmap="viridis_r", aspect="auto", origin="lower")
+        for (i, j), value in np.ndenumerate(table):
+            text = "failed" if not math.isfinite(value) else f"{1e3 * value:.0f}"
+            dark = math.isfinite(value) and value > 0.05
+            axis.text(j, i, text, ha="center", va="center", fontsize=6, color="white" if dark else "black")
+        axis.set_xticks(range(len(speeds)), [f"{speed:g}" for speed in speeds], fontsize=7)
+        axis.set_yticks(range(len(masses)), [f"{mass:g}" for mass in masses], fontsize=7)
+        axis.set_title(name, fontsize=9)
+    for axis in list(axes.flat)[len(peaks) :]:
+        axis.set_visible(False)
+    for axis in axes[-1]:
+        axis.set_xlabel("CG speed [rad/s]", fontsize=8)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("mass [kg]", fontsize=8)
+    figure.colorbar(image, ax=axes, label="peak [m]", shrink=0.8)
+    return _text(figure)
+
+
+def _text(figure: Any) -> str:
+    """The figure as an `svg` element that scales with the page."""
+    import matplotlib as mpl
+
+    stream = io.StringIO()
+    # Text stays text; ids are drawn from the content, so that figures of one page do not share clip paths.
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": None, "font.family": "sans-serif"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
+    pyplot().close(figure)
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"(\d+\.\d\d)\d+", r"\1", text)
+    return re.sub(r'<svg([^>]*?) width="[^"]*"', r'<svg\1 role="img"', text, count=1).replace(
+        ' height="', ' data-h="', 1
+    )
