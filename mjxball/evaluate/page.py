@@ -44,7 +44,7 @@ th, td { padding: 3px 9px; border-bottom: 1px solid var(--line); text-align: rig
 th:nth-child(-n+3), td:nth-child(-n+3) { text-align: left; }
 th button { font: inherit; font-weight: 600; background: none; border: 0; padding: 0; cursor: pointer; }
 th button::after { content: " \\2195"; color: #9aa4ad; } tr.best td { background: var(--best); }
-small { color: #667; } nav a { margin-right: 12px; white-space: nowrap; }
+small { color: #667; } nav { display: flex; flex-wrap: wrap; gap: 4px 14px; }
 .verdict { background: var(--soft); padding: 12px 16px; }
 label { margin-right: 14px; }
 """

@@ -1,0 +1,227 @@
+"""Scenario families, scores over seeds, the verdict, and the report in a real browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjxball.config import preset
+from mjxball.control.followers import make_baseline
+from mjxball.errors import InputError
+from mjxball.evaluate import families, page
+from mjxball.evaluate.judge import Score, bootstrap, by_level, judge, wins
+from mjxball.evaluate.main import main as evaluate
+from mjxball.scenario import check_scenario
+
+CONFIG = preset("paper")
+SHORT = ("delay", "mass-change")
+
+
+def shortened(name: str, seconds: float = 24.0) -> families.Family:
+    """A family whose flights are cut short."""
+    family = families.BY_NAME[name]
+    levels = tuple(
+        dataclasses.replace(level, scenario=dataclasses.replace(level.scenario, seconds=seconds))
+        for level in family.levels
+    )
+    return dataclasses.replace(family, levels=levels)
+
+
+@pytest.fixture(scope="module")
+def scores() -> list[Score]:
+    """Three followers on two short families, two seeds."""
+    followers = [make_baseline(name, CONFIG) for name in ("copy", "adaptive", "oracle")]
+    return judge(CONFIG, followers, [shortened(name) for name in SHORT], 2, "newton-euler")
+
+
+def test_every_level_is_sound_for_every_seed() -> None:
+    for family in families.FAMILIES:
+        assert len({level.label for level in family.levels}) == len(family.levels)
+        for level in family.levels:
+            for seed in range(5):
+                check_scenario(level.config(CONFIG, seed), level.seeded(seed))
+
+
+def test_seeds_are_reproducible_and_differ() -> None:
+    level = families.BY_NAME["noise"].levels[0]
+    assert level.seeded(3) == level.seeded(3)
+    assert level.seeded(3) != level.seeded(4)
+    assert level.seeded(0).phase == 0.0
+    walk = families.BY_NAME["waveform"].levels[1]
+    assert walk.config(CONFIG, 1).motion == walk.config(CONFIG, 1).motion != walk.config(CONFIG, 2).motion
+
+
+def test_unknown_family_is_refused() -> None:
+    with pytest.raises(InputError, match="unknown scenario family"):
+        families.find(["cg-speeds"])
+    assert families.find(["all"]) == list(families.FAMILIES)
+    assert [family.name for family in families.find(["delay", "noise", "delay"])] == ["delay", "noise"]
+
+
+def test_bootstrap_interval_covers_the_median_as_often_as_it_says() -> None:
+    random = np.random.default_rng(0)
+    hits = 0
+    for _ in range(200):
+        found = bootstrap(random.normal(size=25))
+        hits += found.low <= 0 <= found.high
+    # A percentile interval of a median covers a little less or more than 95 %; 200 trials have a deviation of 1.5 %.
+    assert 0.89 <= hits / 200 <= 1.0
+
+
+def test_failures_are_never_averaged_away() -> None:
+    assert math.isinf(bootstrap(np.array([0.1, math.inf, math.inf])).median)
+    assert math.isinf(bootstrap(np.array([0.1, math.inf])).median)  # of two the worse one
+    assert bootstrap(np.array([0.1, 0.2, math.inf])).median == 0.2
+    assert math.isnan(bootstrap(np.array([math.nan])).median)
+
+
+def test_scores_hold_every_seed_and_one_flight(scores) -> None:
+    assert len(scores) == (3 + 3) * 3
+    for score in scores:
+        assert len(score.metrics) == 2
+        assert score.shown.flight is not None
+        assert score.failures == 0
+    delays = [s.summary("peak").median for s in scores if s.family == "delay" and s.follower == "copy"]
+    assert len(set(delays)) == 3  # the levels really differ
+
+
+def test_oracle_is_left_out_of_the_wins(scores) -> None:
+    won = wins(scores)
+    assert "oracle" not in won
+    assert sum(won.values()) == len(by_level(scores)) == 6
+    assert won["adaptive"] == 6
+
+
+def with_peaks(score: Score, name: str, peak: float) -> Score:
+    metrics = tuple(dataclasses.replace(m, x_peak=peak, y_peak=0.0, z_peak=0.0) for m in score.metrics)
+    return dataclasses.replace(score, follower=name, metrics=metrics)
+
+
+@pytest.mark.parametrize(
+    ("kind", "peak", "explained"), [("paper", 5.0, True), ("paper", 1e-6, False), ("task", 5.0, False)]
+)
+def test_verdict_says_that_a_mimic_loses_and_why(scores, kind: str, peak: float, explained: bool) -> None:
+    mine = [with_peaks(s, "mine", peak) for s in scores if s.follower == "copy"]
+    lines = page.verdict([*scores, *mine], {"mine": {"config": {"reward": {"kind": kind}}}})
+    text = next(line for line in lines if line.startswith("mine has a smaller"))
+    assert (page.WHY_COPYING_LOSES in text) == explained
+    assert ("in 0 levels" in text) == (peak == 5.0)
+
+
+# --- the command line and the page ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of two followers on one family, through the command line."""
+    out = tmp_path_factory.mktemp("judged") / "report"
+    flags = ["--followers", "copy", "adaptive", "policies/transport.npz", "--families", "delay", "start-errors"]
+    assert evaluate([*flags, "--seeds", "2", "--physics", "newton-euler", "--out", str(out)]) == 0
+    return out
+
+
+def test_scores_are_json_without_infinities(report: Path) -> None:
+    def refuse(text: str) -> None:
+        raise AssertionError(text)
+
+    found = json.loads((report / "scores.json").read_text(), parse_constant=refuse)["scores"]
+    assert len(found) == 6 * 3
+    assert {row["follower"] for row in found} == {"copy", "adaptive", "transport"}
+    assert all(row["seeds"] == 2 and len(row["rmse"]) == 3 for row in found)
+    never = next(row for row in found if row["follower"] == "copy")["settling_time"]
+    assert never == [None, None, None]
+
+
+def test_list_names_every_family(capsys: pytest.CaptureFixture) -> None:
+    assert evaluate(["--list"]) == 0
+    printed = capsys.readouterr().out
+    assert all(f"{family.name}: " in printed for family in families.FAMILIES)
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"),
+    [
+        (["--families", "nothing"], "unknown scenario family"),
+        (["--families", "delay", "--omega", "1"], "drop --omega"),
+        (["--families", "delay", "--mass-change", "1:0.1"], "drop --mass-change"),
+        (["--families", "delay", "--check"], "drop --check"),
+        (["--families", "delay", "--seeds", "0"], "--seeds must be"),
+        (["--seeds", "3"], "--seeds belongs"),
+    ],
+)
+def test_unsound_requests_are_refused(flags, word, capsys: pytest.CaptureFixture) -> None:
+    assert evaluate(flags) == 2
+    message = capsys.readouterr().err
+    assert word in message
+    assert message.count("\n") == 1
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A real Chromium without a window."""
+    program = shutil.which("chromium-headless-shell") or shutil.which("chromium")
+    if program is None:
+        pytest.skip("no Chromium is installed")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        running = play.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+@pytest.mark.parametrize("width", [1280, 390], ids=["desktop", "phone"])
+def test_report_opens_in_a_browser(browser, report: Path, width: int) -> None:
+    tab = browser.new_page(viewport={"width": width, "height": 800})
+    requests, errors = [], []
+    tab.on("request", lambda request: requests.append(request.url))
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    tab.goto((report / "report.html").as_uri())
+    fetched = [url for url in requests if not url.startswith("data:")]
+    assert fetched == [(report / "report.html").as_uri()]  # nothing from anywhere else
+    assert errors == []
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width  # nothing hangs out at the side
+    assert "Smallest steady-state peak" in tab.inner_text("#verdict")
+    for section in ("delay", "start-errors"):
+        assert tab.locator(f"h2#{section} ~ svg").count() >= 1
+        box = tab.locator(f"h2#{section} ~ svg").first.bounding_box()
+        assert box["width"] > 0.8 * (min(width, 1100) - 32)
+        assert box["height"] > 80
+    tab.close()
+
+
+def test_report_sorts_and_filters(browser, report: Path) -> None:
+    tab = browser.new_page(viewport={"width": 1280, "height": 800})
+    tab.goto((report / "report.html").as_uri())
+
+    def column() -> list[float]:
+        return tab.eval_on_selector_all(
+            "#scores tbody tr:not([hidden]) td:nth-child(8)", "c => c.map(x => +x.dataset.v)"
+        )
+
+    tab.click("#scores th:nth-child(8) button")
+    assert column() == sorted(column())
+    tab.click("#scores th:nth-child(8) button")
+    assert column() == sorted(column(), reverse=True)
+    assert len(column()) == 18
+    tab.select_option("#follower", "transport")
+    assert len(column()) == 6
+    tab.select_option("#family", "delay")
+    assert len(column()) == 3
+    tab.close()
+
+
+def test_report_says_how_it_was_made(report: Path) -> None:
+    text = (report / "report.html").read_text()
+    assert "python eval.py --followers copy adaptive" in text
+    assert "card of <b>transport</b>" in text
+    assert "image/webp;base64" in text or "No animation: MuJoCo" in text
