@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +25,24 @@ from mjxball.scenario import Scenario, check_scenario
 from mjxball.sensing import Senses
 
 Act = Callable[[np.ndarray, Brief], np.ndarray]  # observations (n, 18), what is known -> commands (n, 3)
+
+Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with the scenarios that it flies
+
+
+class Tick(NamedTuple):
+    """One control step of n flights: what `Trajectory` holds for every step, without the contact wrenches."""
+
+    time: float  # [s]
+    position: np.ndarray  # (n, 3) of O in the world [m]
+    target: np.ndarray  # (n, 3) goal of O [m]
+    euler: np.ndarray  # (n, 3) roll, pitch, yaw [rad]
+    rotor_force: np.ndarray  # (n, 2, 4) leader, follower [N]
+    leader_command: np.ndarray  # (n, 3) roll, pitch [rad], vertical acceleration [m/s2]
+    follower_command: np.ndarray  # (n, 3) likewise
+    diverged: np.ndarray  # (n,) bool
+    state: PlantState | None = None
+    observation: np.ndarray | None = None  # (n, 18)
+    cg_offset: np.ndarray | None = None  # (n,) [m]
 
 
 @dataclass(frozen=True)
@@ -57,6 +76,20 @@ class Trajectory:
         """e_o = target - position (T, ..., 3) [m]."""
         return self.target - self.position
 
+    def tick(self, number: int) -> Tick:
+        """Control step `number` of a batch."""
+        names = ("position", "target", "euler", "rotor_force", "leader_command", "follower_command")
+        return Tick(float(self.time[number]), *(getattr(self, name)[number] for name in names), self.diverged)
+
+    def batched(self) -> Trajectory:
+        """A single flight as a batch of one."""
+        parts = {}
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            per_flight = item.name in ("goal", "diverged")
+            parts[item.name] = value if item.name == "time" else np.expand_dims(value, 0 if per_flight else 1)
+        return Trajectory(**parts)
+
     def world(self, index: int) -> Trajectory:
         """Flight `index` of a batch."""
         parts = {}
@@ -78,13 +111,23 @@ def simulate(
     return simulate_batch(config, [(follower, [scenario or Scenario()])], physics).world(0)
 
 
-def simulate_batch(
-    config: Config, flights: Sequence[tuple[Follower, Sequence[Scenario]]], physics: str = "mjx"
-) -> Trajectory:
+def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Trajectory:
     """Fly every (follower, scenarios) pair at once; the batch axis runs over all scenarios in order.
 
     All scenarios must last equally long. Each follower is called once per control step for its own part.
     """
+    scenarios, act = _together(config, flights)
+    return _record(config, scenarios, act, physics)
+
+
+def stream_batch(config: Config, flights: Flights, physics: str = "mjx") -> Iterator[Tick]:
+    """`simulate_batch` step by step, nothing recorded: for more flights than memory would hold."""
+    scenarios, act = _together(config, flights)
+    return fly(config, scenarios, act, physics)
+
+
+def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
+    """All scenarios in order, checked, and the followers' laws, each for its own part of the batch."""
     validate(config)
     scenarios = [scenario for _, part in flights for scenario in part]
     for scenario in scenarios:
@@ -105,44 +148,55 @@ def simulate_batch(
             commands.append(np.asarray(follower(seen[part]), float))
         return np.concatenate(commands)
 
-    return _fly(config, scenarios, act, physics)
+    return scenarios, act
 
 
-def _fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Trajectory:
+def fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Iterator[Tick]:
+    """Every control step of all scenarios at once, the start first; `act` is the followers' laws."""
     step, cg_offset, brief = make_stepper(config, physics), make_cg_offset(config), make_brief(config)
     period = config.timing.control_period
     count = round(scenarios[0].seconds / period)
     load, target = _load(scenarios), _targets(scenarios, count, period)
     start = np.array([scenario.ball_start for scenario in scenarios], float)
-    position, velocity = (
-        np.array([getattr(s, f"start_{what}") for s in scenarios]) for what in ("position", "velocity")
-    )
+    position = np.array([scenario.start_position for scenario in scenarios])
+    velocity = np.array([scenario.start_velocity for scenario in scenarios])
     tilt = np.array([(*scenario.start_tilt, 0.0) for scenario in scenarios])
     state = start_state(config, position, tilt, velocity, load.believed_mass, start)
     senses = Senses([scenario.disturbance for scenario in scenarios], count, period)
     integral, diverged = np.zeros_like(position), np.zeros(len(scenarios), bool)
     mount = np.array(config.plant.follower_mount)
-    states, others = [], []
     for number in range(count + 1):
         goal = target[number]
         matrix = rotations.matrix_from_quaternion(state.quaternion)
+        euler = rotations.euler_from_matrix(matrix)
         seen = observation.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
         led = _leader_command(config, goal, state, integral)
         seen = senses.observe(number, seen)
         followed = act(seen, brief(state, load))
-        states.append(state)
-        others.append((rotations.euler_from_matrix(matrix), led, followed, seen, cg_offset(state, load)))
+        # The time is exact, so that a mass change falls on the same row for every engine.
+        flown = (state.position, goal, euler, state.rotor_force, led, followed, diverged)
+        yield Tick(number * period, *flown, state, seen, cg_offset(state, load))
         if number < count:
             integral = integral + period * (goal - state.position)
             acting = load if senses.pushes is None else load._replace(push=senses.pushes[number])
             moved = step(state, np.stack([led, followed], axis=1), acting)
-            diverged |= _diverged(moved)
+            diverged = diverged | _diverged(moved)
             state = PlantState(*(_keep(diverged, old, new) for old, new in zip(state, moved, strict=True)))
-    flown = PlantState(*(np.stack(leaves) for leaves in zip(*states, strict=True)))
-    grid = np.arange(count + 1) * period  # exact, so that a mass change falls on the same row for every engine
+
+
+def _record(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Trajectory:
+    ticks = list(fly(config, scenarios, act, physics))
+    grid = np.array([tick.time for tick in ticks])
+    load, count = _load(scenarios), len(ticks) - 1
+    pushes = Senses([s.disturbance for s in scenarios], count, config.timing.control_period).pushes
+    target, euler, led, followed, seen, offset = (
+        np.stack([getattr(tick, name) for tick in ticks])
+        for name in ("target", "euler", "leader_command", "follower_command", "observation", "cg_offset")
+    )
+    diverged = ticks[-1].diverged
+    flown = PlantState(*(np.stack(leaves) for leaves in zip(*(tick.state for tick in ticks), strict=True)))
     flown = flown._replace(time=np.broadcast_to(grid[:, None], flown.time.shape))
-    euler, led, followed, seen, offset = (np.stack(column) for column in zip(*others, strict=True))
-    load = load._replace(push=senses.pushes)
+    load = load._replace(push=pushes)
     force, torque = flown_contact_wrenches(config, flown, load, physics)
     return Trajectory(
         time=grid,

@@ -12,9 +12,9 @@ from typing import Any
 from mjxball.config import Config, Plant
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
-from mjxball.evaluate.metrics import Metrics, measure
+from mjxball.evaluate.metrics import Meter, Metrics, measure_batch
 from mjxball.policy import Policy
-from mjxball.rollout import Trajectory, simulate_batch
+from mjxball.rollout import Trajectory, simulate_batch, stream_batch
 from mjxball.scenario import Scenario
 
 REFERENCE = Scenario()
@@ -23,6 +23,10 @@ STANDARD = (
     dataclasses.replace(REFERENCE, amplitude=0.0),
     *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.31, 0.62, 1.0, 2.0, 3.1)),
 )
+
+
+# The metrics of a cell in JSON are fixed; the others are in the judge's scores.
+CONTRACT = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error", "failed")
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class Cell:
             keys["motion"] = self.motion
         if s.mass_changes:
             keys["mass_changes"] = [list(change) for change in s.mass_changes]
-        return {"follower": self.follower, **keys, **dataclasses.asdict(self.metrics)}
+        return {"follower": self.follower, **keys, **{name: getattr(self.metrics, name) for name in CONTRACT}}
 
 
 def cross(
@@ -68,20 +72,20 @@ def cross(
 def run_cells(config: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str) -> list[Cell]:
     """Fly every follower through every scenario; cells are ordered by scenario, then by follower."""
     flights = simulate_batch(config, [(follower, scenarios) for follower in followers], physics)
-    limit = config.scenario.termination_distance
+    measured = measure_batch(flights, config.scenario.termination_distance, config.plant.rotor_force_max)
     cells = []
     for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
-        flight = flights.world(j * len(scenarios) + i)
-        cells.append(
-            Cell(
-                follower.name,
-                scenario,
-                measure(flight, limit, config.plant.rotor_force_max),
-                flight,
-                config.motion.kind,
-            )
-        )
+        index = j * len(scenarios) + i
+        cells.append(Cell(follower.name, scenario, measured[index], flights.world(index), config.motion.kind))
     return cells
+
+
+def score_batch(config: Config, follower: Follower, scenarios: Sequence[Scenario], physics: str) -> list[Metrics]:
+    """Metrics of any number of flights, which are not recorded."""
+    meter = Meter(config.scenario.termination_distance, config.plant.rotor_force_max)
+    for tick in stream_batch(config, [(follower, scenarios)], physics):
+        meter.add(tick)
+    return meter.results()
 
 
 def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy:

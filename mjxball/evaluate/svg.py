@@ -50,7 +50,8 @@ def level_curves(scores: Sequence[Score], axis: str) -> str:
             rows[~np.isfinite(rows)] = np.nan
             panel.plot(range(len(levels)), rows[:, 0], marker="o", markersize=3, color=shade[name], label=name)
             panel.fill_between(range(len(levels)), rows[:, 1], rows[:, 2], color=shade[name], alpha=0.15, linewidth=0)
-        panel.set_yscale("log" if metric == "peak" else "linear")
+        if metric == "peak" and any(np.isfinite(line.get_ydata()).any() for line in panel.lines):
+            panel.set_yscale("log")
         panel.set_ylabel(label)
         panel.set_xticks(range(len(levels)), levels, fontsize=8, rotation=15 if max(map(len, levels)) > 9 else 0)
         panel.set_xlabel(axis)
