@@ -9,7 +9,7 @@ from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
 from mjxball.config import preset, replace
 from mjxball.control.baselines import lqg
 from mjxball.control.baselines.gains import pitch_gains
-from mjxball.control.followers import BASELINES, make_baseline, make_law
+from mjxball.control.followers import LAWS, make_baseline, make_law
 from mjxball.errors import InputError
 from mjxball.evaluate.cells import REFERENCE, Cell, cross, run_cells
 from mjxball.rollout import simulate
@@ -30,7 +30,7 @@ REFERENCE_NUMBERS = {
 def cells() -> dict[tuple[str, float], Cell]:
     """Every baseline at every speed, closed-form physics."""
     config = preset("paper")
-    followers = [make_baseline(name, config) for name in BASELINES]
+    followers = [make_baseline(name, config) for name in LAWS]
     flown = run_cells(config, followers, cross(SPEEDS, [0.05], [0.2]), "newton-euler")
     return {(cell.follower, cell.scenario.omega): cell for cell in flown}
 

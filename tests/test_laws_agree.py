@@ -12,7 +12,8 @@ from mjxball.config import preset
 from mjxball.control import attitude, leader, mixer, observation, rotations
 from mjxball.control.attitude import AttitudeGains
 from mjxball.control.baselines.law import Brief
-from mjxball.control.followers import BASELINES, make_law
+from mjxball.control.followers import LAWS as FOLLOWERS
+from mjxball.control.followers import make_law
 
 WORLDS = 64
 random = np.random.default_rng(7)
@@ -91,7 +92,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
         lambda a, s: observation.follower_command(a, s, True, REACH, KP, KD, G, LIMITS),
         (ACTION, 3 * SEEN),
     ),
-    **{f"baseline {name}": (flown(name), (FLIGHT, *BRIEF)) for name in BASELINES},
+    **{f"baseline {name}": (flown(name), (FLIGHT, *BRIEF)) for name in FOLLOWERS},
 }
 # Computed once in NumPy float64, from the config, not from arrays.
 NOT_LAWS = {"attitude.design_gains", "observation.memory_size", "observation.input_mask"}

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mjxball import __version__, cli, config
-from mjxball.control.followers import BASELINES, make_baseline
+from mjxball.control.followers import BASELINES, LAWS, make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate import families
 from mjxball.evaluate.cells import REFERENCE, STANDARD, Cell, check_bounds, cross, load_policy, run_cells
@@ -20,7 +20,7 @@ from mjxball.evaluate.report import to_json, write_report
 from mjxball.evaluate.table import table
 from mjxball.evaluate.waveform import read_waveform
 from mjxball.physics.stepper import ENGINES
-from mjxball.policy import Policy
+from mjxball.policy import Policy, PolicyFileError
 from mjxball.policy.shipped import shipped_policies
 from mjxball.scenario import Scenario, check_scenario
 from mjxball.train.provenance import versions
@@ -37,7 +37,7 @@ def parser() -> cli.Parser:
         epilog="Without policies, followers or scenarios: every shipped policy and baseline on the standard scenarios.",
         allow_abbrev=False,
     )
-    names = ", ".join(BASELINES)
+    names = ", ".join(LAWS)
     result.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="policy files")
     result.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=f"baselines: {names}")
     result.add_argument("--omega", nargs="+", type=float, metavar="W", help="CG speeds [rad/s] (default 0.31)")
@@ -63,6 +63,7 @@ def parser() -> cli.Parser:
     result.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its card")
     result.add_argument("--families", nargs="+", metavar="NAME", help="scenario families, or all; see --list")
     result.add_argument("--seeds", type=int, metavar="N", help="seeds of each level of a family (default 3)")
+    result.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
     result.add_argument("--list", action="store_true", help="list the scenario families and stop")
     result.add_argument("--version", action="version", version=f"mjxball {__version__}")
     return result
@@ -105,11 +106,11 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     files = [*options.policies, *(Path(name) for name in options.followers if name.endswith(".npz"))]
     named = [name for name in options.followers if not name.endswith(".npz")]
     paths = files if files or named else shipped_policies()
-    names = named if files or named else list(BASELINES)
+    names = named if files or named else list(LAWS if chosen else BASELINES)
     if options.check and not paths:
         raise InputError("--check needs a policy")
     # A pitch frequency that was asked for is an experiment, not a mistake.
-    policies = [load_policy(path, setup, compare_laws=options.wn_pitch is None) for path in paths]
+    policies = _load(paths, setup, options)
     unbounded = [policy.name for policy in policies if options.check and not policy.card["bounds"]]
     if unbounded:
         raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
@@ -175,6 +176,27 @@ def _mass_change(text: str) -> tuple[float, float]:
     except ValueError:
         raise InputError(f"--mass-change takes TIME:KG, for example 10:0.2, not {text!r}") from None
     return time, mass
+
+
+def _load(paths: Sequence[Path], setup: config.Config, options: argparse.Namespace) -> list[Policy]:
+    """The policies; files of one stem are called by their directory too, forced ones carry a mark in their name."""
+    policies = []
+    for path in paths:
+        try:
+            policies.append(load_policy(path, setup, compare_laws=options.wn_pitch is None))
+        except PolicyFileError:
+            raise
+        except InputError as error:
+            if not options.force:
+                raise InputError(f"{error}; --force flies it all the same") from None
+            print(f"warning: FORCED: {error}", file=sys.stderr)  # noqa: T201
+            policies.append(Policy.load(path))
+            policies[-1].name += " (FORCED)"
+    stems = [policy.name for policy in policies]
+    for policy, path in zip(policies, paths, strict=True):
+        if stems.count(policy.name) > 1:
+            policy.name = f"{path.absolute().parent.name}/{policy.name}"
+    return policies
 
 
 def _refuse_same_names(names: list[str]) -> None:

@@ -1,0 +1,123 @@
+"""Every metric on flights made by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjxball.evaluate.metrics import Metrics, measure, measure_batch
+from mjxball.rollout import Trajectory
+
+TIME = np.arange(1501) * 0.02  # 30 s
+GOAL = np.array([1.0, -2.0, 0.0])
+
+
+def flight(position: np.ndarray, **parts: Any) -> Trajectory:
+    """A level flight at rest attitude whose commands are zero, unless `parts` say otherwise."""
+    n = len(position)
+    zero = {3: np.zeros((n, 3)), 0: np.zeros(n)}
+    common = {
+        "time": TIME[:n],
+        "position": position,
+        "velocity": zero[3],
+        "euler": zero[3],
+        "rates": zero[3],
+        "quaternion": np.tile([1.0, 0, 0, 0], (n, 1)),
+        "rotor_force": np.full((n, 2, 4), 2.0),
+        "leader_command": zero[3],
+        "follower_command": zero[3],
+        "observation": np.zeros((n, 18)),
+        "cg_offset": zero[0],
+        "object_mass": zero[0],
+        "contact_force": np.zeros((n, 2, 3)),
+        "contact_torque": np.zeros((n, 2, 3)),
+        "goal": GOAL,
+        "target": np.tile(GOAL, (n, 1)),
+        "diverged": np.bool_(False),
+    }
+    return Trajectory(**{**common, **parts})
+
+
+def approach(rate: float = 1.0) -> np.ndarray:
+    """|e_o| falls as exp(-rate t) on a straight line."""
+    return GOAL * (1 - np.exp(-rate * TIME))[:, None]
+
+
+def of(trajectory: Trajectory) -> Metrics:
+    return measure(trajectory, termination_distance=2.5)
+
+
+def test_exponential_approach() -> None:
+    found = of(flight(approach()))
+    distance = np.linalg.norm(GOAL)
+    # Samples of exp(-2 t): their mean over 20 s is 1 / 40 up to the sampling's end effects.
+    assert found.rmse == pytest.approx(distance * np.sqrt(np.mean(np.exp(-2 * TIME[:1001]))))
+    assert found.settling_time == pytest.approx(np.floor(np.log(50) / 0.02) * 0.02)
+    assert found.settling_time_10 == pytest.approx(np.floor(np.log(10) / 0.02) * 0.02)
+    assert found.overshoot == pytest.approx(-np.exp(-30.0), abs=1e-9)
+    assert (found.x_peak, found.y_peak) == pytest.approx((np.exp(-20.0), 2 * np.exp(-20.0)))
+    assert (found.z_peak, found.max_tilt, found.action_error, found.paper_return) == (0, 0, 0, 0)
+    assert (found.effort, found.smoothness, found.saturation, found.failed) == (0, 0, 0, False)
+
+
+def test_never_settled_short_and_overshooting_flights() -> None:
+    assert of(flight(approach(0.1))).settling_time is None
+    short = of(flight(approach()[:1001]))  # ends at 20 s
+    assert (short.x_peak, short.settling_time) == (None, pytest.approx(3.9, abs=0.02))
+    beyond = approach()
+    beyond[700] = [1.3, -2.0, 0.0]
+    assert of(flight(beyond)).overshoot == pytest.approx(0.3)
+
+
+def test_commands_and_rotors() -> None:
+    command = np.zeros((1501, 3))
+    command[1::2, 1] = 0.1  # pitch jumps up and down at every step
+    rotors = np.full((1501, 2, 4), 2.0)
+    rotors[750:, 1, 0] = 5.5
+    found = of(flight(approach(), follower_command=command, rotor_force=rotors))
+    assert found.smoothness == pytest.approx(0.1 / np.sqrt(2))
+    assert found.action_error == pytest.approx(np.sqrt(0.01 * 750 / 1501 / 3))
+    assert found.paper_return == pytest.approx(-10 * 0.1 * 500)
+    assert found.saturation == pytest.approx(751 / 1501 / 4)
+    assert found.effort == pytest.approx(np.sqrt(3.5**2 * 751 / 1501 / 4))
+
+
+def test_tilt_is_the_hypotenuse() -> None:
+    euler = np.zeros((1501, 3))
+    euler[10] = (0.3, -0.4, 2.0)
+    assert of(flight(approach(), euler=euler)).max_tilt == pytest.approx(0.5)
+
+
+def test_failures() -> None:
+    far = approach()
+    far[100, 2] = 2.6
+    assert of(flight(far)).failed
+    assert of(flight(approach(), diverged=np.bool_(True))).failed
+    lost = approach()
+    lost[50:] = np.nan
+    found = of(flight(lost))
+    assert (found.failed, found.settling_time, found.rmse) == (True, None, None)
+
+
+def test_waypoints_start_settling_and_peaks_anew() -> None:
+    target = np.tile(GOAL, (1501, 1))
+    target[500:] = (0.0, 0.0, 0.0)  # at 10 s
+    position = approach(5.0)
+    position[500:] = GOAL * np.exp(-(TIME[500:] - TIME[500]))[:, None]
+    found = of(flight(position, target=target, goal=np.zeros(3)))
+    assert found.settling_time == pytest.approx(np.floor(np.log(50) / 0.02) * 0.02)
+    assert found.x_peak == pytest.approx(np.exp(-10.0))  # from 20 s, 10 s after the waypoint
+    assert found.overshoot is None
+
+
+def test_a_batch_is_measured_as_its_flights() -> None:
+    flights = [flight(approach(rate)) for rate in (0.1, 1.0, 3.0)]
+    parts = {}
+    for item in dataclasses.fields(Trajectory):
+        values = [getattr(one, item.name) for one in flights]
+        axis = 0 if item.name in ("goal", "diverged") else 1
+        parts[item.name] = values[0] if item.name == "time" else np.stack(values, axis=axis)
+    assert measure_batch(Trajectory(**parts), 2.5) == [of(one) for one in flights]
