@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from mjxball.physics.stepper import make_stepper
 from mjxball.scenario import Scenario, check_scenario
 from mjxball.sensing import Senses
 
+Array = Any
 Act = Callable[[np.ndarray, Brief], np.ndarray]  # observations (n, 18), what is known -> commands (n, 3)
 
 Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with the scenarios that it flies
@@ -120,12 +121,6 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     return _record(config, scenarios, act, physics)
 
 
-def stream_batch(config: Config, flights: Flights, physics: str = "mjx") -> Iterator[Tick]:
-    """`simulate_batch` step by step, nothing recorded: for more flights than memory would hold."""
-    scenarios, act = _together(config, flights)
-    return fly(config, scenarios, act, physics)
-
-
 def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     """All scenarios in order, checked, and the followers' laws, each for its own part of the batch."""
     validate(config)
@@ -156,22 +151,20 @@ def fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -
     step, cg_offset, brief = make_stepper(config, physics), make_cg_offset(config), make_brief(config)
     period = config.timing.control_period
     count = round(scenarios[0].seconds / period)
-    load, target = _load(scenarios), _targets(scenarios, count, period)
-    start = np.array([scenario.ball_start for scenario in scenarios], float)
-    position = np.array([scenario.start_position for scenario in scenarios])
-    velocity = np.array([scenario.start_velocity for scenario in scenarios])
-    tilt = np.array([(*scenario.start_tilt, 0.0) for scenario in scenarios])
-    state = start_state(config, position, tilt, velocity, load.believed_mass, start)
+    load, target = load_of(scenarios), targets(scenarios, count, period)
+    state = start_of(config, scenarios)
     senses = Senses([scenario.disturbance for scenario in scenarios], count, period)
-    integral, diverged = np.zeros_like(position), np.zeros(len(scenarios), bool)
+    integral, diverged, memory = np.zeros_like(state.position), np.zeros(len(scenarios), bool), None
     mount = np.array(config.plant.follower_mount)
     for number in range(count + 1):
         goal = target[number]
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         euler = rotations.euler_from_matrix(matrix)
         seen = observation.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
-        led = _leader_command(config, goal, state, integral)
-        seen = senses.observe(number, seen)
+        led = leader_command(config, goal, state, integral)
+        memory = memory or senses.start(seen)
+        noise, arrives = (None if table is None else table[number] for table in (senses.noise, senses.arrives))
+        memory, seen = senses.step(memory, number, seen, noise, arrives)
         followed = act(seen, brief(state, load))
         # The time is exact, so that a mass change falls on the same row for every engine.
         flown = (state.position, goal, euler, state.rotor_force, led, followed, diverged)
@@ -180,14 +173,14 @@ def fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -
             integral = integral + period * (goal - state.position)
             acting = load if senses.pushes is None else load._replace(push=senses.pushes[number])
             moved = step(state, np.stack([led, followed], axis=1), acting)
-            diverged = diverged | _diverged(moved)
-            state = PlantState(*(_keep(diverged, old, new) for old, new in zip(state, moved, strict=True)))
+            diverged = diverged | has_diverged(moved)
+            state = PlantState(*(keep(diverged, old, new) for old, new in zip(state, moved, strict=True)))
 
 
 def _record(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Trajectory:
     ticks = list(fly(config, scenarios, act, physics))
     grid = np.array([tick.time for tick in ticks])
-    load, count = _load(scenarios), len(ticks) - 1
+    load, count = load_of(scenarios), len(ticks) - 1
     pushes = Senses([s.disturbance for s in scenarios], count, config.timing.control_period).pushes
     target, euler, led, followed, seen, offset = (
         np.stack([getattr(tick, name) for tick in ticks])
@@ -262,7 +255,7 @@ def flown_contact_wrenches(
 DIVERGED_POSITION, DIVERGED_RATE = 1e3, 1e2  # [m], [rad/s]
 
 
-def _targets(scenarios: Sequence[Scenario], count: int, period: float) -> np.ndarray:
+def targets(scenarios: Sequence[Scenario], count: int, period: float) -> np.ndarray:
     """Goal of O (count + 1, n, 3) at every control step."""
     time = np.arange(count + 1) * period
     target = np.empty((count + 1, len(scenarios), 3))
@@ -273,7 +266,18 @@ def _targets(scenarios: Sequence[Scenario], count: int, period: float) -> np.nda
     return target
 
 
-def _load(scenarios: Sequence[Scenario]) -> Load:
+def start_of(config: Config, scenarios: Sequence[Scenario]) -> PlantState:
+    """The state in which the scenarios begin."""
+    believed = load_of(scenarios).believed_mass
+    position = np.array([scenario.start_position for scenario in scenarios], float)
+    velocity = np.array([scenario.start_velocity for scenario in scenarios], float)
+    tilt = np.array([(*scenario.start_tilt, 0.0) for scenario in scenarios])
+    ball = np.array([scenario.ball_start for scenario in scenarios], float)
+    return start_state(config, position, tilt, velocity, believed, ball)
+
+
+def load_of(scenarios: Sequence[Scenario]) -> Load:
+    """Masses and CG motions of the scenarios, one world each."""
     mass = np.array([scenario.mass for scenario in scenarios], float)
     believed = [s.mass if s.believed_mass is None else s.believed_mass for s in scenarios]
     sine = (np.array([getattr(s, name) for s in scenarios], float) for name in ("amplitude", "omega", "phase"))
@@ -283,19 +287,25 @@ def _load(scenarios: Sequence[Scenario]) -> Load:
     return Load(mass, np.array(believed, float), *sine, changes[..., 1], changes[..., 0])
 
 
-def _leader_command(config: Config, goal: np.ndarray, state: PlantState, integral: np.ndarray) -> np.ndarray:
+def leader_command(config: Config, goal: Array, state: PlantState, integral: Array) -> Array:
+    """The leader's command (n, 3) at `state`, `integral` (n, 3) of its error so far."""
+    xp = goal.__array_namespace__()
     law = config.leader
-    gains = (np.array(gain) for gain in (law.kp, law.kd, law.ki))
+    gains = (xp.asarray(gain, dtype=goal.dtype) for gain in (law.kp, law.kd, law.ki))
     wanted = leader.desired_acceleration(goal - state.position, -state.velocity, integral, *gains)
     return leader.command(wanted, 0.0, config.plant.gravity, law.tilt_limit, law.vertical_limit)
 
 
-def _diverged(state: PlantState) -> np.ndarray:
-    flat = np.concatenate([leaf.reshape(len(state.time), -1) for leaf in state], axis=1)
+def has_diverged(state: PlantState) -> Array:
+    """(n,) true where a value of `state` is not finite or beyond any bound."""
+    xp = state.position.__array_namespace__()
+    flat = xp.concat([xp.reshape(leaf, (leaf.shape[0], -1)) for leaf in state], axis=1)
     with np.errstate(invalid="ignore"):
-        far = (np.abs(state.position) > DIVERGED_POSITION).any(-1) | (np.abs(state.rates) > DIVERGED_RATE).any(-1)
-    return far | ~np.isfinite(flat).all(-1)
+        far = (xp.abs(state.position) > DIVERGED_POSITION).any(-1) | (xp.abs(state.rates) > DIVERGED_RATE).any(-1)
+    return far | ~xp.isfinite(flat).all(-1)
 
 
-def _keep(diverged: np.ndarray, old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    return np.where(diverged.reshape((-1,) + (1,) * (new.ndim - 1)), old, new)
+def keep(diverged: Array, old: Array, new: Array) -> Array:
+    """`new`, but `old` where the world (first axis) has `diverged`."""
+    xp = new.__array_namespace__()
+    return xp.where(xp.reshape(diverged, (-1,) + (1,) * (new.ndim - 1)), old, new)

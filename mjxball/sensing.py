@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from mjxball.errors import InputError
 # Standard deviation of each observation slot at noise level 1: motion capture and a small drone's inertial sensors.
 NOISE = np.array([*[0.003] * 3, *[0.005] * 3, *[0.02] * 3, *[0.02] * 3, *[0.003] * 3, *[0.02] * 3])
 GUST_TIME = 1.0  # [s] over which a gust is correlated
+Array = Any
 Vector3 = tuple[float, float, float]
 
 
@@ -47,39 +49,45 @@ def check(disturbance: Disturbance, period: float) -> None:
         raise InputError(f"relay loss must be at least 0 and below 1, not {disturbance.relay_loss:g}")
 
 
+class Memory(NamedTuple):
+    """What the senses of n flights carry from step to step."""
+
+    relayed: Array  # (n, 6) object error and its rate as last relayed
+    past: Array  # (longest delay + 1, n, 18) newest first
+
+
 class Senses:
-    """The disturbances of n flights of `count` control steps. `observe` must be called once a step, in order."""
+    """The disturbances of n flights of `count` control steps, drawn. `step` runs on NumPy and on JAX arrays."""
 
     def __init__(self, disturbances: Sequence[Disturbance], count: int, period: float):
-        self._noise = _stack([_noise(d, count) for d in disturbances])
-        self._arrives = _stack([_arrivals(d, count, period) for d in disturbances])
-        self._push = _stack([_gusts(d, count, period) for d in disturbances])
-        self._bias = np.array([d.relay_bias for d in disturbances])
-        self._delays = np.array([round(d.delay / period) for d in disturbances])
-        self._relayed: np.ndarray | None = None
-        self._past: list[np.ndarray] = []
+        self.noise = _stack([_noise(d, count) for d in disturbances])  # (count + 1, n, 18), None: none
+        self.arrives = _stack([_arrivals(d, count, period) for d in disturbances])  # (count + 1, n), None: always
+        self.pushes = _stack([_gusts(d, count, period) for d in disturbances])  # (count + 1, n, 3) on O [N]
+        self.bias = np.array([d.relay_bias for d in disturbances])
+        self.delays = np.array([round(d.delay / period) for d in disturbances])
 
-    @property
-    def pushes(self) -> np.ndarray | None:
-        """Force on O (count + 1, n, 3) in the world [N]; None if there is none."""
-        return self._push
+    def start(self, seen: Array) -> Memory:
+        """Memory before the first step, at which the truth is `seen` (n, 18)."""
+        xp = seen.__array_namespace__()
+        return Memory(seen[:, ERROR.start :], xp.stack([seen] * (int(self.delays.max()) + 1)))
 
-    def observe(self, number: int, seen: np.ndarray) -> np.ndarray:
-        """What the followers get to see (n, 18) of what is true (n, 18) at control step `number`."""
-        seen = seen if self._noise is None else seen + self._noise[number]
-        if self._arrives is not None:
-            relayed = np.concatenate([seen[:, ERROR] + self._bias, seen[:, ERROR_RATE]], axis=1)
-            new = self._arrives[number][:, None]
-            self._relayed = relayed if self._relayed is None else np.where(new, relayed, self._relayed)
-            seen = np.concatenate([seen[:, : ERROR.start], self._relayed], axis=1)
-        elif self._bias.any():
-            seen = seen.copy()
-            seen[:, ERROR] += self._bias
-        if not self._delays.any():
-            return seen
-        self._past = [seen, *self._past][: self._delays.max() + 1]
-        age = np.minimum(self._delays, len(self._past) - 1)
-        return np.stack(self._past)[age, np.arange(len(age))]
+    def step(
+        self, memory: Memory, number: Array, seen: Array, noise: Array | None, arrives: Array | None
+    ) -> tuple[Memory, Array]:
+        """(memory, what the followers get to see (n, 18)) of the truth `seen` at step `number` with its draws."""
+        xp = seen.__array_namespace__()
+        if noise is not None:
+            seen = seen + noise
+        error = seen[:, ERROR] + xp.asarray(self.bias, dtype=seen.dtype)
+        object_part = xp.concat([error, seen[:, ERROR_RATE]], axis=-1)
+        if arrives is not None:
+            object_part = xp.where(arrives[:, None], object_part, memory.relayed)
+        seen = xp.concat([seen[:, : ERROR.start], object_part], axis=-1)
+        if not self.delays.any():
+            return Memory(object_part, memory.past), seen
+        past = xp.concat([seen[None], memory.past[:-1]], axis=0)
+        past = xp.where(number == 0, xp.broadcast_to(seen, past.shape), past)
+        return Memory(object_part, past), past[self.delays, np.arange(len(self.delays))]
 
 
 def _stack(tables: list[np.ndarray | None]) -> np.ndarray | None:

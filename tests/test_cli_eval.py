@@ -304,3 +304,25 @@ def test_refusal_of_a_real_process(here: Path, arguments: list[str]) -> None:
     assert_one_line(done.stderr)
     assert not done.stdout
     assert listing(here) == before
+
+
+def test_policies_of_one_stem_are_called_by_their_directory(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("a", "b"):
+        (here / name).mkdir()
+        (here / name / "policy.npz").write_bytes(TRANSPORT.read_bytes())
+    paths = [here / name / "policy.npz" for name in ("a", "b")]
+    assert call(main, [*paths, "--seconds", "1", "--json", here / "cells.json", *FAST]) == 0
+    assert [cell["follower"] for cell in cells_of(here / "cells.json")] == ["a/policy", "b/policy"]
+
+
+def test_a_policy_for_another_rate_flies_only_when_forced(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arrays, card = load_arrays(TRANSPORT)
+    write_arrays(here / "slow.npz", arrays, {**card, "control_period": 0.04})
+    flags = [here / "slow.npz", "--seconds", "1", *FAST]
+    assert call(main, flags) == 2
+    refusal = capsys.readouterr().err
+    assert_one_line(refusal)
+    assert "--force" in refusal
+    assert call(main, [*flags, "--force", "--json", here / "forced.json"]) == 0
+    assert "FORCED" in capsys.readouterr().err
+    assert cells_of(here / "forced.json")[0]["follower"] == "slow (FORCED)"

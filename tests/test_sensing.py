@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,12 @@ SEEN = np.arange(18.0)[None]
 def seen_by(disturbance: Disturbance, steps: int) -> np.ndarray:
     """Observations (steps + 1, 18) of a truth that counts: at step k every slot holds k."""
     senses = Senses([disturbance], steps, PERIOD)
-    return np.array([senses.observe(k, np.full((1, 18), float(k)))[0] for k in range(steps + 1)])
+    memory, seen = senses.start(np.zeros((1, 18))), []
+    for k in range(steps + 1):
+        noise, arrives = (None if table is None else table[k] for table in (senses.noise, senses.arrives))
+        memory, observed = senses.step(memory, k, np.full((1, 18), float(k)), noise, arrives)
+        seen.append(observed[0])
+    return np.array(seen)
 
 
 def test_nothing_is_disturbed_by_default() -> None:
@@ -64,9 +70,9 @@ def test_a_steady_push_shifts_the_pair_as_statics_says() -> None:
     push = np.array([0.0, 0.11, -0.22])
 
     class Steady(Senses):
-        @property
-        def pushes(self) -> np.ndarray:
-            return np.broadcast_to(push, (3001, 1, 3))
+        def __init__(self, *arguments: Any):
+            super().__init__(*arguments)
+            self.pushes = np.broadcast_to(push, (3001, 1, 3))
 
     from mjxball import rollout
 

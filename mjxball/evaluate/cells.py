@@ -12,9 +12,9 @@ from typing import Any
 from mjxball.config import Config, Plant
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
-from mjxball.evaluate.metrics import Meter, Metrics, measure_batch
+from mjxball.evaluate.metrics import Metrics, measure_batch
 from mjxball.policy import Policy
-from mjxball.rollout import Trajectory, simulate_batch, stream_batch
+from mjxball.rollout import Trajectory, simulate_batch
 from mjxball.scenario import Scenario
 
 REFERENCE = Scenario()
@@ -78,14 +78,6 @@ def run_cells(config: Config, followers: Sequence[Follower], scenarios: Sequence
         index = j * len(scenarios) + i
         cells.append(Cell(follower.name, scenario, measured[index], flights.world(index), config.motion.kind))
     return cells
-
-
-def score_batch(config: Config, follower: Follower, scenarios: Sequence[Scenario], physics: str) -> list[Metrics]:
-    """Metrics of any number of flights, which are not recorded."""
-    meter = Meter(config.scenario.termination_distance, config.plant.rotor_force_max)
-    for tick in stream_batch(config, [(follower, scenarios)], physics):
-        meter.add(tick)
-    return meter.results()
 
 
 def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjxball.rewards import paper_reward
 from mjxball.rollout import Tick, Trajectory
 
+Array = Any
 RMSE_UNTIL = 20.0  # [s]
 PAPER_STEPS = 1000  # of an episode, over which the paper's reward is summed
 STEADY_AFTER = 20.0  # [s]
 WAYPOINT_SECONDS = 10.0  # [s] after the last waypoint became the goal, before which nothing is steady
-SETTLED_WITHIN, NEARLY_SETTLED_WITHIN = 0.02, 0.10  # of the error at the start of the last leg
+SETTLED = (0.02, 0.10)  # of the error at the start of the last leg
 SATURATED_WITHIN = 1e-6  # of the largest rotor force
 NEVER_WITHIN = 0.1  # [s] of the end: not settled
-TINY = 1e-9  # [s]
+TINY, ROUNDING = 1e-9, 1e-5  # [s] of a time in float64, in float32
 
 
 @dataclass(frozen=True)
@@ -39,94 +41,125 @@ class Metrics:
     failed: bool  # |e_o| beyond d_term, or a value that is not finite
 
 
-class Meter:
-    """Measures n flights while they fly: `add` every step in order, then `results`."""
+class Tally(NamedTuple):
+    """Sums and extremes of n flights so far, NumPy or JAX arrays (n,) unless said otherwise."""
 
-    def __init__(self, termination_distance: float, rotor_force_max: float):
-        self._limit, self._force_max = termination_distance, rotor_force_max
-        self._steps = 0
+    steps: Array  # ()
+    time: Array  # () of the last step [s]
+    early: Array  # () steps within the first 20 s
+    square: Array  # sum of |e_o|^2 over them
+    difference: Array
+    returned: Array
+    effort: Array
+    change: Array
+    saturated: Array
+    failed: Array
+    initial: Array  # |e_o| at the start of the leg [m]
+    leg: Array  # when the last waypoint became the goal [s]
+    steady_from: Array  # [s]
+    steady: Array  # steps in steady state
+    outside: Array  # (n, 2) last time |e_o| was beyond 2 % and 10 %, -inf: never [s]
+    peaks: Array  # (n, 3) NaN before the first
+    furthest: Array  # (n, 3)
+    tilt: Array
+    hover: Array  # (n, 4) the follower's rotor forces at the start [N]
+    tilts: Array  # (n, 2) its last roll and pitch commands
+    target: Array  # (n, 3)
 
-    def add(self, tick: Tick) -> None:
-        """Take one control step of all flights into account."""
-        error = tick.target - tick.position
-        distance = np.linalg.norm(error, axis=-1)
-        rotors, tilts = tick.rotor_force[:, 1], tick.follower_command[:, :2]
-        if self._steps == 0:
-            self._begin(tick, distance, rotors)
-        else:
-            self._new_leg(tick, distance)
-        early = tick.time <= RMSE_UNTIL + TINY
-        self._square += distance**2 if early else 0.0
-        self._early += early
-        for share, last in self._outside.items():
-            last[~(distance <= share * self._initial)] = tick.time
-        steady = tick.time >= np.maximum(STEADY_AFTER, self._steady_from) - TINY
-        self._peaks = np.where(steady[:, None], np.fmax(self._peaks, np.abs(error)), self._peaks)
-        self._steady += steady
-        self._furthest = np.fmax(self._furthest, tick.position)
-        self._tilt = np.fmax(self._tilt, np.hypot(tick.euler[:, 0], tick.euler[:, 1]))
-        self._difference += np.mean((tick.follower_command - tick.leader_command) ** 2, axis=-1)
-        if self._steps < PAPER_STEPS:
-            self._return += paper_reward(tick.leader_command, tick.follower_command)
-        self._effort += np.mean((rotors - self._hover) ** 2, axis=-1)
-        self._change += np.mean((tilts - self._tilts) ** 2, axis=-1)
-        slack = SATURATED_WITHIN * self._force_max
-        self._saturated += np.mean((rotors <= slack) | (rotors >= self._force_max - slack), axis=-1)
-        self._failed |= tick.diverged | ~(distance <= self._limit)
-        self._tilts, self._target, self._time = tilts, tick.target, tick.time
-        self._steps += 1
 
-    def results(self) -> list[Metrics]:
-        """Metrics of every flight."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            peaks = np.where((self._steady > 1)[:, None], self._peaks, np.nan)
-            goal = np.where(self._target == 0, np.nan, self._target)
-            over = np.where(self._leg[:, None] > 0, np.nan, self._furthest / goal)
-            overshoot = np.fmax.reduce(over, axis=1) - 1
-            columns = {
-                "rmse": np.sqrt(self._square / self._early),
-                "settling_time": self._settled(SETTLED_WITHIN),
-                "overshoot": overshoot,
-                "x_peak": peaks[:, 0],
-                "y_peak": peaks[:, 1],
-                "z_peak": peaks[:, 2],
-                "max_tilt": self._tilt,
-                "action_error": np.sqrt(self._difference / self._steps),
-                "settling_time_10": self._settled(NEARLY_SETTLED_WITHIN),
-                "paper_return": self._return,
-                "effort": np.sqrt(self._effort / self._steps),
-                "smoothness": np.sqrt(self._change / max(self._steps - 1, 1)),
-                "saturation": self._saturated / self._steps,
-            }
-        rows = zip(*columns.values(), strict=True)
-        named = (dict(zip(columns, map(_number, row), strict=True)) for row in rows)
-        return [Metrics(**numbers, failed=bool(failed)) for numbers, failed in zip(named, self._failed, strict=True)]
+def begin(position: Array, target: Array, rotor_force: Array) -> Tally:
+    """Before the first step, at `position` (n, 3) with `target` (n, 3) and `rotor_force` (n, 2, 4)."""
+    xp = position.__array_namespace__()
+    zero, none = xp.zeros_like(position[:, 0]), xp.full_like(position, xp.nan)
+    scalar = xp.sum(zero[:0])
+    return Tally(
+        *(scalar, scalar, scalar, zero, zero, zero, zero, zero, zero, zero > 1),
+        initial=_norm(target - position),
+        leg=zero,
+        steady_from=zero + STEADY_AFTER,
+        steady=zero,
+        outside=xp.full_like(position[:, :2], -xp.inf),
+        peaks=none,
+        furthest=none,
+        tilt=zero,
+        hover=rotor_force[:, 1],
+        tilts=zero[:, None] * position[:, :2],
+        target=target,
+    )
 
-    def _begin(self, tick: Tick, distance: np.ndarray, rotors: np.ndarray) -> None:
-        n = len(distance)
-        self._square, self._difference, self._return, self._effort, self._change, self._saturated = np.zeros((6, n))
-        self._early, self._steady, self._failed = 0, np.zeros(n, int), np.zeros(n, bool)
-        self._initial, self._leg, self._steady_from = distance, np.zeros(n), np.zeros(n)
-        self._outside = {share: np.full(n, -np.inf) for share in (SETTLED_WITHIN, NEARLY_SETTLED_WITHIN)}
-        self._peaks, self._furthest, self._tilt = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan)
-        self._hover, self._tilts, self._target = rotors, tick.follower_command[:, :2], tick.target
 
-    def _new_leg(self, tick: Tick, distance: np.ndarray) -> None:
-        """Where the goal has changed, settling and peaks start again."""
-        changed = (tick.target != self._target).any(axis=-1)
-        if not changed.any():
-            return
-        self._initial = np.where(changed, distance, self._initial)
-        self._leg = np.where(changed, tick.time, self._leg)
-        self._steady_from = np.where(changed, tick.time + WAYPOINT_SECONDS, self._steady_from)
-        self._peaks[changed], self._steady[changed] = np.nan, 0
-        for last in self._outside.values():
-            last[changed] = -np.inf
+def update(tally: Tally, tick: Tick, termination_distance: float, rotor_force_max: float) -> Tally:
+    """Take one control step of all flights into account."""
+    xp = tick.position.__array_namespace__()
+    error = tick.target - tick.position
+    distance = _norm(error)
+    # Where the goal has changed, settling and peaks start again.
+    new = xp.any(tick.target != tally.target, axis=-1)
+    initial = xp.where(new, distance, tally.initial)
+    steady_from = xp.where(new, tick.time + WAYPOINT_SECONDS, tally.steady_from)
+    steady_from = xp.where(steady_from > STEADY_AFTER, steady_from, STEADY_AFTER)
+    outside = xp.where(new[:, None], -xp.inf, tally.outside)
+    beyond = xp.stack([~(distance <= share * initial) for share in SETTLED], axis=-1)
+    peaks = xp.where(new[:, None], xp.nan, tally.peaks)
+    steady = tick.time >= steady_from - TINY
+    rotors, tilts = tick.rotor_force[:, 1], tick.follower_command[:, :2]
+    slack = SATURATED_WITHIN * rotor_force_max
+    at_a_limit = (rotors <= slack) | (rotors >= rotor_force_max - slack)
+    early = tick.time <= RMSE_UNTIL + TINY
+    mimicry = paper_reward(tick.leader_command, tick.follower_command)
+    change = xp.mean((tilts - tally.tilts) ** 2, axis=-1)
+    return Tally(
+        steps=tally.steps + 1,
+        time=tally.time * 0 + tick.time,
+        early=tally.early + xp.where(early, 1.0, 0.0),
+        square=tally.square + xp.where(early, distance**2, 0.0),
+        difference=tally.difference + xp.mean((tick.follower_command - tick.leader_command) ** 2, axis=-1),
+        returned=tally.returned + xp.where(tally.steps < PAPER_STEPS, mimicry, 0.0),
+        effort=tally.effort + xp.mean((rotors - tally.hover) ** 2, axis=-1),
+        change=tally.change + xp.where(tally.steps > 0, change, 0.0),
+        saturated=tally.saturated + xp.mean(xp.where(at_a_limit, 1.0, 0.0), axis=-1),
+        failed=tally.failed | tick.diverged | ~(distance <= termination_distance),
+        initial=initial,
+        leg=xp.where(new, tick.time, tally.leg),
+        steady_from=steady_from,
+        steady=xp.where(new, 0.0, tally.steady) + xp.where(steady, 1.0, 0.0),
+        outside=xp.where(beyond, tick.time, outside),
+        peaks=xp.where(steady[:, None], xp.fmax(peaks, xp.abs(error)), peaks),
+        furthest=xp.fmax(tally.furthest, tick.position),
+        tilt=xp.fmax(tally.tilt, xp.hypot(tick.euler[:, 0], tick.euler[:, 1])),
+        hover=tally.hover,
+        tilts=tilts,
+        target=tick.target,
+    )
 
-    def _settled(self, share: float) -> np.ndarray:
-        last = self._outside[share]
-        settled = np.where(np.isneginf(last), 0.0, last - self._leg)
-        return np.where(last >= self._time - NEVER_WITHIN - TINY, np.nan, settled)
+
+def results(tally: Tally) -> list[Metrics]:
+    """Metrics of every flight."""
+    t = Tally(*(np.asarray(leaf, float) for leaf in tally))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        peaks = np.where((t.steady > 1)[:, None], t.peaks, np.nan)
+        goal = np.where(t.target == 0, np.nan, t.target)
+        over = np.where(t.leg[:, None] > 0, np.nan, t.furthest / goal)
+        settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg[:, None])
+        settled = np.where(t.outside >= t.time - NEVER_WITHIN - ROUNDING, np.nan, settled)
+        columns = {
+            "rmse": np.sqrt(t.square / t.early),
+            "settling_time": settled[:, 0],
+            "overshoot": np.fmax.reduce(over, axis=1) - 1,
+            "x_peak": peaks[:, 0],
+            "y_peak": peaks[:, 1],
+            "z_peak": peaks[:, 2],
+            "max_tilt": t.tilt,
+            "action_error": np.sqrt(t.difference / t.steps),
+            "settling_time_10": settled[:, 1],
+            "paper_return": t.returned,
+            "effort": np.sqrt(t.effort / t.steps),
+            "smoothness": np.sqrt(t.change / max(t.steps - 1, 1)),
+            "saturation": t.saturated / t.steps,
+        }
+    rows = zip(*columns.values(), strict=True)
+    named = (dict(zip(columns, map(_number, row), strict=True)) for row in rows)
+    return [Metrics(**numbers, failed=bool(failed)) for numbers, failed in zip(named, t.failed, strict=True)]
 
 
 def measure(flight: Trajectory, termination_distance: float, rotor_force_max: float = 5.5) -> Metrics:
@@ -136,10 +169,15 @@ def measure(flight: Trajectory, termination_distance: float, rotor_force_max: fl
 
 def measure_batch(flights: Trajectory, termination_distance: float, rotor_force_max: float = 5.5) -> list[Metrics]:
     """Metrics of every flight of a recorded batch."""
-    meter = Meter(termination_distance, rotor_force_max)
+    first = flights.tick(0)
+    tally = begin(first.position, first.target, first.rotor_force)
     for number in range(len(flights.time)):
-        meter.add(flights.tick(number))
-    return meter.results()
+        tally = update(tally, flights.tick(number), termination_distance, rotor_force_max)
+    return results(tally)
+
+
+def _norm(vector: Array) -> Array:
+    return vector.__array_namespace__().sqrt((vector * vector).sum(axis=-1))
 
 
 def _number(value: float) -> float | None:

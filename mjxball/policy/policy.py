@@ -73,3 +73,28 @@ class Policy:
     def __call__(self, observation: Array) -> Array:
         """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18)."""
         return layout.follower_command(self.scaled(observation), np.asarray(observation, self._dtype), *self._law)
+
+
+class NetworkLaw:
+    """A policy as two pure functions of arrays (see `control.baselines.law.Law`), for batches on NumPy or JAX."""
+
+    needs_truth = False
+
+    def __init__(self, policy: Policy):
+        self.name = policy.name
+        self._parts = (policy._weights, policy._biases, policy._mean, policy._scale)
+        self._memory_shape, self._law = policy._memory_shape, policy._law
+
+    def start(self, observation: Array) -> Array:
+        """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
+        return layout.start_memory(observation, *self._memory_shape)
+
+    def step(self, memory: Array, observation: Array, brief: Any) -> tuple[Array, Array]:
+        """(memory, command (..., 3)) at `observation` (..., 18); `brief` is not read."""
+        xp = observation.__array_namespace__()
+        weights, biases, mean, scale = self._parts
+        single = [xp.asarray(part, dtype=observation.dtype) for part in (mean, scale)]
+        layers = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
+        scaled = mean_action(*layers, *single, layout.network_input(observation, memory))
+        command = layout.follower_command(scaled, observation, *self._law)
+        return layout.next_memory(memory, observation, scaled, *self._memory_shape), command

@@ -1,0 +1,72 @@
+"""Batches that keep only metrics give what recorded flights give."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mjxball.config import preset
+from mjxball.control.followers import LAWS, make_baseline
+from mjxball.errors import InputError
+from mjxball.evaluate.batch import Batch
+from mjxball.evaluate.cells import run_cells
+from mjxball.policy import Policy
+from mjxball.policy.shipped import shipped_policies
+from mjxball.scenario import Scenario
+from mjxball.sensing import Disturbance
+
+CONFIG = preset("paper")
+SECONDS = 22.0
+SCENARIOS = [
+    Scenario(seconds=SECONDS),
+    Scenario(omega=2.0, amplitude=0.1, mass=0.3, believed_mass=0.2, goal=(-1, 0.5, 0), seconds=SECONDS),
+    Scenario(mass_changes=((5.0, 0.1),), start_tilt=(0.1, 0.0), waypoints=((8.0, (0.0, 0.0, 1.0)),), seconds=SECONDS),
+    Scenario(disturbance=Disturbance(noise=0.5, gust=0.2, seed=1), seconds=SECONDS),
+    Scenario(disturbance=Disturbance(delay=0.04, relay_rate=10.0, relay_loss=0.3, seed=2), seconds=SECONDS),
+]
+
+
+@pytest.mark.parametrize("name", ["copy", "adaptive-mass", "lqg", "oracle", "transport"])
+def test_batch_equals_recorded_flights(name: str) -> None:
+    transport = next(path for path in shipped_policies() if path.stem == "transport")
+    follower = make_baseline(name, CONFIG) if name in LAWS else Policy.load(transport)
+    batched = Batch(CONFIG, follower).fly(SCENARIOS)
+    recorded = [cell.metrics for cell in run_cells(CONFIG, [follower], SCENARIOS, "newton-euler")]
+    for mine, other in zip(batched, recorded, strict=True):
+        for field in dataclasses.fields(mine):
+            a, b = getattr(mine, field.name), getattr(other, field.name)
+            if a is None or b is None or isinstance(a, bool):
+                assert a == b, field.name
+            elif field.name.startswith("settling"):
+                assert a == pytest.approx(b, abs=0.05), field.name  # a sample or two at the threshold
+            else:
+                # Float32 against float64 through a closed loop of 1100 steps, 1e-4 of the numbers' size.
+                # Saturation counts samples at a threshold: one rotor and step of 1101 x 4 is 2.3e-4.
+                slack = 1e-3 if field.name == "saturation" else 2e-4
+                assert a == pytest.approx(b, rel=2e-3, abs=slack), field.name
+
+
+def test_second_call_does_not_compile() -> None:
+    batch = Batch(CONFIG, make_baseline("copy", CONFIG))
+    flights = [Scenario(seconds=0.1, phase=phase) for phase in (0.0, 1.0)]
+    batch.fly(flights)
+    (program,) = batch._compiled.values()
+    batch.fly(flights[::-1])
+    assert program._cache_size() == 1
+    assert len(batch._compiled) == 1
+
+
+def test_what_a_batch_cannot_fly_is_refused() -> None:
+    class Mine:
+        name = "mine"
+
+    with pytest.raises(InputError, match="mujoco"):
+        Batch(CONFIG, make_baseline("copy", CONFIG), "mujoco")
+    with pytest.raises(InputError, match="no baseline and no policy"):
+        Batch(CONFIG, Mine())
+    with pytest.raises(InputError, match="equally long"):
+        Batch(CONFIG, make_baseline("copy", CONFIG)).fly([Scenario(seconds=1), Scenario(seconds=2)])
+    with pytest.raises(InputError, match="finite"):
+        Batch(CONFIG, make_baseline("copy", CONFIG)).fly([Scenario(omega=np.inf)])
