@@ -213,6 +213,15 @@ def say(row: dict[str, Any]) -> None:
     print("  ".join(f"{k} {v}" for k, v in shown.items()), flush=True)
 
 
+def _finite(value: Any) -> Any:
+    """`value` with None for what JSON has no number for."""
+    if isinstance(value, dict):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def versions() -> dict[str, Any]:
     """Machine and libraries, for the JSON file."""
     import jax
@@ -241,7 +250,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, nargs="+", default=[2, 4], help="for the part `distributed`")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
-    found: dict[str, Any] = {"bar": BAR, "command": sys.argv[1:]}
+    found: dict[str, Any] = {"bar": BAR, "settings": {k: v for k, v in vars(options).items() if k != "json"}}
     with tempfile.TemporaryDirectory() as name:
         place, rows = Path(name), []
         # Children first: a process that holds the GPU would keep most of its memory from them.
@@ -268,7 +277,7 @@ def main() -> None:
         found["speed-up"] = ratio
         print(f"stock cold / ours cold: {ratio:.2f}")
     if options.json:
-        options.json.write_text(json.dumps(found, indent=2, default=str) + "\n")
+        options.json.write_text(json.dumps(_finite(found), indent=2, default=str, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":
