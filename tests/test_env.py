@@ -191,7 +191,7 @@ def test_engine_flies_the_closed_form_path(transport, fast_pair: CompiledEnv):
     start = fast_pair.reset(jax.random.key(12))
     closed_form = fast_pair.roll(start, actions)
     mjx = fast_pair._replace(step=jax.jit(CoupledPairEnv(transport, "mjx").step)).roll(start, actions)
-    assert np.abs(mjx.pipeline_state.plant.position).max() > 0.1
+    assert np.abs(mjx.pipeline_state.plant.position).max() > 0.05  # 500 times the tolerance below
     # Float32 rounding over 200 physics steps: 200 ulp of 10 m/s2 and of some rad/s, integrated over 1 s.
     np.testing.assert_allclose(mjx.obs, closed_form.obs, rtol=0, atol=1e-4)
 
