@@ -82,6 +82,10 @@ class Trajectory:
         names = ("position", "target", "euler", "rotor_force", "leader_command", "follower_command")
         return Tick(float(self.time[number]), *(getattr(self, name)[number] for name in names), self.diverged)
 
+    def copied(self) -> Trajectory:
+        """The same with memory of its own: `world` shares that of its whole batch."""
+        return Trajectory(**{item.name: np.array(getattr(self, item.name)) for item in dataclasses.fields(self)})
+
     def batched(self) -> Trajectory:
         """A single flight as a batch of one."""
         parts = {}

@@ -59,6 +59,13 @@ def test_seeds_are_reproducible_and_differ() -> None:
     assert walk.config(CONFIG, 1).motion == walk.config(CONFIG, 1).motion != walk.config(CONFIG, 2).motion
 
 
+def test_rolling_balls_differ_between_seeds() -> None:
+    level = families.BY_NAME["rolling-ball"].levels[0]
+    starts = {level.seeded(seed).ball_start for seed in range(6)}
+    assert len(starts) == 6
+    assert max(map(abs, starts)) == level.scenario.ball_start
+
+
 def test_unknown_family_is_refused() -> None:
     with pytest.raises(InputError, match="unknown scenario family"):
         families.find(["cg-speeds"])
@@ -135,6 +142,7 @@ def test_scores_are_json_without_infinities(report: Path) -> None:
     found = json.loads((report / "scores.json").read_text(), parse_constant=refuse)["scores"]
     assert len(found) == 6 * 3
     assert {row["follower"] for row in found} == {"copy", "adaptive", "transport"}
+    assert {"paper_return", "settling_time_10", "y_peak", "action_error"} <= set(found[0])
     assert all(row["seeds"] == 2 and len(row["rmse"]) == 3 for row in found)
     never = next(row for row in found if row["follower"] == "copy")["settling_time"]
     assert never == [None, None, None]

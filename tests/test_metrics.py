@@ -72,6 +72,12 @@ def test_never_settled_short_and_overshooting_flights() -> None:
     assert of(flight(beyond)).overshoot == pytest.approx(0.3)
 
 
+def test_overshoot_counts_towards_the_goal_on_either_side() -> None:
+    beyond = approach()
+    beyond[700] = [1.0, -2.2, 0.0]
+    assert of(flight(beyond)).overshoot == pytest.approx(0.1)
+
+
 def test_commands_and_rotors() -> None:
     command = np.zeros((1501, 3))
     command[1::2, 1] = 0.1  # pitch jumps up and down at every step

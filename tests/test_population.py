@@ -80,6 +80,24 @@ def test_swept_settings_differ_between_members(small: Config) -> None:
     assert moved[1] > 1e-2  # 20 steps of 1e-2
 
 
+def test_sweeps_do_not_share_a_traced_program(small: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The swept numbers are constants in the traced program: the cache must tell them apart."""
+    monkeypatch.setattr("mjxball.train.traced.traced_directory", lambda: tmp_path)
+    moved = []
+    for rates in ([1e-6, 1e-6], [1e-2, 1e-2], [1e-2, 1e-2]):
+        population = Population(small, "newton-euler", 2, {"sac.learning_rate": rates})
+        compiled = population.compile(creating=True)
+        state = population.start(compiled, 5)
+        before = np.asarray(jax.tree.leaves(state.learner.policy)[-1])
+        state, _ = compiled.advance(state, population.mode(programs.prefill(10)))
+        state, _ = compiled.advance(state, population.mode(programs.train(5, 1)))
+        moved.append(float(np.abs(np.asarray(jax.tree.leaves(state.learner.policy)[-1]) - before).max()))
+    assert moved[0] < 1e-4
+    assert moved[1] > 1e-3
+    assert moved[1] == moved[2]  # the third comes from the cache
+    assert len(list(tmp_path.glob("advance-*"))) == 2
+
+
 @pytest.mark.parametrize(
     ("content", "word"),
     [

@@ -37,10 +37,15 @@ class Level:
         return configs.validate(base)
 
     def seeded(self, seed: int) -> Scenario:
-        """The scenario of one seed. Seed 0 starts the CG at phase 0, the others at a phase drawn from the seed."""
-        phase = 0.0 if seed == 0 else float(np.random.default_rng([seed, 7]).uniform(0, 2 * np.pi))
+        """The scenario of one seed. Seed 0 starts the CG at phase 0, the others at a place drawn from the seed."""
+        random = np.random.default_rng([seed, 7])
+        phase = 0.0 if seed == 0 else float(random.uniform(0, 2 * np.pi))
+        # A rolling ball knows no phase: it starts on either side, up to 30 % nearer to O.
+        start = self.scenario.ball_start * (
+            1.0 if seed == 0 else float(random.choice([-1, 1]) * random.uniform(0.7, 1))
+        )
         disturbance = dataclasses.replace(self.scenario.disturbance, seed=seed)
-        return dataclasses.replace(self.scenario, phase=phase, disturbance=disturbance)
+        return dataclasses.replace(self.scenario, phase=phase, ball_start=start, disturbance=disturbance)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,9 @@ from mjxball.evaluate.metrics import Metrics
 
 # What the tables show and rank: less is better in each.
 RANKED = ("rmse", "settling_time", "overshoot", "x_peak", "peak", "max_tilt", "effort", "smoothness", "saturation")
+MEASURED = tuple(item.name for item in dataclasses.fields(Metrics) if item.name != "failed")
 ORACLE = "oracle"
+TOGETHER = 32  # scenarios in one batch of recorded flights
 RESAMPLES, CONFIDENCE = 2000, 0.95
 
 
@@ -58,7 +60,7 @@ class Score:
     def record(self) -> dict[str, Any]:
         """The score as JSON: metric -> [median, low, high], None for infinite."""
         found: dict[str, Any] = {"family": self.family, "level": self.level, "follower": self.follower}
-        for name in RANKED:
+        for name in (*RANKED, *(name for name in MEASURED if name not in RANKED)):
             numbers = dataclasses.astuple(self.summary(name))
             found[name] = [number if math.isfinite(number) else None for number in numbers]
         return {**found, "seeds": len(self.metrics), "failed": self.failures}
@@ -124,12 +126,17 @@ def _fly(
             flown = level.config(base, seed)
             key = f"{configs.config_hash(flown)} {level.scenario.seconds}"
             groups.setdefault(key, (flown, []))[1].append((level, seed))
-    for flown, members in groups.values():
+    parts = [
+        (flown, members[first : first + TOGETHER])
+        for flown, members in groups.values()
+        for first in range(0, len(members), TOGETHER)
+    ]
+    for flown, members in parts:
         cells = run_cells(flown, followers, [level.seeded(seed) for level, seed in members], physics)
         for number, (level, seed) in enumerate(members):
             mine = cells[number * len(followers) : (number + 1) * len(followers)]
             # Only seed 0 is drawn: the other flights would fill the memory.
-            kept = mine if seed == 0 else [dataclasses.replace(cell, flight=None) for cell in mine]
+            kept = [replace(cell, flight=cell.flight.copied() if seed == 0 else None) for cell in mine]
             yield (level.label, seed), kept
 
 

@@ -86,7 +86,7 @@ def _families(options: argparse.Namespace) -> list[families.Family]:
         raise InputError(f"--families fly their own scenarios; drop --{flag}")
     if options.seeds is not None and not 1 <= options.seeds <= 1000:
         raise InputError(f"--seeds must be between 1 and 1000, not {options.seeds}")
-    return families.find(options.families)
+    return families.find([name for name in options.families if not name.endswith(".npz")])
 
 
 def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
@@ -103,7 +103,8 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.json:
         cli.output_file(options.json, ".json")
     # `--followers copy mine.npz` reads as it looks: a file name among the followers is a policy.
-    files = [*options.policies, *(Path(name) for name in options.followers if name.endswith(".npz"))]
+    listed = [name for name in (*options.followers, *(options.families or [])) if name.endswith(".npz")]
+    files = [*options.policies, *map(Path, listed)]
     named = [name for name in options.followers if not name.endswith(".npz")]
     paths = files if files or named else shipped_policies()
     names = named if files or named else list(LAWS if chosen else BASELINES)

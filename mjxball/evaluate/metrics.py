@@ -60,7 +60,7 @@ class Tally(NamedTuple):
     steady: Array  # steps in steady state
     outside: Array  # (n, 2) last time |e_o| was beyond 2 % and 10 %, -inf: never [s]
     peaks: Array  # (n, 3) NaN before the first
-    furthest: Array  # (n, 3)
+    furthest: Array  # (n, 3) along each axis towards the goal [m]
     tilt: Array
     hover: Array  # (n, 4) the follower's rotor forces at the start [N]
     tilts: Array  # (n, 2) its last roll and pitch commands
@@ -125,7 +125,7 @@ def update(tally: Tally, tick: Tick, termination_distance: float, rotor_force_ma
         steady=xp.where(new, 0.0, tally.steady) + xp.where(steady, 1.0, 0.0),
         outside=xp.where(beyond, tick.time, outside),
         peaks=xp.where(steady[:, None], xp.fmax(peaks, xp.abs(error)), peaks),
-        furthest=xp.fmax(tally.furthest, tick.position),
+        furthest=xp.fmax(tally.furthest, tick.position * xp.sign(tick.target)),
         tilt=xp.fmax(tally.tilt, xp.hypot(tick.euler[:, 0], tick.euler[:, 1])),
         hover=tally.hover,
         tilts=tilts,
@@ -139,7 +139,7 @@ def results(tally: Tally) -> list[Metrics]:
     with np.errstate(invalid="ignore", divide="ignore"):
         peaks = np.where((t.steady > 1)[:, None], t.peaks, np.nan)
         goal = np.where(t.target == 0, np.nan, t.target)
-        over = np.where(t.leg[:, None] > 0, np.nan, t.furthest / goal)
+        over = np.where(t.leg[:, None] > 0, np.nan, t.furthest / np.abs(goal))
         settled = np.where(np.isneginf(t.outside), 0.0, t.outside - t.leg[:, None])
         settled = np.where(t.outside >= t.time - NEVER_WITHIN - ROUNDING, np.nan, settled)
         columns = {

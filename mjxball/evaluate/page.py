@@ -101,14 +101,15 @@ def verdict(scores: Sequence[Score], cards: Mapping[str, Mapping[str, Any]]) -> 
     best = wins(scores)
     ranking = sorted(best, key=lambda name: -best[name])
     total = len(by_level(scores))
-    tally = ", ".join(f"{name} {best[name]}" for name in ranking if best[name])
+    tally = ", ".join(f"{name} {best[name]}" for name in ranking if best[name]) or "nobody's, no flight was that long"
     lines.append(f"Smallest steady-state peak in {total} levels (the oracle, which is told the CG, left out): {tally}.")
     for policy, card in cards.items():
         for rival in ("adaptive", "lqg"):
             if rival not in best:
                 continue
             lines.append(_against(scores, policy, rival, card))
-    failed = {name: sum(s.failures for s in scores if s.follower == name) for name in best}
+    everybody = dict.fromkeys(score.follower for score in scores)
+    failed = {name: sum(s.failures for s in scores if s.follower == name) for name in everybody}
     fell = ", ".join(f"{name} {count}" for name, count in failed.items() if count)
     lines.append(f"Failed flights: {fell}." if fell else "No flight failed.")
     return lines

@@ -132,7 +132,7 @@ def _text(figure: Any) -> str:
     pyplot().close(figure)
     text = stream.getvalue()
     text = text[text.index("<svg") :]
-    text = re.sub(r"(\d+\.\d\d)\d+", r"\1", text)
+    text = re.sub(r' d="[^"]*"', lambda found: re.sub(r"(\.\d\d)\d+", r"\1", found[0]), text)
     return re.sub(r'<svg([^>]*?) width="[^"]*"', r'<svg\1 role="img"', text, count=1).replace(
         ' height="', ' data-h="', 1
     )

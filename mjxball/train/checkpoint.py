@@ -56,20 +56,25 @@ class Checkpoints:
         """Environment steps of every complete checkpoint, newest first."""
         return sorted(self._manager.all_steps(), reverse=True)
 
-    def restore(self, template: TrainState, warn: Callable[[str], None]) -> TrainState | None:
+    def restore(self, template: TrainState, warn: Callable[[str], None], discard: bool) -> TrainState | None:
         """The newest sound state, shaped like `template` (arrays or `jax.ShapeDtypeStruct`); None if there is none.
 
-        Half-written checkpoints never count as complete; one that cannot be read is skipped and `warn`ed of.
+        Half-written checkpoints never count as complete; one that cannot be read is skipped and `warn`ed of, and
+        with `discard` deleted once an older one is restored: Orbax would refuse to save its steps again.
         """
         wanted = {name: np.empty(leaf.shape, leaf.dtype) for name, leaf in _named_leaves(template).items()}
+        unreadable = []
         for step in self.steps():
             try:
-                arrays = self._manager.restore(step, args=ocp.args.StandardRestore(wanted))
-                return _rebuild(template, arrays)
+                state = _rebuild(template, self._manager.restore(step, args=ocp.args.StandardRestore(wanted)))
             except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
                 warn(f"checkpoint {step} cannot be read and is skipped: {str(error).splitlines()[0][:200]}")
-                if is_writer():
-                    self._manager.delete(step)  # else Orbax would refuse to save the same steps again
+                unreadable.append(step)
+                continue
+            if discard and is_writer():
+                for damaged in unreadable:
+                    self._manager.delete(damaged)
+            return state
         return None
 
     def close(self) -> None:
@@ -110,16 +115,17 @@ def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> TrainSta
             f"{run} was trained with every follower's worlds on {parts} device(s), not {population.parts}; "
             "continue it with as many processes as before"
         )
-    return _restore(run, population)
+    return _restore(run, population, discard=True)
 
 
-def _restore(run: Path, population: Population) -> TrainState | None:
+def _restore(run: Path, population: Population, discard: bool) -> TrainState | None:
     if not (run / CHECKPOINTS).is_dir():
         return None
     with contextlib.closing(Checkpoints(run)) as checkpoints:
         if not checkpoints.steps():
             return None
-        state = checkpoints.restore(population.template(), lambda text: print(f"warning: {text}", file=sys.stderr))  # noqa: T201
+        say = lambda text: print(f"warning: {text}", file=sys.stderr)  # noqa: E731, T201
+        state = checkpoints.restore(population.template(), say, discard)
     if state is None:
         raise InputError(f"{run} has no checkpoint that can be read")
     return state
@@ -129,7 +135,7 @@ def restore_policy(run: Path) -> tuple[Config, Any, int, dict[str, Any]]:
     """Configuration, learner, environment steps and origin of a run's newest checkpoint; of a population the best's."""
     config, origin = read_config(run)
     population, best = _population(config, origin), best_member(read_members(run))
-    state = _restore(run, population)
+    state = _restore(run, population, discard=False)
     if state is None:
         raise InputError(f"{run} has no complete checkpoint")
     chosen = population.member(state, best)

@@ -112,8 +112,8 @@ def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: boo
         return 0 if Run(settings, out, origin, state).train() else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
-            kept = (out / POLICY).exists()
-            where = f"the last good policy and checkpoint are in {out}" if kept else "no good policy came before"
+            kept = any(path.name.isdigit() for path in (out / "checkpoints").glob("*"))
+            where = f"the last good policy and checkpoint are in {out}" if kept else "no checkpoint came before"
             print(f"training diverged: {error}; {where}", file=sys.stderr)  # noqa: T201
         return 1
 

@@ -153,7 +153,7 @@ class Population:
             "config": configs.to_dict(self.config),
             "physics": self._physics,
             "members": self.members,
-            "swept": sorted(self._values),
+            "swept": {name: values.tolist() for name, values in self._values.items()},  # constants in `advance`
             "source": source_hash(),
             "versions": versions(),
         }

@@ -103,7 +103,7 @@ class Run:
                 self._loop(stop)
                 self._save()
                 self.progress.say(self._cost())
-            return not stop.requested
+            return not self._ended
 
     def close(self) -> None:
         """Wait until every checkpoint is on disk."""
@@ -140,24 +140,27 @@ class Run:
         # At least one batch and one n-step window must be recorded before the first update.
         first = max(math.ceil(sac.prefill / sac.worlds), math.ceil(sac.batch / sac.worlds), sac.return_steps)
         done = self._steps() // sac.worlds
-        if done < first and not stop.requested:
+        (ended,) = processes.any_of((stop.requested,))
+        if done < first and not ended:
             self.state, _ = self._advance(self.state, programs.prefill(first - done))
             done = first
         chunk = max(1, math.ceil(total / CHUNKS))
-        every = max(1, CHUNKS // sac.evaluations)
-        while done < total and not stop.requested:
+        while done < total and not ended:
             number = done // chunk + 1
             steps = min(number * chunk, total) - done
             row = self._chunk(steps)
             done += steps
             late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
-            stop.requested, late = processes.any_of((stop.requested, late))
-            if number % every == 0 or done >= total:
+            # All processes act on what they agreed on here, whenever a signal reaches one of them.
+            ended, late = processes.any_of((stop.requested, late))
+            due = number * sac.evaluations // CHUNKS > (number - 1) * sac.evaluations // CHUNKS
+            if due or done >= total:
                 row = self._evaluated(row)
                 self._save()
             elif late:
                 self._save()
             self.progress.show(row)
+        self._ended = ended
 
     def _steps(self) -> int:
         return _count(self.state)

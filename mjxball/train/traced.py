@@ -24,6 +24,7 @@ class Traced:
 
         `key` must hold everything that the traced program depends on.
         """
+        self._name = name
         self._shapes, self._structure = shapes, jax.tree.structure(result)
         path = _path(name, key)
         exported = _read(path)
@@ -43,6 +44,7 @@ class Traced:
         def call(*arguments: Any) -> Any:
             return jax.tree.unflatten(self._structure, self._exported.call(*jax.tree.leaves(arguments)))
 
+        call.__name__ = self._name  # what profiles and the compilation cache call it
         return jax.jit(call, donate_argnums=() if donate is None else donate).lower(*self._shapes)
 
 
