@@ -104,10 +104,13 @@ def verdict(scores: Sequence[Score], cards: Mapping[str, Mapping[str, Any]]) -> 
     tally = ", ".join(f"{name} {best[name]}" for name in ranking if best[name]) or "nobody's, no flight was that long"
     lines.append(f"Smallest steady-state peak in {total} levels (the oracle, which is told the CG, left out): {tally}.")
     for policy, card in cards.items():
-        for rival in ("adaptive", "lqg"):
-            if rival not in best:
-                continue
-            lines.append(_against(scores, policy, rival, card))
+        lost = False
+        for rival in (name for name in ("adaptive", "lqg") if name in best):
+            text, behind = _against(scores, policy, rival)
+            lines.append(text)
+            lost |= behind
+        if lost and card.get("config", {}).get("reward", {}).get("kind") == "paper":
+            lines.append(f"{policy} mimics its leader and loses. {WHY_COPYING_LOSES}")
     everybody = dict.fromkeys(score.follower for score in scores)
     failed = {name: sum(s.failures for s in scores if s.follower == name) for name in everybody}
     fell = ", ".join(f"{name} {count}" for name, count in failed.items() if count)
@@ -115,7 +118,8 @@ def verdict(scores: Sequence[Score], cards: Mapping[str, Mapping[str, Any]]) -> 
     return lines
 
 
-def _against(scores: Sequence[Score], policy: str, rival: str, card: Mapping[str, Any]) -> str:
+def _against(scores: Sequence[Score], policy: str, rival: str) -> tuple[str, bool]:
+    """(how `policy` compares with `rival`, whether it is behind)."""
     ahead = behind = 0
     for rivals in by_level(scores).values():
         medians = {score.follower: score.summary("peak").median for score in rivals}
@@ -124,10 +128,7 @@ def _against(scores: Sequence[Score], policy: str, rival: str, card: Mapping[str
             continue
         ahead, behind = ahead + (mine < other), behind + (mine > other)
     text = f"{policy} has a smaller steady-state peak than {rival} in {ahead} levels and a larger one in {behind}."
-    mimics = card.get("config", {}).get("reward", {}).get("kind") == "paper"
-    if mimics and behind > ahead:
-        text += f" {policy} mimics its leader and loses. {WHY_COPYING_LOSES}"
-    return text
+    return text, behind > ahead
 
 
 def _page(report: Report) -> str:
