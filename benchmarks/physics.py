@@ -31,7 +31,7 @@ ROADS = {
     "newton-euler": ("loop", "unrolled", "fused", "kernel"),
     "mjx": ("loop", "unrolled"),
 }  # How the physics steps of a control step are compiled: a compiled loop, unrolled, unrolled on split components, or
-# one Triton kernel (GPU only). The closed form trains on `fused`, MJX on `loop`.
+# one Triton kernel (GPU only). Both engines train on `loop`.
 
 
 def batch(config: configs.Config, worlds: int, dtype: type) -> tuple[PlantState, np.ndarray, Load]:

@@ -45,7 +45,7 @@ class Draws(NamedTuple):
     """What happens at each control step, (count + 1, ...)."""
 
     number: Array
-    target: Array  # (count + 1, n, 3), or (count + 1, 1, ...) of one that stands still
+    target: Array  # (count + 1, n, 3)
     noise: Array | None
     arrives: Array | None
     push: Array | None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 import time
@@ -86,7 +85,6 @@ def _film(setup: Config, scores: Sequence[Score], policies: Sequence[str]) -> tu
     wanted = [name for name in ("copy", *policies[:1]) if any(score.follower == name for score in first)]
     wanted = wanted or [first[0].follower]
     flights = [next(s for s in first if s.follower == name).shown.flight for name in wanted]
-    plant = dataclasses.replace(setup.plant)
-    picture, why = animate(plant, flights)
+    picture, why = animate(setup.plant, flights)
     what = f"{' and '.join(wanted)}: {scores[0].family} {scores[0].level}, the first 10 s"
     return picture, what if picture else f"No animation: {why}."

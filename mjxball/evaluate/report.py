@@ -10,6 +10,8 @@ from pathlib import Path
 from mjxball.evaluate.cells import Cell
 from mjxball.evaluate.figures import draw_flights, scenario_name
 
+CELLS = "cells.json"
+
 
 def to_json(cells: Sequence[Cell]) -> str:
     """`{"cells": [...]}` as scripts outside the project read it."""
@@ -19,7 +21,7 @@ def to_json(cells: Sequence[Cell]) -> str:
 def write_report(cells: Sequence[Cell], out: Path) -> list[Path]:
     """Write `cells.json` and one figure per scenario into `out`; return the paths."""
     out.mkdir(parents=True, exist_ok=True)
-    paths = [out / "cells.json"]
+    paths = [out / CELLS]
     paths[0].write_text(to_json(cells))
     for _, group in itertools.groupby(cells, key=lambda cell: cell.scenario):
         same = list(group)

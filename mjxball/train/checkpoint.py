@@ -19,10 +19,9 @@ from mjxball.train.members import best_member, read_members
 from mjxball.train.population import Population
 from mjxball.train.processes import is_writer
 from mjxball.train.program import TrainState
-from mjxball.train.record import read_config
+from mjxball.train.record import CHECKPOINTS, read_config
 
 KEEP = 2
-CHECKPOINTS = "checkpoints"
 logging.getLogger("absl").setLevel(logging.ERROR)
 
 

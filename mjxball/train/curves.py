@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mjxball.config import Config
+from mjxball.train.record import METRICS
 
 PANELS = {
     "task": (("steady_error", "eval_steady_error", "steady-state error [m]"),),
@@ -23,7 +24,7 @@ def draw_training(run: Path, config: Config, path: Path) -> None:
     """Draw `metrics.csv` of the directory `run` to `path`, whose directory is made."""
     from mjxball.evaluate.figures import pyplot
 
-    with (run / "metrics.csv").open(newline="") as stream:
+    with (run / METRICS).open(newline="") as stream:
         rows = list(csv.DictReader(stream))
 
     def column(name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -20,15 +20,15 @@ from mjxball import __version__, cli, config
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.cells import REFERENCE, STANDARD
+from mjxball.evaluate.report import CELLS
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.scenario import Scenario, check_scenario
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
 from mjxball.train.provenance import commit, differences, source_hash, versions
+from mjxball.train.record import CHECKPOINTS, POLICY
 
 MOST_MEMBERS = 4096
-POLICY = "policy.npz"
-CELLS = "cells.json"
 
 
 def parser() -> cli.Parser:
@@ -81,7 +81,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
         code = _run(settings, origin, out, options.resume is not None)
         if meeting:
             processes.leave()
-    if code is None and (out / "eval" / CELLS).exists():
+    if writes and code is None and (out / "eval" / CELLS).exists():
         print(f"{out} was finished and evaluated before; nothing is left to do")  # noqa: T201
         return 0
     if not writes or code == 1:
@@ -112,7 +112,7 @@ def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: boo
         return 0 if Run(settings, out, origin, state).train() else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
-            kept = any(path.name.isdigit() for path in (out / "checkpoints").glob("*"))
+            kept = any(path.name.isdigit() for path in (out / CHECKPOINTS).glob("*"))
             where = f"the last good policy and checkpoint are in {out}" if kept else "no checkpoint came before"
             print(f"training diverged: {error}; {where}", file=sys.stderr)  # noqa: T201
         return 1

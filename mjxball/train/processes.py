@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import subprocess
 import sys
@@ -74,20 +75,27 @@ def is_writer() -> bool:
 def gather(tree: Any) -> Any:
     """The whole of every array as NumPy, copied, in every process; all must call it."""
     import jax
-    from jax.sharding import NamedSharding, PartitionSpec
 
     leaves, structure = jax.tree.flatten(tree)
     spread = [k for k, leaf in enumerate(leaves) if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable]
     if spread:
         mesh = next(leaves[k].sharding.mesh for k in spread if leaves[k].size)
-        whole = NamedSharding(mesh, PartitionSpec())
         wanted = [k for k in spread if leaves[k].size]
-        together = jax.jit(lambda arrays: arrays, out_shardings=whole)([leaves[k] for k in wanted])
+        together = _replicate(mesh)([leaves[k] for k in wanted])
         for k in spread:
             leaves[k] = np.zeros(leaves[k].shape, leaves[k].dtype)
         for k, leaf in zip(wanted, together, strict=True):
             leaves[k] = leaf.addressable_data(0)
     return jax.tree.unflatten(structure, [np.array(leaf) for leaf in leaves])
+
+
+@functools.cache
+def _replicate(mesh: Any) -> Any:
+    """The program that brings arrays whole to every device; one, so that it is compiled once for each tree."""
+    import jax
+    from jax.sharding import NamedSharding, PartitionSpec
+
+    return jax.jit(lambda arrays: arrays, out_shardings=NamedSharding(mesh, PartitionSpec()))
 
 
 def any_of(flags: tuple[bool, ...]) -> tuple[bool, ...]:

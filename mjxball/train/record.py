@@ -11,7 +11,8 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.physics.stepper import TRAINING_ENGINES
 
-CONFIG_FILE = "config.json"
+# What a run directory holds.
+CONFIG_FILE, METRICS, POLICY, CHECKPOINTS = "config.json", "metrics.csv", "policy.npz", "checkpoints"
 ORIGIN = ("seed", "physics", "seeds", "sweep")  # what it must say beside the configuration
 
 

@@ -27,14 +27,12 @@ from mjxball.train.members import MemberLog
 from mjxball.train.population import Population
 from mjxball.train.program import Mode, Tally, TrainState
 from mjxball.train.progress import Progress, Row
-from mjxball.train.record import CONFIG_FILE, write_config
+from mjxball.train.record import CONFIG_FILE, METRICS, POLICY, write_config
 
 CHUNKS = 50  # rows of metrics.csv in a run
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
 EVALUATION_DRAW = 20_261_121  # tells the evaluation's worlds from those of any seed
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
-POLICY = "policy.npz"
-METRICS = "metrics.csv"
 
 
 @dataclass

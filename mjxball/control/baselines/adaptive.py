@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mjxball.config import Config
-from mjxball.control.baselines.gains import pitch_gains
+from mjxball.control.baselines.gains import copied_law, pitch_gains
 from mjxball.control.baselines.law import Brief
 from mjxball.control.leader import clip_command
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
@@ -42,9 +42,8 @@ class Adaptive:
 
     def __init__(self, config: Config, adapts_mass: bool = False):
         self.name = "adaptive-mass" if adapts_mass else "adaptive"
-        law = config.leader
-        self._law = (law.kp, law.kd, config.plant.gravity, law.tilt_limit, law.vertical_limit)
-        self._height = (law.kp[2], law.kd[2])
+        self._law = copied_law(config)
+        self._height = (config.leader.kp[2], config.leader.kd[2])
         self._gains = pitch_gains(config, self.name)
         self._adapts_mass = adapts_mass
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.config import Config
+from mjxball.control.baselines.gains import copied_law
 from mjxball.control.baselines.law import Brief
 from mjxball.control.observation import ACTION_SIZE, copy_command, scale_action
 
@@ -21,8 +22,7 @@ class Copy:
     needs_truth = False
 
     def __init__(self, config: Config):
-        law = config.leader
-        self._law = (law.kp, law.kd, config.plant.gravity, law.tilt_limit, law.vertical_limit)
+        self._law = copied_law(config)
 
     def start(self, observation: Array) -> Any:
         """See `Law.start`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,12 @@ class PitchGains(NamedTuple):
     period: float  # between two commands [s]
     natural_frequency: tuple[float, float]  # of the closed roll and pitch loops [rad/s]
     damping: float
+
+
+def copied_law(config: Config) -> tuple[Any, ...]:
+    """What `observation.copy_command` takes after the observation, for the configured leader."""
+    law = config.leader
+    return law.kp, law.kd, config.plant.gravity, law.tilt_limit, law.vertical_limit
 
 
 def pitch_gains(config: Config, name: str) -> PitchGains:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 Array = Any
@@ -29,6 +28,3 @@ class Law(Protocol):
 
     def step(self, memory: Any, observation: Array, brief: Brief) -> tuple[Any, Array]:
         """(memory, command (..., 3): roll, pitch [rad], vertical acceleration [m/s2]) at `observation` (..., 18)."""
-
-
-Truth = Callable[[float], Brief]  # time of a control step [s] -> what is told then

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control.baselines.gains import PitchGains, pitch_gains
+from mjxball.control.baselines.gains import PitchGains, copied_law, pitch_gains
 from mjxball.control.baselines.law import Brief
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 
@@ -56,8 +56,7 @@ class Takeover:
     name = ""
 
     def __init__(self, config: Config):
-        law = config.leader
-        self._law = (law.kp, law.kd, config.plant.gravity, law.tilt_limit, law.vertical_limit)
+        self._law = copied_law(config)
         self._plant = pitch_gains(config, self.name)
         self._feedback = feedback(self._plant)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from mjxball.config import Config
-from mjxball.control.baselines.gains import PitchGains, pitch_gains
+from mjxball.control.baselines.gains import PitchGains, copied_law, pitch_gains
 from mjxball.control.baselines.law import Brief
 from mjxball.control.leader import clip_command
 from mjxball.control.observation import copy_command
@@ -20,8 +20,7 @@ class Oracle:
     needs_truth = True
 
     def __init__(self, config: Config):
-        law = config.leader
-        self._law = (law.kp, law.kd, config.plant.gravity, law.tilt_limit, law.vertical_limit)
+        self._law = copied_law(config)
         self._gains: PitchGains = pitch_gains(config, self.name)
 
     def start(self, observation: Array) -> Any:
