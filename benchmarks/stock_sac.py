@@ -3,8 +3,9 @@
 `python benchmarks/stock_sac.py OUT.npz [--seed N] [--steps N] [--worlds N] ... [--physics mjx|newton-euler]`
 
 The other side of `benchmarks/training.py`. Brax 0.14.2 calls `jax.device_put_replicated`, which JAX has removed; it is
-supplied here. Brax's closing evaluation is left out, which makes it faster. What the networks see, how actions are
-bounded and what is rewarded are the preset's, exactly as in `train.py`.
+supplied here. Brax's own evaluations are left out, which makes it faster. Besides OUT.npz, written at the end, there is
+OUT-<steps>.npz at each of `--snapshots` equal parts of the way; the files' times tell when each was reached. What the
+networks see, how actions are bounded and what is rewarded are the preset's, exactly as in `train.py`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import functools
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,18 +53,24 @@ class Masked:
         return state.replace(obs=state.obs * self._mask)
 
 
-def train(config: configs.Config, options: argparse.Namespace) -> Any:
-    """(observation statistics, policy parameters) after `options.steps` environment steps."""
+def train(config: configs.Config, options: argparse.Namespace, export: Callable[[int, Any], None]) -> None:
+    """Train; `export(environment steps, (observation statistics, policy parameters))` at every snapshot."""
     import_brax_env()
     from brax.envs.wrappers import training as wrappers
     from brax.training import acting
     from brax.training.agents.sac import networks, train
 
     jax.device_put_replicated = replicated
-    acting.Evaluator.run_evaluation = lambda self, params, training_metrics, **_: dict(training_metrics)
+    newest: list[Any] = [None]
+
+    def look(self: Any, parameters: Any, training_metrics: dict[str, Any], **_: Any) -> dict[str, Any]:
+        newest[0] = parameters  # Brax hands them out nowhere else before the end
+        return dict(training_metrics)
+
+    acting.Evaluator.run_evaluation = look
     layers = tuple(int(size) for size in options.layers.split(","))
     with jax.default_matmul_precision("highest"):
-        _, parameters, _ = train.train(
+        train.train(
             environment=Masked(CoupledPairEnv(config, options.physics)),
             wrap_env_fn=wrappers.wrap,
             num_timesteps=options.steps,
@@ -72,7 +80,8 @@ def train(config: configs.Config, options: argparse.Namespace) -> Any:
             discounting=options.discount,
             seed=options.seed,
             batch_size=options.batch,
-            num_evals=1,
+            num_evals=options.snapshots + 1,
+            progress_fn=lambda steps, _: export(steps, newest[0]) if steps else None,
             normalize_observations=True,
             max_devices_per_host=1,
             reward_scaling=options.reward_scale,
@@ -84,7 +93,6 @@ def train(config: configs.Config, options: argparse.Namespace) -> Any:
                 networks.make_sac_networks, hidden_layer_sizes=layers, activation=jax.nn.relu
             ),
         )
-    return parameters
 
 
 def main() -> None:
@@ -94,6 +102,7 @@ def main() -> None:
     parser.add_argument("--preset", default="transport")
     parser.add_argument("--physics", default="mjx")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--snapshots", type=int, default=1, help="policies exported on the way, the last one included")
     parser.add_argument("--steps", type=int, default=768_000)
     parser.add_argument("--worlds", type=int, default=128)
     parser.add_argument("--updates", type=int, default=4)
@@ -107,10 +116,16 @@ def main() -> None:
     options = parser.parse_args()
     enable_compilation_cache()
     config = configs.preset(options.preset)
-    statistics, policy = train(config, options)
-    learner = types.SimpleNamespace(average=policy, normaliser=statistics)
     card = {"trainer": "brax.training.agents.sac.train", "seed": options.seed, "physics": options.physics}
-    save_file(options.out, policy_file(config, learner, options.steps, card))
+
+    def export(steps: int, parameters: Any) -> None:
+        learner = types.SimpleNamespace(average=parameters[1], normaliser=parameters[0])
+        exported = policy_file(config, learner, steps, card)
+        save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)
+        if steps >= options.steps:
+            save_file(options.out, exported)
+
+    train(config, options, export)
     print(f"policy: {options.out}", flush=True)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -34,12 +36,22 @@ def _jax_stepper(config: Config, physics: str) -> ControlStep:
 
     enable_compilation_cache()
     make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
-    with jax.enable_x64(True):
+    with jax.enable_x64(True), _on_the_host():
         step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
         compiled = jax.jit(jax.vmap(step))
 
     def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), _on_the_host():
             return PlantState(*map(np.asarray, compiled(state, commands, load)))
 
     return stepper
+
+
+def _on_the_host() -> AbstractContextManager[Any]:
+    """Compute on the CPU: a GPU takes 4 ms for each control step of a few worlds, most of it waiting."""
+    import jax
+
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:  # JAX was told to leave the CPU alone
+        return contextlib.nullcontext()
