@@ -48,7 +48,7 @@ def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any]
         "config_hash": config_hash(config),
         "package_version": __version__,
         "training_steps": int(steps),
-        "bounds": to_dict(config.bounds),
+        "bounds": {name: bound for name, bound in to_dict(config.bounds).items() if bound > 0},
         **(origin or {}),
     }
     return PolicyFile(
@@ -72,9 +72,10 @@ def is_sound(policy: PolicyFile) -> bool:
 def export_run(run: Path, out: Path) -> None:
     """Export the newest checkpoint of the run directory `run` to the new file `out`."""
     from mjxball.train.checkpoint import restore_policy
+    from mjxball.train.curves import training_curve
 
     config, learner, steps, origin = restore_policy(run)
-    policy = policy_file(config, learner, steps, origin)
+    policy = policy_file(config, learner, steps, {**origin, "curve": training_curve(run, origin["seed"])})
     if not is_sound(policy):
         raise InputError(f"the newest checkpoint of {run} holds values that are not finite")
     save_file(out, policy)

@@ -197,11 +197,12 @@ class Sac:
 
 @dataclass(frozen=True)
 class Bounds:
-    """What `eval.py --check` enforces for the exported policy on the reference scenario."""
+    """What `eval.py --check` enforces for the exported policy on the reference scenario; 0 leaves a metric free."""
 
-    x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", above=0)
-    settling_time: float = setting(4.0, "2 % settling time [s]", above=0)
-    rmse: float = setting(0.36, "root mean square of |e_o| over 20 s [m]", above=0)
+    x_peak: float = setting(0.05, "largest |e_x| after 20 s [m]", low=0)
+    settling_time: float = setting(4.0, "2 % settling time [s]", low=0)
+    rmse: float = setting(0.36, "root mean square of |e_o| over 20 s [m]", low=0)
+    action_error: float = setting(0.0, "rms of the command less the leader's, over all three [rad, m/s2]", low=0)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mjxball.config import Config
+from mjxball.train.members import read_members
 from mjxball.train.record import METRICS
 
 PANELS = {
@@ -20,12 +21,33 @@ PANELS = {
 BLUE, GREY = "#1b6ca8", "#9a9a9a"
 
 
+def training_curve(run: Path, seed: int) -> dict[str, list[float]]:
+    """What a policy's card says of its training: environment steps, returns of an episode exploring and evaluated.
+
+    In a population `episode_return` is the median over all members, `eval_return` the own one of member `seed`.
+    """
+    rows = _rows(run)
+    curve = {
+        "steps": [int(row["steps"]) for row in rows],
+        "episode_return": [round(float(row["episode_return"]), 3) for row in rows],
+    }
+    own = [row for row in read_members(run) if row["seed"] == seed]
+    evaluated = own or [row for row in rows if row["eval_return"]]
+    curve["eval_steps"] = [int(row["steps"]) for row in evaluated]
+    curve["eval_return"] = [round(float(row["eval_return"]), 3) for row in evaluated]
+    return curve
+
+
+def _rows(run: Path) -> list[dict[str, str]]:
+    with (run / METRICS).open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
 def draw_training(run: Path, config: Config, path: Path) -> None:
     """Draw `metrics.csv` of the directory `run` to `path`, whose directory is made."""
     from mjxball.evaluate.figures import pyplot
 
-    with (run / METRICS).open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = _rows(run)
 
     def column(name: str) -> tuple[np.ndarray, np.ndarray]:
         kept = [(int(row["steps"]), float(row[name])) for row in rows if row[name]]

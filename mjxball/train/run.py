@@ -23,6 +23,7 @@ from mjxball.export import is_sound, policy_file
 from mjxball.policy import save_file
 from mjxball.train import processes
 from mjxball.train import program as programs
+from mjxball.train.curves import training_curve
 from mjxball.train.members import MemberLog
 from mjxball.train.population import Population
 from mjxball.train.program import Mode, Tally, TrainState
@@ -154,10 +155,9 @@ class Run:
             due = number * sac.evaluations // CHUNKS > (number - 1) * sac.evaluations // CHUNKS
             if due or done >= total:
                 row = self._evaluated(row)
-                self._save()
-            elif late:
-                self._save()
             self.progress.show(row)
+            if due or late or done >= total:
+                self._save()
         self._ended = ended
 
     def _steps(self) -> int:
@@ -238,7 +238,8 @@ class Run:
             return False
         for member in range(self.population.members):
             learner = self.population.member(learners, member)
-            origin = {**self.origin, "seed": self.origin["seed"] + member}
+            seed = self.origin["seed"] + member
+            origin = {**self.origin, "seed": seed, "curve": training_curve(self.out, seed)}
             policy = policy_file(self.population.member_config(member), learner, steps, origin)
             if not is_sound(policy):
                 continue
