@@ -199,6 +199,7 @@ def test_report_opens_in_a_browser(browser, report: Path, width: int) -> None:
     assert errors == []
     assert tab.evaluate("document.documentElement.scrollWidth") <= width  # nothing hangs out at the side
     assert "Smallest steady-state peak" in tab.inner_text("#verdict")
+    assert tab.locator("#wins-table tbody tr").count() == 4 + 2  # metrics over all levels, then the families
     for section in ("delay", "start-errors"):
         assert tab.locator(f"h2#{section} ~ svg").count() >= 1
         box = tab.locator(f"h2#{section} ~ svg").first.bounding_box()

@@ -140,14 +140,26 @@ def _fly(
             yield (level.label, seed), kept
 
 
+def winners(rivals: Sequence[Score], name: str) -> list[str]:
+    """Who is best on one level by the median of `name`: one follower, several of equal numbers, or nobody.
+
+    The oracle, which is told, and a follower that failed in any seed are left out; so are, from overshoot, those that
+    never come within 10 % of the goal: who does not arrive overshoots nothing.
+    """
+    able = [score for score in rivals if score.follower != ORACLE and not score.failures]
+    if name == "overshoot":
+        able = [score for score in able if math.isfinite(score.summary("settling_time_10").median)]
+    medians = {score.follower: score.summary(name).median for score in able}
+    finite = [value for value in medians.values() if math.isfinite(value)]
+    return [follower for follower, value in medians.items() if finite and value == min(finite)]
+
+
 def wins(scores: Sequence[Score], name: str = "peak") -> dict[str, int]:
-    """In how many levels each follower is the best by the median of `name`; the oracle, which is told, is left out."""
+    """In how many levels each follower but the oracle is the best by the median of `name`."""
     count = {score.follower: 0 for score in scores if score.follower != ORACLE}
     for rivals in by_level(scores).values():
-        medians = {score.follower: score.summary(name).median for score in rivals if score.follower != ORACLE}
-        finite = [value for value in medians.values() if math.isfinite(value)]
-        for follower, value in medians.items():
-            count[follower] += bool(finite and value == min(finite))
+        for follower in winners(rivals, name):
+            count[follower] += 1
     return count
 
 

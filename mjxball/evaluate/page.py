@@ -14,7 +14,8 @@ from typing import Any
 
 from mjxball.evaluate import svg
 from mjxball.evaluate.families import GRID, Family
-from mjxball.evaluate.judge import ORACLE, RANKED, Score, Summary, by_level, wins
+from mjxball.evaluate.judge import RANKED, Score, Summary, by_level, winners, wins
+from mjxball.evaluate.wins import wins_table
 
 UNITS = {
     "rmse": "m",
@@ -27,11 +28,12 @@ UNITS = {
     "smoothness": "rad",
     "saturation": "",
 }
-WHY_COPYING_LOSES = (
-    "Its reward asks it to copy the leader, and it does. Copied commands leave the CG's torque m_o g c to the two "
-    "attitude loops alone, which settle at a steady tilt, and the pair sways by (g/kp) m_o g c / (2 Kp): copying "
-    "perfectly is not balancing."
+CARD_HIDES = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
+COPYING = (
+    "Copied commands leave the CG's torque m_o g c to the two attitude loops alone, which settle at a steady tilt, and "
+    "the pair sways by (g/kp) m_o g c / (2 Kp): copying perfectly is not balancing."
 )
+WHY_COPYING_LOSES = f"Its reward asks it to copy the leader, and it does. {COPYING}"
 STYLE = """
 :root { color-scheme: light; --ink: #1d2329; --line: #d8dde2; --soft: #f4f6f8; --best: #dff0e2; }
 body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); margin: 0 auto; max-width: 1100px; }
@@ -41,10 +43,13 @@ svg { width: 100%; height: auto; } img { max-width: 100%; } figure { margin: 1re
 pre { background: var(--soft); padding: 10px; white-space: pre-wrap; overflow-wrap: anywhere; font-size: 13px; }
 .scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
 th, td { padding: 3px 9px; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
-th:nth-child(-n+3), td:nth-child(-n+3) { text-align: left; }
+th:first-child, td:first-child, table.scores :is(th, td):nth-child(-n+3) { text-align: left; }
 th button { font: inherit; font-weight: 600; background: none; border: 0; padding: 0; cursor: pointer; }
 th button::after { content: " \\2195"; color: #9aa4ad; } tr.best td { background: var(--best); }
 small { color: #667; } nav { display: flex; flex-wrap: wrap; gap: 4px 14px; }
+figcaption p { margin: 0.5rem 0; } .paper svg { display: block; max-width: 720px; margin: 0 auto; }
+.paper :is(th, td:first-child) { white-space: normal; } .paper td:first-child { min-width: 9em; }
+tr.more td { border-top: 2px solid var(--line); } td.zero { color: #9aa4ad; }
 .verdict { background: var(--soft); padding: 12px 16px; }
 label { margin-right: 14px; }
 """
@@ -135,11 +140,9 @@ def _page(report: Report) -> str:
     sections = "".join(_family(family, report) for family in report.families)
     links = "".join(f'<a href="#{family.name}">{family.name}</a>' for family in report.families)
     spoken = "".join(f"<p>{html.escape(line)}</p>" for line in verdict(report.scores, report.cards))
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>mjxball: followers judged</title><style>{STYLE}</style></head><body>
-<h1>Followers judged</h1>
+    body = f"""<h1>Followers judged</h1>
 <div class="verdict" id="verdict">{spoken}</div>
+{wins_table(report.scores)}
 <p>Every follower flew the same worlds, {report.seeds} seed(s) a level. Numbers are medians over the seeds with 95 %
 bootstrap intervals; a flight that failed or never settled counts as infinitely bad and is never averaged away.
 Reference: CG ±5 cm at 0.31 rad/s, 0.2 kg, from the origin to (1, 1, 1) m, 45 s.</p>
@@ -149,12 +152,26 @@ Reference: CG ±5 cm at 0.31 rad/s, 0.2 kg, from the origin to (1, 1, 1) m, 45 s
 <h2 id="scores-title">All scores</h2>
 {_filters(report)}
 <div class="scroll">{_table(report.scores)}</div>
-<h2 id="made">How it was made</h2>
-<pre>{html.escape(report.command)}</pre>
-<pre>{html.escape(json.dumps(dict(report.versions), indent=1))}</pre>
-{_cards(report)}
-<script>{SCRIPT}</script></body></html>
+{made(report.command, report.versions, report.cards)}
+<script>{SCRIPT}</script>"""
+    return document("mjxball: followers judged", body)
+
+
+def document(title: str, body: str) -> str:
+    """A whole page around `body`, in the style of every page of ours."""
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(title)}</title><style>{STYLE}</style></head><body>
+{body}</body></html>
 """
+
+
+def made(command: str, versions: Mapping[str, str], cards: Mapping[str, Mapping[str, Any]]) -> str:
+    """The last section of a page: the command, the versions, and the policies' cards."""
+    return f"""<h2 id="made">How it was made</h2>
+<pre>{html.escape(command)}</pre>
+<pre>{html.escape(json.dumps(dict(versions), indent=1))}</pre>
+{_cards(cards)}"""
 
 
 def _picture(report: Report) -> str:
@@ -195,20 +212,16 @@ def _filters(report: Report) -> str:
 def _table(scores: Sequence[Score], sortable: bool = True) -> str:
     heads = ["family", "level", "follower", *(f"{name} {UNITS[name]}".strip() for name in RANKED), "failed"]
     cells = "".join(f"<th><button>{head}</button></th>" if sortable else f"<th>{head}</th>" for head in heads)
-    smallest = {
-        key: min((s.summary("peak").median for s in rivals if s.follower != ORACLE), default=math.nan)
-        for key, rivals in by_level(scores).items()
-    }
+    winning = {key: winners(rivals, "peak") for key, rivals in by_level(scores).items()}
     rows = []
     for score in scores:
-        peak = score.summary("peak").median
-        best = score.follower != ORACLE and math.isfinite(peak) and peak == smallest[score.family, score.level]
+        best = score.follower in winning[score.family, score.level]
         names = "".join(f"<td>{html.escape(text)}</td>" for text in (score.family, score.level, score.follower))
         numbers = "".join(_number(score.summary(name)) for name in RANKED)
         failed = f'<td data-v="{score.failures}">{score.failures}/{len(score.metrics)}</td>'
         rows.append(f"<tr{' class=best' if best else ''}>{names}{numbers}{failed}</tr>")
     name = ' id="scores"' if sortable else ""
-    return f"<table{name}><thead><tr>{cells}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
+    return f'<table class="scores"{name}><thead><tr>{cells}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
 
 
 def _number(summary: Summary) -> str:
@@ -222,10 +235,10 @@ def _number(summary: Summary) -> str:
     return f'<td data-v="{median:.9g}">{median:.3g}{spread}</td>'
 
 
-def _cards(report: Report) -> str:
+def _cards(cards: Mapping[str, Mapping[str, Any]]) -> str:
     parts = []
-    for name, card in report.cards.items():
-        shown = {key: value for key, value in card.items() if key not in ("config", "plant", "observation", "action")}
+    for name, card in cards.items():
+        shown = {key: value for key, value in card.items() if key not in CARD_HIDES}
         text = html.escape(json.dumps(shown, indent=1, default=str))
         parts.append(f"<details><summary>card of <b>{html.escape(name)}</b></summary><pre>{text}</pre></details>")
     return "".join(parts)
