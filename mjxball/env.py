@@ -9,10 +9,12 @@ import jax.numpy as jnp
 
 from mjxball.config import Config
 from mjxball.control import leader, observation, rotations
+from mjxball.control.recall import recall_of
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mjx import jax_repeat, make_engine
-from mjxball.physics.step import ControlStep, make_control_step, start_state
+from mjxball.physics.motion import object_mass
+from mjxball.physics.step import ControlStep, make_cg_offset, make_control_step, start_state
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.quiet import import_brax_env
 from mjxball.rewards import paper_reward, task_reward
@@ -20,6 +22,7 @@ from mjxball.rewards import paper_reward, task_reward
 Array = Any
 Env, State = import_brax_env()
 STEADY_AFTER = 8.0  # [s] of an episode, after which its error counts as steady state in the metrics
+SECRETS = 4  # what privileged critics see more: CG offset, first moment, object mass, error of the believed one
 DRAWS = 18  # random numbers of a reset
 RATE_BOUND = 50.0  # [rad/s] beyond which a world has diverged
 
@@ -31,7 +34,7 @@ class World(NamedTuple):
     load: Load
     goal: Array  # (3,) of O [m]
     integral: Array  # (3,) of the leader's error [m s]
-    memory: Array  # (m,) older observations and the last action, as the network sees them
+    memory: Array  # (m,) see `control.recall`
     action: Array  # (3,) last network action in [-1, 1]
     steps: Array  # () control steps since the reset
 
@@ -52,18 +55,24 @@ class CoupledPairEnv(Env):
         self._backend = physics
         self._control_step = _make_step(config, physics)
         self._mount = jnp.asarray(config.plant.follower_mount, jnp.float32)
+        self._recall = recall_of(config)
+        self._secrets = SECRETS if config.sac.privileged else 0
+        self._cg = make_cg_offset(config)
 
     @property
     def observation_size(self) -> int:
-        """Length of the network's input."""
-        follower = self.config.follower
-        return observation.OBSERVATION_SIZE + observation.memory_size(follower.history, follower.previous_action)
+        """Length of the networks' input."""
+        return len(self.input_mask)
 
     @property
     def input_mask(self) -> list[float]:
-        """1 for each number of the observation that the networks use, else 0."""
-        follower = self.config.follower
-        return observation.input_mask(follower.history, follower.previous_action, follower.ignore_position)
+        """1 for each number of the observation that the policy uses, else 0."""
+        return [*self._recall.mask(self.config.follower.ignore_position), *[0.0] * self._secrets]
+
+    @property
+    def critic_mask(self) -> list[float]:
+        """1 for each number of the observation that the critics use, else 0."""
+        return [*self._recall.mask(self.config.follower.ignore_position), *[1.0] * self._secrets]
 
     @property
     def action_size(self) -> int:
@@ -112,28 +121,27 @@ class CoupledPairEnv(Env):
             ball_offset=symmetric(scenario.ball_start, 1)[0],
         )
         goal = symmetric(scenario.goal_reach)
-        follower = self.config.follower
         first = self._observe(plant, goal)
         world = World(
             plant=plant,
             load=load,
             goal=goal,
             integral=jnp.zeros(3),
-            memory=observation.start_memory(first, follower.history, follower.previous_action),
+            memory=self._recall.start(first),
             action=jnp.zeros(3),
             steps=jnp.zeros((), jnp.int32),
         )
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
-        return State(world, observation.network_input(first, world.memory), zero, zero, metrics, {"truncation": zero})
+        return State(world, self._input(first, world), zero, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Array) -> State:
         """Apply the network's `action` (3,) in [-1, 1] for one control period."""
         world: World = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action))
         action = jnp.where(sound, action, jnp.zeros_like(action))
-        follower, timing = self.config.follower, self.config.timing
+        timing = self.config.timing
         seen = state.obs[: observation.OBSERVATION_SIZE]
         led = self._leader_command(world)
         followed = self._follower_command(action, seen)
@@ -153,14 +161,14 @@ class CoupledPairEnv(Env):
         moved = world._replace(
             plant=plant,
             integral=world.integral + timing.control_period * (world.goal - world.plant.position),
-            memory=observation.next_memory(world.memory, seen, action, follower.history, follower.previous_action),
+            memory=self._recall.next(world.memory, seen, action),
             action=action,
             steps=steps,
         )
         steady = (plant.time > STEADY_AFTER).astype(jnp.float32)
         return state.replace(
             pipeline_state=moved,
-            obs=observation.network_input(self._observe(plant, world.goal), moved.memory),
+            obs=self._input(self._observe(plant, world.goal), moved),
             reward=reward,
             done=jnp.logical_or(terminated, truncated).astype(jnp.float32),
             metrics={
@@ -178,6 +186,20 @@ class CoupledPairEnv(Env):
     def _observe(self, plant: PlantState, goal: Array) -> Array:
         matrix = rotations.matrix_from_quaternion(plant.quaternion)
         return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, self._mount)
+
+    def _input(self, seen: Array, world: World) -> Array:
+        """The networks' input: what the follower sees and remembers, and what only critics are told, at the end."""
+        shown = self._recall.network_input(seen, world.memory)
+        if not self._secrets:
+            return shown
+        mass = object_mass(world.plant.time, world.load)
+        secrets = [
+            self._cg(world.plant, world.load),
+            mass * self._cg(world.plant, world.load),
+            mass,
+            mass - world.load.believed_mass,
+        ]
+        return jnp.concatenate([shown, jnp.stack(secrets)])
 
     def _leader_command(self, world: World) -> Array:
         law = self.config.leader

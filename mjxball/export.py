@@ -12,7 +12,8 @@ import numpy as np
 from mjxball import __version__
 from mjxball.cli import Parser, output_file, run_command
 from mjxball.config import Config, config_hash, to_dict
-from mjxball.control.observation import ACTION, OBSERVATION, input_mask
+from mjxball.control.observation import ACTION, OBSERVATION
+from mjxball.control.recall import recall_of
 from mjxball.errors import InputError
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.file import FORMAT_VERSION
@@ -26,14 +27,16 @@ def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any]
     layers = learner.average["params"]
     names = sorted(layers, key=lambda name: int(name.rsplit("_", 1)[1]))
     follower, leader = config.follower, config.leader
-    mask = np.array(input_mask(follower.history, follower.previous_action, follower.ignore_position))
-    deviation = np.asarray(learner.normaliser.std, np.float64)
+    mask = np.array(recall_of(config).mask(follower.ignore_position))
+    size = len(mask)  # behind it stands what only the critics were told; the policy's weights for it never moved
+    deviation = np.asarray(learner.normaliser.std, np.float64)[:size]
     reach = [follower.tilt_limit, follower.vertical_limit]
     card = {
         "format_version": FORMAT_VERSION,
         "observation": [list(slot) for slot in OBSERVATION],
         "history": follower.history,
         "previous_action": follower.previous_action,
+        "filters": list(follower.filters),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
         "action_reach": reach,
@@ -51,10 +54,11 @@ def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any]
         "bounds": {name: bound for name, bound in to_dict(config.bounds).items() if bound > 0},
         **(origin or {}),
     }
+    weights = [np.asarray(layers[name]["kernel"], np.float32) for name in names]
     return PolicyFile(
-        weights=tuple(np.asarray(layers[name]["kernel"], np.float32) for name in names),
+        weights=(weights[0][:size], *weights[1:]),
         biases=tuple(np.asarray(layers[name]["bias"], np.float32) for name in names),
-        observation_mean=np.asarray(learner.normaliser.mean, np.float32),
+        observation_mean=np.asarray(learner.normaliser.mean, np.float32)[:size],
         observation_scale=(mask / deviation).astype(np.float32),
         action_scale=np.array([reach[0], reach[0], reach[1]], np.float32),
         card=card,

@@ -14,6 +14,7 @@ from mjxball.control.attitude import AttitudeGains
 from mjxball.control.baselines.law import Brief
 from mjxball.control.followers import LAWS as FOLLOWERS
 from mjxball.control.followers import make_law
+from mjxball.control.recall import Recall
 
 WORLDS = 64
 random = np.random.default_rng(7)
@@ -33,7 +34,8 @@ KP, KD, KI = (0.5, 0.4, 0.3), (1.0, 0.9, 0.8), (0.1, 0.0, 0.2)
 GAINS = AttitudeGains((0.24, 3.22, 0.543), (0.0433, 0.579, 0.244))
 MOUNT = np.array([-0.17, 0.0, 0.0])
 LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
-SEEN, MEMORY, ACTION = normal(18), normal(39), random.uniform(-1, 1, (WORLDS, 3))
+RECALL = Recall(history=3, previous_action=True, filters=(0.1, 0.5))
+SEEN, MEMORY, ACTION = normal(18), normal(RECALL.size), random.uniform(-1, 1, (WORLDS, 3))
 BRIEF = Brief(random.uniform(0.1, 0.3, WORLDS), 0.01 * normal(), 0.01 * normal(), random.uniform(2.1, 2.3, WORLDS))
 FLIGHT = 0.1 * normal(4, 18)  # four observations in a row
 
@@ -83,9 +85,9 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
         observation.observe,
         (normal(3), MATRIX, normal(3), normal(3), normal(3), np.array([-0.17, 0, 0])),
     ),
-    "observation.network_input": (observation.network_input, (SEEN, MEMORY)),
-    "observation.start_memory": (lambda s: observation.start_memory(s, 3, True), (SEEN,)),
-    "observation.next_memory": (lambda m, s, a: observation.next_memory(m, s, a, 3, True), (MEMORY, SEEN, ACTION)),
+    "recall.network_input": (RECALL.network_input, (SEEN, MEMORY)),
+    "recall.start": (RECALL.start, (SEEN,)),
+    "recall.next": (RECALL.next, (MEMORY, SEEN, ACTION)),
     "observation.copy_command": (lambda s: observation.copy_command(s, KP, KD, G, *LIMITS), (3 * SEEN,)),
     "observation.scale_action": (lambda a: observation.scale_action(a, *REACH), (ACTION,)),
     "observation.follower_command": (
@@ -95,7 +97,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     **{f"baseline {name}": (flown(name), (FLIGHT, *BRIEF)) for name in FOLLOWERS},
 }
 # Computed once in NumPy float64, from the config, not from arrays.
-NOT_LAWS = {"attitude.design_gains", "observation.memory_size", "observation.input_mask"}
+NOT_LAWS = {"attitude.design_gains"}
 each_law = pytest.mark.parametrize("name", LAWS)
 
 

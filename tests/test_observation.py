@@ -1,7 +1,6 @@
 """What the follower sees: order, values, memory, mask; and how its action becomes a command."""
 
 import numpy as np
-import pytest
 
 from mjxball.control import observation as layout
 from mjxball.control import rotations
@@ -64,58 +63,6 @@ def test_velocity_is_the_derivative_of_the_position():
     # h^2 |w|^3 |r| / 6 = 4e-11 of truncation and 1e-16 / h = 1e-11 of rounding.
     np.testing.assert_allclose(slope[0:3], seen[6:9], rtol=0, atol=1e-9)
     np.testing.assert_allclose(slope[layout.ERROR], seen[layout.ERROR_RATE], rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("history", "previous_action", "size"), [(1, False, 0), (1, True, 3), (3, False, 36), (3, True, 39)]
-)
-def test_memory_size_is_what_the_memory_holds(history, previous_action, size):
-    seen = np.arange(18.0)
-    memory = layout.start_memory(seen, history, previous_action)
-    assert layout.memory_size(history, previous_action) == size
-    assert memory.shape == (size,)
-    assert layout.next_memory(memory, seen, np.zeros(3), history, previous_action).shape == (size,)
-    assert len(layout.input_mask(history, previous_action, ignore_position=True)) == 18 + size
-
-
-def test_memory_starts_as_the_first_observation_repeated_and_a_zero_action():
-    seen = np.arange(18.0)
-    memory = layout.start_memory(seen, history=3, previous_action=True)
-    np.testing.assert_array_equal(memory, [*seen, *seen, 0, 0, 0])
-
-
-def test_memory_keeps_the_newest_first():
-    observations = [np.full(18, float(k)) for k in range(5)]
-    actions = [np.full(3, 0.1 * k) for k in range(5)]
-    memory = layout.start_memory(observations[0], 3, True)
-    for seen, action in zip(observations, actions, strict=True):
-        memory = layout.next_memory(memory, seen, action, 3, True)
-    np.testing.assert_array_equal(memory, [*observations[4], *observations[3], *actions[4]])
-    seen = layout.network_input(np.full(18, 5.0), memory)
-    np.testing.assert_array_equal(seen, [*[5.0] * 18, *[4.0] * 18, *[3.0] * 18, *actions[4]])
-
-
-def test_memory_without_extras_is_empty_and_the_network_sees_the_observation_alone():
-    seen = np.arange(18.0)
-    memory = layout.start_memory(seen, 1, False)
-    np.testing.assert_array_equal(layout.network_input(seen, memory), seen)
-
-
-def test_memory_of_a_batch_is_the_memory_of_each():
-    random = np.random.default_rng(0)
-    seen, action, first = random.normal(size=(4, 18)), random.normal(size=(4, 3)), random.normal(size=(4, 18))
-    memory = layout.start_memory(first, 3, True)
-    batch = layout.next_memory(memory, seen, action, 3, True)
-    np.testing.assert_array_equal(batch[2], layout.next_memory(memory[2], seen[2], action[2], 3, True))
-
-
-def test_input_mask_hides_every_absolute_position_and_nothing_else():
-    mask = layout.input_mask(history=2, previous_action=True, ignore_position=True)
-    names = [name for name, _ in layout.OBSERVATION] * 2 + ["action"] * 3
-    hidden = [name for name, used in zip(names, mask, strict=True) if used == 0.0]
-    assert hidden == ["follower_x", "follower_y", "follower_z"] * 2
-    assert set(mask) == {0.0, 1.0}
-    assert layout.input_mask(history=2, previous_action=True, ignore_position=False) == [1.0] * 39
 
 
 def seen_with(error, rate):

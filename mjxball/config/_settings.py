@@ -114,6 +114,9 @@ class Follower:
         True, "the network's input omits the absolute position: the dynamics do not depend on it"
     )
     previous_action: bool = setting(False, "the network also sees its last action, scaled to [-1, 1]")
+    filters: tuple[float, ...] = setting(
+        (), "time constants of exponential averages of observations and actions that the network sees [s]", above=1e-3
+    )
 
 
 @dataclass(frozen=True)
@@ -173,6 +176,7 @@ class Sac:
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1)
     critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
+    privileged: bool = setting(False, "the critics, which no flight needs, also see where the CG is and the true mass")
     critics: int = setting(2, "Q networks, of which the smallest value counts", low=1, high=2)
     state_value: bool = setting(
         False, "a state-value network with a slow copy gives the targets (the paper's eqs. 6-8), not slow Q networks"

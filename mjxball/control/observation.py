@@ -49,42 +49,6 @@ def observe(position: Array, matrix: Array, velocity: Array, rates: Array, goal:
     return xp.concat([follower, euler, follower_velocity, rates, goal - position, -velocity], axis=-1)
 
 
-def network_input(observation: Array, memory: Array) -> Array:
-    """Input of the network (..., n): the observation (..., 18), then `memory` (..., m), older ones and actions."""
-    xp = observation.__array_namespace__()
-    return xp.concat([observation, memory], axis=-1)
-
-
-def memory_size(history: int, previous_action: bool) -> int:
-    """Length of the memory that `network_input` appends."""
-    return (history - 1) * OBSERVATION_SIZE + (ACTION_SIZE if previous_action else 0)
-
-
-def input_mask(history: int, previous_action: bool, ignore_position: bool) -> list[float]:
-    """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
-    one = [0.0 if ignore_position else 1.0] * 3 + [1.0] * (OBSERVATION_SIZE - 3)
-    return one * history + [1.0] * (memory_size(1, previous_action))
-
-
-def start_memory(observation: Array, history: int, previous_action: bool) -> Array:
-    """Memory (..., m) at the start of an episode: the first observation repeated, and a zero action."""
-    xp = observation.__array_namespace__()
-    parts = [observation] * (history - 1)
-    if previous_action:
-        parts.append(xp.zeros_like(observation[..., :ACTION_SIZE]))
-    return xp.concat(parts, axis=-1) if parts else observation[..., :0]
-
-
-def next_memory(memory: Array, observation: Array, scaled_action: Array, history: int, previous_action: bool) -> Array:
-    """Memory for the next step, newest first, after `observation` was answered by `scaled_action` in [-1, 1]."""
-    xp = observation.__array_namespace__()
-    kept = (history - 1) * OBSERVATION_SIZE
-    parts = [xp.concat([observation, memory[..., :kept]], axis=-1)[..., :kept]] if kept else []
-    if previous_action:
-        parts.append(scaled_action)
-    return xp.concat(parts, axis=-1) if parts else memory
-
-
 def copy_command(
     observation: Array, kp: Array, kd: Array, gravity: float, tilt_limit: float, vertical_limit: float
 ) -> Array:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, memory_size
+from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE
+from mjxball.control.recall import Recall
 from mjxball.errors import InputError
 
 FORMAT_VERSION = 1
@@ -56,6 +57,12 @@ class PolicyFile:
     observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for a slot that is not used
     action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
     card: dict[str, Any]
+
+
+def recall_of(card: dict[str, Any]) -> Recall:
+    """What the follower of a policy file remembers; `filters` is absent from the first files."""
+    filters = tuple(card.get("filters", ()))
+    return Recall(card["history"], card["previous_action"], filters, float(card["control_period"]))
 
 
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
@@ -149,7 +156,7 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
 def check(policy: PolicyFile, name: str) -> None:
     """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
     _check_card(policy.card, name)
-    size = OBSERVATION_SIZE + memory_size(policy.card["history"], policy.card["previous_action"])
+    size = OBSERVATION_SIZE + recall_of(policy.card).size
     vectors = [
         ("observation_mean", policy.observation_mean, size),
         ("observation_scale", policy.observation_scale, size),
@@ -208,6 +215,9 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
         raise PolicyFileError(f"{name}: action_mode must be residual or direct, not {card['action_mode']!r}")
     if not 1 <= card["history"] <= 100:
         raise PolicyFileError(f"{name}: history must be 1 to 100, not {card['history']}")
+    filters = card.get("filters", [])
+    if not isinstance(filters, list) or len(filters) > 10 or not all(_is_finite(t) and t >= 1e-3 for t in filters):
+        raise PolicyFileError(f"{name}: filters must be up to 10 time constants of at least 1 ms")
     lengths = {"action_reach": 2, "command_limits": 2, "leader_kp": 3, "leader_kd": 3}
     for field, length in lengths.items():
         numbers = card[field]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.control import observation as layout
-from mjxball.policy.file import PolicyFile, load_file
+from mjxball.policy.file import PolicyFile, load_file, recall_of
 from mjxball.policy.network import mean_action
 
 Array = Any
@@ -35,8 +35,7 @@ class Policy:
         self._biases = [np.ascontiguousarray(bias, dtype) for bias in biases]
         self._mean = contents.observation_mean.astype(dtype)
         self._scale = contents.observation_scale.astype(dtype)
-        self._memory_shape = (card["history"], card["previous_action"])
-        self._remembers = layout.memory_size(*self._memory_shape) > 0
+        self._recall = recall_of(card)
         self._memory: Array | None = None
         self._law = (
             card["action_mode"] == "residual",
@@ -61,13 +60,13 @@ class Policy:
         seen = np.asarray(observation, self._dtype)
         if seen.shape[-1:] != (layout.OBSERVATION_SIZE,):
             raise ValueError(f"observation must have {layout.OBSERVATION_SIZE} numbers last, not shape {seen.shape}")
-        if not self._remembers:
+        if not self._recall.size:
             return mean_action(self._weights, self._biases, self._mean, self._scale, seen)
         if self._memory is None:
-            self._memory = layout.start_memory(seen, *self._memory_shape)
-        full = layout.network_input(seen, self._memory)
+            self._memory = self._recall.start(seen)
+        full = self._recall.network_input(seen, self._memory)
         action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
-        self._memory = layout.next_memory(self._memory, seen, action, *self._memory_shape)
+        self._memory = self._recall.next(self._memory, seen, action)
         return action
 
     def __call__(self, observation: Array) -> Array:
@@ -83,11 +82,11 @@ class NetworkLaw:
     def __init__(self, policy: Policy):
         self.name = policy.name
         self._parts = (policy._weights, policy._biases, policy._mean, policy._scale)
-        self._memory_shape, self._law = policy._memory_shape, policy._law
+        self._recall, self._law = policy._recall, policy._law
 
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
-        return layout.start_memory(observation, *self._memory_shape)
+        return self._recall.start(observation)
 
     def step(self, memory: Array, observation: Array, brief: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `brief` is not read."""
@@ -95,6 +94,6 @@ class NetworkLaw:
         weights, biases, mean, scale = self._parts
         single = [xp.asarray(part, dtype=observation.dtype) for part in (mean, scale)]
         layers = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
-        scaled = mean_action(*layers, *single, layout.network_input(observation, memory))
+        scaled = mean_action(*layers, *single, self._recall.network_input(observation, memory))
         command = layout.follower_command(scaled, observation, *self._law)
-        return layout.next_memory(memory, observation, scaled, *self._memory_shape), command
+        return self._recall.next(memory, observation, scaled), command

@@ -107,7 +107,7 @@ class Program:
         self.config = config
         self.env = CoupledPairEnv(config, physics)
         self.sizes = (self.env.observation_size, self.env.action_size)
-        self.networks = sac.make_networks(config.sac, self.env.input_mask, self.sizes[1])
+        self.networks = sac.make_networks(config.sac, self.env.input_mask, self.sizes[1], self.env.critic_mask)
         self._shards = shards or Shards()
         self._worlds = config.sac.worlds // self._shards.count
         self._update = sac.make_update(self.networks, config.sac, self.sizes[1], self._shards.mean)

@@ -39,15 +39,17 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """The commit of the source tree, marked `-dirty` if it has changes.
+    """The commit of the source tree, marked `-dirty` if it has changes, or 'unknown' outside a repository.
 
-    Outside a repository (a container, a copied tree) what `MJXBALL_COMMIT` says, else 'unknown'.
+    `MJXBALL_COMMIT` overrules it, for containers and copied trees.
     """
+    if given := os.environ.get("MJXBALL_COMMIT"):
+        return given
     command = ["git", "-C", str(PACKAGE), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
     except (OSError, subprocess.SubprocessError):
-        return os.environ.get("MJXBALL_COMMIT", "unknown")
+        return "unknown"
 
 
 def differences(recorded: Mapping[str, Any]) -> list[str]:

@@ -52,20 +52,17 @@ class Losses(NamedTuple):
     entropy: Array  # of the policy [nat], in [-1, 1] action units
 
 
-def make_networks(config: Sac, mask: Any, action_size: int) -> Networks:
+def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = None) -> Networks:
     """Brax's SAC networks: tanh-squashed Gaussian policy and critics, ReLU, on normalised observations.
 
-    `mask` (n,) of 0 and 1 hides slots of the observation from all networks.
+    `mask` (n,) of 0 and 1 hides slots of the observation from the policy, `critic_mask` from critics and value
+    (None: the same).
     """
     distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
-    mask = jnp.asarray(mask, jnp.float32)
-    observation_size = mask.size
-
-    def normalise(seen: Array, statistics: Any) -> Array:
-        return brax.running_statistics.normalize(seen, statistics) * mask
-
+    observation_size = len(mask)
+    normalise, normalise_all = _normaliser(mask), _normaliser(mask if critic_mask is None else critic_mask)
     value_network = brax.networks.make_value_network(
-        observation_size, preprocess_observations_fn=normalise, hidden_layer_sizes=config.critic_layers
+        observation_size, preprocess_observations_fn=normalise_all, hidden_layer_sizes=config.critic_layers
     )
     return Networks(
         policy_network=brax.networks.make_policy_network(
@@ -78,7 +75,7 @@ def make_networks(config: Sac, mask: Any, action_size: int) -> Networks:
         q_network=brax.networks.make_q_network(
             observation_size,
             action_size,
-            preprocess_observations_fn=normalise,
+            preprocess_observations_fn=normalise_all,
             hidden_layer_sizes=config.critic_layers,
             activation=jax.nn.relu,
             layer_norm=config.critic_layer_norm,
@@ -87,6 +84,12 @@ def make_networks(config: Sac, mask: Any, action_size: int) -> Networks:
         value_network=value_network if config.state_value else None,
         parametric_action_distribution=distribution,
     )
+
+
+def _normaliser(mask: Any) -> Callable[[Array, Any], Array]:
+    """Normalisation of an observation by running statistics, with zeros where `mask` (n,) has them."""
+    shown = jnp.asarray(mask, jnp.float32)
+    return lambda seen, statistics: brax.running_statistics.normalize(seen, statistics) * shown
 
 
 def create(networks: Networks, config: Sac, observation_size: int, key: Array) -> Learner:
