@@ -7,7 +7,7 @@ import dataclasses
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mjxball import __version__, cli, config
@@ -16,6 +16,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate import families
 from mjxball.evaluate.cells import REFERENCE, STANDARD, Cell, check_bounds, cross, load_policy, run_cells
 from mjxball.evaluate.judging import judge_families, scores_of, write_judgement
+from mjxball.evaluate.paper import command as paper
 from mjxball.evaluate.report import to_json, write_report
 from mjxball.evaluate.table import table
 from mjxball.evaluate.waveform import read_waveform
@@ -27,6 +28,8 @@ from mjxball.train.provenance import versions
 
 SCENARIO_FLAGS = ("omega", "amplitude", "mass", "believed_mass", "goal", "seconds")
 SCENARIO_FLAGS += ("waveform", "mass_change", "rolling")
+# What the paper's figures settle themselves.
+NOT_WITH_FIGURES = ("families", "seeds", "check", "followers", "json", "wn_pitch", *SCENARIO_FLAGS)
 
 
 def parser() -> cli.Parser:
@@ -63,6 +66,7 @@ def parser() -> cli.Parser:
     result.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its card")
     result.add_argument("--families", nargs="+", metavar="NAME", help="scenario families, or all; see --list")
     result.add_argument("--seeds", type=int, metavar="N", help="seeds of each level of a family (default 3)")
+    result.add_argument("--figures", nargs="+", metavar="NAME", help=f"the paper's: {', '.join(paper.NAMES)}, or all")
     result.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
     result.add_argument("--list", action="store_true", help="list the scenario families and stop")
     result.add_argument("--version", action="version", version=f"mjxball {__version__}")
@@ -93,6 +97,8 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.list:
         print(families.listing())  # noqa: T201
         return 0
+    if options.figures is not None:
+        return _figures(options, arguments)
     setup = _setup(options)
     chosen = _families(options)
     scenarios = _scenarios(options)
@@ -111,7 +117,7 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.check and not paths:
         raise InputError("--check needs a policy")
     # A pitch frequency that was asked for is an experiment, not a mistake.
-    policies = _load(paths, setup, options)
+    policies = _load(paths, lambda path: setup, options)
     unbounded = [policy.name for policy in policies if options.check and not policy.card["bounds"]]
     if unbounded:
         raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
@@ -138,6 +144,25 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         write_judgement(options.out, setup, scores, shown, policies, command, versions())
         print(f"report.html, figures and cells.json are in {options.out}")  # noqa: T201
     return _check(setup, policies, cells, options.physics) if options.check else 0
+
+
+def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Draw the paper's figures; what was flown is theirs, so that hardly any other flag goes with them."""
+    given = [name for name in NOT_WITH_FIGURES if getattr(options, name) not in (None, False, [])]
+    if given:
+        raise InputError(f"--figures fly the paper's scenarios; drop --{given[0].replace('_', '-')}")
+    names = paper.find([name for name in options.figures if not name.endswith(".npz")])
+    if options.out is None:
+        raise InputError("--figures needs --out DIR, a directory to write to")
+    cli.output_directory(options.out)
+    listed = [Path(name) for name in options.figures if name.endswith(".npz")]
+    paths = [*options.policies, *listed] or shipped_policies()
+    policies = _load(paths, paper.plant_of, options)
+    _refuse_same_names([*LAWS, *(policy.name for policy in policies)])
+    figures = paper.draw_figures(names, policies, options.physics)
+    paper.write_figures(options.out, figures, policies, shlex.join(["python", "eval.py", *arguments]), versions())
+    print(f"the figures are in {options.out / paper.PAGE}")  # noqa: T201
+    return 0
 
 
 def _setup(options: argparse.Namespace) -> config.Config:
@@ -179,12 +204,17 @@ def _mass_change(text: str) -> tuple[float, float]:
     return time, mass
 
 
-def _load(paths: Sequence[Path], setup: config.Config, options: argparse.Namespace) -> list[Policy]:
-    """The policies; files of one stem are called by their directory too, forced ones carry a mark in their name."""
+def _load(
+    paths: Sequence[Path], setup_of: Callable[[Path], config.Config], options: argparse.Namespace
+) -> list[Policy]:
+    """The policies, each to fit the configuration of its file.
+
+    Files of one stem are called by their directory too, forced ones carry a mark in their name.
+    """
     policies = []
     for path in paths:
         try:
-            policies.append(load_policy(path, setup, compare_laws=options.wn_pitch is None))
+            policies.append(load_policy(path, setup_of(path), compare_laws=options.wn_pitch is None))
         except PolicyFileError:
             raise
         except InputError as error:

@@ -57,7 +57,7 @@ def level_curves(scores: Sequence[Score], axis: str) -> str:
         panel.set_xlabel(axis)
         panel.grid(alpha=0.25)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncol=6, fontsize=8)
-    return _text(figure)
+    return as_text(figure)
 
 
 def flight_curves(scores: Sequence[Score]) -> str:
@@ -82,7 +82,7 @@ def flight_curves(scores: Sequence[Score]) -> str:
         axis.grid(alpha=0.25)
         axis.margins(x=0)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncol=6, fontsize=8)
-    return _text(figure)
+    return as_text(figure)
 
 
 def heat_maps(scores: Sequence[Score]) -> str:
@@ -118,10 +118,10 @@ def heat_maps(scores: Sequence[Score]) -> str:
     for axis in axes[:, 0]:
         axis.set_ylabel("mass [kg]", fontsize=8)
     figure.colorbar(image, ax=axes, label="peak [m]", shrink=0.8)
-    return _text(figure)
+    return as_text(figure)
 
 
-def _text(figure: Any) -> str:
+def as_text(figure: Any) -> str:
     """The figure as an `svg` element that scales with the page."""
     import matplotlib as mpl
 
