@@ -32,7 +32,8 @@ SWING = 0.01  # [m] on either side of the goal that an oscillation must pass
 SHOWS = (
     "Position of the object's centre O over time, its goal dotted: CG ±0.05 m at 0.31 rad/s, object of 0.2 kg. The "
     "adaptive follower is ours, since the paper's is not public, and copy is the known optimum of the paper's reward. "
-    "Swings: how often O passes from more than 1 cm on one side of its goal to more than 1 cm on the other, all axes."
+    "Swings: how often O passes from more than 1 cm on one side of its goal to more than 1 cm on the other, all axes. "
+    "Peak: root of the squares of the largest errors along the three axes."
 )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from mjxball.control.followers import Follower, make_baseline
 from mjxball.evaluate import svg
 from mjxball.evaluate.metrics import STEADY_AFTER
-from mjxball.evaluate.paper.figure import Figure, Table, called, legend_above, listed, metres, panels, thinned
+from mjxball.evaluate.paper.figure import Figure, Table, called, legend_above, listed, panels, thinned
 from mjxball.evaluate.paper.stand import LEVEL, STANDS, StandFlight, fly_stand, stand_config
 from mjxball.policy import Policy
 
@@ -73,7 +73,7 @@ def judged(flown: dict[str, dict[str, StandFlight]]) -> tuple[tuple[str, ...], t
                 f"{where} what is left of the roll still follows the CG, by its correlation: {listed(follows)}."
             )
         off = [
-            f"{called(name)} ({metres(height_peak(flight))})"
+            f"{called(name)} ({_millimetres(flight)})"
             for name, flight in flights.items()
             if height_peak(flight) > 0.5 * abs(flight.height[0] - LEVEL)
         ]
@@ -98,6 +98,10 @@ def correlation(flight: StandFlight) -> float:
     return float(np.corrcoef(flight.roll[steady], flight.cg_offset[steady])[0, 1])
 
 
+def _millimetres(flight: StandFlight) -> str:
+    return f"{1e3 * height_peak(flight):.1f} mm"
+
+
 def _steady(flight: StandFlight) -> np.ndarray:
     return flight.time >= STEADY_AFTER
 
@@ -108,7 +112,7 @@ def _table(flown: dict[str, dict[str, StandFlight]]) -> Table:
     for stand, flights in flown.items():
         for name, flight in flights.items():
             rms = float(np.sqrt(np.mean(flight.vertical[_steady(flight)] ** 2)))
-            numbers = (f"{roll_peak(flight):.2f} deg", metres(height_peak(flight)), f"{rms:.3f} m/s²")
+            numbers = (f"{roll_peak(flight):.2f} deg", _millimetres(flight), f"{rms:.3f} m/s²")
             rows.append((f"{STANDS[stand]}, {name}", *numbers))
     return Table(heads, tuple(rows))
 

@@ -16,7 +16,8 @@ LINEAR = 10.0  # returns nearer to 0 than this are drawn on a linear scale, the 
 PAPER_STEPS = 1_000_000  # that the paper trained for, "over a million time steps"
 SHOWS = (
     "Return of an episode of 1000 steps while the followers were trained, read from their policy files: grey the "
-    "exploring policy, in colour the deterministic one in fresh worlds. The scale is logarithmic below -10."
+    "exploring policy, in colour the deterministic one in fresh worlds, scaled to as many steps. The scale is "
+    "logarithmic below -10."
 )
 
 
@@ -50,6 +51,8 @@ def draw(policies: Sequence[Policy]) -> Figure:
     curves = [(policy.name, read_curve(policy)) for policy in policies]
     drawn = [curve for _, curve in curves if curve]
     without = [name for name, curve in curves if not curve]
+    several = [f"{called(p.name)} ({p.card['seeds']})" for p in policies if _is_several(p.card.get("seeds"))]
+    shows = f"{SHOWS} Grey is the median of all that were trained together: {listed(several)}." if several else SHOWS
     agrees, differs = judged(drawn)
     if without:
         have = "has" if len(without) == 1 else "have"
@@ -62,7 +65,7 @@ def draw(policies: Sequence[Policy]) -> Figure:
         title="Training",
         number=2,
         drawing=_draw(drawn),
-        shows=SHOWS,
+        shows=shows,
         table=_table(drawn) if drawn else None,
         agrees=agrees,
         differs=differs,
@@ -121,6 +124,10 @@ def _draw(curves: Sequence[Curve]) -> str:
     legend_above(figure, axes[:, 0])
     axes[-1, 0].set_xlabel("environment steps")
     return svg.as_text(figure)
+
+
+def _is_several(seeds: Any) -> bool:
+    return isinstance(seeds, int) and seeds > 1
 
 
 def _is_number(value: Any) -> bool:
