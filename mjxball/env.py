@@ -9,7 +9,9 @@ import jax.numpy as jnp
 
 from mjxball.config import Config
 from mjxball.control import leader, observation, rotations
+from mjxball.control.constants import trim_reach
 from mjxball.control.recall import recall_of
+from mjxball.nuisance import Nuisances
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mjx import jax_repeat, make_engine
@@ -22,7 +24,7 @@ from mjxball.rewards import paper_reward, task_reward
 Array = Any
 Env, State = import_brax_env()
 STEADY_AFTER = 8.0  # [s] of an episode, after which its error counts as steady state in the metrics
-SECRETS = 4  # what privileged critics see more: CG offset, first moment, object mass, error of the believed one
+SECRETS = 4  # numbers that privileged critics see more where nothing is disturbed
 DRAWS = 18  # random numbers of a reset
 RATE_BOUND = 50.0  # [rad/s] beyond which a world has diverged
 
@@ -34,6 +36,7 @@ class World(NamedTuple):
     load: Load
     goal: Array  # (3,) of O [m]
     integral: Array  # (3,) of the leader's error [m s]
+    nuisance: Any  # see `nuisance.Nuisance`, () if there is none
     memory: Array  # (m,) see `control.recall`
     action: Array  # (3,) last network action in [-1, 1]
     steps: Array  # () control steps since the reset
@@ -56,7 +59,10 @@ class CoupledPairEnv(Env):
         self._control_step = _make_step(config, physics)
         self._mount = jnp.asarray(config.plant.follower_mount, jnp.float32)
         self._recall = recall_of(config)
-        self._secrets = SECRETS if config.sac.privileged else 0
+        self._nuisances = Nuisances(config)
+        scenario = config.scenario
+        self._varies = scenario.rotor_lag_scale != (1.0, 1.0) or scenario.thrust_scale != (1.0, 1.0)
+        self._secrets = self._count_secrets() if config.sac.privileged else 0
         self._cg = make_cg_offset(config)
 
     @property
@@ -106,7 +112,9 @@ class CoupledPairEnv(Env):
         load = Load(
             object_mass=mass,
             believed_mass=mass if scenario.mass_known else nominal,
-            cg_amplitude=between(*scenario.cg_amplitude),
+            cg_amplitude=jnp.minimum(
+                between(*scenario.cg_amplitude), trim_reach(self.config.plant, mass, scenario.trim_margin)
+            ),
             cg_speed=between(*scenario.cg_speed),
             cg_phase=between(0.0, 2 * jnp.pi),
             mass_change=between(*scenario.mass_change)[None],
@@ -121,12 +129,16 @@ class CoupledPairEnv(Env):
             ball_offset=symmetric(scenario.ball_start, 1)[0],
         )
         goal = symmetric(scenario.goal_reach)
-        first = self._observe(plant, goal)
+        truth = self._observe(plant, goal)
+        nuisance, first = self._nuisances.start(jax.random.fold_in(rng, 1), truth)
+        if self._varies:
+            load = self._varied(load, jax.random.fold_in(rng, 2))
         world = World(
             plant=plant,
             load=load,
             goal=goal,
             integral=jnp.zeros(3),
+            nuisance=nuisance,
             memory=self._recall.start(first),
             action=jnp.zeros(3),
             steps=jnp.zeros((), jnp.int32),
@@ -134,7 +146,7 @@ class CoupledPairEnv(Env):
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
-        return State(world, self._input(first, world), zero, zero, metrics, {"truncation": zero})
+        return State(world, self._input(first, truth, world), zero, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Array) -> State:
         """Apply the network's `action` (3,) in [-1, 1] for one control period."""
@@ -145,7 +157,8 @@ class CoupledPairEnv(Env):
         seen = state.obs[: observation.OBSERVATION_SIZE]
         led = self._leader_command(world)
         followed = self._follower_command(action, seen)
-        plant = self._control_step(world.plant, jnp.stack([led, followed]), world.load)
+        load = world.load._replace(push=world.nuisance.push) if self._nuisances.present else world.load
+        plant = self._control_step(world.plant, jnp.stack([led, followed]), load)
 
         diverged = jnp.logical_or(self._diverged(plant), ~sound)
         plant = jax.tree.map(lambda new, old: jnp.where(diverged, old, new), plant, world.plant)
@@ -158,8 +171,11 @@ class CoupledPairEnv(Env):
         truncated = jnp.logical_and(steps >= timing.episode_steps, ~terminated) & (not wrapped)
         reward = self._reward(led, followed, plant, error, action, world.action, terminated)
 
+        truth = self._observe(plant, world.goal)
+        nuisance, after = self._nuisances.step(world.nuisance, truth)
         moved = world._replace(
             plant=plant,
+            nuisance=nuisance,
             integral=world.integral + timing.control_period * (world.goal - world.plant.position),
             memory=self._recall.next(world.memory, seen, action),
             action=action,
@@ -168,7 +184,7 @@ class CoupledPairEnv(Env):
         steady = (plant.time > STEADY_AFTER).astype(jnp.float32)
         return state.replace(
             pipeline_state=moved,
-            obs=self._input(self._observe(plant, world.goal), moved),
+            obs=self._input(after, truth, moved),
             reward=reward,
             done=jnp.logical_or(terminated, truncated).astype(jnp.float32),
             metrics={
@@ -187,19 +203,33 @@ class CoupledPairEnv(Env):
         matrix = rotations.matrix_from_quaternion(plant.quaternion)
         return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, self._mount)
 
-    def _input(self, seen: Array, world: World) -> Array:
-        """The networks' input: what the follower sees and remembers, and what only critics are told, at the end."""
+    def _varied(self, load: Load, key: Array) -> Load:
+        """`load` with rotors of its own."""
+        scenario, share = self.config.scenario, jax.random.uniform(key, (3,))
+        (low, high), (weak, strong) = scenario.rotor_lag_scale, scenario.thrust_scale
+        return load._replace(
+            rotor_lag_scale=low + (high - low) * share[0], thrust_scale=weak + (strong - weak) * share[1:]
+        )
+
+    def _input(self, seen: Array, truth: Array, world: World) -> Array:
+        """The networks' input: what the follower sees and remembers, and behind it what only critics are told."""
         shown = self._recall.network_input(seen, world.memory)
-        if not self._secrets:
-            return shown
-        mass = object_mass(world.plant.time, world.load)
-        secrets = [
-            self._cg(world.plant, world.load),
-            mass * self._cg(world.plant, world.load),
-            mass,
-            mass - world.load.believed_mass,
-        ]
-        return jnp.concatenate([shown, jnp.stack(secrets)])
+        return jnp.concatenate([shown, self._told(truth, world)]) if self._secrets else shown
+
+    def _told(self, truth: Array, world: World) -> Array:
+        """CG offset, first moment, object mass, error of the believed one; of disturbed worlds the truth as well."""
+        offset, mass = self._cg(world.plant, world.load), object_mass(world.plant.time, world.load)
+        parts = [jnp.stack([offset, mass * offset, mass, mass - world.load.believed_mass])]
+        if self._nuisances.present:
+            nuisance = world.nuisance
+            parts += [truth[3:], nuisance.push, jnp.stack([nuisance.noise, nuisance.delay.astype(jnp.float32)])]
+        if self._varies:
+            parts += [world.load.rotor_lag_scale[None], world.load.thrust_scale]
+        return jnp.concatenate(parts)
+
+    def _count_secrets(self) -> int:
+        clean = observation.OBSERVATION_SIZE - 3 + 5 if self._nuisances.present else 0
+        return SECRETS + clean + (3 if self._varies else 0)
 
     def _leader_command(self, world: World) -> Array:
         law = self.config.leader

@@ -59,7 +59,45 @@ def _transport() -> Config:
     )
 
 
-PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType({"transport": _transport(), "paper": _paper()})
+def _robust() -> Config:
+    return Config(
+        preset="robust",
+        follower=Follower(tilt_limit=0.3, vertical_limit=6.0, filters=(0.05, 0.2, 1.0)),
+        scenario=Scenario(
+            cg_speed=(0.2, 3.2),
+            cg_amplitude=(0.0, 0.17),
+            object_mass=(0.1, 0.4),
+            mass_known=False,
+            mass_change=(-0.1, 0.1),
+            start_velocity=0.2,
+            start_tilt=0.05,
+            noise=(0.0, 1.5),
+            delay=(0.0, 0.04),
+            gust=(0.0, 0.3),
+            rotor_lag_scale=(0.5, 2.0),
+            thrust_scale=(0.85, 1.15),
+        ),
+        reward=Reward(error_scale=0.02, velocity=1.0),
+        sac=Sac(
+            steps=3_072_000,
+            worlds=512,
+            batch=512,
+            updates=16,
+            replay=1_024_000,
+            policy_layers=(128, 128),
+            critic_layers=(128, 128),
+            privileged=True,
+            discount=0.97,
+            return_steps=10,
+            learning_rate=2e-3,
+            learning_rate_end=0.02,
+        ),
+    )
+
+
+PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
+    {"transport": _transport(), "paper": _paper(), "robust": _robust()}
+)
 
 
 def preset(name: str) -> Config:

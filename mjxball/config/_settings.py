@@ -139,11 +139,24 @@ class Scenario:
     cg_speed: Range = setting((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0, ordered=True)
     cg_amplitude: Range = setting((0.05, 0.05), "amplitude of the CG's sine [m]", low=0, ordered=True)
     object_mass: Range = setting((0.2, 0.2), "true mass of the object [kg]", above=0, ordered=True)
+    trim_margin: float = setting(
+        0.15, "the CG's amplitude is cut to where one drone holds it with this share of its torque left", low=0, high=1
+    )
     mass_change: Range = setting(
         (0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]", ordered=True
     )
     mass_change_time: Range = setting((5.0, 15.0), "when the object's mass changes [s]", low=0, ordered=True)
     ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0)
+    noise: Range = setting(
+        (0.0, 0.0),
+        "noise of the follower's senses, in deviations of motion capture and a small drone's IMU",
+        low=0,
+        ordered=True,
+    )
+    delay: Range = setting((0.0, 0.0), "delay of the follower's senses [s]", low=0, high=0.5, ordered=True)
+    gust: Range = setting((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0, ordered=True)
+    rotor_lag_scale: Range = setting((1.0, 1.0), "factor on the rotors' time constant", above=0, ordered=True)
+    thrust_scale: Range = setting((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0, ordered=True)
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
     termination_distance: float = setting(2.5, "an episode ends when |e_o| exceeds this, d_term [m]", above=0)
 

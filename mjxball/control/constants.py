@@ -58,3 +58,13 @@ def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
     gains = design_gains(design_inertia, attitude.natural_frequency, attitude.damping)
     gains = AttitudeGains(tuple(map(float, gains.kp)), tuple(map(float, gains.kd)))
     return PlantConstants(mass, mounts, share, gains, mass @ mounts, drone_inertia, shell, ball)
+
+
+def trim_reach(plant: Plant, object_mass: float, margin: float) -> float:
+    """CG offset [m] up to which one drone's pitch torque holds the object's weight with `margin` of it left (ours).
+
+    A drone that hovers with half the assembly's weight has the torque 2 (F_max - T / 4) L about each axis.
+    """
+    thrust = (plant.leader_mass + plant.follower_mass + object_mass) * plant.gravity / 2
+    torque = 2 * (plant.rotor_force_max - thrust / 4) * plant.arm
+    return (1 - margin) * torque / (object_mass * plant.gravity)

@@ -41,6 +41,8 @@ class Load(NamedTuple):
     mass_change: Array  # (..., k) mass added, or dropped if negative [kg]
     mass_change_time: Array  # (..., k) when [s]
     push: Array | None = None  # (..., 3) force on O in the world, held over a control step [N]; None: none
+    rotor_lag_scale: Array | None = None  # (...) factor on the rotors' time constant; None: 1
+    thrust_scale: Array | None = None  # (..., 2) factor on the rotor forces of leader and follower; None: 1
 
 
 class Wrench(NamedTuple):

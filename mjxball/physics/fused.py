@@ -12,7 +12,7 @@ from mjxball.physics.step import ControlStep, Repeat, make_control_step, python_
 
 Array = Any
 STATE_AXES = PlantState(1, 1, 1, 1, 2, 0, 0, 0)  # trailing axes of every leaf
-LOAD_AXES = Load(0, 0, 0, 0, 0, 1, 1)
+LOAD_AXES = (0, 0, 0, 0, 0, 1, 1)  # of the leaves that every load has
 
 
 def split_state(state: PlantState) -> PlantState:
@@ -22,9 +22,10 @@ def split_state(state: PlantState) -> PlantState:
 
 def split_load(load: Load) -> Load:
     """Every leaf of `load` as `Components`."""
-    if load.push is not None:
-        raise ValueError("the split road knows no push")
-    return Load(*map(split, load[:-1], LOAD_AXES[:-1]))
+    known, optional = load[: len(LOAD_AXES)], load[len(LOAD_AXES) :]
+    if any(leaf is not None for leaf in optional):
+        raise ValueError("the split road knows no push and no rotors of a world's own")
+    return Load(*map(split, known, LOAD_AXES))
 
 
 def join_state(state: PlantState) -> PlantState:

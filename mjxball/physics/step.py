@@ -38,13 +38,19 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
     plant = config.plant
     constants = plant_constants(plant, config.attitude)
     h = config.physics_step
-    keep = math.exp(-h / plant.rotor_lag)  # share of the old rotor force left after a step
-    mean = plant.rotor_lag / h * (1 - keep)  # its mean share over the step
+    nominal = math.exp(-h / plant.rotor_lag)  # share of the old rotor force left after a step
     accelerate = make_accelerations(config, engine)
 
     def physics_step(state: PlantState, commands: Array, load: Load) -> PlantState:
         xp = commands.__array_namespace__()
         target = rotor_targets(config, constants, state, commands, load.believed_mass)
+        keep, mean = nominal, plant.rotor_lag / h * (1 - nominal)  # `mean`: its mean share over the step
+        if load.rotor_lag_scale is not None:
+            lag = (plant.rotor_lag * load.rotor_lag_scale)[..., None, None]
+            keep = xp.exp(-h / lag)
+            mean = lag / h * (1 - keep)
+        if load.thrust_scale is not None:
+            target = target * load.thrust_scale[..., None]
         acting = target + mean * (state.rotor_force - target)
         middle = _drift(state, h / 2)
         rotors = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust)
