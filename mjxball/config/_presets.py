@@ -66,7 +66,7 @@ def _robust() -> Config:
         scenario=Scenario(
             cg_speed=(0.2, 3.2),
             cg_amplitude=(0.0, 0.17),
-            object_mass=(0.1, 0.4),
+            object_mass=(0.15, 0.4),
             mass_known=False,
             mass_change=(-0.1, 0.1),
             start_velocity=0.2,
