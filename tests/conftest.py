@@ -99,7 +99,7 @@ class Trained(NamedTuple):
 def make_trained(config: Config) -> Trained:
     """A learner whose observation statistics have seen data of very different scales, as in a real run."""
     env = CoupledPairEnv(config, "newton-euler")
-    networks = sac.make_networks(config.sac, env.input_mask, env.action_size)
+    networks = sac.make_networks(config.sac, env.input_mask, env.action_size, env.critic_mask)
     learner = sac.create(networks, config.sac, env.observation_size, jax.random.key(3))
     random = np.random.default_rng(4)
     spread, centre = random.uniform(0.05, 3.0, env.observation_size), random.normal(size=env.observation_size)
@@ -116,8 +116,9 @@ def trained(transport: Config) -> Trained:
 
 @pytest.fixture(scope="session")
 def remembering(transport: Config) -> Trained:
-    """A follower that sees three observations and its last action."""
-    return make_trained(with_settings(transport, follower={"history": 3, "previous_action": True}))
+    """A follower with everything that it can remember; its critics are told more than it."""
+    follower = {"history": 3, "previous_action": True, "filters": (0.1, 0.5)}
+    return make_trained(with_settings(transport, follower=follower, sac={"privileged": True}))
 
 
 @pytest.fixture(scope="session")

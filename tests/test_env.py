@@ -201,9 +201,14 @@ def test_memory_of_the_environment_follows_the_layout(remembering_pair: Compiled
     actions = jax.random.uniform(jax.random.key(14), (4, 3), minval=-1, maxval=1)
     states = remembering_pair.roll(first, actions)
     seen = [first.obs[:18], *states.obs[:, :18]]
-    np.testing.assert_array_equal(first.obs, [*seen[0], *seen[0], *seen[0], 0, 0, 0])
-    np.testing.assert_array_equal(states.obs[0], [*seen[1], *seen[0], *seen[0], *actions[0]])
-    np.testing.assert_array_equal(states.obs[3], [*seen[4], *seen[3], *seen[2], *actions[3]])
+    # Behind three observations two averages of 21 numbers, the last action, and what critics are told.
+    history, last, told = slice(0, 54), slice(54 + 42, 57 + 42), 57 + 42
+    assert first.obs.shape == (told + 4,)
+    np.testing.assert_array_equal(first.obs[history], [*seen[0], *seen[0], *seen[0]])
+    np.testing.assert_array_equal(first.obs[54:told], np.zeros(45))
+    for number, older in ((0, (1, 0, 0)), (3, (4, 3, 2))):
+        np.testing.assert_array_equal(states.obs[number][history], np.concatenate([seen[k] for k in older]))
+        np.testing.assert_array_equal(states.obs[number][last], actions[number])
 
 
 class TestBraxWrappers:

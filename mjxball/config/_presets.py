@@ -59,6 +59,37 @@ def _transport() -> Config:
     )
 
 
+def _transport_large() -> Config:
+    """What `transport` becomes with a GPU: all loads that one drone can trim, and a memory."""
+    return Config(
+        preset="transport-large",
+        follower=Follower(tilt_limit=0.3, filters=(0.05, 0.2)),
+        scenario=Scenario(
+            cg_speed=(0.2, 3.2),
+            cg_amplitude=(0.0, 0.17),
+            object_mass=(0.1, 0.6),
+            start_velocity=0.2,
+            start_tilt=0.05,
+        ),
+        # Speed is dear so that the goal is not overshot.
+        reward=Reward(error_scale=0.02, velocity=4.0),
+        sac=Sac(
+            steps=2_048_000,
+            worlds=512,
+            batch=512,
+            updates=16,
+            replay=512_000,
+            policy_layers=(128, 128),
+            critic_layers=(128, 128),
+            privileged=True,
+            discount=0.97,
+            return_steps=10,
+            learning_rate=3e-3,
+            learning_rate_end=0.02,
+        ),
+    )
+
+
 def _robust() -> Config:
     return Config(
         preset="robust",
@@ -96,7 +127,7 @@ def _robust() -> Config:
 
 
 PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
-    {"transport": _transport(), "paper": _paper(), "robust": _robust()}
+    {made.preset: made for made in (_transport(), _paper(), _transport_large(), _robust())}
 )
 
 

@@ -9,12 +9,13 @@ import resource
 import signal
 import sys
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjxball.config import Config
@@ -88,8 +89,10 @@ class Run:
                 write_config(out, config, self.origin)
         self.progress = Progress(out / METRICS if self._writes else None, config.sac.steps, done, origin["seeds"])
         self.members = MemberLog(out if self._writes else None, origin["seed"], done)
-        # Orbax takes half a second to load: beside the compilation, not before it.
-        self._checkpoints = ThreadPoolExecutor(1).submit(_open_checkpoints, out) if self._writes else None
+        # One thread writes checkpoints; Orbax takes half a second to load: beside the compilation, not before it.
+        self._writer = ThreadPoolExecutor(1)
+        self._checkpoints = self._writer.submit(_open_checkpoints, out) if self._writes else None
+        self._pending: Future[None] | None = None
         self.state: TrainState | None = resumed
         self._saved_at = self._saving = 0.0  # [s]
         self._saved_steps = -1
@@ -106,8 +109,11 @@ class Run:
 
     def close(self) -> None:
         """Wait until every checkpoint is on disk."""
-        if self._checkpoints:
-            self._checkpoints.result().close()
+        with self._writer:
+            if self._pending:
+                self._pending.result()
+            if self._checkpoints:
+                self._checkpoints.result().close()
 
     def _cost(self) -> str:
         """What the run took, for people and for `benchmarks/training.py`."""
@@ -222,12 +228,28 @@ class Run:
             return
         self._saved_steps = self._steps()
         exported = self._export()
-        # Whole, and a copy: the next chunk of training reuses the buffers while the files are still being written.
-        arrays = processes.gather(self.state)
+        kept = self._kept()
         if exported and self._checkpoints:
-            self._checkpoints.result().save(arrays)
+            if self._pending:
+                self._pending.result()
+            self._pending = self._writer.submit(self._write, kept)
         self._saved_at = self.progress.elapsed()
         self._saving += self._saved_at - began
+
+    def _kept(self) -> TrainState:
+        """A copy of the state: the next chunk of training reuses its buffers while it is still being written.
+
+        It stays on the device, if that has room for it, and comes to the host in the thread that writes.
+        """
+        shares = [leaf.nbytes / self.population.devices for leaf in jax.tree.leaves(self.state)]
+        stats = jax.local_devices()[0].memory_stats() or {}
+        room = stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)
+        if jax.process_count() > 1 or 2 * sum(shares) > room:
+            return processes.gather(self.state)
+        return jax.tree.map(jnp.copy, self.state)
+
+    def _write(self, kept: TrainState) -> None:
+        self._checkpoints.result().save(processes.gather(kept))
 
     def _export(self) -> bool:
         """Write the policy file, of a population every member's and the best one's; False if none is sound."""
