@@ -16,6 +16,7 @@ from conftest import with_settings
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy import Policy
+from mjxball.policy.file import load_file
 from mjxball.train import program as programs
 from mjxball.train.main import main as train
 from mjxball.train.members import best_member, read_members
@@ -138,7 +139,17 @@ def test_population_run_exports_every_member_and_the_best(tmp_path: Path, capsys
     members = [Policy.load(out / "members" / f"seed{seed}.npz") for seed in (7, 8)]
     assert [member.card["action_reach"][0] for member in members] == [0.1, 0.2]
     best = best_member(read_members(out))
-    assert (out / "policy.npz").read_bytes() == (out / "members" / f"seed{7 + best}.npz").read_bytes()
+    exported, own = load_file(out / "policy.npz"), load_file(out / "members" / f"seed{7 + best}.npz")
+    for mine, theirs in zip(exported.weights, own.weights, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    spread = exported.card.pop("population")
+    assert exported.card == own.card
+    assert spread["seed"] == [7, 8]
+    assert len(spread["x_peak"]) == len(spread["rmse"]) == 2
+    assert own.card["curve"]["eval_return"][-1] == pytest.approx(
+        max(row["eval_return"] for row in read_members(out) if row["steps"] == own.card["training_steps"]), abs=1e-3
+    )
+    assert own.card["hardware"].startswith("1 x ")
     assert (out / "eval" / "members.png").stat().st_size > 10_000
     assert train(["--resume", str(out)]) == 0
 

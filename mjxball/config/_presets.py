@@ -97,7 +97,7 @@ def _robust() -> Config:
         scenario=Scenario(
             cg_speed=(0.2, 3.2),
             cg_amplitude=(0.0, 0.17),
-            object_mass=(0.15, 0.4),
+            object_mass=(0.15, 0.6),
             mass_known=False,
             mass_change=(-0.1, 0.1),
             start_velocity=0.2,
@@ -108,9 +108,9 @@ def _robust() -> Config:
             rotor_lag_scale=(0.5, 2.0),
             thrust_scale=(0.85, 1.15),
         ),
-        reward=Reward(error_scale=0.02, velocity=1.0),
+        reward=Reward(error_scale=0.02, velocity=4.0),
         sac=Sac(
-            steps=3_072_000,
+            steps=2_048_000,
             worlds=512,
             batch=512,
             updates=16,

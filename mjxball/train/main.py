@@ -179,15 +179,21 @@ def _read_sweep(path: Path | None, members: int, settings: config.Config) -> dic
 
 
 def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) -> None:
-    """Print every member on the reference scenario and their median, and draw them over training."""
+    """Print every member on the reference scenario and their median, draw them over training, and tell the card."""
     from mjxball.evaluate.cells import load_policy, run_cells
     from mjxball.evaluate.table import table
+    from mjxball.policy.file import load_file, save_file
     from mjxball.train.members import POLICIES, draw_members
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
     cells = run_cells(settings, policies, _scenarios(settings)[-1:], origin["physics"])
     print(table(cells))  # noqa: T201
-    for name in ("rmse", "settling_time", "x_peak", "overshoot"):
+    judged = ("rmse", "settling_time", "x_peak", "overshoot")
+    chosen = load_file(out / POLICY)
+    seeds = [int(cell.follower.removeprefix("seed")) for cell in cells]
+    spread = {name: [getattr(cell.metrics, name) for cell in cells] for name in judged}
+    save_file(out / POLICY, dataclasses.replace(chosen, card={**chosen.card, "population": {"seed": seeds, **spread}}))
+    for name in judged:
         values = sorted(math.inf if (v := getattr(cell.metrics, name)) is None else v for cell in cells)
         low, middle, high = values[0], statistics.median(values), values[-1]
         print(f"{name}: median {middle:.4g}, best {low:.4g}, worst {high:.4g} of {len(values)}")  # noqa: T201

@@ -39,13 +39,9 @@ SWEEPABLE = (
     "follower.vertical_limit",
     *(f"reward.{name}" for name in ("error", "error_scale", "velocity", "tilt", "rates", "effort", "smoothness")),
 )
-# Kernels of this size gain nothing from being tuned and optimised further, and it costs half of the compile time.
-GPU_OPTIONS = {
-    "xla_gpu_autotune_level": 0,
-    "xla_backend_optimization_level": 1,
-    "xla_gpu_enable_triton_gemm": False,
-    "xla_llvm_disable_expensive_passes": True,
-}
+# Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
+# (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/results.md.)
+GPU_OPTIONS = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
 Sweep = Mapping[str, Sequence[float]]
 
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mjxball.config import Config
@@ -81,6 +80,7 @@ class Run:
         self.config, self.out = config, out
         self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"])
         self.origin = {**origin, "parts": self.population.parts}
+        self._hardware = f"{self.population.devices} x {jax.devices()[0].device_kind}"
         self._writes = processes.is_writer()
         done = _count(resumed) if resumed else 0
         if self._writes:
@@ -246,7 +246,7 @@ class Run:
         room = stats.get("bytes_limit", math.inf) - stats.get("bytes_in_use", 0)
         if jax.process_count() > 1 or 2 * sum(shares) > room:
             return processes.gather(self.state)
-        return jax.tree.map(jnp.copy, self.state)
+        return jax.device_put(self.state, jax.tree.map(lambda leaf: leaf.sharding, self.state), may_alias=False)
 
     def _write(self, kept: TrainState) -> None:
         self._checkpoints.result().save(processes.gather(kept))
@@ -262,6 +262,7 @@ class Run:
             learner = self.population.member(learners, member)
             seed = self.origin["seed"] + member
             origin = {**self.origin, "seed": seed, "curve": training_curve(self.out, seed)}
+            origin |= {"hardware": self._hardware, "seconds": round(self.progress.seconds())}
             policy = policy_file(self.population.member_config(member), learner, steps, origin)
             if not is_sound(policy):
                 continue
