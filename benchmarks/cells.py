@@ -4,7 +4,8 @@
 
 A cell is flown from the origin to (1, 1, 1) m for 45 s, with the mass known to the hover thrust (by POLICY) or believed
 to be 0.2 kg (by the robust policy, which adaptive with mass adaptation is then compared with), clean and with noise at
-level 1 and 40 ms of delay (robust as well). LQG is always told the plant, and the delay is news to it. Wanted, of medians over the seeds:
+level 1 and 40 ms of delay (robust as well). LQG is always told the plant, but not the delay. Wanted, of medians over
+the seeds:
 
 - peak: the largest |e| of any axis after 20 s at most the adaptive follower's plus 3 mm
 - overshoot: at most the adaptive follower's
@@ -96,7 +97,9 @@ def main() -> None:
             common = {} if known else {"believed_mass": 0.2}
             rivals = ("adaptive" if known else "adaptive-mass", "lqg")
             told = {} if rivals[1] == "lqg" else common
-            flown = {name: fly(make_baseline(name, config), cells, common, disturbed, options.seeds) for name in rivals[:1]}
+            flown = {
+                name: fly(make_baseline(name, config), cells, common, disturbed, options.seeds) for name in rivals[:1]
+            }
             flown["lqg"] = fly(make_baseline("lqg", config), cells, told, disturbed, options.seeds)
             mine = fly(policy, cells, common, disturbed, options.seeds)
             where = f"mass {'known' if known else 'unknown'}, {'noise and 40 ms' if disturbed else 'clean'}"
@@ -128,7 +131,8 @@ def main() -> None:
                 missed = [name for name in WANTED if name not in row["wins"]]
                 if missed:
                     shown = ", ".join(
-                        f"{n} {row[n]:.4g} ({rivals[0]} {row[rivals[0]][n]:.4g}, lqg {row['lqg'][n]:.4g})" for n in missed
+                        f"{n} {row[n]:.4g} ({rivals[0]} {row[rivals[0]][n]:.4g}, lqg {row['lqg'][n]:.4g})"
+                        for n in missed
                     )
                     print(f"    {row['omega']:g} rad/s {row['amplitude']:g} m {row['mass']:g} kg misses {shown}")
     if options.json:

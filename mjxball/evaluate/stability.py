@@ -1,0 +1,136 @@
+"""Local stability of leader, follower and plant about hover: the closed loop's eigenvalues, and the delay it bears.
+
+With the CG at rest at an offset, the loop over one control step is a smooth map of everything that it remembers: the
+object's position, attitude, velocity and rates, the rotors, the follower's memory, and the observations under way if
+its senses are late. Its fixed point is found by flying and by Newton's method, its Jacobian there by JAX, in float64. A
+network with ReLU units is linear around almost every point, so the eigenvalues say what a small error does, no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from mjxball import rollout
+from mjxball.config import Config
+from mjxball.control import observation, rotations
+from mjxball.control.baselines.law import Law
+from mjxball.physics import mjx, newton_euler
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.step import make_control_step, start_state
+from mjxball.scenario import Scenario
+
+Array = Any
+SETTLE, NEWTON = 3000, 8  # control steps flown towards the fixed point, then steps of Newton's method
+SOUND = 1e-8  # largest change over a control step, in SI units, of what counts as a fixed point
+NEUTRAL = 1e-6  # a memory that the loop does not use keeps its value: eigenvalue 1
+
+
+@dataclass(frozen=True)
+class Hover:
+    """The closed loop about hover with the CG at rest."""
+
+    offset: float  # of the CG [m]
+    mass: float  # of the object [kg]
+    delay: int  # control steps by which the follower's senses are late
+    residual: float  # change over a control step at the fixed point; above `SOUND` there is none
+    error: float  # |e_o| at the fixed point [m]
+    tilt: float  # hypot(roll, pitch) there [rad]
+    radius: float  # largest |eigenvalue| of the map over one control step
+
+    @property
+    def stable(self) -> bool:
+        """True if there is a hover in which small errors do not grow."""
+        return self.residual < SOUND and self.radius < 1 + NEUTRAL
+
+
+def hovers(config: Config, law: Law, cases: Sequence[tuple[float, float, float]], delay: int = 0) -> list[Hover]:
+    """The hover of every case: (CG offset [m], object mass [kg], believed mass [kg])."""
+    with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
+        start, step = closed_loop(config, law, delay)
+        names = ("amplitude", "mass", "believed_mass")
+        scenarios = [Scenario(omega=0.0, phase=np.pi / 2, **dict(zip(names, case, strict=True))) for case in cases]
+        loads = jax.tree.map(jnp.asarray, rollout.load_of(scenarios))
+        found = jax.jit(jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load))))(loads)
+        points, residuals, jacobians = map(np.asarray, found)
+    radii = [float(np.abs(np.linalg.eigvals(jacobian)).max()) for jacobian in jacobians]
+    return [
+        Hover(offset, mass, delay, float(residual), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4])), radius)
+        for (offset, mass, _), z, residual, radius in zip(cases, points, residuals, radii, strict=True)
+    ]
+
+
+def delay_margins(
+    config: Config, law: Law, cases: Sequence[tuple[float, float, float]], longest: int = 15
+) -> list[int]:
+    """For every case the control steps of delay up to which its hover stays stable; -1 if it never is."""
+    margins = [-1] * len(cases)
+    for delay in range(longest + 1):
+        for number, hover in enumerate(hovers(config, law, cases, delay)):
+            if hover.stable and margins[number] == delay - 1:
+                margins[number] = delay
+        if max(margins) < delay:
+            break
+    return margins
+
+
+def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], Array], Callable[[Array, Load], Array]]:
+    """(`start(load)` -> z, `step(z, load)` -> z one control period on) for a goal at the origin, on vectors z (k,).
+
+    z holds position, Euler angles, velocity, rates, rotor forces, the follower's memory, older observations.
+    """
+    period = config.timing.control_period
+    advance = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), mjx.jax_repeat)
+    brief, mount = rollout.make_brief(config), jnp.asarray(config.plant.follower_mount)
+    goal = jnp.zeros(3)
+
+    def seen_in(plant: PlantState) -> Array:
+        matrix = rotations.matrix_from_quaternion(plant.quaternion)
+        return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, mount)
+
+    def flat(plant: PlantState, memory: Any, past: Array) -> tuple[Array, Any]:
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
+        return ravel_pytree((plant.position, euler, plant.velocity, plant.rates, plant.rotor_force, memory, past))
+
+    def first(load: Load) -> tuple[PlantState, Any, Array]:
+        still = jnp.zeros(3)
+        plant = start_state(config, still, still, still, load.believed_mass, jnp.zeros(()))
+        seen = seen_in(plant)
+        return plant, law.start(seen), jnp.broadcast_to(seen, (delay, observation.OBSERVATION_SIZE))
+
+    def start(load: Load) -> Array:
+        return flat(*first(load))[0]
+
+    def step(z: Array, load: Load) -> Array:
+        unflatten = flat(*first(load))[1]
+        position, euler, velocity, rates, rotors, memory, past = unflatten(z)
+        zero = jnp.zeros(())
+        plant = PlantState(position, rotations.quaternion_from_euler(euler), velocity, rates, rotors, zero, zero, zero)
+        queue = jnp.concatenate([seen_in(plant)[None], past])
+        led = rollout.leader_command(config, goal, plant, jnp.zeros(3))
+        memory, followed = law.step(memory, queue[-1], brief(plant, load))
+        moved = advance(plant, jnp.stack([led, followed]), load)
+        return flat(moved._replace(time=zero), memory, queue[:-1])[0]
+
+    if config.leader.ki != (0.0, 0.0, 0.0):
+        raise ValueError(f"the leader's integral term {config.leader.ki} has no place in this loop of {period:g} s")
+    return start, step
+
+
+def _linearise(start: Array, step: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
+    """(fixed point, its residual, Jacobian there) of `step`, found from `start`."""
+    z = jax.lax.fori_loop(0, SETTLE, lambda _, z: step(z), start)
+    jacobian = jax.jacfwd(step)
+
+    def polish(_: Array, z: Array) -> Array:
+        better = z + jnp.linalg.solve(jnp.eye(len(z)) - jacobian(z), step(z) - z)
+        return jnp.where(jnp.abs(step(better) - better).max() < jnp.abs(step(z) - z).max(), better, z)
+
+    z = jax.lax.fori_loop(0, NEWTON, polish, z)
+    return z, jnp.abs(step(z) - z).max(), jacobian(z)

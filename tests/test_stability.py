@@ -1,0 +1,53 @@
+"""Eigenvalues about hover against what is known of the classical followers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from mjxball.config import Config, preset
+from mjxball.control.followers import make_baseline
+from mjxball.evaluate.batch import law_of
+from mjxball.evaluate.stability import delay_margins, hovers
+from mjxball.rollout import simulate_batch
+from mjxball.scenario import Scenario
+from mjxball.sensing import Disturbance
+
+CASES = [(0.0, 0.2, 0.2), (0.1, 0.2, 0.2), (0.05, 0.4, 0.4)]
+MISTAKEN = (0.0, 0.25, 0.2)  # the hover thrust believes 0.2 kg
+
+
+@pytest.fixture(scope="module")
+def paper() -> Config:
+    return preset("paper")
+
+
+def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: Config) -> None:
+    """x = (g / kp) m c g / (2 Kp_theta); slowest mode s^2 + kd s + kp, a little faster for the attitude loop's lag.
+
+    Of a mass that is not believed each drone holds half: z = dm g / (2 m^ kp), m^ what one drone believes to lift.
+    """
+    *known, mistaken = hovers(paper, law_of(make_baseline("copy", paper)), [*CASES, MISTAKEN])
+    for (offset, mass, _), hover in zip(CASES, known, strict=True):
+        sway = 9.81 / 0.5 * mass * offset * 9.81 / (2 * 3.2196)
+        assert hover.error == pytest.approx(sway, rel=1e-3, abs=1e-9)
+        assert hover.residual < 1e-12
+        assert hover.stable
+        assert math.log(hover.radius) / 0.02 == pytest.approx(-0.5, rel=0.03)
+    assert mistaken.error == pytest.approx(0.05 * 9.81 / (2 * 1.1 * 0.5), rel=1e-3)
+
+
+def test_delay_margin_is_where_flights_begin_to_grow(paper: Config) -> None:
+    """LQG, which is told of no delay."""
+    lqg = make_baseline("lqg", paper)
+    (margin,) = delay_margins(paper, law_of(lqg), CASES[:1], longest=2)
+    assert 0 <= margin < 2
+    still = {"amplitude": 0.0, "goal": (0.0, 0.0, 0.0), "start_position": (0.001, 0.0, 0.0)}
+    delays = [0.02 * margin, 0.02 * (margin + 1)]
+    scenarios = [Scenario(**still, disturbance=Disturbance(delay=delay)) for delay in delays]
+    errors = np.abs(simulate_batch(paper, [(lqg, scenarios)], "newton-euler").error[:, :, 0])
+    late = errors[-500:].max(axis=0)
+    assert late[0] < 0.0005
+    assert late[1] > 0.01
