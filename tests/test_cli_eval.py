@@ -119,11 +119,14 @@ def test_out_holds_the_cells_and_a_figure_for_each_scenario(tmp_path: Path) -> N
 # --- check ----------------------------------------------------------------------------------------------------------
 
 
-def test_shipped_policy_meets_its_card_from_anywhere(tmp_path: Path) -> None:
+def test_every_shipped_policy_meets_its_card_from_anywhere(tmp_path: Path) -> None:
     """A real process, MJX physics, another working directory, another scenario than the card's."""
-    done = run([script("eval.py"), TRANSPORT, "--check", "--seconds", 1], tmp_path)
+    shipped = shipped_policies()
+    assert {"paper", "transport"} <= {path.stem for path in shipped}
+    done = run([script("eval.py"), *shipped, "--check", "--seconds", 1], tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "check transport: ok" in done.stdout
+    for path in shipped:
+        assert f"check {path.stem}: ok" in done.stdout
     assert not done.stderr
     assert listing(tmp_path) == {}
 

@@ -70,9 +70,13 @@ def _transport_large() -> Config:
             object_mass=(0.1, 0.6),
             start_velocity=0.2,
             start_tilt=0.05,
+            # A little of everything late and noisy, or the command chatters between its limits.
+            noise=(0.0, 1.0),
+            delay=(0.0, 0.04),
+            rotor_lag_scale=(0.7, 1.4),
         ),
         # Speed is dear so that the goal is not overshot.
-        reward=Reward(error_scale=0.02, velocity=4.0),
+        reward=Reward(error_scale=0.02, velocity=6.0),
         sac=Sac(
             steps=2_048_000,
             worlds=512,
@@ -97,18 +101,18 @@ def _robust() -> Config:
         scenario=Scenario(
             cg_speed=(0.2, 3.2),
             cg_amplitude=(0.0, 0.17),
-            object_mass=(0.15, 0.6),
+            object_mass=(0.12, 0.5),
             mass_known=False,
             mass_change=(-0.1, 0.1),
             start_velocity=0.2,
             start_tilt=0.05,
-            noise=(0.0, 1.5),
+            noise=(0.0, 1.0),
             delay=(0.0, 0.04),
             gust=(0.0, 0.3),
             rotor_lag_scale=(0.5, 2.0),
             thrust_scale=(0.85, 1.15),
         ),
-        reward=Reward(error_scale=0.02, velocity=4.0),
+        reward=Reward(error_scale=0.02, velocity=6.0),
         sac=Sac(
             steps=2_048_000,
             worlds=512,

@@ -70,7 +70,7 @@ def _draw_panel(axis: Any, cells: Sequence[Cell], kind: str, index: int | None, 
     time = cells[0].flight.time
     if kind == "position":
         axis.axhline(cells[0].flight.goal[index], color="black", linestyle=":", linewidth=1, label="goal")
-    for cell, colour in zip(cells, _cycle(len(cells)), strict=True):
+    for number, (cell, colour) in enumerate(zip(cells, _cycle(len(cells)), strict=True)):
         if kind == "position":
             axis.plot(time, cell.flight.position[:, index], color=colour, linewidth=1.3, label=cell.follower)
         elif kind == "cg_offset":
@@ -79,9 +79,8 @@ def _draw_panel(axis: Any, cells: Sequence[Cell], kind: str, index: int | None, 
             factor = 1.0 if index == 2 else 57.29577951308232
             led, followed = cell.flight.leader_command, cell.flight.follower_command
             axis.plot(time, factor * followed[:, index], color=colour, linewidth=1.1, label=f"{cell.follower}")
-            axis.plot(
-                time, factor * led[:, index], color=colour, linewidth=0.8, linestyle="--", label="its leader", alpha=0.7
-            )
+            name = None if number else "dashed: their leaders"
+            axis.plot(time, factor * led[:, index], color=colour, linewidth=0.8, linestyle="--", label=name, alpha=0.7)
     axis.set_ylabel(label, fontsize="small")
     axis.grid(alpha=0.25)
     axis.margins(x=0)
