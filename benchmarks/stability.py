@@ -41,7 +41,7 @@ def grid(config: Config, unknown: bool) -> list[tuple[float, float, float]]:
         (offset, mass, 0.2 if unknown else mass)
         for mass in MASSES
         for offset in OFFSETS
-        if abs(offset) <= trim_reach(config.plant, mass, MARGIN)
+        if abs(offset) <= trim_reach(config.plant, mass, MARGIN, 0.2 if unknown else mass)
     ]
 
 
@@ -68,8 +68,8 @@ def random_scenarios(config: Config, count: int, unknown: bool, seed: int = 0) -
     """Feasible scenarios, uniform in everything."""
     random, scenarios = np.random.default_rng(seed), []
     for _ in range(count):
-        mass = float(random.uniform(0.1, 0.4 if unknown else 0.6))
-        reach = min(0.17, trim_reach(config.plant, mass, MARGIN))
+        mass = float(random.uniform(0.1, 0.35 if unknown else 0.6))
+        reach = min(0.17, trim_reach(config.plant, mass, MARGIN, 0.2 if unknown else mass))
         vector = lambda size: tuple(map(float, random.uniform(-size, size, 3)))  # noqa: E731
         scenarios.append(
             Scenario(

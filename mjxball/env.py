@@ -109,12 +109,12 @@ class CoupledPairEnv(Env):
 
         mass = between(*scenario.object_mass)
         nominal = jnp.full_like(mass, self.config.plant.object_mass)
+        believed = mass if scenario.mass_known else nominal
+        reach = jnp.maximum(trim_reach(self.config.plant, mass, scenario.trim_margin, believed), 0.0)
         load = Load(
             object_mass=mass,
-            believed_mass=mass if scenario.mass_known else nominal,
-            cg_amplitude=jnp.minimum(
-                between(*scenario.cg_amplitude), trim_reach(self.config.plant, mass, scenario.trim_margin)
-            ),
+            believed_mass=believed,
+            cg_amplitude=jnp.minimum(between(*scenario.cg_amplitude), reach),
             cg_speed=between(*scenario.cg_speed),
             cg_phase=between(0.0, 2 * jnp.pi),
             mass_change=between(*scenario.mass_change)[None],

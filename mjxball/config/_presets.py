@@ -101,9 +101,9 @@ def _robust() -> Config:
         scenario=Scenario(
             cg_speed=(0.2, 3.2),
             cg_amplitude=(0.0, 0.17),
-            object_mass=(0.12, 0.5),
+            object_mass=(0.1, 0.35),
             mass_known=False,
-            mass_change=(-0.1, 0.1),
+            mass_change=(-0.05, 0.1),
             start_velocity=0.2,
             start_tilt=0.05,
             noise=(0.0, 1.0),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjxball.config import Attitude, Plant
 from mjxball.control.attitude import AttitudeGains, design_gains
+
+Array = Any
 
 
 class PlantConstants(NamedTuple):
@@ -60,11 +62,17 @@ def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
     return PlantConstants(mass, mounts, share, gains, mass @ mounts, drone_inertia, shell, ball)
 
 
-def trim_reach(plant: Plant, object_mass: float, margin: float) -> float:
-    """CG offset [m] up to which one drone's pitch torque holds the object's weight with `margin` of it left (ours).
+def trim_reach(plant: Plant, object_mass: Array, margin: float, believed_mass: Array | None = None) -> Array:
+    """CG offset (...) [m] up to which the follower alone trims the assembly at its goal (ours); negative: nowhere.
 
-    A drone that hovers with half the assembly's weight has the torque 2 (F_max - T / 4) L about each axis.
+    At the goal the leader commands a level hover with the mass (...) that it believes [kg]; what is missing of the
+    weight the follower lifts at its end of the object, and its pitch torque, 2 (F_max - T / 4) L at thrust T, must hold
+    that and the CG's weight with the share `margin` of it left.
     """
-    thrust = (plant.leader_mass + plant.follower_mass + object_mass) * plant.gravity / 2
-    torque = 2 * (plant.rotor_force_max - thrust / 4) * plant.arm
-    return (1 - margin) * torque / (object_mass * plant.gravity)
+    believed = object_mass if believed_mass is None else believed_mass
+    weight = (plant.leader_mass + plant.follower_mass + object_mass) * plant.gravity
+    led = (plant.leader_mass + believed / 2) * plant.gravity
+    lifted = weight - led
+    torque = (1 - margin) * 2 * (plant.rotor_force_max - lifted / 4) * plant.arm
+    lever = float(np.abs(np.subtract(plant.leader_mount, plant.follower_mount)).max()) / 2
+    return (torque - lever * abs(lifted - led)) / (object_mass * plant.gravity)

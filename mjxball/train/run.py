@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import os
 import resource
 import signal
 import sys
@@ -80,7 +81,8 @@ class Run:
         self.config, self.out = config, out
         self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"])
         self.origin = {**origin, "parts": self.population.parts}
-        self._hardware = f"{self.population.devices} x {jax.devices()[0].device_kind}"
+        kind = jax.devices()[0].device_kind
+        self._hardware = f"{os.cpu_count()} CPU cores" if kind == "cpu" else f"{self.population.devices} x {kind}"
         self._writes = processes.is_writer()
         done = _count(resumed) if resumed else 0
         if self._writes:
