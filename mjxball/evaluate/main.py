@@ -22,7 +22,7 @@ from mjxball.evaluate.table import table
 from mjxball.evaluate.waveform import read_waveform
 from mjxball.physics.stepper import ENGINES
 from mjxball.policy import Policy, PolicyFileError
-from mjxball.policy.shipped import shipped_policies
+from mjxball.policy.shipped import shipped_policies, stand_policies
 from mjxball.scenario import Scenario, check_scenario
 from mjxball.train.provenance import versions
 
@@ -156,7 +156,7 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         raise InputError("--figures needs --out DIR, a directory to write to")
     cli.output_directory(options.out)
     listed = [Path(name) for name in options.figures if name.endswith(".npz")]
-    paths = [*options.policies, *listed] or shipped_policies()
+    paths = [*options.policies, *listed] or [*shipped_policies(), *stand_policies()]
     policies = _load(paths, paper.plant_of, options)
     _refuse_same_names([*LAWS, *(policy.name for policy in policies)])
     figures = paper.draw_figures(names, policies, options.physics)
