@@ -27,6 +27,7 @@ from mjxball.evaluate.paper.command import NAMES
 from mjxball.evaluate.paper.figure import listed
 from mjxball.evaluate.paper.stand import LEVEL, SCENARIO, StandFlight, fly_stand, stand_config
 from mjxball.policy import Policy
+from mjxball.policy.shipped import stand_policies
 
 CONFIG = preset("paper")
 FAST = ["--physics", "newton-euler"]
@@ -191,6 +192,15 @@ def test_leader_on_the_stand_flies_on_its_own_position() -> None:
     assert objects.vertical[0] == 0.0
 
 
+@pytest.mark.parametrize("stand", ["heave", "pivot"])
+def test_shipped_stand_follower_balances_where_copying_only_holds(stand: str) -> None:
+    (path,) = [path for path in stand_policies() if path.stem == f"stand-{stand}"]
+    setup = stand_config(stand)
+    mine = fly_stand(setup, Policy.load(path), False, "newton-euler")
+    copied = fly_stand(setup, make_baseline("copy", setup), True, "newton-euler")
+    assert experiment.roll_peak(mine) < 0.25 * experiment.roll_peak(copied)
+
+
 def stand_flight(roll_degrees: float, height: float, follows: bool) -> StandFlight:
     """Two CG cycles of 20 s whose roll is in phase with the CG, or a quarter off."""
     time = np.arange(0, 40.001, 0.02)
@@ -265,10 +275,22 @@ def test_captions_hold_the_numbers_of_the_flights(drawn: Path) -> None:
     assert f"<td>curved, known mass, 0.2 kg</td>{row}{end}" in caption(drawn / "figures.html", "masses")
 
 
+def test_reward_caption_names_who_has_no_curve_and_who_was_trained_together(tmp_path: Path) -> None:
+    arrays, card = load_arrays()
+    without = {name: value for name, value in card.items() if name != "curve"}
+    files = [
+        write_arrays(tmp_path / "bare.npz", arrays, without),
+        write_arrays(tmp_path / "four.npz", arrays, {**without, "curve": CURVE, "seeds": 4}),
+    ]
+    text = reward.draw([Policy.load(path) for path in files]).markup()
+    assert "&quot;bare&quot; has no training curve" in text
+    assert "Grey is the median of all that were trained together: &quot;four&quot; (4)." in text
+
+
 def test_captions_name_who_is_drawn(drawn: Path) -> None:
     page = drawn / "figures.html"
-    assert "&quot;rocked&quot; has no training curve" in caption(page, "reward")
-    assert "Grey is the median of all that were trained together: &quot;rocked&quot; (4)." in caption(page, "reward")
+    assert "curved" in caption(page, "reward")
+    assert "rocked" not in caption(page, "reward")
     assert "rocked" not in caption(page, "speeds")
     assert "roll and height free, rocked" in caption(page, "stand")
     assert "pivot at O, rocked" not in caption(page, "stand")

@@ -54,7 +54,7 @@ def draw_figures(names: Sequence[str], policies: Sequence[Policy], physics: str)
     if "reward" in names and not policies:
         raise InputError("figure reward needs a policy, and none was given or is shipped")
     makers: dict[str, Callable[[], Figure]] = {
-        "reward": lambda: reward.draw(policies),
+        "reward": lambda: reward.draw(free or policies),
         "adaptive": lambda: adaptive.draw(setup, free, physics),
         "speeds": lambda: variations.draw_speeds(setup, free, physics),
         "masses": lambda: variations.draw_masses(setup, free, physics),
