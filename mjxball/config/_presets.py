@@ -112,7 +112,7 @@ def _robust() -> Config:
             rotor_lag_scale=(0.5, 2.0),
             thrust_scale=(0.85, 1.15),
         ),
-        reward=Reward(error_scale=0.02, velocity=10.0),
+        reward=Reward(error_scale=0.02, velocity=15.0),
         sac=Sac(
             steps=2_048_000,
             worlds=512,
