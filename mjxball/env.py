@@ -110,16 +110,16 @@ class CoupledPairEnv(Env):
         mass = between(*scenario.object_mass)
         nominal = jnp.full_like(mass, self.config.plant.object_mass)
         believed = mass if scenario.mass_known else nominal
-        reach = jnp.maximum(trim_reach(self.config.plant, mass, scenario.trim_margin, believed), 0.0)
         load = Load(
             object_mass=mass,
             believed_mass=believed,
-            cg_amplitude=jnp.minimum(between(*scenario.cg_amplitude), reach),
+            cg_amplitude=between(*scenario.cg_amplitude),
             cg_speed=between(*scenario.cg_speed),
             cg_phase=between(0.0, 2 * jnp.pi),
             mass_change=between(*scenario.mass_change)[None],
             mass_change_time=between(*scenario.mass_change_time)[None],
         )
+        load = load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude, self._trimmed(load)))
         plant = start_state(
             self.config,
             euler=jnp.append(symmetric(scenario.start_tilt, 2), 0.0),
@@ -202,6 +202,13 @@ class CoupledPairEnv(Env):
     def _observe(self, plant: PlantState, goal: Array) -> Array:
         matrix = rotations.matrix_from_quaternion(plant.quaternion)
         return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, self._mount)
+
+    def _trimmed(self, load: Load) -> Array:
+        """CG amplitude that can be trimmed before and after the mass changes [m]."""
+        masses = (load.object_mass, load.object_mass + load.mass_change[0])
+        margin = self.config.scenario.trim_margin
+        reaches = (trim_reach(self.config.plant, mass, margin, load.believed_mass) for mass in masses)
+        return jnp.maximum(jnp.minimum(*reaches), 0.0)
 
     def _varied(self, load: Load, key: Array) -> Load:
         """`load` with rotors of its own."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
+import dataclasses
+
 import pytest
 
 from mjxball.config import Config, preset
@@ -20,20 +21,23 @@ def test_reach_of_a_known_mass_by_hand(paper: Config) -> None:
 
 
 @pytest.mark.parametrize(("mass", "believed"), [(0.2, 0.2), (0.5, 0.5), (0.3, 0.2), (0.1, 0.2)])
-def test_at_the_reach_the_rotor_forces_balance_and_one_is_at_its_limit(
-    paper: Config, mass: float, believed: float
+@pytest.mark.parametrize("drones", [(1.0, 1.0), (1.2, 0.9)])
+def test_at_the_reach_everything_balances_and_one_rotor_is_at_its_limit(
+    paper: Config, mass: float, believed: float, drones: tuple[float, float]
 ) -> None:
-    """Vertical force and pitch moment about O of eight rotors, the leader's four alike, vanish with one at F_max."""
-    plant, gravity = paper.plant, paper.plant.gravity
+    """Force and moment about O of four weights' and eight rotors' forces, the leader's four alike."""
+    plant = dataclasses.replace(paper.plant, leader_mass=drones[0], follower_mass=drones[1])
+    gravity, half, arm = plant.gravity, plant.leader_mount[0], plant.arm
     offset = trim_reach(plant, mass, 0.0, believed)
-    leader = (plant.leader_mass + believed / 2) * gravity
-    follower = (plant.leader_mass + plant.follower_mass + mass) * gravity - leader
-    # The CG is on the side that loads the follower's pitch torque, on top of what the uneven lift does.
-    lever = abs(plant.leader_mount[0])
-    needed = mass * gravity * offset + lever * abs(follower - leader)
-    fore_and_aft = follower / 4 + np.array([-1, 1]) * needed / (2 * plant.arm)
-    assert fore_and_aft.max() == pytest.approx(plant.rotor_force_max)
-    assert needed == pytest.approx(plant.arm * (fore_and_aft[1] - fore_and_aft[0]))
+    leader = (drones[0] + believed / 2) * gravity
+    follower = (sum(drones) + mass) * gravity - leader
+    # On which side the CG is harder to hold depends on who lifts too little.
+    side = 1.0 if believed >= mass else -1.0
+    weights = [(half, drones[0]), (-half, drones[1]), (side * -offset, mass)]
+    moment = half * leader - half * follower - gravity * sum(x * m for x, m in weights)
+    # What is left must come from a difference between the follower's fore and aft rotors.
+    fore, aft = follower / 4 - moment / (2 * arm), follower / 4 + moment / (2 * arm)
+    assert max(fore, aft) == pytest.approx(plant.rotor_force_max)
 
 
 def test_a_mass_that_is_heavier_than_believed_leaves_less(paper: Config) -> None:

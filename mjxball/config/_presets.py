@@ -75,6 +75,7 @@ def _transport_large() -> Config:
             delay=(0.0, 0.04),
             rotor_lag_scale=(0.7, 1.4),
         ),
+        bounds=Bounds(x_peak=0.015, settling_time=2.8, rmse=0.345),
         # Speed is dear so that the goal is not overshot.
         reward=Reward(error_scale=0.02, velocity=6.0),
         sac=Sac(
@@ -112,6 +113,7 @@ def _robust() -> Config:
             rotor_lag_scale=(0.5, 2.0),
             thrust_scale=(0.85, 1.15),
         ),
+        bounds=Bounds(x_peak=0.03, settling_time=3.5, rmse=0.355),
         reward=Reward(error_scale=0.02, velocity=15.0),
         sac=Sac(
             steps=2_048_000,

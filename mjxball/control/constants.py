@@ -65,14 +65,14 @@ def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
 def trim_reach(plant: Plant, object_mass: Array, margin: float, believed_mass: Array | None = None) -> Array:
     """CG offset (...) [m] up to which the follower alone trims the assembly at its goal (ours); negative: nowhere.
 
-    At the goal the leader commands a level hover with the mass (...) that it believes [kg]; what is missing of the
-    weight the follower lifts at its end of the object, and its pitch torque, 2 (F_max - T / 4) L at thrust T, must hold
-    that and the CG's weight with the share `margin` of it left.
+    At the goal the leader commands a level hover with its share of the mass (...) that it believes [kg]. What is
+    missing of the object's weight the follower lifts at its own mount, and its pitch torque, 2 (F_max - T / 4) L at
+    thrust T, must hold the moment of that and of the CG with the share `margin` of it left.
     """
     believed = object_mass if believed_mass is None else believed_mass
-    weight = (plant.leader_mass + plant.follower_mass + object_mass) * plant.gravity
-    led = (plant.leader_mass + believed / 2) * plant.gravity
-    lifted = weight - led
-    torque = (1 - margin) * 2 * (plant.rotor_force_max - lifted / 4) * plant.arm
-    lever = float(np.abs(np.subtract(plant.leader_mount, plant.follower_mount)).max()) / 2
-    return (torque - lever * abs(lifted - led)) / (object_mass * plant.gravity)
+    ahead, behind = (getattr(plant, name)["xy".index(plant.cg_axis)] for name in ("leader_mount", "follower_mount"))
+    led = -behind / (ahead - behind) * believed  # of the object's mass, by the leader
+    lifted = object_mass - led  # by the follower
+    torque = (1 - margin) * 2 * (plant.rotor_force_max - (plant.follower_mass + lifted) * plant.gravity / 4) * plant.arm
+    uneven = abs(ahead * led + behind * lifted) * plant.gravity  # moment about O of both lifts
+    return (torque - uneven) / (object_mass * plant.gravity)

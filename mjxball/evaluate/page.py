@@ -124,11 +124,11 @@ def verdict(scores: Sequence[Score], cards: Mapping[str, Mapping[str, Any]]) -> 
 
 
 def _against(scores: Sequence[Score], policy: str, rival: str) -> tuple[str, bool]:
-    """(how `policy` compares with `rival`, whether it is behind)."""
+    """(how `policy` compares with `rival`, whether it is behind); who fails in any seed is behind there."""
     ahead = behind = 0
     for rivals in by_level(scores).values():
-        medians = {score.follower: score.summary("peak").median for score in rivals}
-        mine, other = medians[policy], medians[rival]
+        peaks = {s.follower: math.inf if s.failures else s.summary("peak").median for s in rivals}
+        mine, other = peaks[policy], peaks[rival]
         if math.isnan(mine) or math.isnan(other):
             continue
         ahead, behind = ahead + (mine < other), behind + (mine > other)

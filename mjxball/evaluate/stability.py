@@ -47,7 +47,7 @@ class Hover:
     @property
     def stable(self) -> bool:
         """True if there is a hover in which small errors do not grow."""
-        return self.residual < SOUND and self.radius < 1 + NEUTRAL
+        return bool(self.residual < SOUND and self.radius < 1 + NEUTRAL)
 
 
 def hovers(config: Config, law: Law, cases: Sequence[tuple[float, float, float]], delay: int = 0) -> list[Hover]:
@@ -59,11 +59,16 @@ def hovers(config: Config, law: Law, cases: Sequence[tuple[float, float, float]]
         loads = jax.tree.map(jnp.asarray, rollout.load_of(scenarios))
         found = jax.jit(jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load))))(loads)
         points, residuals, jacobians = map(np.asarray, found)
-    radii = [float(np.abs(np.linalg.eigvals(jacobian)).max()) for jacobian in jacobians]
+    radii = [_radius(jacobian) for jacobian in jacobians]
     return [
         Hover(offset, mass, delay, float(residual), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4])), radius)
         for (offset, mass, _), z, residual, radius in zip(cases, points, residuals, radii, strict=True)
     ]
+
+
+def _radius(jacobian: np.ndarray) -> float:
+    """Largest |eigenvalue|, infinite where the flight towards the fixed point ran away."""
+    return float(np.abs(np.linalg.eigvals(jacobian)).max()) if np.isfinite(jacobian).all() else np.inf
 
 
 def delay_margins(

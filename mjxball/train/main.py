@@ -191,10 +191,11 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
     judged = ("rmse", "settling_time", "x_peak", "overshoot")
     chosen = load_file(out / POLICY)
     seeds = [int(cell.follower.removeprefix("seed")) for cell in cells]
-    spread = {name: [getattr(cell.metrics, name) for cell in cells] for name in judged}
+    spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in cells] for name in judged}
+    spread["failed"] = [cell.metrics.failed for cell in cells]
     save_file(out / POLICY, dataclasses.replace(chosen, card={**chosen.card, "population": {"seed": seeds, **spread}}))
     for name in judged:
-        values = sorted(math.inf if (v := getattr(cell.metrics, name)) is None else v for cell in cells)
+        values = sorted(math.inf if value is None else value for value in spread[name])
         low, middle, high = values[0], statistics.median(values), values[-1]
         print(f"{name}: median {middle:.4g}, best {low:.4g}, worst {high:.4g} of {len(values)}")  # noqa: T201
     (out / "eval").mkdir(exist_ok=True)

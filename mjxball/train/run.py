@@ -112,10 +112,12 @@ class Run:
     def close(self) -> None:
         """Wait until every checkpoint is on disk."""
         with self._writer:
-            if self._pending:
-                self._pending.result()
-            if self._checkpoints:
-                self._checkpoints.result().close()
+            try:
+                if self._pending:
+                    self._pending.result()
+            finally:
+                if self._checkpoints:
+                    self._checkpoints.result().close()
 
     def _cost(self) -> str:
         """What the run took, for people and for `benchmarks/training.py`."""
