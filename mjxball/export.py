@@ -76,10 +76,10 @@ def is_sound(policy: PolicyFile) -> bool:
 def export_run(run: Path, out: Path) -> None:
     """Export the newest checkpoint of the run directory `run` to the new file `out`."""
     from mjxball.train.checkpoint import restore_policy
-    from mjxball.train.curves import training_curve
+    from mjxball.train.curves import told_by_the_run
 
     config, learner, steps, origin = restore_policy(run)
-    policy = policy_file(config, learner, steps, {**origin, "curve": training_curve(run, origin["seed"])})
+    policy = policy_file(config, learner, steps, {**origin, **told_by_the_run(run, origin["seed"])})
     if not is_sound(policy):
         raise InputError(f"the newest checkpoint of {run} holds values that are not finite")
     save_file(out, policy)

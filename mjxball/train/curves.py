@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,12 @@ PANELS = {
     ),
 }
 BLUE, GREY = "#1b6ca8", "#9a9a9a"
+
+
+def told_by_the_run(run: Path, seed: int) -> dict[str, Any]:
+    """What a policy's card says of the run directory `run` so far: its `curve` and the `seconds` it has taken."""
+    rows = _rows(run)
+    return {"curve": training_curve(run, seed), "seconds": round(float(rows[-1]["seconds"])) if rows else 0}
 
 
 def training_curve(run: Path, seed: int) -> dict[str, list[float]]:

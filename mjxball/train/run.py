@@ -24,7 +24,7 @@ from mjxball.export import is_sound, policy_file
 from mjxball.policy import save_file
 from mjxball.train import processes
 from mjxball.train import program as programs
-from mjxball.train.curves import training_curve
+from mjxball.train.curves import told_by_the_run
 from mjxball.train.members import MemberLog
 from mjxball.train.population import Population
 from mjxball.train.program import Mode, Tally, TrainState
@@ -80,9 +80,9 @@ class Run:
         """
         self.config, self.out = config, out
         self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"])
-        self.origin = {**origin, "parts": self.population.parts}
         kind = jax.devices()[0].device_kind
-        self._hardware = f"{os.cpu_count()} CPU cores" if kind == "cpu" else f"{self.population.devices} x {kind}"
+        hardware = f"{os.cpu_count()} CPU cores" if kind == "cpu" else f"{self.population.devices} x {kind}"
+        self.origin = {**origin, "parts": self.population.parts, "hardware": hardware}
         self._writes = processes.is_writer()
         done = _count(resumed) if resumed else 0
         if self._writes:
@@ -265,8 +265,7 @@ class Run:
         for member in range(self.population.members):
             learner = self.population.member(learners, member)
             seed = self.origin["seed"] + member
-            origin = {**self.origin, "seed": seed, "curve": training_curve(self.out, seed)}
-            origin |= {"hardware": self._hardware, "seconds": round(self.progress.seconds())}
+            origin = {**self.origin, "seed": seed, **told_by_the_run(self.out, seed)}
             policy = policy_file(self.population.member_config(member), learner, steps, origin)
             if not is_sound(policy):
                 continue
