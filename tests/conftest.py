@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -133,3 +135,31 @@ def saved(trained: Trained, tmp_path: Path) -> Path:
     path = tmp_path / "follower.npz"
     save_file(path, trained.contents)
     return path
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A real Chromium without a window."""
+    program = shutil.which("chromium-headless-shell") or shutil.which("chromium")
+    if program is None:
+        pytest.skip("no Chromium is installed")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as play:
+        running = play.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+def opened(browser: Any, page: Path, width: int) -> Any:
+    """A tab `width` pixels wide with `page`, which fetches nothing else, makes no error, and fits."""
+    tab = browser.new_page(viewport={"width": width, "height": 800})
+    requests, errors = [], []
+    tab.on("request", lambda request: requests.append(request.url))
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    tab.goto(page.as_uri())
+    assert [url for url in requests if not url.startswith("data:")] == [page.as_uri()]
+    assert errors == []
+    assert tab.evaluate("document.documentElement.scrollWidth") <= width  # nothing hangs out at the side
+    return tab

@@ -5,13 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import shutil
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from conftest import opened
 
 from mjxball.config import preset
 from mjxball.control.followers import make_baseline
@@ -172,32 +170,9 @@ def test_unsound_requests_are_refused(flags, word, capsys: pytest.CaptureFixture
     assert message.count("\n") == 1
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """A real Chromium without a window."""
-    program = shutil.which("chromium-headless-shell") or shutil.which("chromium")
-    if program is None:
-        pytest.skip("no Chromium is installed")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as play:
-        running = play.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield running
-        running.close()
-
-
 @pytest.mark.parametrize("width", [1280, 390], ids=["desktop", "phone"])
 def test_report_opens_in_a_browser(browser, report: Path, width: int) -> None:
-    tab = browser.new_page(viewport={"width": width, "height": 800})
-    requests, errors = [], []
-    tab.on("request", lambda request: requests.append(request.url))
-    tab.on("pageerror", lambda error: errors.append(str(error)))
-    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    tab.goto((report / "report.html").as_uri())
-    fetched = [url for url in requests if not url.startswith("data:")]
-    assert fetched == [(report / "report.html").as_uri()]  # nothing from anywhere else
-    assert errors == []
-    assert tab.evaluate("document.documentElement.scrollWidth") <= width  # nothing hangs out at the side
+    tab = opened(browser, report / "report.html", width)
     assert "Smallest steady-state peak" in tab.inner_text("#verdict")
     assert tab.locator("#wins-table tbody tr").count() == 4 + 2  # metrics over all levels, then the families
     for section in ("delay", "start-errors"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import types
+from dataclasses import replace
 
 from mjxball.config._settings import Bounds, Config, Follower, Reward, Sac, Scenario
 from mjxball.errors import InputError
@@ -96,39 +97,24 @@ def _transport_large() -> Config:
 
 
 def _robust() -> Config:
-    return Config(
+    """`transport-large` with a mass that nobody knows and that changes, gusts, and rotors that differ more."""
+    large = _transport_large()
+    return replace(
+        large,
         preset="robust",
-        follower=Follower(tilt_limit=0.3, vertical_limit=6.0, filters=(0.05, 0.2, 1.0)),
-        scenario=Scenario(
-            cg_speed=(0.2, 3.2),
-            cg_amplitude=(0.0, 0.17),
+        follower=replace(large.follower, vertical_limit=6.0, filters=(0.05, 0.2, 1.0)),
+        scenario=replace(
+            large.scenario,
             object_mass=(0.1, 0.35),
             mass_known=False,
             mass_change=(-0.05, 0.1),
-            start_velocity=0.2,
-            start_tilt=0.05,
-            noise=(0.0, 1.0),
-            delay=(0.0, 0.04),
             gust=(0.0, 0.3),
             rotor_lag_scale=(0.5, 2.0),
             thrust_scale=(0.85, 1.15),
         ),
         bounds=Bounds(x_peak=0.03, settling_time=3.5, rmse=0.355),
-        reward=Reward(error_scale=0.02, velocity=15.0),
-        sac=Sac(
-            steps=2_048_000,
-            worlds=512,
-            batch=512,
-            updates=16,
-            replay=1_024_000,
-            policy_layers=(128, 128),
-            critic_layers=(128, 128),
-            privileged=True,
-            discount=0.97,
-            return_steps=10,
-            learning_rate=2e-3,
-            learning_rate_end=0.02,
-        ),
+        reward=replace(large.reward, velocity=15.0),
+        sac=replace(large.sac, replay=1_024_000, learning_rate=2e-3),
     )
 
 
