@@ -134,11 +134,11 @@ def main() -> None:
         mine = about_hover(config, follower, cases)
         rows += mine
         stable = [row for row in mine if row["stable"]]
-        margins = [1e3 * (row["delay_margin"] or 0.0) for row in mine]
+        margins = [1e3 * row["delay_margin"] for row in mine if row["delay_margin"] is not None]
         radius, error = max(row["radius"] for row in mine), 1e3 * max(row["error"] for row in mine)
         print(
             f"{follower.name}: stable in {len(stable)} of {len(mine)} hovers, worst radius {radius:.4f}, delay "
-            f"margin {min(margins):.0f} ms (median {np.median(margins):.0f}), largest standing error {error:.1f} mm"
+            f"margin of the stable {min(margins, default=0):.0f} - {max(margins, default=0):.0f} ms, largest standing error {error:.1f} mm"
         )
         for row in mine:
             if not row["stable"]:
@@ -162,8 +162,9 @@ def main() -> None:
     if options.picture:
         draw(config, policy, worst, options.picture)
     if options.json:
-        found = {"hovers": rows, "flights": len(flown), "failed": failed, "peaks": sorted(peaks)[-100:]}
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
+        sound = sorted(peak for peak in peaks if math.isfinite(peak))
+        found = {"hovers": rows, "flights": len(flown), "failed": failed, "largest peaks": sound[-100:]}
+        options.json.write_text(json.dumps(found, indent=1, default=str) + "\n")
 
 
 if __name__ == "__main__":
