@@ -53,7 +53,9 @@ class _Stages:
         constants = plant_constants(plant, attitude)
         # Merging the welded bodies is exact and faster; a shell whose mass varies must stay a body of its own.
         model = build_model(plant, fuse=plant.moving_fraction == 1)
-        self._model, self._blank = self._mjx.put_model(model), self._mjx.make_data(model)
+        # MJX's own choice is the first device of all processes, which only the first process can reach.
+        here = {"device": jax.local_devices()[0], "impl": "jax"}
+        self._model, self._blank = self._mjx.put_model(model, **here), self._mjx.make_data(model, **here)
         self._bodies = jnp.array([model.body(ASSEMBLY).id, model.body(BALL).id])
         self._fractions = jnp.array([1 - plant.moving_fraction, plant.moving_fraction])
         self._inertias = jnp.array([constants.shell_inertia_per_mass, constants.ball_inertia_per_mass])
