@@ -138,7 +138,8 @@ def main() -> None:
         radius, error = max(row["radius"] for row in mine), 1e3 * max(row["error"] for row in mine)
         print(
             f"{follower.name}: stable in {len(stable)} of {len(mine)} hovers, worst radius {radius:.4f}, delay "
-            f"margin of the stable {min(margins, default=0):.0f} - {max(margins, default=0):.0f} ms, largest standing error {error:.1f} mm"
+            f"margin of the stable {min(margins, default=0):.0f} - {max(margins, default=0):.0f} ms, "
+            f"largest standing error {error:.1f} mm"
         )
         for row in mine:
             if not row["stable"]:

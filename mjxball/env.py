@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import leader, observation, rotations
-from mjxball.control.constants import trim_reach
+from mjxball.control.constants import plant_constants, trim_reach
 from mjxball.control.recall import recall_of
 from mjxball.nuisance import Nuisances
 from mjxball.physics import newton_euler
@@ -26,6 +28,8 @@ Env, State = import_brax_env()
 STEADY_AFTER = 8.0  # [s] of an episode, after which its error counts as steady state in the metrics
 SECRETS = 4  # numbers that privileged critics see more where nothing is disturbed
 DRAWS = 18  # random numbers of a reset
+DRAWN_BACK = 8  # times at most that a world's thrust is drawn back by three tenths
+PLACES = 16  # that a CG visits, where it does, before it begins again
 RATE_BOUND = 50.0  # [rad/s] beyond which a world has diverged
 
 
@@ -61,7 +65,11 @@ class CoupledPairEnv(Env):
         self._recall = recall_of(config)
         self._nuisances = Nuisances(config)
         scenario = config.scenario
-        self._varies = scenario.rotor_lag_scale != (1.0, 1.0) or scenario.thrust_scale != (1.0, 1.0)
+        scales = (scenario.rotor_lag_scale, scenario.thrust_scale, scenario.inertia_scale)
+        self._varies = any(scale != (1.0, 1.0) for scale in scales)
+        constants = plant_constants(config.plant, config.attitude)
+        self._drones = np.asarray(config.plant.leader_inertia) + config.plant.follower_inertia
+        self._object = constants.object_inertia_per_mass
         self._secrets = self._count_secrets() if config.sac.privileged else 0
         self._cg = make_cg_offset(config)
 
@@ -119,7 +127,11 @@ class CoupledPairEnv(Env):
             mass_change=between(*scenario.mass_change)[None],
             mass_change_time=between(*scenario.mass_change_time)[None],
         )
-        load = load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude, self._trimmed(load)))
+        if self._varies:
+            load = self._varied(load, jax.random.fold_in(rng, 2))
+        if scenario.cg_visits > 0:
+            load = self._visiting(load, jax.random.fold_in(rng, 3))
+        load = load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude, jnp.maximum(self._trimmed(load), 0.0)))
         plant = start_state(
             self.config,
             euler=jnp.append(symmetric(scenario.start_tilt, 2), 0.0),
@@ -131,8 +143,6 @@ class CoupledPairEnv(Env):
         goal = symmetric(scenario.goal_reach)
         truth = self._observe(plant, goal)
         nuisance, first = self._nuisances.start(jax.random.fold_in(rng, 1), truth)
-        if self._varies:
-            load = self._varied(load, jax.random.fold_in(rng, 2))
         world = World(
             plant=plant,
             load=load,
@@ -204,19 +214,36 @@ class CoupledPairEnv(Env):
         return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, self._mount)
 
     def _trimmed(self, load: Load) -> Array:
-        """CG amplitude that can be trimmed before and after the mass changes [m]."""
+        """CG amplitude that can be trimmed before and after the mass changes [m]; negative: none."""
         masses = (load.object_mass, load.object_mass + load.mass_change[0])
-        margin = self.config.scenario.trim_margin
-        reaches = (trim_reach(self.config.plant, mass, margin, load.believed_mass) for mass in masses)
-        return jnp.maximum(jnp.minimum(*reaches), 0.0)
+        margin, plant = self.config.scenario.trim_margin, self.config.plant
+        thrust = (1.0, 1.0) if load.thrust_scale is None else (load.thrust_scale[0], load.thrust_scale[1])
+        reaches = (trim_reach(plant, mass, margin, load.believed_mass, thrust) for mass in masses)
+        return jnp.minimum(*reaches)
 
     def _varied(self, load: Load, key: Array) -> Load:
-        """`load` with rotors of its own."""
-        scenario, share = self.config.scenario, jax.random.uniform(key, (3,))
-        (low, high), (weak, strong) = scenario.rotor_lag_scale, scenario.thrust_scale
-        return load._replace(
-            rotor_lag_scale=low + (high - low) * share[0], thrust_scale=weak + (strong - weak) * share[1:]
+        """`load` with rotors and inertia of its own."""
+        scenario, share = self.config.scenario, jax.random.uniform(key, (4,))
+        ranges = (scenario.rotor_lag_scale, scenario.inertia_scale, scenario.thrust_scale, scenario.thrust_scale)
+        lag, inertia, *thrust = (low + (high - low) * u for (low, high), u in zip(ranges, share, strict=True))
+        own = jnp.asarray(self._drones) + jnp.asarray(self._object) * load.object_mass
+        load = load._replace(
+            rotor_lag_scale=lag, thrust_scale=jnp.stack(thrust), added_inertia=((inertia - 1.0) * own).astype(own.dtype)
         )
+        if scenario.thrust_scale == (1.0, 1.0):
+            return load
+        # A leader that lifts too little can leave more than any follower trims: its world is drawn back towards 1.
+        for _ in range(DRAWN_BACK):
+            milder = load._replace(thrust_scale=1.0 + 0.7 * (load.thrust_scale - 1.0))
+            load = jax.tree.map(functools.partial(jnp.where, self._trimmed(load) < 0), milder, load)
+        return load
+
+    def _visiting(self, load: Load, key: Array) -> Load:
+        """`load` whose CG perhaps goes from place to place."""
+        path_key, key = jax.random.split(key)
+        places = jax.random.uniform(path_key, (PLACES,), minval=-1.0, maxval=1.0)
+        visits = jax.random.uniform(key) < self.config.scenario.cg_visits
+        return load._replace(cg_path=places, cg_visits=visits.astype(jnp.float32))
 
     def _input(self, seen: Array, truth: Array, world: World) -> Array:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are told."""
@@ -231,12 +258,12 @@ class CoupledPairEnv(Env):
             nuisance = world.nuisance
             parts += [truth[3:], nuisance.push, jnp.stack([nuisance.noise, nuisance.delay.astype(jnp.float32)])]
         if self._varies:
-            parts += [world.load.rotor_lag_scale[None], world.load.thrust_scale]
+            parts += [world.load.rotor_lag_scale[None], world.load.thrust_scale, world.load.added_inertia]
         return jnp.concatenate(parts)
 
     def _count_secrets(self) -> int:
         clean = observation.OBSERVATION_SIZE - 3 + 5 if self._nuisances.present else 0
-        return SECRETS + clean + (3 if self._varies else 0)
+        return SECRETS + clean + (6 if self._varies else 0)
 
     def _leader_command(self, world: World) -> Array:
         law = self.config.leader

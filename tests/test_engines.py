@@ -87,6 +87,24 @@ def test_engines_agree_on_10_000_states_for_every_motion(motion: Motion, changes
     assert np.abs(expected[1]).max() > 10  # the states are violent enough to mean something [rad/s2]
 
 
+@pytest.mark.parametrize("name", ["reference", "pivot", "heave"])
+@pytest.mark.parametrize("function", ["prescribed", "rolling"])
+def test_added_inertia_is_that_of_drones_which_have_it(name: str, function: str) -> None:
+    plant, random = PLANTS[name], np.random.default_rng(5)
+    added = random.uniform(-1e-3, 4e-3, 3)
+    heavier = dataclasses.replace(plant, leader_inertia=tuple(np.add(plant.leader_inertia, added)))
+    mass = random.uniform(0.1, 0.6, FEWER)
+    last = random_motion(plant, FEWER, random) if function == "prescribed" else random.normal(size=FEWER)
+    arguments = (random_states(plant, FEWER, random), random_wrench(FEWER, random), mass, last)
+    closed, fast, second = engines(plant, function)
+    expected = engines(heavier, function)[2](*arguments)
+    everywhere = np.broadcast_to(added, (FEWER, 3))
+    assert relative_difference(closed(*arguments, everywhere), expected) <= TOLERANCE
+    assert relative_difference(fast(*arguments, everywhere), expected) <= TOLERANCE
+    with pytest.raises(NotImplementedError, match="without mass"):
+        second(*arguments, everywhere)
+
+
 def test_closed_form_matches_the_hand_solution_of_design_section_4() -> None:
     plant, random = PLANTS["reference"], np.random.default_rng(3)
     state, wrench, cg = random_states(plant, 50, random), random_wrench(50, random), random_motion(plant, 50, random)

@@ -19,13 +19,16 @@ from mjxball.scenario import Scenario
 from mjxball.train.main import main as train
 
 GAP = 1e-4  # [s] of the central differences below
+PLACES = np.array([0.3, -1.0, 1.0, 0.9, -0.2])
 
 
-@pytest.mark.parametrize("kind", ["sine", "waveform"])
+@pytest.mark.parametrize("kind", ["sine", "waveform", "visits"])
 def test_rate_and_acceleration_are_the_offsets_derivatives(kind: str) -> None:
     time = np.linspace(0.013, 18.9, 400)
     if kind == "sine":
         curve = lambda t: motion.sine(t, 0.1, 2.7, 0.4)  # noqa: E731
+    elif kind == "visits":
+        curve = lambda t: motion.visits(t, 0.1, 0.8, 0.4, PLACES)  # noqa: E731
     else:
         spline = motion.fit_spline(SAMPLES.times, SAMPLES.offsets)
         curve = lambda t: motion.follow_spline(spline, t)  # noqa: E731
@@ -34,6 +37,20 @@ def test_rate_and_acceleration_are_the_offsets_derivatives(kind: str) -> None:
     # knot GAP times the jump of c''' (below 1 m/s3).
     np.testing.assert_allclose((after.offset - before.offset) / (2 * GAP), here.rate, atol=1e-6)
     np.testing.assert_allclose((after.rate - before.rate) / (2 * GAP), here.acceleration, atol=2e-4)
+
+
+def test_visits_rest_at_every_place_and_are_hardly_faster_than_the_sine() -> None:
+    amplitude, speed = 0.1, 2.0
+    way = np.pi / speed
+    resting = motion.visits(np.arange(12) * way, amplitude, speed, 0.0, PLACES)
+    np.testing.assert_allclose(resting.offset, amplitude * np.resize(PLACES, 12), atol=1e-12)
+    np.testing.assert_allclose(resting.rate, 0, atol=1e-12)
+    np.testing.assert_allclose(resting.acceleration, 0, atol=1e-10)
+    moving = motion.visits(np.linspace(0, 5 * way, 5001), amplitude, speed, 0.0, PLACES)
+    assert np.abs(moving.offset).max() <= amplitude * (1 + 1e-12)
+    # From end to end: 15/8 of the mean speed, 10/sqrt(3) of its change over the time.
+    assert np.abs(moving.rate).max() == pytest.approx(15 / 8 * 2 * amplitude / way, rel=1e-4)
+    assert np.abs(moving.acceleration).max() == pytest.approx(10 / np.sqrt(3) * 2 * amplitude / way**2, rel=1e-4)
 
 
 def test_spline_passes_its_samples_and_stands_still_outside() -> None:

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from conftest import CompiledEnv, compile_env, with_settings
 
-from mjxball.config import Config, replace
+from mjxball.config import Config, preset, replace
+from mjxball.env import CoupledPairEnv
 from mjxball.nuisance import Nuisances
-from mjxball.physics import newton_euler
+from mjxball.physics import motion, newton_euler
 from mjxball.physics.mjx import jax_repeat
 from mjxball.physics.step import make_control_step
 from mjxball.sensing import GUST_TIME, NOISE
@@ -109,6 +110,7 @@ def disturbed(transport: Config) -> CompiledEnv:
         "gust": (0.2, 0.2),
         "rotor_lag_scale": (0.5, 2.0),
         "thrust_scale": (0.8, 1.2),
+        "inertia_scale": (0.6, 1.4),
         "mass_known": False,
         "object_mass": (0.3, 0.4),
     }
@@ -133,7 +135,9 @@ def test_critics_are_told_the_truth_and_policies_are_not(disturbed: CompiledEnv)
     np.testing.assert_allclose(told[4 + 9 : 4 + 12], world.goal - world.plant.position, rtol=1e-5)
     np.testing.assert_allclose(told[19:22], world.nuisance.push, rtol=1e-6)
     np.testing.assert_allclose(told[22:24], [1.0, 2.0])
-    np.testing.assert_allclose(told[24:], [load.rotor_lag_scale, *load.thrust_scale], rtol=1e-6)
+    np.testing.assert_allclose(told[24:], [load.rotor_lag_scale, *load.thrust_scale, *load.added_inertia], rtol=1e-6)
+    scale = 1 + load.added_inertia[0] / (2 * 2.3e-3 + float(load.object_mass) * (0.1**2 + 0.05**2) / 12)
+    assert 0.6 < float(scale) < 1.4
     assert env.input_mask[18:] == [0.0] * len(told)
     assert env.critic_mask[18:] == [1.0] * len(told)
     # What it sees is late and noisy.
@@ -150,3 +154,27 @@ def test_a_gust_pushes(disturbed: CompiledEnv) -> None:
     moved, kept = (disturbed.step(s, jnp.zeros(3)).pipeline_state.plant.velocity for s in (hard, still))
     mass = 2.0 + float(world.load.object_mass)
     assert float(moved[0] - kept[0]) == pytest.approx(0.02 * 5.0 / mass, rel=0.05)
+
+
+def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> None:
+    config = with_settings(transport, scenario={"cg_visits": 0.5, "cg_amplitude": (0.05, 0.1)})
+    env = CoupledPairEnv(config, "newton-euler")
+    load = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 400)).pipeline_state.load
+    assert 160 < int(load.cg_visits.sum()) < 240
+    assert load.cg_path.shape == (400, 16)
+    assert float(jnp.abs(load.cg_path).max()) <= 1.0
+    times = jnp.linspace(0.0, 60.0, 400)
+    offsets = jax.vmap(lambda time: motion.drawn(jnp.full(400, time), load).offset)(times)
+    assert bool((jnp.abs(offsets).max(axis=0) <= load.cg_amplitude * (1 + 1e-5)).all())
+
+
+def test_no_world_is_drawn_whose_thrust_nobody_could_trim() -> None:
+    config = preset("robust")
+    env = CoupledPairEnv(config, "newton-euler")
+    load = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 2000)).pipeline_state.load
+    assert float(jax.vmap(env._trimmed)(load).min()) > -1e-3
+    # The follower's own rotors keep most of their range; a leader that lifts too much or too little does not.
+    led, followed = load.thrust_scale.T
+    assert float(followed.min()) < 0.83
+    assert float(followed.max()) > 1.17
+    assert float(led[load.object_mass > 0.3].min()) > 0.83

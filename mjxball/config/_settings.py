@@ -157,6 +157,15 @@ class Scenario:
     gust: Range = setting((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0, ordered=True)
     rotor_lag_scale: Range = setting((1.0, 1.0), "factor on the rotors' time constant", above=0, ordered=True)
     thrust_scale: Range = setting((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0, ordered=True)
+    inertia_scale: Range = setting(
+        (1.0, 1.0),
+        "factor on the inertia of drones and object about their own centres, one factor for all",
+        above=0,
+        ordered=True,
+    )
+    cg_visits: float = setting(
+        0.0, "share of the flights whose CG goes from place to place at random instead of the sine", low=0, high=1
+    )
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
     termination_distance: float = setting(2.5, "an episode ends when |e_o| exceeds this, d_term [m]", above=0)
 

@@ -62,17 +62,26 @@ def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
     return PlantConstants(mass, mounts, share, gains, mass @ mounts, drone_inertia, shell, ball)
 
 
-def trim_reach(plant: Plant, object_mass: Array, margin: float, believed_mass: Array | None = None) -> Array:
+def trim_reach(
+    plant: Plant,
+    object_mass: Array,
+    margin: float,
+    believed_mass: Array | None = None,
+    thrust: tuple[Array, Array] = (1.0, 1.0),
+) -> Array:
     """CG offset (...) [m] up to which the follower alone trims the assembly at its goal (ours); negative: nowhere.
 
-    At the goal the leader commands a level hover with its share of the mass (...) that it believes [kg]. What is
-    missing of the object's weight the follower lifts at its own mount, and its pitch torque, 2 (F_max - T / 4) L at
-    thrust T, must hold the moment of that and of the CG with the share `margin` of it left.
+    At the goal the leader commands a level hover with its share of the mass (...) that it believes [kg]; `thrust`
+    is what leader's and follower's rotors (...) give of what they are asked for. What is missing of the weight the
+    follower lifts at its own mount, and its pitch torque, 2 (F_max - T / 4) L for an asked thrust T, must hold the
+    moment of that and of the CG with the share `margin` of it left.
     """
     believed = object_mass if believed_mass is None else believed_mass
     ahead, behind = (getattr(plant, name)["xy".index(plant.cg_axis)] for name in ("leader_mount", "follower_mount"))
-    led = -behind / (ahead - behind) * believed  # of the object's mass, by the leader
+    strong, own = thrust
+    led = strong * (plant.leader_mass - behind / (ahead - behind) * believed) - plant.leader_mass  # beyond its own mass
     lifted = object_mass - led  # by the follower
-    torque = (1 - margin) * 2 * (plant.rotor_force_max - (plant.follower_mass + lifted) * plant.gravity / 4) * plant.arm
+    asked = (plant.follower_mass + lifted) * plant.gravity / 4  # of each rotor, times `own`
+    torque = (1 - margin) * 2 * (own * plant.rotor_force_max - asked) * plant.arm
     uneven = abs(ahead * led + behind * lifted) * plant.gravity  # moment about O of both lifts
     return (torque - uneven) / (object_mass * plant.gravity)

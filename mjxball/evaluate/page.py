@@ -144,8 +144,8 @@ def _page(report: Report) -> str:
 <div class="verdict" id="verdict">{spoken}</div>
 {wins_table(report.scores)}
 <p>Every follower flew the same worlds, {report.seeds} seed(s) a level. Numbers are medians over the seeds with 95 %
-bootstrap intervals; a flight that failed or never settled counts as infinitely bad, and who failed in any seed of a level
-neither wins it nor is ahead of anybody there.
+bootstrap intervals; a flight that failed or never settled counts as infinitely bad, and who failed in any seed of a
+level neither wins it nor is ahead of anybody there.
 Reference: CG ±5 cm at 0.31 rad/s, 0.2 kg, from the origin to (1, 1, 1) m, 45 s.</p>
 <nav>{links}<a href="#scores-title">all scores</a><a href="#made">how it was made</a></nav>
 {_picture(report)}

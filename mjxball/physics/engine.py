@@ -43,6 +43,9 @@ class Load(NamedTuple):
     push: Array | None = None  # (..., 3) force on O in the world, held over a control step [N]; None: none
     rotor_lag_scale: Array | None = None  # (...) factor on the rotors' time constant; None: 1
     thrust_scale: Array | None = None  # (..., 2) factor on the rotor forces of leader and follower; None: 1
+    added_inertia: Array | None = None  # (..., 3) about the body axes through O, without mass [kg m2]; None: none
+    cg_path: Array | None = None  # (..., k) places in [-1, 1] that the CG visits instead of a sine, see `motion.visits`
+    cg_visits: Array | None = None  # (...) 1 where it does, 0 where it follows the sine
 
 
 class Wrench(NamedTuple):
@@ -57,8 +60,9 @@ class Engine(NamedTuple):
     and the angular acceleration in body axes (..., 3) [rad/s2]; directions that a stand locks are 0.
     """
 
-    # prescribed(state, wrench, object_mass (...), cg): the CG follows `cg`, driven by whatever force that takes
-    prescribed: Callable[[PlantState, Wrench, Array, CgState], tuple[Array, Array]]
-    # rolling(state, wrench, object_mass (...), force (...) on the ball along the axis [N]):
+    # prescribed(state, wrench, object_mass (...), cg, added_inertia (..., 3) or None):
+    #   the CG follows `cg`, driven by whatever force that takes
+    prescribed: Callable[[PlantState, Wrench, Array, CgState, Array | None], tuple[Array, Array]]
+    # rolling(state, wrench, object_mass (...), force (...) on the ball along the axis [N], added_inertia):
     #   the ball at state.ball_offset rolls freely; returns its acceleration (...) [m/s2] as well
-    rolling: Callable[[PlantState, Wrench, Array, Array], tuple[Array, Array, Array]]
+    rolling: Callable[[PlantState, Wrench, Array, Array, Array | None], tuple[Array, Array, Array]]

@@ -24,7 +24,7 @@ def split_load(load: Load) -> Load:
     """Every leaf of `load` as `Components`."""
     known, optional = load[: len(LOAD_AXES)], load[len(LOAD_AXES) :]
     if any(leaf is not None for leaf in optional):
-        raise ValueError("the split road knows no push and no rotors of a world's own")
+        raise ValueError("the split road knows no push, and no rotors, inertia or CG path of a world's own")
     return Load(*map(split, known, LOAD_AXES))
 
 

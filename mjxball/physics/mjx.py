@@ -28,14 +28,18 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
     stages = _Stages(plant, attitude)
     share = plant.moving_fraction
 
-    def prescribed(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
-        mass, bias = stages.equations(state, object_mass, cg.offset / share, cg.rate / share)
+    def prescribed(
+        state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState, added: Array | None = None
+    ) -> tuple[Array, Array]:
+        mass, bias = stages.equations(state, object_mass, cg.offset / share, cg.rate / share, added)
         n = stages.root
         force = stages.applied(state, wrench) - bias[:n] - mass[:n, n] * (cg.acceleration / share)
         return stages.result(state, _solve(mass[:n, :n], force))
 
-    def rolling(state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array) -> tuple[Array, Array, Array]:
-        mass, bias = stages.equations(state, object_mass, state.ball_offset, state.ball_rate)
+    def rolling(
+        state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array, added: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        mass, bias = stages.equations(state, object_mass, state.ball_offset, state.ball_rate, added)
         n = stages.root
         driven = _solve(mass[:n, :n], stages.applied(state, wrench) - bias[:n])
         recoil = _solve(mass[:n, :n], -mass[:n, n])
@@ -62,8 +66,10 @@ class _Stages:
         self._stand, self._rigid = plant.stand, plant.moving_fraction == 1
         self.root = model.nv - 1  # degrees of freedom of the root; the ball's slide comes last
 
-    def equations(self, state: PlantState, object_mass: Array, offset: Array, rate: Array) -> tuple[Array, Array]:
-        """Mass matrix (nv, nv) and bias force (nv,) with the ball at `offset` moving at `rate`."""
+    def equations(
+        self, state: PlantState, object_mass: Array, offset: Array, rate: Array, added: Array | None
+    ) -> tuple[Array, Array]:
+        """Mass matrix (nv, nv) and bias force (nv,), ball at `offset` moving at `rate`; inertia (3,) is `added`."""
         dtype = state.rates.dtype
         zero = jnp.zeros((), dtype)
         if self._stand == "free":
@@ -79,7 +85,17 @@ class _Stages:
         mjx = self._mjx
         for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.com_vel, mjx.rne):
             data = stage(model, data)
-        return mjx.full_m(model, data), data.qfrc_bias
+        mass, bias = mjx.full_m(model, data), data.qfrc_bias
+        return (mass, bias) if added is None else self._spun(state, mass, bias, added)
+
+    def _spun(self, state: PlantState, mass: Array, bias: Array, added: Array) -> tuple[Array, Array]:
+        """With inertia about the body axes through O, without mass, on the root's rotation."""
+        n = self.root
+        axes = slice(3, 6) if self._stand == "free" else slice(n - 1, n)
+        gyration = rotations.cross(state.rates, added * state.rates)
+        inertia = added if self._stand == "free" else added[:1]
+        gyration = gyration if self._stand == "free" else 0.0 * added[:1]
+        return mass.at[axes, axes].add(jnp.diag(inertia)), bias.at[axes].add(gyration)
 
     def _loaded(self, object_mass: Array, dtype: Any) -> Any:
         m = self._model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -22,6 +23,39 @@ def sine(time: Array, amplitude: Array, speed: Array, phase: Array) -> CgState:
     xp = angle.__array_namespace__()
     offset = amplitude * xp.sin(angle)
     return CgState(offset, amplitude * speed * xp.cos(angle), -speed * speed * offset)
+
+
+def visits(time: Array, amplitude: Array, speed: Array, phase: Array, places: Array) -> CgState:
+    """The CG goes from place to place, `places` (..., k) in units of the amplitude, again and again (ours).
+
+    Each way takes half of a sine's period, pi / Omega, along the quintic that starts and ends at rest: between the
+    ends of the object its speed and acceleration are at most 1.2 times that sine's.
+    """
+    xp = time.__array_namespace__()
+    count = places.shape[-1]
+    way = (speed * time + phase) / math.pi
+    number = xp.floor(way)
+    s, pace = way - number, speed / math.pi
+    first = xp.astype(number[..., None] % count, number.dtype) == xp.arange(count, dtype=number.dtype)
+    start = (first * places).sum(axis=-1)
+    change = (first * xp.roll(places, -1, axis=-1)).sum(axis=-1) - start
+    rest = 1.0 - s
+    return CgState(
+        amplitude * (start + change * s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)),
+        amplitude * change * pace * 30.0 * s * s * rest * rest,
+        amplitude * change * pace * pace * 60.0 * s * rest * (1.0 - 2.0 * s),
+    )
+
+
+def drawn(time: Array, load: Load) -> CgState:
+    """A flight's own motion: its sine, or the places that it visits instead."""
+    sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
+    swinging = sine(time, *sines)
+    if load.cg_path is None:
+        return swinging
+    xp = time.__array_namespace__()
+    visiting = visits(time, *sines, load.cg_path)
+    return CgState(*(xp.where(load.cg_visits > 0, b, a) for a, b in zip(swinging, visiting, strict=True)))
 
 
 class Spline(NamedTuple):
@@ -69,7 +103,7 @@ def make_prescribed(config: Config) -> Prescribed:
     Raises InputError if a waveform's spline leaves the object between its samples.
     """
     if config.motion.kind == "sine":
-        return lambda time, load: sine(time, load.cg_amplitude, load.cg_speed, load.cg_phase)
+        return drawn
     spline = fit_spline(config.motion.times, config.motion.offsets)
     reach = cg_reach(config.plant)
     if largest_offset(spline) > reach + 1e-9:

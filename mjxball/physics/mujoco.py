@@ -27,7 +27,11 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
     world = MujocoWorld(plant, attitude)
     share = plant.moving_fraction
 
-    def prescribed(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
+    def prescribed(
+        state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState, added: Array | None = None
+    ) -> tuple[Array, Array]:
+        _refuse(added)
+
         def one(s: PlantState, w: Wrench, mass: float, c: CgState) -> np.ndarray:
             world.place(s, mass, c.offset / share, c.rate / share)
             world.push(s, w)
@@ -36,7 +40,11 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
         result = _each((state, wrench, object_mass, cg), state.time.shape, one)
         return result[..., :3], result[..., 3:6]
 
-    def rolling(state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array) -> tuple[Array, Array, Array]:
+    def rolling(
+        state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array, added: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        _refuse(added)
+
         def one(s: PlantState, w: Wrench, mass: float, force: float) -> np.ndarray:
             world.place(s, mass, s.ball_offset, s.ball_rate)
             world.push(s, w)
@@ -46,6 +54,11 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
         return result[..., :3], result[..., 3:6], result[..., 6]
 
     return Engine(prescribed, rolling)
+
+
+def _refuse(added: Array | None) -> None:
+    if added is not None:
+        raise NotImplementedError("C MuJoCo knows bodies only, no inertia without mass")
 
 
 def _each(arguments: Sequence[Any], shape: tuple[int, ...], function: Any) -> np.ndarray:

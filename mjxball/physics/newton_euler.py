@@ -21,19 +21,24 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
     solve = {"free": _solve_free, "pivot": _solve_pivot, "heave": _solve_heave}[plant.stand]
     axis = "xy".index(plant.cg_axis)
 
-    def prescribed(state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState) -> tuple[Array, Array]:
-        terms = _terms(plant, constants, state, wrench, object_mass, cg)
+    def prescribed(
+        state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState, added: Array | None = None
+    ) -> tuple[Array, Array]:
+        terms = _terms(plant, constants, state, wrench, object_mass, cg, added)
         matrix, (mass, moment, inertia, down, force, torque) = terms
         pushed = _shift(force, axis, -object_mass * cg.acceleration)
         linear, angular = solve(mass, moment, inertia, down, pushed, torque)
         return rotations.rotate(matrix, linear), angular
 
-    def rolling(state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array) -> tuple[Array, Array, Array]:
+    def rolling(
+        state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array, added: Array | None = None
+    ) -> tuple[Array, Array, Array]:
         xp = state.rates.__array_namespace__()
         share = plant.moving_fraction
         ball_mass = share * object_mass
         cg = CgState(share * state.ball_offset, share * state.ball_rate, xp.zeros_like(ball_mass))
-        matrix, (mass, moment, inertia, down, force, torque) = _terms(plant, constants, state, wrench, object_mass, cg)
+        terms = _terms(plant, constants, state, wrench, object_mass, cg, added)
+        matrix, (mass, moment, inertia, down, force, torque) = terms
         linear, angular = solve(mass, moment, inertia, down, force, torque)
         recoil = _shift(xp.zeros_like(force), axis, -ball_mass)
         linear_1, angular_1 = solve(mass, moment, inertia, down, recoil, xp.zeros_like(torque))
@@ -55,7 +60,13 @@ def _shift(vector: Array, axis: int, amount: Array) -> Array:
 
 
 def _terms(
-    plant: Plant, constants: PlantConstants, state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState
+    plant: Plant,
+    constants: PlantConstants,
+    state: PlantState,
+    wrench: Wrench,
+    object_mass: Array,
+    cg: CgState,
+    added: Array | None,
 ) -> tuple[Array, tuple[Array, Array, Array, Array, Array, Array]]:
     """R, and (M, S, J_O, u, f, n) of design section 4 without the term of c''."""
     rates = state.rates
@@ -66,7 +77,7 @@ def _terms(
     zero = xp.zeros_like(rates)
     mass = float(constants.drone_mass.sum()) + object_mass
     moment = _shift(zero + xp.asarray(constants.drone_moment, dtype=rates.dtype), axis, object_mass * cg.offset)
-    inertia = _inertia(plant, constants, rates.dtype, object_mass, cg.offset)
+    inertia = _inertia(plant, constants, rates.dtype, object_mass, cg.offset, added)
     offset, rate = _shift(zero, axis, cg.offset), _shift(zero, axis, cg.rate)
     weight = object_mass[..., None]
     slip = 2 * rotations.cross(rates, rate)
@@ -81,8 +92,10 @@ def _terms(
     return matrix, (mass, moment, inertia, down, force, torque)
 
 
-def _inertia(plant: Plant, constants: PlantConstants, dtype: Any, object_mass: Array, offset: Array) -> Array:
-    """J_O (..., 3, 3): drones, shell and ball; the ball sits at c / share."""
+def _inertia(
+    plant: Plant, constants: PlantConstants, dtype: Any, object_mass: Array, offset: Array, added: Array | None
+) -> Array:
+    """J_O (..., 3, 3): drones, shell and ball, which sits at c / share, and what is added (..., 3)."""
     xp = object_mass.__array_namespace__()
     own = xp.asarray(constants.object_inertia_per_mass, dtype=dtype)
     square = offset * offset / plant.moving_fraction
@@ -92,6 +105,8 @@ def _inertia(plant: Plant, constants: PlantConstants, dtype: Any, object_mass: A
     rows = []
     for i in range(3):
         diagonal = object_mass * (own[i] + moving[i])
+        if added is not None:
+            diagonal = diagonal + added[..., i]
         rows.append(xp.stack([drones[i, j] + (diagonal if i == j else still) for j in range(3)], axis=-1))
     return xp.stack(rows, axis=-2)
 

@@ -81,14 +81,15 @@ def make_accelerations(config: Config, engine: Engine) -> Callable[[PlantState, 
         def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Array, ...]:
             mass = motion.object_mass(state.time, load)
             on_ball = force(state.ball_offset, state.ball_rate, config.plant.moving_fraction * mass)
-            return engine.rolling(state, wrench, mass, on_ball)
+            return engine.rolling(state, wrench, mass, on_ball, load.added_inertia)
 
         return roll
     prescribed = motion.make_prescribed(config)
 
     def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Array, ...]:
         mass = motion.object_mass(state.time, load)
-        linear, angular = engine.prescribed(state, wrench, mass, prescribed(state.time, load))
+        cg = prescribed(state.time, load)
+        linear, angular = engine.prescribed(state, wrench, mass, cg, load.added_inertia)
         return linear, angular, state.ball_rate.__array_namespace__().zeros_like(state.ball_rate)
 
     return follow
