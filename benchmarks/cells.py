@@ -1,11 +1,11 @@
 """Every cell of CG speed x amplitude x object mass: does a policy beat the best classical follower there?
 
-`python benchmarks/cells.py POLICY.npz [--robust POLICY.npz] [--seeds N] [--json FILE]`
+`python benchmarks/cells.py POLICY.npz ... [--robust POLICY.npz ...] [--seeds N] [--json FILE]`
 
 A cell is flown from the origin to (1, 1, 1) m for 45 s from several CG phases, with the mass known to the hover thrust
-or believed to be 0.2 kg (then adaptive adapts its mass), undisturbed and with noise at level 1 and 40 ms of delay. Both
-policies fly where the mass is known, the robust one where it is not. Wanted, of medians over the phases; a follower
-that fails in any of them loses the cell:
+or believed to be 0.2 kg (then adaptive adapts its mass), undisturbed and with noise at level 1 and 40 ms of delay. All
+policies fly where the mass is known, the robust ones where it is not; of several, as of the seeds of one run, the
+distribution is printed as well. Wanted, of medians over the phases; a follower that fails in any of them loses the cell:
 
 - peak: the largest |e| of any axis after 20 s at most the adaptive follower's in the same flights plus 3 mm
 - overshoot: at most the adaptive follower's in the same flights
@@ -87,7 +87,7 @@ def wins_of(mine: dict[str, float], bar: dict[str, float]) -> list[str]:
     return [name for name in WANTED if math.isfinite(mine[name]) and mine[name] <= bar[name]]
 
 
-def show(where: str, name: str, rival: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def show(where: str, name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Print and return how often each of the four is reached in `rows`."""
     won = {key: sum(key in row["wins"] for row in rows) for key in WANTED}
     whole = sum(len(row["wins"]) == len(WANTED) for row in rows)
@@ -96,7 +96,9 @@ def show(where: str, name: str, rival: str, rows: list[dict[str, Any]]) -> dict[
     counts = ", ".join(f"{key} {count}" for key, count in won.items())
     medians = ", ".join(f"{who} {1e3 * value:.1f}" for who, value in peaks.items())
     print(
-        f"{where} ({name}): all four in {whole} of {len(rows)}; {counts}; {failed} flights failed; peaks [mm] {medians}"
+        f"{where} ({name}): all four in {whole} of {len(rows)}; {counts}; {failed} flights failed; "
+        f"peaks [mm] {medians}",
+        flush=True,
     )
     return {
         "where": where,
@@ -109,11 +111,54 @@ def show(where: str, name: str, rival: str, rows: list[dict[str, Any]]) -> dict[
     }
 
 
+def distribution(summaries: list[dict[str, Any]]) -> None:
+    """Print least, median and most cells won by the policies of each condition that several flew."""
+    for where in dict.fromkeys(row["where"] for row in summaries):
+        rows = [row for row in summaries if row["where"] == where]
+        if len(rows) > 1:
+            shown = "; ".join(
+                f"{key} {min(row[key] for row in rows)} - {statistics.median(row[key] for row in rows):g} - "
+                f"{max(row[key] for row in rows)}"
+                for key in ("all four", *WANTED)
+            )
+            print(f"{where}: least - median - most of {len(rows)} policies, of {rows[0]['cells']} cells: {shown}")
+
+
+def judge(config: Config, policies: list[Follower], robust: list[Follower], cells: list[Any], seeds: int) -> Any:
+    """(summaries, what is missed) of all policies where the mass is known, of the robust ones where it is not."""
+    calm, summaries, missed = fly(make_baseline("lqg", config), cells, {}, False, seeds), [], []
+    for known, disturbed in ((True, False), (True, True), (False, False), (False, True)):
+        rival = "adaptive" if known else "adaptive-mass"
+        common = {} if known else {"believed_mass": BELIEVED}
+        where = f"mass {'known' if known else 'unknown'}, {'noise and 40 ms' if disturbed else 'undisturbed'}"
+        other = fly(make_baseline(rival, config), cells, common, disturbed, seeds)
+        for policy in dict.fromkeys([*policies, *robust]) if known else robust:
+            rows = []
+            mine = fly(policy, cells, common, disturbed, seeds)
+            for cell, own, theirs, told in zip(cells, mine, other, calm, strict=True):
+                bar = wanted(theirs, told)
+                peaks = {"policy": own["peak"], rival: theirs["peak"], "lqg, undisturbed": told["peak"]}
+                rows.append({"cell": cell, **own, "bar": bar, "peaks": peaks, "wins": wins_of(own, bar)})
+            summaries.append(show(where, policy.name, rows))
+            if not known:
+                own = [row for row in rows if row["cell"][1] <= reach_of(config, row["cell"][2], False)]
+                summaries.append(show(f"{where}, trimmed by the follower alone", policy.name, own))
+            missed += [line for row in rows if (line := shortfall(where, policy.name, row))]
+    return summaries, missed
+
+
+def shortfall(where: str, name: str, row: dict[str, Any]) -> str:
+    """What a cell misses, in words."""
+    names = [key for key in WANTED if key not in row["wins"]]
+    shown = ", ".join(f"{key} {row[key]:.4g} (wanted {row['bar'][key]:.4g})" for key in names)
+    return f"{where}, {name}: {row['cell']} misses {shown}" if names else ""
+
+
 def main() -> None:
     """Fly, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policy", type=Path)
-    parser.add_argument("--robust", type=Path, help="policy for unknown masses (default: the same)")
+    parser.add_argument("policies", type=Path, nargs="*")
+    parser.add_argument("--robust", type=Path, nargs="+", help="policies for unknown masses (default: the same)")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
@@ -122,35 +167,12 @@ def main() -> None:
     cells = [cell for cell in every if cell[1] <= reach_of(config, cell[2], True)]
     lost = ", ".join(f"{a:g} m with {m:g} kg" for a, m in sorted({c[1:] for c in every} - {c[1:] for c in cells}))
     print(f"{len(cells)} of {len(every)} cells are feasible, not at any speed: {lost}")
-    clean = load_policy(options.policy, config)
-    robust = load_policy(options.robust, config) if options.robust else clean
-    lqg = make_baseline("lqg", config)
-    calm, summaries, missed = fly(lqg, cells, {}, False, options.seeds), [], []
-    flights = [(policy, True) for policy in dict.fromkeys((clean, robust))] + [(robust, False)]
-    for policy, known in flights:
-        rival = "adaptive" if known else "adaptive-mass"
-        common = {} if known else {"believed_mass": BELIEVED}
-        for disturbed in (False, True):
-            mine, other = (
-                fly(follower, cells, common, disturbed, options.seeds)
-                for follower in (policy, make_baseline(rival, config))
-            )
-            rows = []
-            for cell, own, theirs, told in zip(cells, mine, other, calm, strict=True):
-                bar = wanted(theirs, told)
-                peaks = {"policy": own["peak"], rival: theirs["peak"], "lqg, undisturbed": told["peak"]}
-                rows.append({"cell": cell, **own, "bar": bar, "peaks": peaks, "wins": wins_of(own, bar)})
-            where = f"mass {'known' if known else 'unknown'}, {'noise and 40 ms' if disturbed else 'undisturbed'}"
-            summaries.append(show(where, policy.name, rival, rows))
-            if not known:
-                own = [row for row in rows if row["cell"][1] <= reach_of(config, row["cell"][2], False)]
-                summaries.append(show(f"{where}, trimmed by the follower alone", policy.name, rival, own))
-            for row in rows:
-                names = [name for name in WANTED if name not in row["wins"]]
-                if names:
-                    shown = ", ".join(f"{name} {row[name]:.4g} (wanted {row['bar'][name]:.4g})" for name in names)
-                    missed.append(f"{where}, {policy.name}: {row['cell']} misses {shown}")
-    print("\n".join(missed))
+    policies = [load_policy(path, config) for path in options.policies]
+    robust = [load_policy(path, config) for path in options.robust] if options.robust else policies
+    summaries, missed = judge(config, policies, robust, cells, options.seeds)
+    distribution(summaries)
+    if len(policies) + len(robust) <= 4:
+        print("\n".join(missed))
     if options.json:
         found = {"cells": len(cells), "summaries": summaries, "missed": missed}
         options.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
