@@ -144,7 +144,8 @@ class Population:
         """Compile everything a run needs, side by side; `create` only if `creating`."""
         lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
         options = GPU_OPTIONS if jax.default_backend() == "gpu" else None
-        with ThreadPoolExecutor(len(lowered)) as pool:  # XLA compiles outside Python's lock
+        # XLA compiles outside Python's lock; two at once end a process that shares GPUs with others by a segfault.
+        with ThreadPoolExecutor(len(lowered) if jax.process_count() == 1 else 1) as pool:
             advance, fresh, *create = pool.map(lambda work: work.compile(compiler_options=options), lowered)
         return Executables(create[0] if create else self._create, advance, fresh)
 
