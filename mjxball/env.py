@@ -46,6 +46,16 @@ class World(NamedTuple):
     steps: Array  # () control steps since the reset
 
 
+class Orders(NamedTuple):
+    """What both drones are told for one control period, and what that follows from."""
+
+    led: Array  # (3,) the leader's command
+    followed: Array  # (3,) the follower's
+    action: Array  # (3,) the network's, zeros if it was not finite
+    sound: Array  # () whether it was finite
+    seen: Array  # (18,) the observation that it answers
+
+
 class CoupledPairEnv(Env):
     """Two drones, one object with a moving CG: the follower acts, the leader flies its PID (design section 5).
 
@@ -77,6 +87,11 @@ class CoupledPairEnv(Env):
     def observation_size(self) -> int:
         """Length of the networks' input."""
         return len(self.input_mask)
+
+    @property
+    def seen_size(self) -> int:
+        """How many numbers of the observation the follower sees and remembers; only critics are told the rest."""
+        return observation.OBSERVATION_SIZE + self._recall.size
 
     @property
     def input_mask(self) -> list[float]:
@@ -160,16 +175,26 @@ class CoupledPairEnv(Env):
 
     def step(self, state: State, action: Array) -> State:
         """Apply the network's `action` (3,) in [-1, 1] for one control period."""
+        orders, load = self.command(state, action)
+        plant = self._control_step(state.pipeline_state.plant, jnp.stack([orders.led, orders.followed]), load)
+        return self.arrive(state, orders, plant)
+
+    def command(self, state: State, action: Array) -> tuple[Orders, Load]:
+        """What the physics is given for one control period at the network's `action` (3,)."""
         world: World = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action))
         action = jnp.where(sound, action, jnp.zeros_like(action))
-        timing = self.config.timing
         seen = state.obs[: observation.OBSERVATION_SIZE]
         led = self._leader_command(world)
         followed = self._follower_command(action, seen)
         load = world.load._replace(push=world.nuisance.push) if self._nuisances.present else world.load
-        plant = self._control_step(world.plant, jnp.stack([led, followed]), load)
+        return Orders(led, followed, action, sound, seen), load
 
+    def arrive(self, state: State, orders: Orders, plant: PlantState) -> State:
+        """What follows once the physics has brought the plant of `state` to `plant`: reward, end, senses, memory."""
+        world: World = state.pipeline_state
+        led, followed, action, sound, seen = orders
+        timing = self.config.timing
         diverged = jnp.logical_or(self._diverged(plant), ~sound)
         plant = jax.tree.map(lambda new, old: jnp.where(diverged, old, new), plant, world.plant)
         error = world.goal - plant.position

@@ -16,6 +16,7 @@ from mjxball.rollout import Trajectory
 
 FRAMES_PER_SECOND = 10
 SIZE = (240, 320)  # height, width of each flight's part
+LOOK_AT = (0.55, 0.55, 0.65)  # between start and goal of the reference scenario [m]
 PATIENCE = 120  # [s]
 
 
@@ -61,36 +62,21 @@ def _json(plant: Plant) -> str:
 def _render(place: Path) -> None:
     import json
 
-    import mujoco
     from PIL import Image
 
     from mjxball import config
-    from mjxball.assembly import BALL_JOINT, build_spec
+    from mjxball.scene import Scene
 
     settings = config.to_dict(config.Config())
     plant = config.from_dict({**settings, "plant": json.loads((place / "plant.json").read_text())}).plant
-    spec = build_spec(plant)
     with np.load(place / "flights.npz") as stored:
         flights = {name: stored[name] for name in stored.files}
-    ball = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [0.03, 0, 0], "rgba": [0.2, 0.8, 0.3, 0.6]}
-    spec.worldbody.add_geom(pos=flights["goal"][0].tolist(), contype=0, conaffinity=0, **ball)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    slide = model.jnt_qposadr[model.joint(BALL_JOINT).id]
-    camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = (0.55, 0.55, 0.65), 2.3, 120.0, -12.0
+    scene = Scene(plant, flights["goal"][0], SIZE, LOOK_AT)
     frames = []
-    with mujoco.Renderer(model, *SIZE) as renderer:
-        for number in range(flights["position"].shape[1]):
-            parts = []
-            for flight in range(flights["position"].shape[0]):
-                data.qpos[:3] = flights["position"][flight, number]
-                data.qpos[3:7] = flights["quaternion"][flight, number]
-                data.qpos[slide] = flights["offset"][flight, number] / plant.moving_fraction
-                mujoco.mj_forward(model, data)
-                renderer.update_scene(data, camera)
-                parts.append(renderer.render().copy())
-            frames.append(Image.fromarray(np.concatenate(parts, axis=1)))
+    for number in range(flights["position"].shape[1]):
+        poses = zip(*(flights[name][:, number] for name in ("position", "quaternion", "offset")), strict=True)
+        frames.append(Image.fromarray(np.concatenate([scene.picture(*pose) for pose in poses], axis=1)))
+    scene.close()
     duration = round(1000 / FRAMES_PER_SECOND)
     frames[0].save(
         place / "flight.webp", save_all=True, append_images=frames[1:], duration=duration, loop=0, quality=60, method=4

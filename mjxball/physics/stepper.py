@@ -36,18 +36,18 @@ def _jax_stepper(config: Config, physics: str) -> ControlStep:
 
     enable_compilation_cache()
     make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
-    with jax.enable_x64(True), _on_the_host():
+    with jax.enable_x64(True), on_the_host():
         step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
         compiled = jax.jit(jax.vmap(step))
 
     def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
-        with jax.enable_x64(True), _on_the_host():
+        with jax.enable_x64(True), on_the_host():
             return PlantState(*map(np.asarray, compiled(state, commands, load)))
 
     return stepper
 
 
-def _on_the_host() -> AbstractContextManager[Any]:
+def on_the_host() -> AbstractContextManager[Any]:
     """Compute on the CPU: a GPU takes 4 ms for each control step of a few worlds, most of it waiting."""
     import jax
 

@@ -1,0 +1,93 @@
+"""Stable-Baselines3's SAC on `mjxball/Transport-v0`: does it learn? Prints a table, writes JSON with --json.
+
+Needs stable-baselines3, and with it PyTorch, which this project does not install: see docs/gym.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import stable_baselines3
+import torch
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import mjxball.gym  # noqa: F401  registers the environments
+
+DRAWN = 1000  # seed of the worlds that every follower is judged in; training draws others
+SETTINGS = {
+    "learning_rate": 1e-3,
+    "gamma": 0.97,
+    "batch_size": 256,
+    "learning_starts": 1000,
+    "policy_kwargs": {"net_arch": [64, 64]},
+}
+
+
+def judged(act: Any, name: str, physics: str, episodes: int) -> dict[str, float]:
+    """Mean return, and |e_o| [m] over the second half, of `act(observation) -> action` in `episodes` fixed worlds."""
+    env = gymnasium.make(name, physics=physics)
+    returns, errors = [], []
+    for number in range(episodes):
+        seen, _ = env.reset(seed=DRAWN + number)
+        total, late, ended = 0.0, [], False
+        while not ended:
+            seen, reward, terminated, truncated, info = env.step(act(seen))
+            total, ended = total + float(reward), terminated or truncated
+            late.append(info["error"])
+        returns.append(total)
+        errors.append(np.mean(late[len(late) // 2 :]))
+    return {"return": float(np.mean(returns)), "late_error": float(np.mean(errors))}
+
+
+def train(name: str, physics: str, steps: int, seed: int) -> Any:
+    """`act` of a follower that SB3's SAC has trained for `steps` control steps."""
+    torch.set_num_threads(1)
+    # Each world of the vector is seeded with its own number; four worlds show four loads at a time.
+    worlds = DummyVecEnv([lambda: gymnasium.make(name, physics=physics)] * 4)
+    env = VecNormalize(worlds, norm_reward=False)
+    model = SAC("MlpPolicy", env, seed=seed, device="cpu", train_freq=1, gradient_steps=2, **SETTINGS)
+    model.learn(steps)
+
+    def act(seen: np.ndarray) -> np.ndarray:
+        return model.predict(env.normalize_obs(seen), deterministic=True)[0]
+
+    return act
+
+
+def main() -> None:
+    """Train and compare with followers that have learnt nothing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--env", default="mjxball/Transport-v0")
+    parser.add_argument("--physics", default="mujoco", help="mujoco, newton-euler or mjx")
+    parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--episodes", type=int, default=5, help="worlds that each follower is judged in")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+
+    random = np.random.default_rng(options.seed)
+    untrained = {"copies its leader": lambda seen: np.zeros(3), "random": lambda seen: random.uniform(-1, 1, 3)}
+    place = (options.env, options.physics, options.episodes)
+    rows = {label: judged(act, *place) for label, act in untrained.items()}
+    started = time.perf_counter()
+    act = train(options.env, options.physics, options.steps, options.seed)
+    seconds = time.perf_counter() - started
+    rows["SB3 SAC"] = judged(act, *place)
+    for label, row in rows.items():
+        print(f"{label:<20}{row['return']:12.1f}{row['late_error']:10.4f} m")
+    print(f"{options.steps} steps in {seconds:.0f} s")
+    if options.json:
+        versions = {"stable-baselines3": stable_baselines3.__version__, "torch": torch.__version__}
+        record = {"rows": rows, "seconds": seconds, "versions": versions, **vars(options), "json": None}
+        options.json.write_text(json.dumps(record, indent=1, default=str) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,28 @@
+"""Gymnasium environments: `import mjxball.gym`, then `gymnasium.make("mjxball/Transport-v0")`.
+
+Every preset is registered, `transport-large` as `mjxball/TransportLarge-v0`. `gymnasium.make` gives one world on
+C MuJoCo, `gymnasium.make_vec(..., num_envs=N, vectorization_mode="vector_entry_point")` N worlds on MJX.
+Observation, reward, endings and the worlds that are drawn are those of `mjxball.env`.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+from mjxball.config import PRESETS
+
+__all__ = ["environment_id"]
+
+
+def environment_id(preset: str) -> str:
+    """Gymnasium's name of `preset`."""
+    return f"mjxball/{''.join(part.capitalize() for part in preset.split('-'))}-v0"
+
+
+for _preset in PRESETS:
+    gymnasium.register(
+        environment_id(_preset),
+        entry_point="mjxball.gym.single:FollowerEnv",
+        vector_entry_point="mjxball.gym.vector:FollowerVectorEnv",
+        kwargs={"preset": _preset},
+    )

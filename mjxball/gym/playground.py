@@ -1,0 +1,124 @@
+"""The environment for MuJoCo Playground's wrappers and trainers, which want `state.data` for Brax's `pipeline_state`.
+
+Playground itself is not needed to import this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import flax.struct
+import mujoco
+import numpy as np
+
+from mjxball.assembly import build_model
+from mjxball.config import Config
+from mjxball.env import CoupledPairEnv, State, World
+from mjxball.gym import worlds
+
+Array = Any
+
+
+@flax.struct.dataclass
+class PlaygroundState:
+    """The fields of Playground's `State`; `data` is this project's `World` instead of an `mjx.Data`."""
+
+    data: World
+    obs: Array  # (n,) the networks' input, critics' part included
+    reward: Array  # ()
+    done: Array  # () 1 at an end
+    metrics: dict[str, Array]
+    info: dict[str, Any]
+
+
+class PlaygroundEnv:
+    """`CoupledPairEnv` with the attributes of Playground's `MjxEnv`. For its `wrap_for_brax_training`.
+
+    Worlds are randomised by every reset, so Playground's `randomization_fn` has nothing to do here; use
+    `full_reset=True`, or every episode of a world repeats its first one.
+    """
+
+    def __init__(self, preset: str = "transport", config: Config | None = None, physics: str = "mjx"):
+        self.config = worlds.settings(preset, config)
+        self._pair = CoupledPairEnv(self.config, physics)
+        self._model: mujoco.MjModel | None = None
+
+    def reset(self, rng: Array) -> PlaygroundState:
+        """See `CoupledPairEnv.reset`."""
+        return _playground(self._pair.reset(rng))
+
+    def step(self, state: PlaygroundState, action: Array) -> PlaygroundState:
+        """See `CoupledPairEnv.step`."""
+        given = State(state.data, state.obs, state.reward, state.done, state.metrics, state.info)
+        return _playground(self._pair.step(given, action))
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the networks' input."""
+        return self._pair.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Roll, pitch, vertical acceleration."""
+        return self._pair.action_size
+
+    @property
+    def dt(self) -> float:
+        """Control period [s]."""
+        return self._pair.dt
+
+    @property
+    def sim_dt(self) -> float:
+        """Physics step [s]."""
+        return self.config.physics_step
+
+    @property
+    def n_substeps(self) -> int:
+        """Physics steps in a control period."""
+        return self.config.timing.physics_steps
+
+    @property
+    def unwrapped(self) -> PlaygroundEnv:
+        """Itself."""
+        return self
+
+    @property
+    def xml_path(self) -> str:
+        """Empty: the model is built, see `python -m mjxball.assembly`."""
+        return ""
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The assembly as a MuJoCo model."""
+        if self._model is None:
+            self._model = build_model(self.config.plant)
+        return self._model
+
+    @property
+    def mjx_model(self) -> Any:
+        """The assembly as an MJX model; the environment itself reads the object's mass from its `World`."""
+        from mjxball.quiet import import_mjx
+
+        return import_mjx().put_model(self.mj_model)
+
+    def render(
+        self, trajectory: Sequence[PlaygroundState], height: int = 240, width: int = 320, *unused: Any
+    ) -> list[np.ndarray]:
+        """Pictures (height, width, 3) of unbatched states; Playground's camera and scene options are not used."""
+        from mjxball.physics.step import make_cg_offset
+        from mjxball.scene import Scene
+
+        offset = make_cg_offset(self.config)
+        goal = np.asarray(trajectory[0].data.goal, float)
+        scene = Scene(self.config.plant, goal, (height, width), goal / 2)
+        poses = ((s.data.plant, float(offset(s.data.plant, s.data.load))) for s in trajectory)
+        pictures = [scene.picture(plant.position, plant.quaternion, c) for plant, c in poses]
+        scene.close()
+        return pictures
+
+
+def _playground(state: Any) -> PlaygroundState:
+    return PlaygroundState(
+        state.pipeline_state, state.obs, state.reward, state.done, dict(state.metrics), dict(state.info)
+    )

@@ -1,0 +1,141 @@
+"""One world as a `gymnasium.Env`, on C MuJoCo unless told otherwise."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, ClassVar, NamedTuple
+
+import gymnasium
+import jax
+import numpy as np
+
+from mjxball.cache import enable_compilation_cache
+from mjxball.config import Config
+from mjxball.env import CoupledPairEnv
+from mjxball.gym import worlds
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.step import make_cg_offset
+from mjxball.physics.stepper import make_stepper, on_the_host
+
+Array = Any
+PICTURE = (360, 480)  # height, width of a rendered frame
+
+
+class Laws(NamedTuple):
+    """The compiled parts of `mjxball.env` around the physics."""
+
+    pair: CoupledPairEnv
+    start: Any  # chain -> (chain, State)
+    command: Any  # (State, action (3,)) -> (Orders, Load)
+    arrive: Any  # (State, Orders, PlantState) -> State
+
+
+@functools.lru_cache(maxsize=8)
+def compiled_laws(config: Config) -> Laws:
+    """The laws of `config`, compiled once for all environments of a process."""
+    enable_compilation_cache()
+    pair = CoupledPairEnv(config, "newton-euler")  # its own physics is never called
+
+    def start(chain: Array) -> tuple[Array, Any]:
+        chain, key = worlds.next_world(chain)
+        return chain, pair.reset(key)
+
+    return Laws(pair, jax.jit(start), jax.jit(pair.command), jax.jit(pair.arrive))
+
+
+class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """The follower's task: observation (n,) float32, action (3,) in [-1, 1], both as in `mjxball.env`.
+
+    `physics` is mujoco, newton-euler or mjx, in float64; `config` replaces the preset's. `terminated` means that
+    the object left d_term or that the world diverged, `truncated` that the episode's time is over: bootstrap there.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
+
+    def __init__(
+        self,
+        preset: str = "transport",
+        config: Config | None = None,
+        physics: str = "mujoco",
+        render_mode: str | None = None,
+    ):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or rgb_array, not {render_mode!r}")
+        self.config = worlds.settings(preset, config)
+        self.render_mode = render_mode
+        self.metadata = {**type(self).metadata, "render_fps": round(1 / self.config.timing.control_period)}
+        with on_the_host():
+            self._laws = compiled_laws(self.config)
+        self._move = make_stepper(self.config, physics)
+        self._cg_offset = make_cg_offset(self.config)
+        self.observation_space, self.action_space = worlds.spaces(self._laws.pair)
+        self._chain: Any = None
+        self._state: Any = None
+        self._load: Load | None = None
+        self._plant: PlantState | None = None  # of `_state`, in float64 and with a batch axis (1, ...)
+        self._scene: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """A fresh world drawn from `config.scenario`; `options` are not used."""
+        super().reset(seed=seed)
+        with on_the_host():
+            if seed is not None or self._chain is None:
+                self._chain = jax.random.key(worlds.seed_number(self.np_random))
+            self._chain, self._state = self._laws.start(self._chain)
+        self._plant = _batch_of_one(self._state.pipeline_state.plant)
+        self._load = self._state.pipeline_state.load
+        if self._scene is not None:
+            self._scene.move_goal(*self._view())
+        return self._seen(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Hold `action` (3,) in [-1, 1] for one control period."""
+        if self._state is None or self._plant is None:
+            raise gymnasium.error.ResetNeeded("call reset before step")
+        with on_the_host():
+            orders, load = self._laws.command(self._state, np.asarray(action, np.float32))
+        commands = np.stack([orders.led, orders.followed]).astype(float)[None]
+        self._load = load
+        plant = self._move(self._plant, commands, _batch_of_one(load))
+        with on_the_host():
+            arrived = PlantState(*(leaf[0].astype(np.float32) for leaf in plant))
+            self._state = self._laws.arrive(self._state, orders, arrived)
+        if not self._state.metrics["diverged"]:
+            self._plant = plant
+        truncated = bool(self._state.info["truncation"])
+        terminated = bool(self._state.done) and not truncated
+        info = {name: float(value) for name, value in worlds.told(self._state).items()}
+        return self._seen(), float(self._state.reward), terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """The pair and its goal as pixels (height, width, 3) uint8, or None without a render mode."""
+        if self.render_mode is None or self._plant is None:
+            gymnasium.logger.warn("render needs render_mode='rgb_array' and a reset before it")
+            return None
+        if self._scene is None:
+            from mjxball.scene import Scene
+
+            goal, look_at = self._view()
+            self._scene = Scene(self.config.plant, goal, PICTURE, look_at)
+        plant = self._plant
+        offset = self._cg_offset(plant, _batch_of_one(self._load))
+        return self._scene.picture(plant.position[0], plant.quaternion[0], float(offset[0]))
+
+    def close(self) -> None:
+        """Free the renderer."""
+        if self._scene is not None:
+            self._scene.close()
+            self._scene = None
+
+    def _seen(self) -> np.ndarray:
+        return np.array(self._state.obs[: self._laws.pair.seen_size])
+
+    def _view(self) -> tuple[np.ndarray, np.ndarray]:
+        """Goal (3,), and what the camera looks at (3,): half way to it."""
+        goal = np.asarray(self._state.pipeline_state.goal, float)
+        return goal, (goal + self._state.pipeline_state.plant.position) / 2
+
+
+def _batch_of_one(leaves: Any) -> Any:
+    """The named tuple `leaves` in float64 with a batch axis; what is absent stays absent."""
+    return type(leaves)(*(None if leaf is None else np.asarray(leaf, float)[None] for leaf in leaves))

@@ -1,0 +1,43 @@
+"""What the single and the vector environment share: spaces, seeds, and what `info` tells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.control.observation import ACTION_SIZE
+from mjxball.env import CoupledPairEnv
+
+Array = Any
+
+
+def settings(preset: str, config: Config | None) -> Config:
+    """`config`, validated, or else the preset called `preset`."""
+    return configs.preset(preset) if config is None else configs.validate(config)
+
+
+def spaces(pair: CoupledPairEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Spaces of observation (n,) and action (3,): what the follower sees and remembers, and [-1, 1]."""
+    seen = gymnasium.spaces.Box(-np.inf, np.inf, (pair.seen_size,), np.float32)
+    return seen, gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+
+def seed_number(random: np.random.Generator) -> int:
+    """The number that one world's keys come from, drawn from Gymnasium's generator."""
+    return int(random.integers(2**32))
+
+
+def next_world(chain: Array) -> tuple[Array, Array]:
+    """(chain, key) for the next reset: world after world of one seed, the same in both environments."""
+    chain, key = jax.random.split(chain)
+    return chain, key
+
+
+def told(state: Any) -> dict[str, Array]:
+    """What `info` holds of a state: |e_o| [m], the squared command errors, and whether the world has diverged."""
+    return {name: state.metrics[name] for name in ("error", "tilt_error", "vertical_error", "diverged")}
