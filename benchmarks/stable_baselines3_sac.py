@@ -16,7 +16,7 @@ import numpy as np
 import stable_baselines3
 import torch
 from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import mjxball.gym  # noqa: F401  registers the environments
 
@@ -25,7 +25,8 @@ SETTINGS = {
     "learning_rate": 1e-3,
     "gamma": 0.97,
     "batch_size": 256,
-    "learning_starts": 1000,
+    "learning_starts": 12_800,
+    "train_freq": 1,
     "policy_kwargs": {"net_arch": [64, 64]},
 }
 
@@ -46,14 +47,62 @@ def judged(act: Any, name: str, physics: str, episodes: int) -> dict[str, float]
     return {"return": float(np.mean(returns)), "late_error": float(np.mean(errors))}
 
 
-def train(name: str, physics: str, steps: int, seed: int) -> Any:
-    """`act` of a follower that SB3's SAC has trained for `steps` control steps."""
+class Worlds(VecEnv):
+    """A `FollowerVectorEnv` with same-step autoreset as Stable-Baselines3's `VecEnv`."""
+
+    def __init__(self, env: Any):
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self._env, self._actions = env, None
+
+    def reset(self) -> np.ndarray:
+        """First observations (N, n)."""
+        return self._env.reset(seed=self._seeds[0])[0]
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep `actions` (N, 3) for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Observations, rewards, endings, and what SB3 wants to know of each world that ended."""
+        seen, reward, terminated, truncated, info = self._env.step(self._actions)
+        ended, told = terminated | truncated, [{} for _ in range(self.num_envs)]
+        for world in np.flatnonzero(ended):
+            told[world] = {
+                "terminal_observation": info["final_obs"][world],
+                "TimeLimit.truncated": bool(truncated[world]),
+            }
+        return seen, reward.astype(np.float32), ended, told
+
+    def close(self) -> None:
+        """Nothing to free."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The same for all worlds."""
+        return [getattr(self._env, attr_name)] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Not needed."""
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Not needed."""
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """No world has a wrapper of its own."""
+        return [False] * self.num_envs
+
+
+def train(name: str, options: argparse.Namespace) -> Any:
+    """`act` of a follower that SB3's SAC has trained for `options.steps` control steps of all worlds together."""
     torch.set_num_threads(1)
-    # Each world of the vector is seeded with its own number; four worlds show four loads at a time.
-    worlds = DummyVecEnv([lambda: gymnasium.make(name, physics=physics)] * 4)
-    env = VecNormalize(worlds, norm_reward=False)
-    model = SAC("MlpPolicy", env, seed=seed, device="cpu", train_freq=1, gradient_steps=2, **SETTINGS)
-    model.learn(steps)
+    made = gymnasium.make_vec(
+        name, options.worlds, vectorization_mode="vector_entry_point", physics="newton-euler", autoreset_mode="SameStep"
+    )
+    env = VecNormalize(Worlds(made), norm_reward=False)
+    model = SAC("MlpPolicy", env, seed=options.seed, device="cpu", gradient_steps=options.updates, **SETTINGS)
+    model.learn(options.steps)
+    env.training = False
 
     def act(seen: np.ndarray) -> np.ndarray:
         return model.predict(env.normalize_obs(seen), deterministic=True)[0]
@@ -65,8 +114,12 @@ def main() -> None:
     """Train and compare with followers that have learnt nothing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="mjxball/Transport-v0")
-    parser.add_argument("--physics", default="mujoco", help="mujoco, newton-euler or mjx")
-    parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument(
+        "--physics", default="mujoco", help="that the follower is judged on: mujoco, newton-euler or mjx"
+    )
+    parser.add_argument("--steps", type=int, default=256_000)
+    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--updates", type=int, default=4, help="gradient updates after each step of all worlds")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=5, help="worlds that each follower is judged in")
     parser.add_argument("--json", type=Path)
@@ -77,7 +130,7 @@ def main() -> None:
     place = (options.env, options.physics, options.episodes)
     rows = {label: judged(act, *place) for label, act in untrained.items()}
     started = time.perf_counter()
-    act = train(options.env, options.physics, options.steps, options.seed)
+    act = train(options.env, options)
     seconds = time.perf_counter() - started
     rows["SB3 SAC"] = judged(act, *place)
     for label, row in rows.items():

@@ -11,6 +11,8 @@ from pathlib import Path
 from mjxball import config as configs
 from mjxball.errors import InputError
 
+EXTRAS = {"onnx": "onnx"}  # packages that another extra than `train` brings
+
 
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one sentence on stderr and exit code 2."""
@@ -33,7 +35,8 @@ def run_command(command: Callable[[], int]) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("mjxball"):
             raise
-        print(f"error: {error.name} is not installed; pip install 'mjxball[train]'", file=sys.stderr)  # noqa: T201
+        extra = EXTRAS.get(error.name or "", "train")
+        print(f"error: {error.name} is not installed; pip install 'mjxball[{extra}]'", file=sys.stderr)  # noqa: T201
         return 2
 
 

@@ -1,4 +1,7 @@
-"""Flax follower -> NumPy policy file. `python -m mjxball.export RUN_DIR OUT.npz` exports a run's newest checkpoint."""
+"""Export a follower: `python -m mjxball.export RUN_DIR OUT`, of a run's newest checkpoint or of a policy file.
+
+OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header); see docs/export.md.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,8 @@ from mjxball.config import Config, config_hash, to_dict
 from mjxball.control.observation import ACTION, OBSERVATION
 from mjxball.control.recall import recall_of
 from mjxball.errors import InputError
-from mjxball.policy import PolicyFile, save_file
-from mjxball.policy.file import FORMAT_VERSION
+from mjxball.policy import PolicyFile, load_file, save_file
+from mjxball.policy.file import FORMAT_VERSION, write_whole
 
 
 def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any] | None = None) -> PolicyFile:
@@ -73,8 +76,8 @@ def is_sound(policy: PolicyFile) -> bool:
     )
 
 
-def export_run(run: Path, out: Path) -> None:
-    """Export the newest checkpoint of the run directory `run` to the new file `out`."""
+def policy_of_run(run: Path) -> PolicyFile:
+    """The policy of the newest checkpoint in the run directory `run`."""
     from mjxball.train.checkpoint import restore_policy
     from mjxball.train.curves import told_by_the_run
 
@@ -82,18 +85,47 @@ def export_run(run: Path, out: Path) -> None:
     policy = policy_file(config, learner, steps, {**origin, **told_by_the_run(run, origin["seed"])})
     if not is_sound(policy):
         raise InputError(f"the newest checkpoint of {run} holds values that are not finite")
-    save_file(out, policy)
+    return policy
+
+
+def contents_of(source: Path) -> PolicyFile:
+    """The policy in `source`, a policy file or a run directory."""
+    return load_file(source) if source.suffix == ".npz" else policy_of_run(source)
+
+
+def _write_onnx(out: Path, policy: PolicyFile) -> None:
+    from mjxball.policy.formats.onnx_file import onnx_model
+
+    write_whole(out, onnx_model(policy, out.stem).SerializeToString())
+
+
+def _write_header(out: Path, policy: PolicyFile) -> None:
+    from mjxball.policy.formats.c_header import c_header
+
+    write_whole(out, c_header(policy, out.stem).encode("ascii"))
+
+
+WRITERS = {".npz": save_file, ".onnx": _write_onnx, ".h": _write_header}
+
+
+def export(source: Path, out: Path) -> None:
+    """Export `source` to the new file `out`, in the format that its ending names; raise InputError if that fails."""
+    if out.suffix not in WRITERS:
+        raise InputError(f"output file {out} must end in {', '.join(WRITERS)}, which chooses the format")
+    output_file(out, out.suffix)
+    WRITERS[out.suffix](out, contents_of(source))
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.export`."""
-    parser = Parser(prog="python -m mjxball.export", description=__doc__)
-    parser.add_argument("run", metavar="RUN_DIR", type=Path, help="run directory written by train.py")
-    parser.add_argument("out", metavar="OUT.npz", type=Path, help="policy file to write; must not exist")
+    about, formats = __doc__.split("\n\n")
+    parser = Parser(prog="python -m mjxball.export", description=about, epilog=formats)
+    parser.add_argument("source", metavar="RUN_DIR", type=Path, help="run directory of train.py, or a policy file .npz")
+    parser.add_argument("out", metavar="OUT", type=Path, help="file to write, .npz, .onnx or .h; must not exist")
     options = parser.parse_args(arguments)
 
     def command() -> int:
-        export_run(options.run, output_file(options.out, ".npz"))
+        export(options.source, options.out)
         print(options.out)  # noqa: T201
         return 0
 

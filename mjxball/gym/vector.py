@@ -24,7 +24,8 @@ class Program(NamedTuple):
 
     pair: CoupledPairEnv
     start: Any  # chains (N,) -> (chains, State)
-    step: Any  # (chains, State, actions (N, 3)) -> (chains, State), ended worlds started anew
+    next_step: Any  # (chains, State, actions (N, 3)) -> (chains, State): ended worlds start anew instead of stepping
+    same_step: Any  # likewise -> (chains, State as stepped, State with the ended worlds started anew)
 
 
 @functools.lru_cache(maxsize=8)
@@ -37,20 +38,30 @@ def compiled_program(config: Config, physics: str) -> Program:
         chain, key = worlds.next_world(chain)
         return chain, pair.reset(key)
 
-    def step(chain: Array, state: Any, action: Array) -> tuple[Array, Any]:
-        ended = state.done > 0
-        fresh = start(chain)
-        moved = (chain, pair.step(state.replace(done=jnp.zeros_like(state.done)), action))
-        return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, moved)
+    def step(state: Any, action: Array) -> Any:
+        return pair.step(state.replace(done=jnp.zeros_like(state.done)), action)
 
-    return Program(pair, jax.jit(jax.vmap(start)), jax.jit(jax.vmap(step)))
+    def next_step(chain: Array, state: Any, action: Array) -> tuple[Array, Any]:
+        return _where(state.done > 0, start(chain), (chain, step(state, action)))
+
+    def same_step(chain: Array, state: Any, action: Array) -> tuple[Array, Any, Any]:
+        moved = step(state, action)
+        chain, fresh = _where(moved.done > 0, start(chain), (chain, moved))
+        return chain, moved, fresh
+
+    return Program(pair, *(jax.jit(jax.vmap(function)) for function in (start, next_step, same_step)))
+
+
+def _where(ended: Array, fresh: Any, going: Any) -> Any:
+    return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, going)
 
 
 class FollowerVectorEnv(gymnasium.vector.VectorEnv):
     """N worlds of the follower's task; world i is `FollowerEnv` seeded with `seed + i`, on another engine.
 
-    `physics` is mjx or newton-euler, in float32. Autoreset is Gymnasium's next-step: the step after an end ignores
-    that world's action, starts its next episode and returns the first observation with reward 0.
+    `physics` is mjx or newton-euler, in float32. Autoreset as in Gymnasium: by the next step, which ignores that
+    world's action and returns its next episode's first observation with reward 0, or with `SameStep` at once, the
+    last observation then being in `info["final_obs"]`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -61,8 +72,14 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         preset: str = "transport",
         config: Config | None = None,
         physics: str = "mjx",
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
     ):
+        mode = AutoresetMode(autoreset_mode)
+        if mode == AutoresetMode.DISABLED:
+            raise ValueError("autoreset_mode must be NextStep or SameStep")
+        self.metadata = {**type(self).metadata, "autoreset_mode": mode}
+        self._same_step = mode == AutoresetMode.SAME_STEP
         if render_mode is not None:
             raise ValueError("the vector environment renders nothing; render one world with gymnasium.make")
         if num_envs < 1:
@@ -95,14 +112,25 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         if given.shape != self.action_space.shape:
             raise ValueError(f"actions must have shape {self.action_space.shape}, not {given.shape}")
         going = np.asarray(self._state.done) == 0
-        self._chains, self._state = self._program.step(self._chains, self._state, given)
-        state = self._state
-        truncated = np.asarray(state.info["truncation"]) > 0
-        terminated = (np.asarray(state.done) > 0) & ~truncated
-        info: dict[str, Any] = {}
-        for name, value in worlds.told(state).items():
-            info[name], info[f"_{name}"] = np.array(value), going.copy()
-        return self._seen(), np.array(state.reward, np.float64), terminated, truncated, info
+        if self._same_step:
+            self._chains, moved, self._state = self._program.same_step(self._chains, self._state, given)
+        else:
+            self._chains, self._state = self._program.next_step(self._chains, self._state, given)
+            moved = self._state
+        truncated = np.asarray(moved.info["truncation"]) > 0
+        terminated = (np.asarray(moved.done) > 0) & ~truncated
+        info = self._ended(moved, terminated | truncated) if self._same_step else _told(moved, going)
+        return self._seen(), np.array(moved.reward, np.float64), terminated, truncated, info
+
+    def _ended(self, moved: Any, ended: np.ndarray) -> dict[str, Any]:
+        """`info` of a step after which the worlds that `ended` (N,) have been started anew."""
+        info = _told(moved, ~ended)
+        if ended.any():
+            last = np.full(self.num_envs, None, object)
+            for world in np.flatnonzero(ended):
+                last[world] = np.array(moved.obs[world, : self._program.pair.seen_size])
+            info |= {"final_obs": last, "_final_obs": ended, "final_info": _told(moved, ended), "_final_info": ended}
+        return info
 
     def _seen(self) -> np.ndarray:
         return np.array(self._state.obs[:, : self._program.pair.seen_size])
@@ -116,3 +144,11 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         else:
             seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
         return [worlds.seed_number(gymnasium.utils.seeding.np_random(each)[0]) for each in seeds]
+
+
+def _told(state: Any, where: np.ndarray) -> dict[str, np.ndarray]:
+    """Gymnasium's vector `info`: arrays (N,), 0 but `where` (N,) there is a value, and that mask."""
+    info = {}
+    for name, value in worlds.told(state).items():
+        info[name], info[f"_{name}"] = np.where(where, value, 0.0), where.copy()
+    return info

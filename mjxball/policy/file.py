@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import zipfile
@@ -76,11 +77,18 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
     }
     for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         arrays[f"weight_{number}"], arrays[f"bias_{number}"] = weight, bias
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    write_whole(path, stream.getvalue())
+
+
+def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write `data` to `path` atomically: a reader sees the old file or the whole new one."""
     target = Path(path)
     partial = target.with_name(f".{target.name}.partial")
     try:
         with partial.open("wb") as stream:
-            np.savez(stream, **arrays)
+            stream.write(data)
             stream.flush()
             os.fsync(stream.fileno())
         partial.replace(target)

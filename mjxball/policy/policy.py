@@ -90,10 +90,21 @@ class NetworkLaw:
 
     def step(self, memory: Array, observation: Array, brief: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `brief` is not read."""
+        scaled = self.scaled(memory, observation)
+        return self.remember(memory, observation, scaled), self.command(scaled, observation)
+
+    def scaled(self, memory: Array, observation: Array) -> Array:
+        """The network's action in [-1, 1] (..., 3)."""
         xp = observation.__array_namespace__()
         weights, biases, mean, scale = self._parts
         single = [xp.asarray(part, dtype=observation.dtype) for part in (mean, scale)]
         layers = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
-        scaled = mean_action(*layers, *single, self._recall.network_input(observation, memory))
-        command = layout.follower_command(scaled, observation, *self._law)
-        return self._recall.next(memory, observation, scaled), command
+        return mean_action(*layers, *single, self._recall.network_input(observation, memory))
+
+    def command(self, scaled: Array, observation: Array) -> Array:
+        """Command (..., 3) of the action `scaled` (..., 3)."""
+        return layout.follower_command(scaled, observation, *self._law)
+
+    def remember(self, memory: Array, observation: Array, scaled: Array) -> Array:
+        """Memory of the next step."""
+        return self._recall.next(memory, observation, scaled)

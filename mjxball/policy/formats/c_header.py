@@ -1,0 +1,167 @@
+"""A policy as one C99 header without allocation, for an app on board. Needs NumPy alone."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mjxball.control.observation import ACTION_SIZE, ERROR, ERROR_RATE, OBSERVATION, OBSERVATION_SIZE
+from mjxball.control.recall import Recall
+from mjxball.policy.file import PolicyFile, recall_of
+from mjxball.policy.formats.c_template import APPROACH, HEADER
+
+FLOAT = 4  # bytes
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """What a header costs on board [bytes]; code comes on top, about 1 KiB with -Os."""
+
+    flash: int  # constants
+    state: int  # `mjxball_follower`
+    stack: int  # arrays of one call
+
+
+def footprint(policy: PolicyFile) -> Footprint:
+    """Bytes that the header of `policy` needs."""
+    weights, biases = _mean_layers(policy)
+    size = len(policy.observation_mean)
+    widest = max(len(bias) for bias in biases)
+    constants = sum(array.size for array in (*weights, *biases)) + 2 * size + 2 * ACTION_SIZE
+    return Footprint(FLOAT * constants, FLOAT * (size - OBSERVATION_SIZE) + 4, FLOAT * (size + 2 * widest))
+
+
+def c_header(policy: PolicyFile, name: str) -> str:
+    """The header's text. `mjxball_follow` computes what `mjxball.Policy` computes, in float."""
+    recall, card, cost = recall_of(policy.card), policy.card, footprint(policy)
+    weights, biases = _mean_layers(policy)
+    sizes = [len(policy.observation_mean), *map(len, biases)]
+    arrays = [_array("mean", policy.observation_mean), _array("scale", policy.observation_scale)]
+    for number, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        arrays += [_array(f"weight_{number}", weight.T), _array(f"bias_{number}", bias)]
+    tilt, vertical = card["command_limits"]
+    arrays += [_array("reach", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
+    return HEADER.format(
+        name=_plain(name),
+        origin=_plain(f"preset {card['preset']}, configuration {card['config_hash']}, {card['training_steps']} steps"),
+        version=_plain(card["package_version"]),
+        period=f"{card['control_period']:g}",
+        observation=_table(),
+        layers=" x ".join(map(str, sizes)),
+        flash=cost.flash,
+        state=cost.state,
+        stack=cost.stack,
+        size=sizes[0],
+        widest=max(sizes[1:]),
+        memory_size=recall.size,
+        memory_field=f"    mjxball_real memory[{recall.size}];\n" if recall.size else "",
+        helpers=APPROACH if recall.filters else "",
+        memory_pointer="    mjxball_real *memory = follower->memory;\n" if recall.size else "",
+        arrays="\n".join(arrays),
+        recall=_recall(recall),
+        remember=_remember(recall),
+        network=_network(sizes),
+        command=_command(card),
+    )
+
+
+def _mean_layers(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Weights and biases without the last layer's second half, which exploration alone uses."""
+    weights = [*policy.weights[:-1], policy.weights[-1][:, :ACTION_SIZE]]
+    return weights, [*policy.biases[:-1], policy.biases[-1][:ACTION_SIZE]]
+
+
+def _number(value: float) -> str:
+    """The shortest literal that is exactly this float."""
+    return np.format_float_scientific(np.float32(value), unique=True, trim="0") + "f"
+
+
+def _array(label: str, values: Iterable[Any]) -> str:
+    numbers = [_number(value) for value in np.asarray(values, np.float32).ravel()]
+    rows = [", ".join(numbers[k : k + 8]) for k in range(0, len(numbers), 8)]
+    body = ",\n    ".join(rows)
+    return f"static const float mjxball_{label}[{len(numbers)}] = {{\n    {body}}};"
+
+
+def _plain(text: Any) -> str:
+    """`text` fit for a C comment, whatever a policy's card says."""
+    return re.sub(r"[^A-Za-z0-9 ,.;:_+()-]", "?", str(text))[:200]
+
+
+def _table() -> str:
+    return "\n".join(f" *   {slot:2d}  {name:<22}{unit}" for slot, (name, unit) in enumerate(OBSERVATION))
+
+
+def _recall(recall: Recall) -> str:
+    """Lines that make the network's input of observation and memory (see `control.recall`)."""
+    if not recall.size:
+        return "    (void)follower;"
+    older, width = (recall.history - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
+    lines = ["    if (!follower->running) {"]
+    lines += [f"        for (i = 0; i < {recall.size}; i++) memory[i] = 0;"]
+    for k in range(recall.history - 1):
+        lines += [f"        mjxball_copy(memory + {k * OBSERVATION_SIZE}, observation, {OBSERVATION_SIZE});"]
+    for k in range(len(recall.filters)):
+        lines += [f"        mjxball_copy(memory + {older + k * width}, observation, {OBSERVATION_SIZE});"]
+    lines += ["        follower->running = 1;", "    }"]
+    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {recall.size});"]
+    for k in range(len(recall.filters)):
+        place = OBSERVATION_SIZE + older + k * width
+        lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
+    return "\n".join(lines)
+
+
+def _remember(recall: Recall) -> str:
+    """Lines that move the memory on by one step."""
+    lines = []
+    older, width = (recall.history - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
+    if older:
+        lines += [
+            f"    for (i = {older - 1}; i >= {OBSERVATION_SIZE}; i--) memory[i] = memory[i - {OBSERVATION_SIZE}];"
+        ]
+        lines += [f"    mjxball_copy(memory, observation, {OBSERVATION_SIZE});"]
+    for k, tau in enumerate(recall.filters):
+        place, share = older + k * width, _number(-math.expm1(-recall.period / tau))
+        lines += [f"    mjxball_approach(memory + {place}, observation, {OBSERVATION_SIZE}, {share});"]
+        lines += [f"    mjxball_approach(memory + {place + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
+    if recall.previous_action:
+        lines += [f"    mjxball_copy(memory + {recall.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
+    return "\n".join(lines)
+
+
+def _network(sizes: Sequence[int]) -> str:
+    """Calls of the layers, from `input` through two buffers in turn to `action`."""
+    lines, source = [], "input"
+    last = len(sizes) - 2
+    for number in range(last + 1):
+        target = "action" if number == last else f"hidden[{number % 2}]"
+        arrays = f"mjxball_weight_{number}, mjxball_bias_{number}"
+        lines.append(f"    mjxball_layer({arrays}, {sizes[number]}, {sizes[number + 1]}, {source}, {target});")
+        if number < last:
+            lines.append(f"    for (i = 0; i < {sizes[number + 1]}; i++) if ({target}[i] < 0) {target}[i] = 0;")
+        source = target
+    return "\n".join(lines)
+
+
+def _command(card: dict[str, Any]) -> str:
+    """Lines that make the command of `action`: for a residual the PD law on the observed error is added."""
+    if card["action_mode"] == "direct":
+        return "    for (i = 0; i < 3; i++) command[i] = 0;"
+    g = _number(card["gravity"])
+    wanted = [
+        f"{_number(kp)} * observation[{ERROR.start + k}] + {_number(kd)} * observation[{ERROR_RATE.start + k}]"
+        for k, (kp, kd) in enumerate(zip(card["leader_kp"], card["leader_kd"], strict=True))
+    ]
+    return "\n".join(
+        [
+            f"    command[0] = -({wanted[1]}) / {g};",
+            f"    command[1] = ({wanted[0]}) / {g};",
+            f"    command[2] = {wanted[2]};",
+            "    for (i = 0; i < 3; i++) command[i] = mjxball_clip(command[i], mjxball_limit[i]);",
+        ]
+    )

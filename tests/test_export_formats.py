@@ -1,0 +1,243 @@
+"""Policies as ONNX and as a C99 header: the numbers of NumPy inference, and refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+from command_line import TRANSPORT, assert_one_line, call, listing, load_arrays, run, write_arrays
+from conftest import Trained
+
+from mjxball.export import main
+from mjxball.policy import Policy, PolicyFile, load_file
+from mjxball.policy.formats.c_header import c_header, footprint
+from mjxball.policy.formats.onnx_file import onnx_model
+
+STEPS = 60
+HARNESS = """
+#include <stdio.h>
+#include "follower.h"
+
+/* Each record: start (int), memory, observation -> action, command, memory, in MJXBALL_REAL. */
+int main(void) {
+    mjxball_follower follower;
+    mjxball_real seen[18], action[3], command[3];
+    int start;
+    fprintf(stderr, "%d", (int)sizeof follower);
+    mjxball_reset(&follower);
+    while (fread(&start, sizeof start, 1, stdin) == 1) {
+        if (start) mjxball_reset(&follower);
+#if MJXBALL_MEMORY_SIZE > 0
+        mjxball_real memory[MJXBALL_MEMORY_SIZE];
+        if (fread(memory, sizeof memory, 1, stdin) != 1) return 1;
+        if (!start) mjxball_copy(follower.memory, memory, MJXBALL_MEMORY_SIZE);
+#endif
+        if (fread(seen, sizeof seen, 1, stdin) != 1) return 1;
+        mjxball_follow(&follower, seen, action, command);
+        fwrite(action, sizeof action, 1, stdout);
+        fwrite(command, sizeof command, 1, stdout);
+#if MJXBALL_MEMORY_SIZE > 0
+        fwrite(follower.memory, sizeof follower.memory, 1, stdout);
+#endif
+    }
+    return 0;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def direct(trained: Trained) -> PolicyFile:
+    """A follower that commands directly, with other gains and limits."""
+    card = {**trained.contents.card, "action_mode": "direct", "command_limits": [0.1, 1.5]}
+    return dataclasses.replace(trained.contents, card=card)
+
+
+@pytest.fixture(scope="module")
+def limited(remembering: Trained) -> PolicyFile:
+    """A follower with everything that it can remember, whose PD law differs on every axis and meets its limits."""
+    card = {**remembering.contents.card, "leader_kp": [0.5, 0.7, 0.9], "leader_kd": [1.0, 1.2, 1.4]}
+    return dataclasses.replace(remembering.contents, card={**card, "command_limits": [0.05, 0.6]})
+
+
+@pytest.fixture(params=["trained", "direct", "remembering", "limited", "shipped"])
+def contents(request: pytest.FixtureRequest) -> PolicyFile:
+    if request.param == "shipped":
+        return load_file(TRANSPORT)
+    made = request.getfixturevalue(request.param)
+    return made.contents if isinstance(made, Trained) else made
+
+
+@dataclasses.dataclass(frozen=True)
+class Flight:
+    """What NumPy inference in one dtype does, step by step; two flights, the second starts half way."""
+
+    start: np.ndarray  # (T,) bool
+    memory: np.ndarray  # (T, m) before each step
+    observation: np.ndarray  # (T, 18) float32
+    action: np.ndarray  # (T, 3) in [-1, 1]
+    command: np.ndarray  # (T, 3)
+    next_memory: np.ndarray  # (T, m)
+
+
+def flown(contents: PolicyFile, dtype: Any) -> Flight:
+    """NumPy inference on observations that change as smoothly as a flight's."""
+    policy, random = Policy(contents, "follower", dtype), np.random.default_rng(3)
+    walk = np.cumsum(random.normal(scale=0.03, size=(STEPS, 18)), axis=0) + random.normal(scale=0.3, size=18)
+    size = len(contents.observation_mean) - 18
+    rows: dict[str, list[Any]] = {field.name: [] for field in dataclasses.fields(Flight)}
+    for number, seen in enumerate(walk.astype(np.float32)):
+        start = number % (STEPS // 2) == 0
+        if start:
+            policy.reset()
+        rows["start"].append(start)
+        rows["memory"].append(np.zeros(size) if policy._memory is None else policy._memory)
+        rows["observation"].append(seen)
+        memory = policy._memory
+        rows["action"].append(policy.scaled(seen))
+        after = policy._memory
+        policy._memory = memory
+        rows["command"].append(policy(seen))
+        rows["next_memory"].append(np.zeros(0) if after is None else after)
+    return Flight(**{name: np.array(values) for name, values in rows.items()})
+
+
+def allowed(contents: PolicyFile, dtype: Any) -> float:
+    """How far one step's action in [-1, 1] may be from NumPy's in the same dtype.
+
+    1e-6, but in float32 the shipped policy is so steep that NumPy itself is 4e-6 away from its own float64.
+    """
+    return 1e-5 if dtype == np.float32 and contents.card["training_steps"] > 1e6 else 1e-6
+
+
+def test_onnx_computes_what_numpy_computes(contents: PolicyFile):
+    session = onnxruntime.InferenceSession(onnx_model(contents, "follower").SerializeToString())
+    flight = flown(contents, np.float32)
+    feed: dict[str, np.ndarray] = {"observation": flight.observation}
+    if flight.memory.shape[1]:
+        feed |= {"memory": flight.memory.astype(np.float32), "start": flight.start[:, None]}
+    assert {item.name for item in session.get_inputs()} == set(feed)
+    names = [item.name for item in session.get_outputs()]
+    answer = dict(zip(names, session.run(None, feed), strict=True))  # all steps as one batch
+    tolerance = allowed(contents, np.float32)
+    np.testing.assert_allclose(answer["action"], flight.action, rtol=0, atol=tolerance)
+    reach = float(contents.action_scale.max())
+    np.testing.assert_allclose(answer["command"], flight.command, rtol=0, atol=1e-6 + reach * tolerance)
+    if flight.memory.shape[1]:
+        np.testing.assert_allclose(answer["next_memory"], flight.next_memory, rtol=0, atol=1e-6 + tolerance)
+    assert np.abs(flight.action).max() > 0.05
+
+
+def test_onnx_flies_by_itself(limited: PolicyFile):
+    """Fed its own memory, whose first value it must not read."""
+    session = onnxruntime.InferenceSession(onnx_model(limited, "follower").SerializeToString())
+    flight = flown(limited, np.float32)
+    memory = np.full((1, flight.memory.shape[1]), 7.0, np.float32)
+    for number, seen in enumerate(flight.observation):
+        feed = {"observation": seen[None], "memory": memory, "start": flight.start[None, number : number + 1]}
+        action, memory = session.run(["action", "next_memory"], feed)
+        np.testing.assert_allclose(action[0], flight.action[number], rtol=0, atol=5e-6)  # 30 steps of rounding
+
+
+def compiled(contents: PolicyFile, place: Path, real: str) -> Path:
+    """The harness around the header of `contents`, compiled as strictly as gcc can."""
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc is installed")
+    (place / "follower.h").write_text(c_header(contents, "follower"))
+    (place / "main.c").write_text(HARNESS)
+    strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Werror", "-O2"]
+    command = ["gcc", *strict, f"-DMJXBALL_REAL={real}", "main.c", "-o", "harness", "-lm"]
+    done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return place / "harness"
+
+
+@pytest.mark.parametrize("real", ["float", "double"])
+def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_path: Path):
+    dtype = np.float32 if real == "float" else np.float64
+    flight = flown(contents, dtype)
+    records = b"".join(
+        np.int32(start).tobytes() + memory.astype(dtype).tobytes() + seen.astype(dtype).tobytes()
+        for start, memory, seen in zip(flight.start, flight.memory, flight.observation, strict=True)
+    )
+    done = subprocess.run([compiled(contents, tmp_path, real)], input=records, capture_output=True, check=True)
+    answer = np.frombuffer(done.stdout, dtype).reshape(STEPS, -1)
+    tolerance = allowed(contents, dtype)
+    np.testing.assert_allclose(answer[:, :3], flight.action, rtol=0, atol=tolerance)
+    reach = float(contents.action_scale.max())
+    np.testing.assert_allclose(answer[:, 3:6], flight.command, rtol=0, atol=1e-6 + reach * tolerance)
+    np.testing.assert_allclose(answer[:, 6:], flight.next_memory, rtol=0, atol=1e-6 + tolerance)
+    if real == "float":
+        assert int(done.stderr) == footprint(contents).state
+
+
+def test_the_header_states_what_it_costs(contents: PolicyFile):
+    text = c_header(contents, "follower")
+    arrays = [int(size) for size in re.findall(r"static const float \w+\[(\d+)\]", text)]
+    cost = footprint(contents)
+    assert 4 * sum(arrays) == cost.flash
+    assert f"Flash: {cost.flash} bytes" in text
+    assert f"RAM: {cost.state} bytes" in text
+    size, widest = map(int, re.search(r"mjxball_real input\[(\d+)\], hidden\[2\]\[(\d+)\];", text).groups())
+    assert 4 * (size + 2 * widest) == cost.stack
+    assert f"{cost.stack} bytes of arrays on the stack" in text
+    assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
+
+
+def test_a_card_cannot_leave_the_comment(trained: Trained, tmp_path: Path):
+    evil = '*/ #error "out" /* \\\n'
+    card = {**trained.contents.card, "preset": evil, "package_version": evil}
+    compiled(dataclasses.replace(trained.contents, card=card), tmp_path, "float")
+
+
+@pytest.mark.parametrize("name", ["follower.onnx", "follower.h", "again.npz"])
+def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    out = tmp_path / name
+    assert call(main, [saved, out]) == 0
+    assert capsys.readouterr().out == f"{out}\n"
+    if name.endswith(".onnx"):
+        model = onnx_model(load_file(saved), "follower")
+        assert out.read_bytes() == model.SerializeToString()
+    elif name.endswith(".h"):
+        assert out.read_text() == c_header(load_file(saved), "follower")
+    else:
+        np.testing.assert_array_equal(load_file(out).weights[0], load_file(saved).weights[0])
+
+
+@pytest.mark.parametrize(
+    ("source", "out", "message"),
+    [
+        ("follower.npz", "follower.txt", "must end in .npz, .onnx, .h"),
+        ("follower.npz", "follower", "must end in .npz, .onnx, .h"),
+        ("follower.npz", "taken.h", "taken.h exists"),
+        ("follower.npz", "nowhere/follower.h", "nowhere does not exist"),
+        ("none.npz", "follower.h", "none.npz does not exist"),
+        ("broken.npz", "follower.onnx", "broken.npz: card field history is missing"),
+        ("no-run", "follower.onnx", "no-run"),
+    ],
+)
+def test_refusals(source: str, out: str, message: str, saved: Path, monkeypatch, capsys):
+    (saved.parent / "taken.h").write_text("mine")
+    arrays, card = load_arrays(saved)
+    del card["history"]
+    write_arrays(saved.parent / "broken.npz", arrays, card)
+    before = listing(saved.parent)
+    monkeypatch.chdir(saved.parent)
+    assert call(main, [source, out]) == 2
+    errors = capsys.readouterr().err
+    assert_one_line(errors)
+    assert message in errors
+    assert listing(saved.parent) == before
+
+
+def test_a_missing_package_is_named_with_its_extra(saved: Path):
+    script = "import sys; sys.modules['onnx'] = None; from mjxball.export import main; sys.exit(main(sys.argv[1:]))"
+    done = run(["-c", script, saved, "out.onnx"], Path(__file__).parents[1])
+    assert done.returncode == 2
+    assert done.stderr == "error: onnx is not installed; pip install 'mjxball[onnx]'\n"

@@ -1,0 +1,272 @@
+"""Gymnasium: its checker, flights as in the Brax environment and in Gymnasium's own vector, endings, Playground."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from command_line import run
+from conftest import compile_env, with_settings
+from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.seeding import np_random
+
+import mjxball.gym
+from mjxball.config import PRESETS, Config, preset
+from mjxball.errors import InputError
+from mjxball.gym import worlds
+from mjxball.gym.playground import PlaygroundEnv
+from mjxball.gym.single import FollowerEnv
+from mjxball.gym.vector import FollowerVectorEnv
+from mjxball.quiet import import_brax_env
+
+import_brax_env()
+from brax.envs.wrappers import training as brax_wrappers  # noqa: E402
+
+STILL = np.zeros(3, np.float32)
+
+
+@pytest.fixture(scope="module")
+def short() -> Config:
+    """Episodes of 8 steps."""
+    return with_settings(preset("transport"), timing={"episode_steps": 8})
+
+
+def actions(steps: int, *shape: int) -> np.ndarray:
+    """Full-reach random actions (steps, *shape, 3)."""
+    return np.random.default_rng(5).uniform(-1, 1, (steps, *shape, 3)).astype(np.float32)
+
+
+def test_every_preset_is_registered():
+    ours = {name for name in gymnasium.registry if name.startswith("mjxball/")}
+    assert ours == {mjxball.gym.environment_id(name) for name in PRESETS}
+    assert {"mjxball/Transport-v0", "mjxball/Paper-v0", "mjxball/Robust-v0"} <= ours
+
+
+@pytest.mark.parametrize("name", ["Transport", "Robust"])
+def test_gymnasiums_checker_finds_nothing(name: str):
+    with warnings.catch_warnings(record=True) as raised:
+        warnings.simplefilter("always")
+        env = gymnasium.make(f"mjxball/{name}-v0")
+        assert isinstance(env.unwrapped, FollowerEnv)
+        check_env(env.unwrapped, skip_render_check=True)  # the renderer has a test of its own
+    # An observation has no bounds; the checker asks whether that is meant.
+    odd = [str(each.message) for each in raised if issubclass(each.category, UserWarning)]
+    assert [text for text in odd if "infinity" not in text] == []
+
+
+@pytest.mark.parametrize(("name", "engine"), [("transport", "mjx"), ("robust", "newton-euler")])
+def test_it_flies_as_the_brax_environment(name: str, engine: str):
+    """C MuJoCo in float64 against the training environment in float32, from the same drawn world, 50 steps."""
+    config = preset(name)
+    env = FollowerEnv(config=config)
+    first, _ = env.reset(seed=7)
+    _, key = worlds.next_world(jax.random.key(worlds.seed_number(np_random(7)[0])))
+    pair = compile_env(config, engine)
+    state = pair.reset(key)
+    size = len(first)
+    assert size == env.observation_space.shape[0] <= pair.env.observation_size
+    np.testing.assert_allclose(first, state.obs[:size], rtol=0, atol=1e-6)  # the same function, compiled apart
+    moved = 0.0
+    for action in actions(50):
+        seen, reward, terminated, truncated, info = env.step(action)
+        state = pair.step(state, action)
+        # As between the two training engines: float32 rounding over 200 physics steps.
+        np.testing.assert_allclose(seen, state.obs[:size], rtol=0, atol=1e-4)
+        # An error of 1e-4 m is worth error / error_scale of that, at most 50 times as much.
+        assert reward == pytest.approx(float(state.reward), abs=5e-3)
+        assert info["error"] == pytest.approx(float(state.metrics["error"]), abs=1e-4)
+        assert (terminated, truncated) == (False, False)
+        moved = max(moved, float(np.abs(seen[:3] - first[:3]).max()))
+    assert moved > 0.05  # 500 times the tolerance
+
+
+def test_seeds():
+    env = FollowerEnv()
+    first, again, other = (env.reset(seed=seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    env.reset(seed=1)
+    following = env.reset()[0]
+    assert not np.array_equal(first, following)
+    assert not np.array_equal(FollowerEnv().reset()[0], FollowerEnv().reset()[0])
+
+
+def test_the_time_limit_truncates_and_leaving_terminates(short: Config):
+    env = FollowerEnv(config=short)
+    env.reset(seed=3)
+    ends = [env.step(STILL)[2:4] for _ in range(8)]
+    assert ends == [*[(False, False)] * 7, (False, True)]
+    env.reset(seed=3)
+    world = env._state.pipeline_state
+    env._state = env._state.replace(pipeline_state=world._replace(goal=world.goal + jnp.array([0.0, 0.0, 5.0])))
+    assert env.step(STILL)[2:4] == (True, False)
+
+
+def test_an_action_that_is_not_finite_ends_the_episode():
+    env = FollowerEnv()
+    env.reset(seed=3)
+    seen, reward, terminated, truncated, info = env.step(np.array([0.0, np.nan, 0.0], np.float32))
+    assert (terminated, truncated, info["diverged"]) == (True, False, 1.0)
+    assert np.isfinite(seen).all()
+    assert np.isfinite(reward)
+
+
+def test_mistakes_are_named():
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        FollowerEnv().step(STILL)
+    with pytest.raises(InputError, match="unknown preset 'nothing'"):
+        FollowerEnv("nothing")
+    with pytest.raises(InputError, match="unknown physics 'ode'"):
+        FollowerEnv(physics="ode")
+    with pytest.raises(ValueError, match="render_mode must be"):
+        FollowerEnv(render_mode="human")
+    vector = FollowerVectorEnv(2, physics="newton-euler")
+    with pytest.raises(ValueError, match="3 seeds were given for 2 worlds"):
+        vector.reset(seed=[1, 2, 3])
+
+
+def assert_same_info(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
+    """Gymnasium leaves out what no world tells; here it is there, and its mask false."""
+    assert set(theirs) <= set(ours)
+    for name, value in ours.items():
+        if name.startswith("_"):
+            np.testing.assert_array_equal(value, theirs.get(name, np.zeros(3, bool)))
+        elif name == "final_info":
+            assert_same_info(value, theirs[name])
+        elif name == "final_obs":
+            assert [last is None for last in value] == [last is None for last in theirs[name]]
+            pairs = [pair for pair in zip(value, theirs[name], strict=True) if pair[0] is not None]
+            np.testing.assert_allclose(*zip(*pairs, strict=True), rtol=0, atol=2e-5)
+        else:
+            # Squared command errors and |e_o|, float32 against float64.
+            np.testing.assert_allclose(value, theirs.get(name, np.zeros(3)), rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_the_vector_is_gymnasiums_own_vector_of_single_worlds(short: Config, mode: str):
+    """Three episodes of 8 steps: seeds, autoreset, endings and info as in `SyncVectorEnv`."""
+    ours = FollowerVectorEnv(3, config=short, physics="newton-euler", autoreset_mode=mode)
+    single = [lambda: FollowerEnv(config=short, physics="newton-euler")] * 3
+    theirs = gymnasium.vector.SyncVectorEnv(single, autoreset_mode=mode)
+    assert ours.metadata["autoreset_mode"] == theirs.metadata["autoreset_mode"]
+    assert (ours.observation_space, ours.action_space) == (theirs.observation_space, theirs.action_space)
+    starts = [vector.reset(seed=11)[0] for vector in (ours, theirs)]
+    np.testing.assert_allclose(*starts, rtol=0, atol=1e-6)
+    ended = 0
+    for given in actions(27, 3):
+        (seen, reward, *ends, info), (seen_too, reward_too, *ends_too, info_too) = ours.step(given), theirs.step(given)
+        # Float32 against float64 within episodes of 8 steps; the reward multiplies errors by 20.
+        np.testing.assert_allclose(seen, seen_too, rtol=0, atol=2e-5)
+        np.testing.assert_allclose(reward, reward_too, rtol=0, atol=4e-4)
+        np.testing.assert_array_equal(ends, ends_too)
+        assert_same_info(info, info_too)
+        ended += int(np.sum(ends))
+    # Episodes of 8 steps follow each other at once, or with a step between them.
+    assert ended == 9
+
+
+def test_make_vec_takes_mjx():
+    vector = gymnasium.make_vec("mjxball/Transport-v0", num_envs=2, vectorization_mode="vector_entry_point")
+    assert isinstance(vector.unwrapped, FollowerVectorEnv)
+    assert vector.unwrapped._program.pair.backend == "mjx"
+
+
+RENDER = """
+import gymnasium, numpy as np, mjxball.gym
+env = gymnasium.make("mjxball/Transport-v0", render_mode="rgb_array")
+env.reset(seed=4)
+first = env.render()
+for _ in range(40):
+    env.step(np.ones(3, np.float32))
+last = env.render()
+env.close()
+np.savez("pictures.npz", first=first, last=last)
+"""
+
+
+def test_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """In a process of its own, which a failing GL library may end."""
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    done = run(["-c", RENDER], tmp_path)
+    if done.returncode and re.search("EGL|OpenGL|gl_context|libGL|GLError", done.stderr):
+        pytest.skip("MuJoCo's renderer finds no GL library")
+    assert done.returncode == 0, done.stderr
+    with np.load(tmp_path / "pictures.npz") as stored:
+        first, last = stored["first"].astype(int), stored["last"].astype(int)
+    assert first.shape == (360, 480, 3)
+    assert (np.abs(first - last).max(axis=-1) > 30).sum() > 200  # the pair has moved
+    green = (first[..., 1] > first[..., 0] + 40) & (first[..., 1] > first[..., 2] + 40)
+    assert green.sum() > 20  # the goal
+
+
+class Restarting:
+    """What Playground's auto-reset wrapper asks of an environment and its state, in short."""
+
+    def __init__(self, env: Any):
+        self.env = env
+
+    def reset(self, rng: Any) -> Any:
+        state = self.env.reset(rng)
+        state.info["first_data"], state.info["first_obs"] = state.data, state.obs
+        return state
+
+    def step(self, state: Any, action: Any) -> Any:
+        state.info.update(steps=jnp.where(state.done, jnp.zeros_like(state.info["steps"]), state.info["steps"]))
+        state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
+
+        def where_done(new: Any, old: Any) -> Any:
+            return jnp.where(jnp.reshape(state.done, [new.shape[0]] + [1] * (new.ndim - 1)), new, old)
+
+        data = jax.tree.map(where_done, state.info["first_data"], state.data)
+        return state.replace(data=data, obs=where_done(state.info["first_obs"], state.obs))
+
+
+def playground_wrapped(env: PlaygroundEnv, length: int) -> Any:
+    """Playground's own wrappers where it is installed, else those that it takes from Brax and a short auto-reset."""
+    try:
+        from mujoco_playground import wrapper
+    except ImportError:
+        vmapped = brax_wrappers.VmapWrapper(env)
+        return Restarting(brax_wrappers.EpisodeWrapper(vmapped, length, 1))
+    return wrapper.wrap_for_brax_training(env, episode_length=length)
+
+
+def test_playgrounds_wrappers_take_the_adapter():
+    env = PlaygroundEnv("transport", physics="newton-euler")
+    assert (env.dt, env.sim_dt, env.n_substeps, env.action_size) == (0.02, 0.005, 4, 3)
+    assert env.unwrapped is env
+    assert env.mj_model.nu == 8
+    wrapped = playground_wrapped(env, length=4)
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
+    first = jax.jit(wrapped.reset)(keys)
+    assert first.obs.shape == (2, env.observation_size)
+    step, state, dones = jax.jit(wrapped.step), first, []
+    for action in actions(8, 2):
+        state = step(state, action)
+        dones.append(np.asarray(state.done).tolist())
+    assert dones == [*[[0, 0]] * 3, [1, 1]] * 2
+    np.testing.assert_array_equal(state.info["truncation"], [1, 1])
+    np.testing.assert_array_equal(state.obs, first.obs)
+    np.testing.assert_array_equal(state.data.plant.position, first.data.plant.position)
+
+
+@pytest.mark.slow
+def test_stable_baselines3_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """SAC of Stable-Baselines3 beats the copying follower after a short run; see docs/gym.md for a longer one."""
+    pytest.importorskip("stable_baselines3")
+    import json
+
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    script = Path(__file__).parents[1] / "benchmarks" / "stable_baselines3_sac.py"
+    done = run([script, "--steps", 20_000, "--episodes", 2, "--json", "result.json"], tmp_path, timeout=1200)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "result.json").read_text())["rows"]
+    assert rows["SB3 SAC"]["return"] > rows["copies its leader"]["return"] > rows["random"]["return"]
