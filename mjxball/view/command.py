@@ -1,0 +1,67 @@
+"""Command line of `python -m mjxball.view`."""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import webbrowser
+from pathlib import Path
+
+from mjxball.cli import Parser, output_file, run_command
+from mjxball.policy.file import write_whole
+from mjxball.scenario import Scenario
+from mjxball.view.flight_file import save_flight
+from mjxball.view.page import flight_page
+from mjxball.view.sources import flight_from
+
+REFERENCE = Scenario()
+
+
+def parser() -> Parser:
+    """The argument parser of `python -m mjxball.view`."""
+    result = Parser(
+        prog="python -m mjxball.view",
+        description="Play a flight in the browser: one HTML page that needs neither a server nor a network.",
+    )
+    result.add_argument(
+        "source", metavar="RUN_OR_LOG", help="recorded flight (.npz), or run directory, policy file or baseline to fly"
+    )
+    result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
+    result.add_argument("--save", type=Path, metavar="FILE.npz", help="write the flight itself too")
+    flown = result.add_argument_group("scenario of what is flown on the spot")
+    flown.add_argument("--omega", type=float, default=REFERENCE.omega, help="CG speed [rad/s] (default %(default)s)")
+    flown.add_argument("--amplitude", type=float, default=REFERENCE.amplitude, help="of the CG [m] (%(default)s)")
+    flown.add_argument("--mass", type=float, default=REFERENCE.mass, help="of the object [kg] (%(default)s)")
+    flown.add_argument("--goal", nargs=3, type=float, default=REFERENCE.goal, metavar=("X", "Y", "Z"), help="[m]")
+    flown.add_argument("--seconds", type=float, default=REFERENCE.seconds, help="length of the flight (%(default)s)")
+    flown.add_argument("--physics", choices=("newton-euler", "mjx", "mujoco"), default="newton-euler")
+    return result
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Show a flight; return the exit code."""
+    options = parser().parse_args(arguments)
+    return run_command(lambda: _view(options))
+
+
+def _view(options: argparse.Namespace) -> int:
+    for path, suffix in ((options.out, ".html"), (options.save, ".npz")):
+        if path:
+            output_file(path, suffix)
+    scenario = Scenario(
+        omega=options.omega,
+        amplitude=options.amplitude,
+        mass=options.mass,
+        goal=tuple(options.goal),
+        seconds=options.seconds,
+    )
+    flight = flight_from(options.source, scenario, options.physics)
+    if options.save:
+        save_flight(options.save, flight)
+        print(f"the flight is {options.save}")  # noqa: T201
+    page = options.out or Path(tempfile.mkdtemp(prefix="mjxball-")) / "flight.html"
+    write_whole(page, flight_page(flight).encode())
+    print(f"the page is {page}")  # noqa: T201
+    if not options.out:
+        webbrowser.open(page.as_uri())
+    return 0

@@ -1,0 +1,59 @@
+"""The page around a flight: one HTML file that works from disk."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball.view.flight_file import Flight
+
+PARTS = Path(__file__).parent / "parts"
+SCRIPTS = ("space.js", "scene.js", "plots.js", "player.js")
+
+
+def flight_page(flight: Flight) -> str:
+    """The page's text; the flight is inside, as float32."""
+    script = "\n".join((PARTS / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    return (
+        (PARTS / "page.html")
+        .read_text(encoding="utf-8")
+        .replace("{{title}}", html.escape(flight.title))
+        .replace("{{style}}", (PARTS / "style.css").read_text(encoding="utf-8"))
+        .replace("{{data}}", _json(_contents(flight)))
+        .replace("{{script}}", script)
+    )
+
+
+def _contents(flight: Flight) -> dict[str, Any]:
+    thrust = flight["rotor_force"].sum(axis=-1)
+    shown = {**flight.arrays, "thrust": thrust, "error": flight["target"] - flight["position"]}
+    plant = flight.plant
+    return {
+        "title": flight.title,
+        "rows": len(flight["time"]),
+        "arrays": {name: _packed(array) for name, array in shown.items() if name != "rotor_force"},
+        "plant": {
+            "size": plant.object_size,
+            "arm": plant.arm,
+            "mounts": [plant.leader_mount, plant.follower_mount],
+            "axis": "xy".index(plant.cg_axis),
+            "share": plant.moving_fraction,
+            "ball": plant.ball_radius,
+            "gravity": plant.gravity,
+        },
+    }
+
+
+def _packed(array: np.ndarray) -> str:
+    """Row after row as little-endian float32 in base64."""
+    return base64.b64encode(np.ascontiguousarray(array, "<f4").tobytes()).decode("ascii")
+
+
+def _json(value: Any) -> str:
+    """JSON that cannot end the script element which holds it."""
+    return json.dumps(value).replace("<", "\\u003c")

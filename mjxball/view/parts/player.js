@@ -1,0 +1,176 @@
+// The player: reads the flight, moves the time, and keeps scene, plots and controls together.
+class Flight {
+  constructor({ rows, arrays, plant }) {
+    this.rows = rows;
+    this.plant = plant;
+    this.arrays = {};
+    for (const [name, text] of Object.entries(arrays)) {
+      const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+      this.arrays[name] = new Float32Array(bytes.buffer);
+    }
+    this.time = this.arrays.time;
+  }
+
+  // Row `row` of the array `name`, flat.
+  at(name, row) {
+    const array = this.arrays[name], width = array.length / this.rows;
+    return Array.from(array.subarray(row * width, (row + 1) * width));
+  }
+
+  column(name, index, factor = 1) {
+    const array = this.arrays[name], width = array.length / this.rows;
+    return Float32Array.from({ length: this.rows }, (_, row) => factor * array[row * width + index]);
+  }
+
+  largest(name) { return this.arrays[name].reduce((most, value) => Math.max(most, Math.abs(value)), 1e-6); }
+
+  largestContact() {
+    let most = 1e-6;
+    for (let row = 0; row < this.rows; row++) {
+      const f = this.at('contact_force', row);
+      most = Math.max(most, length(f.slice(0, 3)), length(f.slice(3)));
+    }
+    return most;
+  }
+
+  bounds() {
+    const low = [Infinity, Infinity, Infinity], high = low.map((v) => -v);
+    for (const name of ['position', 'target']) {
+      this.arrays[name].forEach((value, k) => {
+        low[k % 3] = Math.min(low[k % 3], value);
+        high[k % 3] = Math.max(high[k % 3], value);
+      });
+    }
+    return { low, high };
+  }
+
+  rowAt(time) {
+    let low = 0, high = this.rows - 1;
+    while (low < high) {
+      const middle = (low + high + 1) >> 1;
+      if (this.time[middle] <= time + 1e-6) low = middle; else high = middle - 1;
+    }
+    return low;
+  }
+}
+
+class Player {
+  constructor(flight) {
+    Object.assign(this, { flight, playing: false, now: flight.time[0] });
+    this.scene = new Scene(document.getElementById('scene'), flight);
+    this.play = document.getElementById('play');
+    this.seeker = document.getElementById('seek');
+    this.speed = document.getElementById('speed');
+    this.seeker.max = flight.rows - 1;
+    this.plots = this.makePlots();
+    this.makeToggles();
+    this.play.onclick = () => this.toggle();
+    this.seeker.oninput = () => this.seek(flight.time[+this.seeker.value]);
+    this.listen();
+    new ResizeObserver(() => this.draw()).observe(document.body);
+    this.seek(this.now);
+  }
+
+  makePlots() {
+    const { flight } = this, parent = document.getElementById('plots'), degrees = 180 / Math.PI;
+    const line = (name, colour, values, dash) => ({ name, colour, values, dash });
+    const axes = ['#c92a2a', '#2b8a3e', '#1864ab'];
+    const drones = [['leader', COLOURS.leader], ['follower', COLOURS.follower]];
+    const command = (index, factor) => drones.map(([name, colour], k) =>
+      line(name, colour, flight.column(`${name}_command`, index, factor), k ? [] : [5, 3]));
+    const push = (drone) => Float32Array.from({ length: flight.rows }, (_, row) =>
+      length(flight.at('contact_force', row).slice(3 * drone, 3 * drone + 3)));
+    const make = (title, unit, series) => new Plot(parent, title, unit, flight.time, series, (time) => this.seek(time));
+    return [
+      make('Error to the goal', 'm', ['x', 'y', 'z'].map((name, k) => line(name, axes[k], flight.column('error', k)))),
+      make('CG from the centre', 'cm', [line('offset', COLOURS.cg, flight.column('cg_offset', 0, 100))]),
+      make('Attitude', '°', ['roll', 'pitch', 'yaw'].map((name, k) => line(name, axes[k], flight.column('euler', k, degrees)))),
+      make('Commanded pitch', '°', command(1, degrees)),
+      make('Commanded roll', '°', command(0, degrees)),
+      make('Commanded vertical acceleration', 'm/s²', command(2, 1)),
+      make('Thrust', 'N', drones.map(([name, colour], k) => line(name, colour, flight.column('thrust', k)))),
+      make('Contact force on the object', 'N', drones.map(([name, colour], k) => line(name, colour, push(k)))),
+    ];
+  }
+
+  makeToggles() {
+    const parent = document.getElementById('shown'), { reach } = this.scene;
+    const scaleOf = (kind) => `${short(0.1 / reach[kind])} N per 10 cm`;
+    const labels = { thrust: `thrust, ${scaleOf('thrust')}`, contact: `contact forces, ${scaleOf('contact')}`, weight: 'object’s weight at the CG', path: 'path' };
+    for (const [kind, text] of Object.entries(labels)) {
+      const label = document.createElement('label');
+      label.innerHTML = `<input type="checkbox" checked><i class="swatch" style="background:${COLOURS[kind]}"></i>${text}`;
+      label.firstChild.id = `show-${kind}`;
+      label.firstChild.onchange = (event) => { this.scene.shown[kind] = event.target.checked; this.draw(); };
+      parent.append(label);
+    }
+  }
+
+  listen() {
+    const { canvas, camera } = this.scene, fingers = new Map();
+    const apart = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
+    canvas.addEventListener('pointerdown', (event) => {
+      fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      canvas.setPointerCapture(event.pointerId);
+    });
+    canvas.addEventListener('pointermove', (event) => {
+      const last = fingers.get(event.pointerId);
+      if (!last) return;
+      const before = fingers.size === 2 ? apart() : 0;
+      fingers.set(event.pointerId, [event.clientX, event.clientY]);
+      if (fingers.size === 1) camera.turn(event.clientX - last[0], event.clientY - last[1]);
+      else if (fingers.size === 2 && before > 0) camera.zoom(before / Math.max(apart(), 1));
+      this.draw();
+    });
+    for (const name of ['pointerup', 'pointercancel']) canvas.addEventListener(name, (event) => fingers.delete(event.pointerId));
+    canvas.addEventListener('wheel', (event) => { event.preventDefault(); camera.zoom(Math.exp(0.001 * event.deltaY)); this.draw(); }, { passive: false });
+    canvas.addEventListener('dblclick', () => { camera.reset(); this.draw(); });
+    document.addEventListener('keydown', (event) => {
+      if (event.target.matches('input, select, button')) return;
+      if (event.key === ' ') { event.preventDefault(); this.toggle(); }
+      if (event.key === 'ArrowRight') this.seek(this.now + 0.1);
+      if (event.key === 'ArrowLeft') this.seek(this.now - 0.1);
+    });
+  }
+
+  toggle() {
+    this.playing = !this.playing;
+    const { time, rows } = this.flight;
+    if (this.playing && this.row === rows - 1) this.seek(time[0]);
+    this.play.textContent = this.playing ? '❚❚' : '▶';
+    this.play.setAttribute('aria-label', this.playing ? 'pause' : 'play');
+    this.last = undefined;
+    if (this.playing) requestAnimationFrame((stamp) => this.frame(stamp));
+  }
+
+  frame(stamp) {
+    if (!this.playing) return;
+    const passed = this.last === undefined ? 0 : Math.min(0.25, (stamp - this.last) / 1000);
+    this.last = stamp;
+    this.seek(this.now + passed * +this.speed.value);
+    if (this.row === this.flight.rows - 1) this.toggle();
+    else requestAnimationFrame((next) => this.frame(next));
+  }
+
+  seek(time) {
+    const { flight } = this;
+    this.now = Math.max(flight.time[0], Math.min(flight.time[flight.rows - 1], time));
+    this.row = flight.rowAt(this.now);
+    this.seeker.value = this.row;
+    this.draw();
+  }
+
+  draw() {
+    const { flight, row } = this, euler = flight.at('euler', row);
+    const tilt = Math.hypot(euler[0], euler[1]) * 180 / Math.PI, cg = 100 * flight.at('cg_offset', row)[0];
+    const tell = (name, text) => { document.getElementById(`now-${name}`).textContent = text; };
+    tell('time', `${flight.time[row].toFixed(2)} s`);
+    tell('error', `${length(flight.at('error', row)).toFixed(3)} m`);
+    tell('tilt', `${tilt.toFixed(1)}°`);
+    tell('cg', `${cg.toFixed(1).replace('-', '−')} cm`);
+    this.scene.draw(row);
+    this.plots.forEach((plot) => plot.draw(row));
+  }
+}
+
+const player = new Player(new Flight(JSON.parse(document.getElementById('flight').textContent)));

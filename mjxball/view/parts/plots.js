@@ -1,0 +1,98 @@
+// Time plots: lines over time with a cursor; click or drag to seek.
+const LEFT = 46, RIGHT = 8, TOP = 6, BOTTOM = 18;
+
+// About `count` round numbers between low and high.
+function ticks(low, high, count) {
+  const raw = (high - low) / count, power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].map((k) => k * power).find((k) => k >= raw * 0.999);
+  const found = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push(k * step);
+  return found;
+}
+
+const short = (value) => String(+value.toPrecision(3)).replace('-', '−');
+
+class Plot {
+  // series: [{ name, colour, values, dash }]
+  constructor(parent, title, unit, time, series, seek) {
+    Object.assign(this, { time, series });
+    const block = document.createElement('div');
+    block.className = 'plot';
+    block.innerHTML = `<h2>${title} <small>[${unit}]</small></h2><div class="legend"></div><canvas></canvas>`;
+    parent.append(block);
+    this.canvas = block.querySelector('canvas');
+    this.readouts = series.map(({ name, colour }) => {
+      const label = document.createElement('span');
+      label.innerHTML = `<i class="swatch" style="background:${colour}"></i>${name} <b></b>`;
+      block.querySelector('.legend').append(label);
+      return label.querySelector('b');
+    });
+    this.range();
+    const move = (event) => {
+      if (event.type === 'pointermove' && !event.buttons) return;
+      const box = this.canvas.getBoundingClientRect();
+      const share = (event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT);
+      seek(Math.max(0, Math.min(1, share)) * (time[time.length - 1] - time[0]) + time[0]);
+    };
+    this.canvas.addEventListener('pointerdown', move);
+    this.canvas.addEventListener('pointermove', move);
+  }
+
+  range() {
+    let low = Infinity, high = -Infinity;
+    for (const { values } of this.series) for (const v of values) { low = Math.min(low, v); high = Math.max(high, v); }
+    const margin = Math.max(0.06 * (high - low), 1e-3 * Math.max(Math.abs(low), Math.abs(high)), 1e-6);
+    [this.low, this.high] = [low - margin, high + margin];
+  }
+
+  // The lines are drawn once for each size of the canvas.
+  still(width, height, ratio) {
+    const picture = document.createElement('canvas');
+    [picture.width, picture.height] = [width * ratio, height * ratio];
+    const c = picture.getContext('2d'), { time, low, high } = this, end = time[time.length - 1];
+    c.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.x = (t) => LEFT + (width - LEFT - RIGHT) * (t - time[0]) / (end - time[0]);
+    const y = (v) => TOP + (height - TOP - BOTTOM) * (high - v) / (high - low);
+    c.font = '11px system-ui, sans-serif';
+    c.fillStyle = '#5c6670';
+    c.strokeStyle = '#e3e8ec';
+    c.textAlign = 'right';
+    c.textBaseline = 'middle';
+    for (const v of ticks(low, high, 3)) {
+      c.beginPath(); c.moveTo(LEFT, y(v)); c.lineTo(width - RIGHT, y(v)); c.stroke();
+      c.fillText(short(v), LEFT - 6, y(v));
+    }
+    c.textAlign = 'center';
+    const marks = ticks(time[0], end, Math.max(2, width / 90));
+    marks.forEach((t, k) => c.fillText(short(t) + (k === marks.length - 1 ? ' s' : ''), Math.min(this.x(t), width - 14), height - 7));
+    c.lineWidth = 1.5;
+    c.lineJoin = 'round';
+    for (const { values, colour, dash } of this.series) {
+      c.strokeStyle = colour;
+      c.setLineDash(dash || []);
+      c.beginPath();
+      for (let k = 0; k < time.length; k++) c.lineTo(this.x(time[k]), y(values[k]));
+      c.stroke();
+    }
+    return picture;
+  }
+
+  draw(row) {
+    const { canvas } = this, ratio = window.devicePixelRatio || 1;
+    const width = canvas.clientWidth, height = canvas.clientHeight;
+    if (!width) return;
+    if (this.size !== `${width} ${height} ${ratio}`) {
+      this.size = `${width} ${height} ${ratio}`;
+      this.picture = this.still(width, height, ratio);
+      [canvas.width, canvas.height] = [this.picture.width, this.picture.height];
+    }
+    const c = canvas.getContext('2d');
+    c.setTransform(1, 0, 0, 1, 0, 0);
+    c.clearRect(0, 0, canvas.width, canvas.height);
+    c.drawImage(this.picture, 0, 0);
+    c.setTransform(ratio, 0, 0, ratio, 0, 0);
+    c.strokeStyle = '#1d2329';
+    c.beginPath(); c.moveTo(this.x(this.time[row]), TOP); c.lineTo(this.x(this.time[row]), height - BOTTOM); c.stroke();
+    this.series.forEach(({ values }, k) => { this.readouts[k].textContent = short(values[row]); });
+  }
+}

@@ -1,0 +1,51 @@
+"""Where a flight comes from: a file that holds one, or a follower that is flown on the spot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mjxball.config import preset
+from mjxball.errors import InputError
+from mjxball.scenario import Scenario
+from mjxball.view.flight_file import Flight, flight_of, is_flight, load_flight
+
+
+def flight_from(source: str, scenario: Scenario, physics: str) -> Flight:
+    """The flight that `source` names.
+
+    A flight file or a flight log is read; a policy file, a run directory (its `policy.npz`) or the name of a classical
+    follower is flown through `scenario` on the `paper` plant. Raises InputError if it is none of these.
+    """
+    path = Path(source)
+    if path.suffix == ".npz" and is_flight(path):
+        return load_flight(path)
+    if path.is_file() and path.suffix != ".npz":
+        return read_log(path)
+    return _flown(source, scenario, physics)
+
+
+def read_log(path: Path) -> Flight:
+    """The flight in a log of `mjxball.fly`: the place where its reader belongs."""
+    raise InputError(f"{path} is no flight (.npz), policy (.npz) or run directory; flight logs are not read yet")
+
+
+def _flown(source: str, scenario: Scenario, physics: str) -> Flight:
+    from mjxball.control.followers import LAWS, make_baseline
+    from mjxball.evaluate.cells import load_policy
+    from mjxball.rollout import simulate
+
+    setup, path = preset("paper"), Path(source)
+    if source in LAWS:
+        follower = make_baseline(source, setup)
+    elif path.is_dir():
+        if not (path / "policy.npz").exists():
+            raise InputError(f"run directory {path} has no policy.npz; python -m mjxball.export makes one")
+        follower = load_policy(path / "policy.npz", setup)
+        follower.name = path.name
+    elif path.suffix == ".npz":
+        follower = load_policy(path, setup)
+    else:
+        raise InputError(f"{source} is no flight, policy file, run directory or one of {', '.join(LAWS)}")
+    flown = simulate(setup, follower, scenario, physics)
+    title = f"{follower.name}: CG ±{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s, {scenario.mass:g} kg"
+    return flight_of(flown, setup.plant, title)
