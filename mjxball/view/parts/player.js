@@ -61,6 +61,8 @@ class Player {
     this.play = document.getElementById('play');
     this.seeker = document.getElementById('seek');
     this.speed = document.getElementById('speed');
+    this.width = document.getElementById('width');
+    this.width.onchange = () => this.draw();
     this.seeker.max = flight.rows - 1;
     this.plots = this.makePlots();
     this.makeToggles();
@@ -160,6 +162,13 @@ class Player {
     this.draw();
   }
 
+  // The plots show the whole flight, or some seconds around now.
+  span() {
+    const { time, rows } = this.flight, wanted = +this.width.value, first = time[0], last = time[rows - 1];
+    const from = wanted ? Math.max(first, Math.min(this.now - wanted / 2, last - wanted)) : first;
+    this.plots.forEach((plot) => plot.span(from, wanted ? Math.min(last, from + wanted) : last));
+  }
+
   draw() {
     const { flight, row } = this, euler = flight.at('euler', row);
     const tilt = Math.hypot(euler[0], euler[1]) * 180 / Math.PI, cg = 100 * flight.at('cg_offset', row)[0];
@@ -168,6 +177,7 @@ class Player {
     tell('error', `${length(flight.at('error', row)).toFixed(3)} m`);
     tell('tilt', `${tilt.toFixed(1)}°`);
     tell('cg', `${cg.toFixed(1).replace('-', '−')} cm`);
+    this.span();
     this.scene.draw(row);
     this.plots.forEach((plot) => plot.draw(row));
   }

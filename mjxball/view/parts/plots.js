@@ -28,11 +28,12 @@ class Plot {
       return label.querySelector('b');
     });
     this.range();
+    this.span(time[0], time[time.length - 1]);
     const move = (event) => {
       if (event.type === 'pointermove' && !event.buttons) return;
       const box = this.canvas.getBoundingClientRect();
       const share = (event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT);
-      seek(Math.max(0, Math.min(1, share)) * (time[time.length - 1] - time[0]) + time[0]);
+      seek(this.from + Math.max(0, Math.min(1, share)) * (this.to - this.from));
     };
     this.canvas.addEventListener('pointerdown', move);
     this.canvas.addEventListener('pointermove', move);
@@ -45,13 +46,16 @@ class Plot {
     [this.low, this.high] = [low - margin, high + margin];
   }
 
-  // The lines are drawn once for each size of the canvas.
+  // Show the time from `from` to `to` [s].
+  span(from, to) { [this.from, this.to] = [from, to]; }
+
+  // The lines are drawn once for each size of the canvas and each span.
   still(width, height, ratio) {
     const picture = document.createElement('canvas');
     [picture.width, picture.height] = [width * ratio, height * ratio];
-    const c = picture.getContext('2d'), { time, low, high } = this, end = time[time.length - 1];
+    const c = picture.getContext('2d'), { time, low, high, from, to } = this;
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
-    this.x = (t) => LEFT + (width - LEFT - RIGHT) * (t - time[0]) / (end - time[0]);
+    this.x = (t) => LEFT + (width - LEFT - RIGHT) * (t - from) / (to - from);
     const y = (v) => TOP + (height - TOP - BOTTOM) * (high - v) / (high - low);
     c.font = '11px system-ui, sans-serif';
     c.fillStyle = '#5c6670';
@@ -63,15 +67,18 @@ class Plot {
       c.fillText(short(v), LEFT - 6, y(v));
     }
     c.textAlign = 'center';
-    const marks = ticks(time[0], end, Math.max(2, width / 90));
+    const marks = ticks(from, to, Math.max(2, width / 90));
     marks.forEach((t, k) => c.fillText(short(t) + (k === marks.length - 1 ? ' s' : ''), Math.min(this.x(t), width - 14), height - 7));
+    c.beginPath(); c.rect(LEFT, 0, width - LEFT - RIGHT, height); c.clip();
     c.lineWidth = 1.5;
     c.lineJoin = 'round';
     for (const { values, colour, dash } of this.series) {
       c.strokeStyle = colour;
       c.setLineDash(dash || []);
       c.beginPath();
-      for (let k = 0; k < time.length; k++) c.lineTo(this.x(time[k]), y(values[k]));
+      for (let k = 0; k < time.length; k++) {
+        if (time[k] >= from - 0.1 && time[k] <= to + 0.1) c.lineTo(this.x(time[k]), y(values[k]));
+      }
       c.stroke();
     }
     return picture;
@@ -81,8 +88,9 @@ class Plot {
     const { canvas } = this, ratio = window.devicePixelRatio || 1;
     const width = canvas.clientWidth, height = canvas.clientHeight;
     if (!width) return;
-    if (this.size !== `${width} ${height} ${ratio}`) {
-      this.size = `${width} ${height} ${ratio}`;
+    const size = `${width} ${height} ${ratio} ${this.from} ${this.to}`;
+    if (this.size !== size) {
+      this.size = size;
       this.picture = this.still(width, height, ratio);
       [canvas.width, canvas.height] = [this.picture.width, this.picture.height];
     }

@@ -17,11 +17,11 @@ class Scene {
     this.flight = flight;
     this.shown = { thrust: true, contact: true, weight: true, path: true };
     const box = flight.bounds(), middle = times(0.5, add(box.low, box.high));
-    this.camera = new Camera(middle, 1.1 * length(sub(box.high, box.low)) + 1.0);
+    this.camera = new Camera(middle, 0.95 * length(sub(box.high, box.low)) + 0.85);
     this.floor = Math.min(box.low[2] - 0.25, -0.25);
     this.middle = middle;
-    // Arrows: 0.3 m for the largest of its kind.
-    this.reach = { thrust: 0.3 / flight.largest('thrust'), contact: 0.3 / flight.largestContact() };
+    // Arrows: this long [m] for the largest of its kind.
+    this.reach = { thrust: 0.3 / flight.largest('thrust'), contact: 0.4 / flight.largestContact() };
   }
 
   draw(row) {
@@ -46,6 +46,8 @@ class Scene {
     this.pair(row);
     this.paint();
     this.arrows(row);
+    this.centreOfGravity(row);
+    this.paint();
   }
 
   face(points, colour, alpha = 1, edge = 'rgba(30,40,50,0.35)') {
@@ -133,13 +135,10 @@ class Scene {
   }
 
   pair(row) {
-    const { flight } = this, { size, mounts, axis, share, ball, arm } = flight.plant;
+    const { flight } = this, { size, mounts, arm } = flight.plant;
     const place = flight.at('position', row), turn = flight.at('quaternion', row);
     const world = (point) => add(place, rotate(turn, point));
     this.box(world, [0, 0, 0], size.map((edge) => edge / 2), '#c8b07a', 0.4);
-    const offset = [0, 0, 0];
-    offset[axis] = flight.at('cg_offset', row)[0] / share;
-    this.ball(world(offset), 1.3 * ball, COLOURS.cg);
     mounts.forEach((mount, drone) => {
       const colour = drone ? COLOURS.follower : COLOURS.leader, hub = 0.18 * arm, high = 0.028;
       this.box(world, mount, [hub * 1.3, hub * 1.3, 0.022], colour, 1);
@@ -151,9 +150,22 @@ class Scene {
           const angle = k * Math.PI / 10;
           disc.push(world(add(tip, [0.6 * arm * Math.cos(angle), 0.6 * arm * Math.sin(angle), 0])));
         }
-        this.face(disc, colour, 0.34);
+        this.face(disc, colour, 0.42);
       });
     });
+  }
+
+  // Where along its axis the object's CG is, in body axes.
+  offset(row) {
+    const offset = [0, 0, 0];
+    offset[this.flight.plant.axis] = this.flight.at('cg_offset', row)[0];
+    return offset;
+  }
+
+  // Drawn last: it is inside the object.
+  centreOfGravity(row) {
+    const { flight } = this, turned = rotate(flight.at('quaternion', row), this.offset(row));
+    this.ball(add(flight.at('position', row), turned), flight.plant.ball, COLOURS.cg);
   }
 
   box(world, centre, half, colour, alpha) {
@@ -181,10 +193,8 @@ class Scene {
       if (this.shown.contact) this.arrow(from, rotate(turn, push), COLOURS.contact);
     });
     if (!this.shown.weight) return;
-    const offset = [0, 0, 0];
-    offset[flight.plant.axis] = flight.at('cg_offset', row)[0];
     const weight = flight.plant.gravity * flight.at('object_mass', row)[0];
-    this.arrow(add(place, rotate(turn, offset)), [0, 0, -this.reach.contact * weight], COLOURS.weight);
+    this.arrow(add(place, rotate(turn, this.offset(row))), [0, 0, -this.reach.contact * weight], COLOURS.weight);
   }
 
   arrow(from, along, colour) {

@@ -1,0 +1,263 @@
+"""The viewer: flight files, what is flown on the spot, the page in a real browser, and refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import TRANSPORT, assert_one_line, call, listing
+from conftest import opened
+
+from mjxball.config import Plant
+from mjxball.errors import InputError
+from mjxball.scenario import Scenario
+from mjxball.view.command import main
+from mjxball.view.flight_file import SHAPES, Flight, load_flight, save_flight
+from mjxball.view.page import flight_page
+from mjxball.view.sources import flight_from
+
+SECONDS = 4.0
+COLOURS = {"thrust": "#0c8599", "contact": "#c2255c", "goal": "#2f9e44", "cg": "#e0a800"}
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """The shipped policy on the reference scenario, its first seconds."""
+    return flight_from(str(TRANSPORT), Scenario(seconds=SECONDS), "newton-euler")
+
+
+@pytest.fixture(scope="module")
+def page(flight: Flight, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "flight.html"
+    path.write_text(flight_page(flight), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(params=[1280, 390], ids=["desktop", "phone"])
+def tab(request: pytest.FixtureRequest, browser: Any, page: Path) -> Any:
+    """The page, which fetched nothing, made no error and fits in width."""
+    result = opened(browser, page, request.param)
+    yield result
+    result.close()
+
+
+def test_what_is_flown_is_the_reference(flight: Flight):
+    assert len(flight["time"]) == 201
+    assert np.linalg.norm(flight["target"][0] - flight["position"][0]) == pytest.approx(np.sqrt(3))
+    assert np.linalg.norm(flight["target"][-1] - flight["position"][-1]) < 0.05  # it settles within 2 s
+    assert flight.title == "transport: CG ±5 cm at 0.31 rad/s, 0.2 kg"
+
+
+def test_a_flight_file_gives_the_flight_back(flight: Flight, tmp_path: Path):
+    save_flight(tmp_path / "flight.npz", flight)
+    again = flight_from(str(tmp_path / "flight.npz"), Scenario(), "newton-euler")
+    assert (again.title, again.plant) == (flight.title, flight.plant)
+    np.testing.assert_array_equal(again["time"], flight["time"])
+    for name in SHAPES:
+        np.testing.assert_allclose(again[name], flight[name], rtol=1e-6, atol=0)  # float32
+
+
+def test_a_run_directory_and_a_baseline_are_flown(flight: Flight, tmp_path: Path):
+    (tmp_path / "mine").mkdir()
+    shutil.copy(TRANSPORT, tmp_path / "mine" / "policy.npz")
+    run = flight_from(str(tmp_path / "mine"), Scenario(seconds=SECONDS), "newton-euler")
+    assert run.title.startswith("mine: ")
+    np.testing.assert_array_equal(run["position"], flight["position"])
+    copy = flight_from("copy", Scenario(seconds=1.0), "newton-euler")
+    np.testing.assert_array_equal(copy["leader_command"], copy["follower_command"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda arrays: arrays.pop("position"), "position is missing"),
+        (lambda arrays: arrays.update(euler=arrays["euler"][:-1]), "euler is missing or not of shape"),
+        (lambda arrays: arrays.update(time=arrays["time"][::-1]), "time must increase"),
+        (lambda arrays: arrays["target"].__setitem__((3, 1), np.nan), "target holds a value that is not finite"),
+        (lambda arrays: arrays.update(time=np.zeros(1)), "at least two rows"),
+    ],
+)
+def test_an_unsound_flight_file_is_refused(change: Any, message: str, flight: Flight, tmp_path: Path):
+    arrays = {name: array.copy() for name, array in flight.arrays.items()}
+    time = arrays["time"]
+    change(arrays)
+    arrays.setdefault("time", time)
+    save_flight(tmp_path / "bad.npz", dataclasses.replace(flight, arrays=arrays))
+    with pytest.raises(InputError, match=message):
+        load_flight(tmp_path / "bad.npz")
+
+
+def test_damaged_files_are_refused(flight: Flight, tmp_path: Path):
+    save_flight(tmp_path / "whole.npz", flight)
+    whole = (tmp_path / "whole.npz").read_bytes()
+    (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
+    np.savez(tmp_path / "pickle.npz", about=np.array({"format": 1}, object))
+    np.savez(tmp_path / "other.npz", about=np.array('{"format": "another"}'))
+    for name, message in (("half", "damaged"), ("pickle", "damaged"), ("other", "not a flight")):
+        with pytest.raises(InputError, match=message):
+            load_flight(tmp_path / f"{name}.npz")
+
+
+def test_text_in_a_title_stays_text(flight: Flight, browser: Any, tmp_path: Path):
+    evil = "</script><script>document.title='gone'</script>&"
+    path = tmp_path / "evil.html"
+    path.write_text(flight_page(dataclasses.replace(flight, title=evil)), encoding="utf-8")
+    tab = opened(browser, path, 800)
+    assert tab.title() == tab.inner_text("h1") == evil
+    tab.close()
+
+
+def coloured(tab: Any, colour: str, around: list[float] | None = None) -> int:
+    """Pixels of the scene near `colour`, within 60 pixels of `around` if given."""
+    return tab.evaluate(
+        """([colour, around]) => {
+            const canvas = document.getElementById('scene');
+            const { width, height, data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+            const wanted = [1, 3, 5].map((k) => parseInt(colour.slice(k, k + 2), 16));
+            let count = 0;
+            for (let k = 0; k < width * height; k++) {
+                if (around && Math.hypot(k % width - around[0], Math.floor(k / width) - around[1]) > 60) continue;
+                if (wanted.every((value, c) => Math.abs(data[4 * k + c] - value) < 28)) count++;
+            }
+            return count;
+        }""",
+        [colour, around],
+    )
+
+
+def test_it_shows_the_numbers_of_the_moment(tab: Any, flight: Flight):
+    tab.evaluate("player.seek(1.5)")
+    row = 75
+    assert tab.inner_text("#now-time") == "1.50 s"
+    error = flight["target"][row] - flight["position"][row]
+    assert tab.inner_text("#now-error") == f"{np.linalg.norm(error):.3f} m"
+    assert tab.inner_text("#now-tilt") == f"{np.degrees(np.hypot(*flight['euler'][row, :2])):.1f}°"
+    assert tab.inner_text("#now-cg") == f"{100 * flight['cg_offset'][row]:.1f} cm"
+    shown = [
+        float(text.replace("−", "-")) for text in tab.locator(".plot").first.locator(".legend b").all_inner_texts()
+    ]
+    np.testing.assert_allclose(shown, error, rtol=6e-3)  # three digits
+    titles = [re.sub(r" \[.*", "", text) for text in tab.locator(".plot h2").all_inner_texts()]
+    assert titles[0] == "Error to the goal"
+    assert {"Thrust", "Contact force on the object", "CG from the centre"} <= set(titles)
+
+
+def test_the_scene_shows_everything_where_it_is(tab: Any, flight: Flight):
+    tab.evaluate("player.seek(0.7)")
+    row, ratio = 35, tab.evaluate("window.devicePixelRatio")
+
+    def place(point: np.ndarray) -> list[float]:
+        return [ratio * value for value in tab.evaluate("p => player.scene.camera.project(p)", point.tolist())[:2]]
+
+    assert coloured(tab, COLOURS["goal"], place(flight["target"][row])) > 40
+    assert coloured(tab, COLOURS["cg"], place(flight["position"][row])) > 10
+    for kind in ("thrust", "contact"):
+        before = coloured(tab, COLOURS[kind])
+        tab.uncheck(f"#show-{kind}")
+        assert coloured(tab, COLOURS[kind]) < 0.2 * before, kind
+        assert before > 60
+        tab.check(f"#show-{kind}")
+        assert coloured(tab, COLOURS[kind]) == before
+
+
+def test_an_arrow_is_the_force(tab: Any, flight: Flight):
+    """The leader's thrust arrow in pixels is the projection of R e3 times its newtons."""
+    drawn = tab.evaluate(
+        """() => {
+            const found = [], { scene } = player, arrow = scene.arrow;
+            scene.arrow = (from, along, colour) => { found.push([from, along, colour]); };
+            player.seek(0.7);
+            scene.arrow = arrow;
+            return [found, scene.reach];
+        }"""
+    )
+    (from_place, along, colour), scale = drawn[0][0], drawn[1]["thrust"]
+    w, x, y, z = flight["quaternion"][35]
+    up = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    axis = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
+    thrust = flight["rotor_force"].sum(axis=-1)
+    np.testing.assert_allclose(along, scale * thrust[35, 0] * up, atol=1e-5)  # float32
+    np.testing.assert_allclose(from_place, flight["position"][35] + 0.17 * axis, atol=1e-5)
+    assert scale == pytest.approx(0.3 / thrust.max(), rel=1e-5)
+    assert colour == COLOURS["thrust"]
+    assert len(drawn[0]) == 5  # thrust and contact of each drone, the weight
+
+
+def test_controls(tab: Any):
+    tab.select_option("#speed", "5")
+    tab.click("#play")
+    tab.wait_for_function("player.now > 0.5")
+    tab.click("#play")
+    stopped = tab.evaluate("player.now")
+    assert not tab.evaluate("player.playing")
+    tab.evaluate("document.getElementById('seek').value = 100; player.seeker.oninput()")
+    assert tab.inner_text("#now-time") == "2.00 s"
+    assert stopped != 2.0
+    plot = tab.locator(".plot canvas").first
+    box = plot.bounding_box()
+    plot.click(position={"x": 46 + 0.25 * (box["width"] - 54), "y": 40})
+    assert tab.evaluate("player.now") == pytest.approx(0.25 * SECONDS, abs=SECONDS / 100)  # a pixel or two
+    before = tab.evaluate("player.scene.camera.azimuth")
+    scene = tab.locator("#scene").bounding_box()
+    tab.mouse.move(scene["x"] + 150, scene["y"] + 150)
+    tab.mouse.down()
+    tab.mouse.move(scene["x"] + 200, scene["y"] + 150)
+    tab.mouse.up()
+    assert tab.evaluate("player.scene.camera.azimuth") != before
+    tab.select_option("#width", "1")
+    assert tab.evaluate("player.plots[0].to - player.plots[0].from") == pytest.approx(1.0)
+
+
+def test_it_plays_to_the_end_and_stops(browser: Any, page: Path):
+    tab = opened(browser, page, 1000)
+    tab.evaluate(f"player.seek({SECONDS} - 0.1)")
+    tab.click("#play")
+    tab.wait_for_function("!player.playing")
+    assert tab.inner_text("#now-time") == f"{SECONDS:.2f} s"
+    tab.close()
+
+
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture):
+    page, record = tmp_path / "page.html", tmp_path / "flight.npz"
+    given = ["copy", "--seconds", 1, "--omega", 2, "--out", page, "--save", record]
+    assert call(main, given) == 0
+    assert capsys.readouterr().out == f"the flight is {record}\nthe page is {page}\n"
+    assert load_flight(record).title == "copy: CG ±5 cm at 2 rad/s, 0.2 kg"
+    shown = flight_from("copy", Scenario(omega=2, seconds=1), "newton-euler")
+    assert page.read_text(encoding="utf-8") == flight_page(shown)
+    before = listing(tmp_path)
+    assert call(main, given) == 2
+    assert "exists" in capsys.readouterr().err
+    assert listing(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nobody"], "nobody is no flight"),
+        (["log.csv"], "flight logs are not read yet"),
+        (["empty"], "has no policy.npz"),
+        (["none.npz"], "none.npz does not exist"),
+        (["copy", "--out", "page.txt"], "must end in .html"),
+        (["copy", "--amplitude", "3"], "leaves the object"),
+    ],
+)
+def test_refusals(arguments: list[str], message: str, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "log.csv").write_text("t,x\n")
+    before = listing(tmp_path)
+    assert call(main, [arguments[0], *(arguments[1:] or ["--out", "page.html"])]) == 2
+    errors = capsys.readouterr().err
+    assert_one_line(errors)
+    assert message in errors
+    assert listing(tmp_path) == before
+
+
+def test_a_flight_knows_its_plant(flight: Flight):
+    assert flight.plant == Plant()
