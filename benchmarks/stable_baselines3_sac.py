@@ -22,8 +22,9 @@ import mjxball.gym  # noqa: F401  registers the environments
 
 DRAWN = 1000  # seed of the worlds that every follower is judged in; training draws others
 SETTINGS = {
-    "learning_rate": 1e-3,
+    "learning_rate": lambda left: 2e-3 * max(left, 0.02),  # linear, as the preset's own
     "gamma": 0.97,
+    "n_steps": 5,
     "batch_size": 256,
     "learning_starts": 12_800,
     "train_freq": 1,
@@ -51,6 +52,7 @@ class Worlds(VecEnv):
     """A `FollowerVectorEnv` with same-step autoreset as Stable-Baselines3's `VecEnv`."""
 
     def __init__(self, env: Any):
+        self.render_mode = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._env, self._actions = env, None
 
@@ -117,9 +119,9 @@ def main() -> None:
     parser.add_argument(
         "--physics", default="mujoco", help="that the follower is judged on: mujoco, newton-euler or mjx"
     )
-    parser.add_argument("--steps", type=int, default=256_000)
+    parser.add_argument("--steps", type=int, default=192_000)
     parser.add_argument("--worlds", type=int, default=64)
-    parser.add_argument("--updates", type=int, default=4, help="gradient updates after each step of all worlds")
+    parser.add_argument("--updates", type=int, default=6, help="gradient updates after each step of all worlds")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=5, help="worlds that each follower is judged in")
     parser.add_argument("--json", type=Path)

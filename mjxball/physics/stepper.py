@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -28,6 +29,7 @@ def make_stepper(config: Config, physics: str) -> ControlStep:
     return _jax_stepper(config, physics)
 
 
+@functools.lru_cache(maxsize=8)  # compiling takes seconds
 def _jax_stepper(config: Config, physics: str) -> ControlStep:
     import jax
 
