@@ -263,13 +263,13 @@ def test_playgrounds_wrappers_take_the_adapter():
 
 @pytest.mark.slow
 def test_stable_baselines3_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """SAC of Stable-Baselines3 beats the copying follower after a short run; see docs/gym.md for a longer one."""
+    """SAC of Stable-Baselines3 beats the copying follower, as docs/gym.md says."""
     pytest.importorskip("stable_baselines3")
     import json
 
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
     script = Path(__file__).parents[1] / "benchmarks" / "stable_baselines3_sac.py"
-    done = run([script, "--steps", 20_000, "--episodes", 2, "--json", "result.json"], tmp_path, timeout=1200)
+    done = run([script, "--episodes", 2, "--json", "result.json"], tmp_path, timeout=1800)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "result.json").read_text())["rows"]
     assert rows["SB3 SAC"]["return"] > rows["copies its leader"]["return"] > rows["random"]["return"]
