@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -118,7 +119,7 @@ def _add_scenery(spec: mujoco.MjSpec) -> None:
     spec.worldbody.add_camera(name="side", pos=[0.5, -3.2, 1.0], xyaxes=[1, 0, 0, 0, 0.2, 1])
 
 
-def _add_visual(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: object, rgba: object) -> mujoco.MjsGeom:
+def _add_visual(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Any, rgba: Any) -> mujoco.MjsGeom:
     geom = body.add_geom(name=name, type=kind, rgba=rgba, group=1)
     geom.size[: len(size)] = size
     geom.contype = geom.conaffinity = 0
@@ -127,7 +128,7 @@ def _add_visual(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: obj
 
 
 def _add_drone(
-    spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, mass: float, inertia: object, mount: object, plant: Plant
+    spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, mass: float, inertia: Any, mount: Any, plant: Plant
 ) -> None:
     drone = parent.add_body(
         name=name, pos=mount, mass=mass, explicitinertial=True, ipos=[0, 0, 0], inertia=list(inertia)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 VARIABLE = "MJXBALL_CACHE"
 
@@ -19,10 +20,15 @@ def cache_directory() -> Path | None:
 
 def traced_directory() -> Path | None:
     """Where traced programs are kept: in the compilation cache's directory; None if there is no such cache."""
+    place = _directory_of_jax()
+    return Path(place) / "traced" if place and "://" not in place else None
+
+
+def _directory_of_jax() -> str | None:
     import jax
 
-    place = jax.config.jax_compilation_cache_dir
-    return Path(place) / "traced" if place and "://" not in place else None
+    settings: Any = jax.config  # its settings are made while JAX is imported: no type checker knows them
+    return settings.jax_compilation_cache_dir
 
 
 def enable_compilation_cache() -> Path | None:
@@ -30,7 +36,7 @@ def enable_compilation_cache() -> Path | None:
     import jax
 
     place = cache_directory()
-    if place is None or jax.config.jax_compilation_cache_dir:
+    if place is None or _directory_of_jax():
         return None
     try:
         place.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,10 @@ from mjxball.quiet import import_brax_env
 from mjxball.rewards import paper_reward, task_reward
 
 Array = Any
-Env, State = import_brax_env()
+if TYPE_CHECKING:
+    from brax.envs.base import Env, State
+else:
+    Env, State = import_brax_env()
 STEADY_AFTER = 8.0  # [s] of an episode, after which its error counts as steady state in the metrics
 SECRETS = 4  # numbers that privileged critics see more where nothing is disturbed
 DRAWS = 18  # random numbers of a reset
@@ -278,12 +281,13 @@ class CoupledPairEnv(Env):
     def _told(self, truth: Array, world: World) -> Array:
         """CG offset, first moment, object mass, error of the believed one; of disturbed worlds the truth as well."""
         offset, mass = self._cg(world.plant, world.load), object_mass(world.plant.time, world.load)
-        parts = [jnp.stack([offset, mass * offset, mass, mass - world.load.believed_mass])]
+        parts: list[Any] = [jnp.stack([offset, mass * offset, mass, mass - world.load.believed_mass])]
         if self._nuisances.present:
             nuisance = world.nuisance
             parts += [truth[3:], nuisance.push, jnp.stack([nuisance.noise, nuisance.delay.astype(jnp.float32)])]
         if self._varies:
-            parts += [world.load.rotor_lag_scale[None], world.load.thrust_scale, world.load.added_inertia]
+            lag: Array = world.load.rotor_lag_scale
+            parts += [lag[None], world.load.thrust_scale, world.load.added_inertia]
         return jnp.concatenate(parts)
 
     def _count_secrets(self) -> int:

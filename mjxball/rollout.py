@@ -80,7 +80,8 @@ class Trajectory:
     def tick(self, number: int) -> Tick:
         """Control step `number` of a batch."""
         names = ("position", "target", "euler", "rotor_force", "leader_command", "follower_command")
-        return Tick(float(self.time[number]), *(getattr(self, name)[number] for name in names), self.diverged)
+        values = {name: getattr(self, name)[number] for name in names}
+        return Tick(float(self.time[number]), **values, diverged=self.diverged)
 
     def copied(self) -> Trajectory:
         """The same with memory of its own: `world` shares that of its whole batch."""
@@ -284,11 +285,12 @@ def load_of(scenarios: Sequence[Scenario]) -> Load:
     """Masses and CG motions of the scenarios, one world each."""
     mass = np.array([scenario.mass for scenario in scenarios], float)
     believed = [s.mass if s.believed_mass is None else s.believed_mass for s in scenarios]
-    sine = (np.array([getattr(s, name) for s in scenarios], float) for name in ("amplitude", "omega", "phase"))
+    names = ("amplitude", "omega", "phase")
+    amplitude, omega, phase = (np.array([getattr(s, name) for s in scenarios], float) for name in names)
     most = max(len(scenario.mass_changes) for scenario in scenarios)
     padded = [[*s.mass_changes, *[(np.inf, 0.0)] * (most - len(s.mass_changes))] for s in scenarios]
     changes = np.array(padded, float).reshape(len(scenarios), most, 2)
-    return Load(mass, np.array(believed, float), *sine, changes[..., 1], changes[..., 0])
+    return Load(mass, np.array(believed, float), amplitude, omega, phase, changes[..., 1], changes[..., 0])
 
 
 def leader_command(config: Config, goal: Array, state: PlantState, integral: Array) -> Array:

@@ -54,8 +54,8 @@ def _parse(path: str, text: str, example: Any) -> Any:
             return tuple(kind(part) for part in text.split(",")) if text else ()
         return type(example)(text)
     except (ValueError, KeyError):
-        kind = "comma-separated numbers" if isinstance(example, tuple) else type(example).__name__
-        raise InputError(f"--{path} takes {kind}, not {text!r}") from None
+        wanted = "comma-separated numbers" if isinstance(example, tuple) else type(example).__name__
+        raise InputError(f"--{path} takes {wanted}, not {text!r}") from None
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -12,8 +12,8 @@ Array = Any
 class AttitudeGains(NamedTuple):
     """PD gains of one drone on (roll, pitch, yaw)."""
 
-    kp: tuple[float, float, float]  # [N m/rad]
-    kd: tuple[float, float, float]  # [N m s/rad]
+    kp: tuple[float, ...]  # (3,) [N m/rad]
+    kd: tuple[float, ...]  # (3,) [N m s/rad]
 
 
 def design_gains(inertia: Array, natural_frequency: Array, damping: float) -> AttitudeGains:

@@ -8,6 +8,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ def animate(plant: Plant, flights: Sequence[Trajectory], seconds: float = 10.0) 
         return picture.read_bytes(), ""
 
 
-def _frames(flights: Sequence[Trajectory], seconds: float) -> dict[str, np.ndarray]:
+def _frames(flights: Sequence[Trajectory], seconds: float) -> dict[str, Any]:
     time = flights[0].time
     every = max(1, round(1 / FRAMES_PER_SECOND / (time[1] - time[0])))
     rows = slice(0, int(np.searchsorted(time, seconds)), every)

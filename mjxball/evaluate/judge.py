@@ -22,6 +22,7 @@ RANKED = ("rmse", "settling_time", "overshoot", "x_peak", "peak", "max_tilt", "e
 MEASURED = tuple(item.name for item in dataclasses.fields(Metrics) if item.name != "failed")
 ORACLE = "oracle"
 TOGETHER = 32  # scenarios in one batch of recorded flights
+UNDRAWN: Any = None  # in place of the flights of all seeds but 0, which nobody draws and which would fill the memory
 RESAMPLES, CONFIDENCE = 2000, 0.95
 
 
@@ -70,8 +71,7 @@ def _value(metrics: Metrics, name: str) -> float:
     if metrics.failed:
         return math.inf
     if name == "peak":
-        peaks = (metrics.x_peak, metrics.y_peak, metrics.z_peak)
-        return math.nan if None in peaks else math.hypot(*peaks)
+        return metrics.peak
     value = getattr(metrics, name)
     if value is None:
         return math.inf if name.startswith("settling") else math.nan
@@ -135,8 +135,7 @@ def _fly(
         cells = run_cells(flown, followers, [level.seeded(seed) for level, seed in members], physics)
         for number, (level, seed) in enumerate(members):
             mine = cells[number * len(followers) : (number + 1) * len(followers)]
-            # Only seed 0 is drawn: the other flights would fill the memory.
-            kept = [replace(cell, flight=cell.flight.copied() if seed == 0 else None) for cell in mine]
+            kept = [replace(cell, flight=cell.flight.copied() if seed == 0 else UNDRAWN) for cell in mine]
             yield (level.label, seed), kept
 
 

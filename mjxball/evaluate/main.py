@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mjxball import __version__, cli, config
-from mjxball.control.followers import BASELINES, LAWS, make_baseline
+from mjxball.control.followers import BASELINES, LAWS, Follower, make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate import families
 from mjxball.evaluate.cells import REFERENCE, STANDARD, Cell, check_bounds, cross, load_policy, run_cells
@@ -26,8 +26,17 @@ from mjxball.policy.shipped import shipped_policies, stand_policies
 from mjxball.scenario import Scenario, check_scenario
 from mjxball.train.provenance import versions
 
-SCENARIO_FLAGS = ("omega", "amplitude", "mass", "believed_mass", "goal", "seconds")
-SCENARIO_FLAGS += ("waveform", "mass_change", "rolling")
+SCENARIO_FLAGS = (
+    "omega",
+    "amplitude",
+    "mass",
+    "believed_mass",
+    "goal",
+    "seconds",
+    "waveform",
+    "mass_change",
+    "rolling",
+)
 # What the paper's figures settle themselves.
 NOT_WITH_FIGURES = ("families", "seeds", "check", "followers", "json", "wn_pitch", *SCENARIO_FLAGS)
 
@@ -121,7 +130,7 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     unbounded = [policy.name for policy in policies if options.check and not policy.card["bounds"]]
     if unbounded:
         raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
-    followers = [*(make_baseline(name, setup) for name in dict.fromkeys(names)), *policies]
+    followers: list[Follower] = [*(make_baseline(name, setup) for name in dict.fromkeys(names)), *policies]
     _refuse_same_names([follower.name for follower in followers])
 
     command = shlex.join(["python", "eval.py", *arguments])

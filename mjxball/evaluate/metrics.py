@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -39,6 +40,12 @@ class Metrics:
     smoothness: float | None  # rms change of the follower's pitch and roll command from step to step [rad]
     saturation: float | None  # share of the follower's rotors and all steps at 0 or the largest force
     failed: bool  # |e_o| beyond d_term, or a value that is not finite
+
+    @property
+    def peak(self) -> float:
+        """Root of the squared x, y, z peaks [m]; NaN of a flight too short to have them."""
+        peaks = [peak for peak in (self.x_peak, self.y_peak, self.z_peak) if peak is not None]
+        return math.hypot(*peaks) if len(peaks) == 3 else math.nan
 
 
 class Tally(NamedTuple):

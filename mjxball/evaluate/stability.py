@@ -54,8 +54,10 @@ def hovers(config: Config, law: Law, cases: Sequence[tuple[float, float, float]]
     """The hover of every case: (CG offset [m], object mass [kg], believed mass [kg])."""
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
         start, step = closed_loop(config, law, delay)
-        names = ("amplitude", "mass", "believed_mass")
-        scenarios = [Scenario(omega=0.0, phase=np.pi / 2, **dict(zip(names, case, strict=True))) for case in cases]
+        scenarios = [
+            Scenario(omega=0.0, phase=np.pi / 2, amplitude=offset, mass=mass, believed_mass=believed)
+            for offset, mass, believed in cases
+        ]
         loads = jax.tree.map(jnp.asarray, rollout.load_of(scenarios))
         found = jax.jit(jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load))))(loads)
         points, residuals, jacobians = map(np.asarray, found)

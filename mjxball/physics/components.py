@@ -75,7 +75,7 @@ class Components:
             return Components(np.zeros(parts.shape[1:], object))
         total = Components(parts[0]) if isinstance(parts[0], np.ndarray) else Components(_objects(parts[0]))
         for part in parts[1:]:
-            total = total + Components(_objects(part))
+            total = operator.add(total, Components(_objects(part)))
         return total
 
     def __neg__(self) -> Components:

@@ -22,7 +22,7 @@ MAX_LAYERS = 32
 # Metrics that a card may bound, all of them the better the smaller.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
 MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
-CARD_FIELDS: dict[str, type | tuple[type, ...]] = {
+CARD_FIELDS: dict[str, type] = {
     "format_version": int,
     "observation": list,
     "history": int,
@@ -69,7 +69,7 @@ def recall_of(card: dict[str, Any]) -> Recall:
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
     """Write `policy` to `path` atomically: a reader sees the old file or the whole new one."""
     check(policy, str(path))
-    arrays = {
+    arrays: dict[str, Any] = {
         "observation_mean": policy.observation_mean,
         "observation_scale": policy.observation_scale,
         "action_scale": policy.action_scale,

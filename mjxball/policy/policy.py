@@ -31,13 +31,13 @@ class Policy:
         half = layout.ACTION_SIZE
         weights = [*contents.weights[:-1], contents.weights[-1][:, :half]]
         biases = [*contents.biases[:-1], contents.biases[-1][:half]]
-        self._weights = [np.ascontiguousarray(weight, dtype) for weight in weights]
-        self._biases = [np.ascontiguousarray(bias, dtype) for bias in biases]
-        self._mean = contents.observation_mean.astype(dtype)
-        self._scale = contents.observation_scale.astype(dtype)
+        self._weights: list[np.ndarray] = [np.ascontiguousarray(weight, dtype) for weight in weights]
+        self._biases: list[np.ndarray] = [np.ascontiguousarray(bias, dtype) for bias in biases]
+        self._mean: np.ndarray = contents.observation_mean.astype(dtype)
+        self._scale: np.ndarray = contents.observation_scale.astype(dtype)
         self._recall = recall_of(card)
         self._memory: Array | None = None
-        self._law = (
+        self._law: tuple[Any, ...] = (
             card["action_mode"] == "residual",
             tuple(card["action_reach"]),
             np.asarray(card["leader_kp"], dtype),

@@ -34,12 +34,12 @@ def training_curve(run: Path, seed: int) -> dict[str, list[float]]:
     In a population `episode_return` is the median over all members, `eval_return` the own one of member `seed`.
     """
     rows = _rows(run)
-    curve = {
+    curve: dict[str, list[float]] = {
         "steps": [int(row["steps"]) for row in rows],
         "episode_return": [round(float(row["episode_return"]), 3) for row in rows],
     }
-    own = [row for row in read_members(run) if row["seed"] == seed]
-    evaluated = own or [row for row in rows if row["eval_return"]]
+    own: list[Any] = [row for row in read_members(run) if row["seed"] == seed]
+    evaluated: list[Any] = own or [row for row in rows if row["eval_return"]]
     curve["eval_steps"] = [int(row["steps"]) for row in evaluated]
     curve["eval_return"] = [round(float(row["eval_return"]), 3) for row in evaluated]
     return curve

@@ -243,7 +243,7 @@ def _scenarios(settings: config.Config) -> tuple[Scenario, ...]:
     plant = settings.plant
     reach = min(REFERENCE.goal[0], settings.scenario.goal_reach)
     free = {"free": (1, 1, 1), "pivot": (0, 0, 0), "heave": (0, 0, 1)}[plant.stand]
-    common = {"mass": plant.object_mass, "goal": tuple(reach * float(axis) for axis in free)}
+    common: dict[str, Any] = {"mass": plant.object_mass, "goal": tuple(reach * float(axis) for axis in free)}
     reference = dataclasses.replace(
         REFERENCE,
         amplitude=min(REFERENCE.amplitude, config.cg_reach(plant)),

@@ -46,7 +46,9 @@ class MemberLog:
         return best_member(self._rows)
 
     def policy_path(self, member: int) -> Path:
-        """Where a member's policy is written."""
+        """Where a member's policy is written; only who writes the run may ask."""
+        if self._out is None:
+            raise RuntimeError("this process writes no policies")
         place = self._out / POLICIES
         place.mkdir(exist_ok=True)
         return place / f"seed{self._seed + member}.npz"

@@ -101,8 +101,8 @@ class Population:
         self.devices, self.parts = groups * parts, parts
         self._shards = Shards("worlds", parts) if parts > 1 else Shards()
         self.program = Program(config, physics, shards=self._shards)
-        whole = PartitionSpec() if self._single else PartitionSpec("members")
-        split = PartitionSpec(*whole, "worlds")
+        whole: Any = PartitionSpec() if self._single else PartitionSpec("members")
+        split: Any = PartitionSpec(*whole, "worlds")
         self._whole, self._split = whole, split
         self._state_spec = TrainState(whole, Replay(rows=split, inserted=whole), split, whole, whole)
         self._tally_spec = Tally(**{name: split if name == "peak" else whole for name in Tally._fields})
@@ -161,7 +161,7 @@ class Population:
         }
         values, keys = jax.tree.map(_shape, self._starts(0))
         mode, state = jax.tree.map(_shape, prefill(1)), self.template()
-        tally = Tally(*[0] * (len(Tally._fields) - 1), Losses(*[0] * len(Losses._fields)))
+        tally = Tally._make([*[0] * (len(Tally._fields) - 1), Losses._make([0] * len(Losses._fields))])
         one_key = _shape(jax.random.PRNGKey(0))
         lowered = [
             Traced("advance", key, self.advance, (state, mode), (state, tally)).lower(donate=0),
@@ -254,18 +254,20 @@ class Population:
 
     def _results(self, *specs: Any) -> dict[str, Any]:
         """Where `jax.jit` shall leave its results; said, because else arrays without elements end up anywhere."""
-        if self.mesh is None:
+        mesh = self.mesh
+        if mesh is None:
             return {}
-        places = jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), specs, is_leaf=_is_spec)
+        places = jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs, is_leaf=_is_spec)
         return {"out_shardings": places if len(places) > 1 else places[0]}
 
     def _placed_shapes(self, template: Any, specs: Any) -> Any:
         """`template` with the shardings that `place_state` gives."""
-        if self.mesh is None:
+        mesh = self.mesh
+        if mesh is None:
             return template
 
         def placed(spec: PartitionSpec, part: Any) -> Any:
-            sharding = NamedSharding(self.mesh, spec)
+            sharding = NamedSharding(mesh, spec)
             return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), part)
 
         return jax.tree.map(placed, specs, template, is_leaf=_is_spec)

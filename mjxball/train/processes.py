@@ -29,10 +29,9 @@ class Rendezvous:
     process: int | None = None
 
     def __post_init__(self) -> None:
-        given = [value is not None for value in (self.coordinator, self.processes, self.process)]
-        if any(given) and not all(given):
-            raise InputError("--coordinator, --processes and --process belong together: give all three or none")
-        if not all(given):
+        if self.coordinator is None or self.processes is None or self.process is None:
+            if (self.coordinator, self.processes, self.process) != (None, None, None):
+                raise InputError("--coordinator, --processes and --process belong together: give all three or none")
             return
         port = self.coordinator.rpartition(":")[2]
         if ":" not in self.coordinator or not port.isdigit() or not 0 < int(port) < 65536:

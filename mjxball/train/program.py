@@ -74,10 +74,10 @@ class Tally(NamedTuple):
 
 
 class Shards(NamedTuple):
-    """One follower's worlds, replay and batches cut into `count` equal parts along a mapped axis (data parallel)."""
+    """One follower's worlds, replay and batches cut into `parts` equal parts along a mapped axis (data parallel)."""
 
     axis: str | None = None
-    count: int = 1
+    parts: int = 1
 
     def own(self, key: Array) -> Array:
         """A key of this shard alone, from one that all shards share."""
@@ -109,7 +109,7 @@ class Program:
         self.sizes = (self.env.observation_size, self.env.action_size)
         self.networks = sac.make_networks(config.sac, self.env.input_mask, self.sizes[1], self.env.critic_mask)
         self._shards = shards or Shards()
-        self._worlds = config.sac.worlds // self._shards.count
+        self._worlds = config.sac.worlds // self._shards.parts
         self._update = sac.make_update(self.networks, config.sac, self.sizes[1], self._shards.mean)
         self._reset, self._step = jax.vmap(self.env.reset), jax.vmap(self.env.step)
 
@@ -122,7 +122,7 @@ class Program:
         worlds = worlds.replace(pipeline_state=worlds.pipeline_state._replace(steps=spread))
         return TrainState(
             learner=sac.create(self.networks, limits, self.sizes[0], learner_key),
-            replay=replay.create(limits.replay // self._shards.count, self._worlds, *self.sizes),
+            replay=replay.create(limits.replay // self._shards.parts, self._worlds, *self.sizes),
             worlds=worlds,
             key=key,
             steps=jnp.zeros((), jnp.int32),
@@ -211,7 +211,7 @@ class Program:
     def _sample(self, buffer: replay.Replay, key: Array) -> replay.Transitions:
         limits = self.config.sac
         steps, discount = limits.return_steps, limits.discount
-        batch = limits.batch // self._shards.count
+        batch = limits.batch // self._shards.parts
         return replay.sample(buffer, key, batch, self._worlds, *self.sizes, steps, discount)
 
     def _learn(self, state: TrainState, tally: Tally, mode: Mode) -> tuple[TrainState, Tally]:

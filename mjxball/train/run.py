@@ -95,9 +95,20 @@ class Run:
         self._writer = ThreadPoolExecutor(1)
         self._checkpoints = self._writer.submit(_open_checkpoints, out) if self._writes else None
         self._pending: Future[None] | None = None
-        self.state: TrainState | None = resumed
+        self._state = resumed
         self._saved_at = self._saving = 0.0  # [s]
         self._saved_steps = -1
+
+    @property
+    def state(self) -> TrainState:
+        """What is trained; there is none before `train` unless the run was resumed."""
+        if self._state is None:
+            raise RuntimeError("the run has not started")
+        return self._state
+
+    @state.setter
+    def state(self, state: TrainState) -> None:
+        self._state = state
 
     def train(self) -> bool:
         """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk."""
@@ -129,7 +140,7 @@ class Run:
     def _start(self) -> None:
         devices = self.population.devices
         self.progress.say(f"compiling the training program for {devices} x {jax.devices()[0].device_kind} ...")
-        creating = self.state is None
+        creating = self._state is None
         self._compiled = self.population.compile(creating)
         if creating:
             self.state = self.population.start(self._compiled, self.origin["seed"])
@@ -228,7 +239,7 @@ class Run:
 
     def _save(self) -> None:
         began = self.progress.elapsed()
-        if self.state is None or self._saved_steps == self._steps():
+        if self._state is None or self._saved_steps == self._steps():
             return
         self._saved_steps = self._steps()
         exported = self._export()
@@ -236,7 +247,7 @@ class Run:
         if exported and self._checkpoints:
             if self._pending:
                 self._pending.result()
-            self._pending = self._writer.submit(self._write, kept)
+            self._pending = self._writer.submit(_write, self._checkpoints, kept)
         self._saved_at = self.progress.elapsed()
         self._saving += self._saved_at - began
 
@@ -251,9 +262,6 @@ class Run:
         if jax.process_count() > 1 or 2 * sum(shares) > room:
             return processes.gather(self.state)
         return jax.device_put(self.state, jax.tree.map(lambda leaf: leaf.sharding, self.state), may_alias=False)
-
-    def _write(self, kept: TrainState) -> None:
-        self._checkpoints.result().save(processes.gather(kept))
 
     def _export(self) -> bool:
         """Write the policy file, of a population every member's and the best one's; False if none is sound."""
@@ -281,6 +289,10 @@ def _open_checkpoints(out: Path) -> Any:
     from mjxball.train.checkpoint import Checkpoints
 
     return Checkpoints(out)
+
+
+def _write(checkpoints: Future[Any], kept: TrainState) -> None:
+    checkpoints.result().save(processes.gather(kept))
 
 
 def _count(state: TrainState) -> int:

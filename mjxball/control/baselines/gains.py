@@ -41,13 +41,14 @@ def pitch_gains(config: Config, name: str) -> PitchGains:
     constants = plant_constants(plant, attitude)
     inertia = np.diag(constants.drone_inertia) + plant.object_mass * constants.object_inertia_per_mass
     roll, pitch, _ = attitude.natural_frequency
+    led, followed = map(float, constants.share)
     return PitchGains(
         kp=constants.gains.kp[1],
         kd=constants.gains.kd[1],
         inertia=float(inertia[1]),
         half_length=0.5 * (plant.leader_mount[0] - plant.follower_mount[0]),
         drone_mass=(plant.leader_mass, plant.follower_mass),
-        share=tuple(map(float, constants.share)),
+        share=(led, followed),
         gravity=plant.gravity,
         lag=plant.rotor_lag,
         period=config.timing.control_period,

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control.followers import make_baseline
+from mjxball.control.followers import Follower, make_baseline
 from mjxball.evaluate import svg
 from mjxball.evaluate.cells import REFERENCE, Cell, run_cells
 from mjxball.evaluate.page import COPYING, WHY_COPYING_LOSES
@@ -48,7 +48,7 @@ def swings(flight: Trajectory) -> int:
 
 def draw(setup: Config, policies: Sequence[Policy], physics: str) -> Figure:
     """Fly and draw."""
-    followers = [*(make_baseline(name, setup) for name in (COPY, ADAPTIVE)), *policies]
+    followers: list[Follower] = [*(make_baseline(name, setup) for name in (COPY, ADAPTIVE)), *policies]
     cells = run_cells(setup, followers, [REFERENCE], physics)
     shade = svg.colours([cell.follower for cell in cells])
     figure, axes = panels([1.5] * 3)
@@ -94,7 +94,8 @@ def judged(cells: Sequence[Cell], copyists: Sequence[str]) -> tuple[tuple[str, .
 def _compared(cell: Cell, adaptive: Cell) -> tuple[list[str], list[str]]:
     """What of the paper's claims `cell` does better than the adaptive follower, and what not, with both numbers."""
     mine, other = _claims(cell), _claims(adaptive)
-    better, worse = [], []
+    better: list[str] = []
+    worse: list[str] = []
     for name, (value, text) in mine.items():
         against, written = other[name]
         (better if value < against else worse).append(f"{name} ({text} against {written})")
@@ -117,8 +118,7 @@ def _claims(cell: Cell) -> dict[str, tuple[float, str]]:
 
 def steady_peak(cell: Cell) -> float:
     """Root of the squared x, y, z peaks after 20 s [m], as the judge ranks; NaN of a shorter flight."""
-    peaks = (cell.metrics.x_peak, cell.metrics.y_peak, cell.metrics.z_peak)
-    return math.nan if None in peaks else math.hypot(*peaks)
+    return cell.metrics.peak
 
 
 def _row(cell: Cell) -> tuple[str, ...]:

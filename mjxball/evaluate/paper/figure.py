@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,7 +81,7 @@ def panels(heights: Sequence[float], columns: int = 1) -> tuple[Any, np.ndarray]
     return figure, axes
 
 
-def draw_position(axes: Sequence[Any], cells: Sequence[Cell], styles: Sequence[Mapping[str, Any]]) -> None:
+def draw_position(axes: Iterable[Any], cells: Sequence[Cell], styles: Sequence[Mapping[str, Any]]) -> None:
     """x, y, z of O over time into three panels, the goal dotted."""
     for k, axis in enumerate(axes):
         target = cells[0].flight.target[:, k]
@@ -92,7 +92,7 @@ def draw_position(axes: Sequence[Any], cells: Sequence[Cell], styles: Sequence[M
         axis.set_ylabel(f"{'xyz'[k]} [m]")
 
 
-def legend_above(figure: Any, axes: Sequence[Any], columns: int = 4) -> None:
+def legend_above(figure: Any, axes: Iterable[Any], columns: int = 4) -> None:
     """One legend above the panels with every label of `axes`, each once."""
     handles: dict[str, Any] = {}
     for axis in axes:

@@ -39,7 +39,7 @@ def read_curve(policy: Policy) -> Curve | None:
     if stored is None:
         return None
     named = ("steps", "episode_return", "eval_steps", "eval_return")
-    columns = [stored.get(name) for name in named] if isinstance(stored, dict) else []
+    columns: list[Any] = [stored.get(name) for name in named] if isinstance(stored, dict) else []
     sound = bool(columns) and all(isinstance(column, list) and all(map(_is_number, column)) for column in columns)
     if not sound or not columns[0] or [*map(len, columns[::2])] != [*map(len, columns[1::2])]:
         raise InputError(f"the card of policy {policy.name} has an unsound training curve")
