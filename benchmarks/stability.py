@@ -24,8 +24,8 @@ from mjxball.control.constants import trim_reach
 from mjxball.control.followers import Follower, make_baseline
 from mjxball.evaluate.batch import Batch, law_of
 from mjxball.evaluate.cells import load_policy
-from mjxball.evaluate.figures import pyplot
 from mjxball.evaluate.stability import delay_margins, hovers
+from mjxball.plotting import pyplot
 from mjxball.rollout import simulate_batch
 from mjxball.scenario import Scenario
 

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 from mjxball import config as configs
 from mjxball.cache import enable_compilation_cache
 from mjxball.env import CoupledPairEnv
-from mjxball.export import policy_file
 from mjxball.policy import save_file
+from mjxball.policy.export import policy_file
 from mjxball.quiet import import_brax_env
 
 

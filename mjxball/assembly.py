@@ -12,10 +12,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjxball.cli import Parser, output_file, run_command
+from mjxball.cli import make_parser, output_file, quit_on_interrupt, run_command
 from mjxball.config import Attitude, Plant
-from mjxball.control.constants import plant_constants
-from mjxball.physics.engine import ROLLING_INERTIA
+from mjxball.control.constants import ROLLING_INERTIA, plant_constants
 
 ASSEMBLY = "assembly"
 LEADER = "leader"
@@ -153,7 +152,7 @@ def _add_drone(
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.assembly`; returns the exit code."""
-    parser = Parser(prog="python -m mjxball.assembly", description="Write the reference plant as MJCF.")
+    parser = make_parser("python -m mjxball.assembly", "Write the reference plant as MJCF.")
     parser.add_argument("out", metavar="OUT.xml", type=Path, help="file to write; must not exist")
     options = parser.parse_args(arguments)
 
@@ -165,4 +164,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    quit_on_interrupt()
     sys.exit(main())

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
 
@@ -20,6 +22,23 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> None:  # type: ignore[override]
         """Print `message` and exit with code 2."""
         self.exit(2, f"{self.prog}: {message}\n")
+
+
+def make_parser(program: str, description: str, usage: str | None = None, epilog: str | None = None) -> Parser:
+    """The parser of the command `program`, with the `--help` and `--version` of every command; no flag is shortened.
+
+    Installed commands (`mjxball-train`) are called by their own name, whatever `program` says.
+    """
+    called = Path(sys.argv[0]).stem
+    name = called if called.startswith("mjxball-") else program
+    parser = Parser(prog=name, description=description, usage=usage, epilog=epilog, allow_abbrev=False)
+    parser.add_argument("--version", action="version", version=f"mjxball {__version__}")
+    return parser
+
+
+def quit_on_interrupt() -> None:
+    """Let Ctrl-C end the process at once and silently, code 130: an import cut short can abort the interpreter."""
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 
 def run_command(command: Callable[[], int]) -> int:

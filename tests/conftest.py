@@ -20,8 +20,8 @@ import pytest
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.env import CoupledPairEnv
-from mjxball.export import policy_file
 from mjxball.policy import PolicyFile, save_file
+from mjxball.policy.export import policy_file
 from mjxball.train import sac
 from mjxball.train.program import statistics
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from command_line import TRANSPORT, assert_one_line, call, listing, load_arrays, run, script, write_arrays
 
+from mjxball.commands.evaluate import main
 from mjxball.control.followers import BASELINES
-from mjxball.evaluate.main import main
 from mjxball.policy.shipped import shipped_policies
 
 FAST = ["--physics", "newton-euler"]

@@ -18,8 +18,8 @@ from command_line import assert_one_line, call, environment, listing, load_array
 
 from mjxball import config as configs
 from mjxball import export
+from mjxball.commands.train import main
 from mjxball.policy import Policy
-from mjxball.train.main import main
 
 WORLDS = 32
 # Small enough for seconds: closed-form physics, tiny networks, one update a step.

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from mjxball.commands.train import main as train
 from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.train.checkpoint import CHECKPOINTS
-from mjxball.train.main import main as train
 from mjxball.train.population import check_parts, grid
 from mjxball.train.processes import Rendezvous
 

@@ -14,11 +14,11 @@ from command_line import TRANSPORT, assert_one_line, call, listing, load_arrays,
 from conftest import opened
 
 from mjxball import config as configs
+from mjxball.commands.evaluate import main
 from mjxball.config import preset
 from mjxball.control.followers import make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate.cells import REFERENCE, Cell, run_cells
-from mjxball.evaluate.main import main
 from mjxball.evaluate.paper import adaptive, reward, variations
 from mjxball.evaluate.paper.command import NAMES
 from mjxball.evaluate.paper.figure import listed

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from conftest import opened
 
+from mjxball.commands.evaluate import main as evaluate
 from mjxball.config import preset
 from mjxball.control.followers import make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate import families, page
 from mjxball.evaluate.judge import Score, bootstrap, by_level, judge, wins
-from mjxball.evaluate.main import main as evaluate
 from mjxball.scenario import check_scenario
 
 CONFIG = preset("paper")

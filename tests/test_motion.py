@@ -9,6 +9,7 @@ import pytest
 from plants import BEAM, ROLLING, SAMPLES, copying, paper_with
 
 from mjxball import config as configs
+from mjxball.commands.train import main as train
 from mjxball.config import Attitude, Motion, Plant
 from mjxball.errors import InputError
 from mjxball.evaluate.waveform import read_waveform
@@ -16,7 +17,6 @@ from mjxball.physics import motion, newton_euler
 from mjxball.physics.engine import PlantState, Wrench
 from mjxball.rollout import simulate
 from mjxball.scenario import Scenario
-from mjxball.train.main import main as train
 
 GAP = 1e-4  # [s] of the central differences below
 PLACES = np.array([0.3, -1.0, 1.0, 0.9, -0.2])

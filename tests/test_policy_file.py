@@ -13,8 +13,8 @@ import pytest
 from conftest import Trained
 
 from mjxball.control import observation as layout
-from mjxball.export import policy_file
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
+from mjxball.policy.export import policy_file
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 18))
 

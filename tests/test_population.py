@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from conftest import with_settings
 
+from mjxball.commands.train import main as train
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.policy.file import load_file
 from mjxball.train import program as programs
-from mjxball.train.main import main as train
 from mjxball.train.members import best_member, read_members
 from mjxball.train.population import Population, read_sweep
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS
-from mjxball.train.main import main as train
 
 REPOSITORY = Path(__file__).parents[1]
 TINY = [

@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Attitude, Plant
+from mjxball.control import rotations
 from mjxball.control.attitude import AttitudeGains, design_gains
 
 Array = Any
+ROLLING_INERTIA = 0.4  # spin inertia of a solid ball over r^2 and its mass: (7/5) m x'' = m g sin
 
 
 class PlantConstants(NamedTuple):
@@ -36,11 +38,6 @@ def box_inertia_per_mass(size: tuple[float, float, float]) -> np.ndarray:
     return np.array([b * b + c * c, a * a + c * c, a * a + b * b]) / 12
 
 
-def point_inertia(position: np.ndarray) -> np.ndarray:
-    """Inertia (3, 3) [m2] about the origin of a unit point mass at `position` (3,) [m]."""
-    return float(position @ position) * np.eye(3) - np.outer(position, position)
-
-
 def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
     """Derive the constants of `plant`; the attitude gains are those of `attitude.design_object_mass` at c = 0.
 
@@ -50,9 +47,9 @@ def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
     mass = np.array([plant.leader_mass, plant.follower_mass])
     mounts = np.array([plant.leader_mount, plant.follower_mount])
     own = np.diag(plant.leader_inertia) + np.diag(plant.follower_inertia)
-    drone_inertia = own + sum(m * point_inertia(r) for m, r in zip(mass, mounts, strict=True))
+    drone_inertia = own + sum(m * rotations.point_inertia(r) for m, r in zip(mass, mounts, strict=True))
     box, fraction = box_inertia_per_mass(plant.object_size), plant.moving_fraction
-    ball = box if fraction == 1 else np.full(3, fraction * 0.4 * plant.ball_radius**2)
+    ball = box if fraction == 1 else np.full(3, fraction * ROLLING_INERTIA * plant.ball_radius**2)
     shell = (1 - fraction) * box
     design_inertia = np.diag(drone_inertia) + attitude.design_object_mass * (shell + ball)
     ahead, behind = mounts[:, "xy".index(plant.cg_axis)]

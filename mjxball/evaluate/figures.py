@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.evaluate.cells import Cell
+from mjxball.plotting import pyplot
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e933c", "#edae49", "#6f4a8e", "#00798c", "#8d6a4f", "#444444")
 PANELS = (
@@ -18,16 +19,6 @@ PANELS = (
     ("command", 1, "pitch command [deg]"),
     ("command", 2, "vertical command [m/s²]"),
 )
-
-
-def pyplot() -> Any:
-    """Matplotlib's pyplot on the file-only backend."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt
 
 
 def scenario_title(cell: Cell) -> str:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.evaluate.figures import pyplot
 from mjxball.evaluate.judge import Score
+from mjxball.plotting import pyplot
 
 POINTS = 240  # of a curve over time
 COLOURS = {

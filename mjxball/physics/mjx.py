@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from mjxball.assembly import ASSEMBLY, BALL, build_model
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.control.constants import plant_constants
-from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, PlantState, Wrench
+from mjxball.control.constants import ROLLING_INERTIA, plant_constants
+from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
 from mjxball.quiet import import_mjx
 
 Array = Any

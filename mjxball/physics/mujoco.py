@@ -11,9 +11,9 @@ import numpy as np
 from mjxball.assembly import ASSEMBLY, BALL, FOLLOWER, LEADER, build_model
 from mjxball.config import Attitude, Config, Plant
 from mjxball.control import mixer, rotations
-from mjxball.control.constants import plant_constants
+from mjxball.control.constants import ROLLING_INERTIA, plant_constants
 from mjxball.physics import motion
-from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, Load, PlantState, Wrench
+from mjxball.physics.engine import CgState, Engine, Load, PlantState, Wrench
 
 Array = Any
 

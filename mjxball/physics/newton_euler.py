@@ -7,8 +7,8 @@ from typing import Any
 
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.control.constants import PlantConstants, plant_constants
-from mjxball.physics.engine import ROLLING_INERTIA, CgState, Engine, PlantState, Wrench
+from mjxball.control.constants import ROLLING_INERTIA, PlantConstants, plant_constants
+from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
 
 Array = Any
 # solve(mass, moment S, inertia J_O, down u = R^T E3, force, torque) -> (a_b, w') in body axes

@@ -52,7 +52,7 @@ def _rows(run: Path) -> list[dict[str, str]]:
 
 def draw_training(run: Path, config: Config, path: Path) -> None:
     """Draw `metrics.csv` of the directory `run` to `path`, whose directory is made."""
-    from mjxball.evaluate.figures import pyplot
+    from mjxball.plotting import pyplot
 
     rows = _rows(run)
 

@@ -73,7 +73,7 @@ def best_member(rows: list[dict[str, float]]) -> int:
 
 def draw_members(run: Path, path: Path) -> None:
     """Picture of all members over training: steady-state error and return, each one, their median and quartiles."""
-    from mjxball.evaluate.figures import pyplot
+    from mjxball.plotting import pyplot
 
     rows = read_members(run)
     steps = sorted({row["steps"] for row in rows})

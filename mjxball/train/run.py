@@ -20,8 +20,8 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.errors import TrainingDivergedError
-from mjxball.export import is_sound, policy_file
 from mjxball.policy import save_file
+from mjxball.policy.export import is_sound, policy_file
 from mjxball.train import processes
 from mjxball.train import program as programs
 from mjxball.train.curves import told_by_the_run

@@ -12,10 +12,10 @@ from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.evaluate import page
-from mjxball.evaluate.figures import pyplot
 from mjxball.evaluate.paper import adaptive, experiment, reward, variations
 from mjxball.evaluate.paper.figure import LETTERS, Figure
 from mjxball.evaluate.paper.stand import STANDS, stand_config
+from mjxball.plotting import pyplot
 from mjxball.policy import Policy
 
 PAGE = "figures.html"

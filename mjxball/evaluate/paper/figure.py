@@ -11,7 +11,7 @@ import numpy as np
 
 from mjxball.evaluate import svg
 from mjxball.evaluate.cells import Cell
-from mjxball.evaluate.figures import pyplot
+from mjxball.plotting import pyplot
 from mjxball.policy import Policy
 
 WIDTH = 4.5  # [in] of every drawing, so that its letters stay readable on a phone

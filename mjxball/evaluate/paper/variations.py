@@ -10,9 +10,9 @@ from mjxball.control.followers import make_baseline
 from mjxball.evaluate import svg
 from mjxball.evaluate.cells import Cell, run_cells
 from mjxball.evaluate.families import BY_NAME, Family
-from mjxball.evaluate.figures import pyplot
 from mjxball.evaluate.paper.adaptive import COPY, steady_peak
 from mjxball.evaluate.paper.figure import Figure, Table, called, draw_position, listed, metres, panels, seconds
+from mjxball.plotting import pyplot
 from mjxball.policy import Policy
 
 HEADS = ("flown", "peak after 20 s", "settles", "off its goal at the end")

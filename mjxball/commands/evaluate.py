@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from mjxball import __version__, cli, config
+from mjxball import cli, config
 from mjxball.control.followers import BASELINES, LAWS, Follower, make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate import families
@@ -42,12 +42,11 @@ NOT_WITH_FIGURES = ("families", "seeds", "check", "followers", "json", "wn_pitch
 
 
 def parser() -> cli.Parser:
-    """The argument parser of `eval.py` (design section 9)."""
-    result = cli.Parser(
-        prog="eval.py",
+    """The argument parser of `eval.py`."""
+    result = cli.make_parser(
+        "eval.py",
         description="Fly policies and baselines through scenarios on a CPU and print their metrics.",
         epilog="Without policies, followers or scenarios: every shipped policy and baseline on the standard scenarios.",
-        allow_abbrev=False,
     )
     names = ", ".join(LAWS)
     result.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="policy files")
@@ -78,7 +77,6 @@ def parser() -> cli.Parser:
     result.add_argument("--figures", nargs="+", metavar="NAME", help=f"the paper's: {', '.join(paper.NAMES)}, or all")
     result.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
     result.add_argument("--list", action="store_true", help="list the scenario families and stop")
-    result.add_argument("--version", action="version", version=f"mjxball {__version__}")
     return result
 
 

@@ -33,14 +33,13 @@ MOST_MEMBERS = 4096
 
 def parser() -> cli.Parser:
     """The argument parser; configuration flags are generated from `mjxball.config`."""
-    result = cli.Parser(
-        prog="train.py",
-        usage="train.py [PRESET] [--seed N] [--seeds K] [--sweep FILE] [--out DIR] [--resume DIR] [--physics ENGINE]\n"
+    result = cli.make_parser(
+        "train.py",
+        usage="%(prog)s [PRESET] [--seed N] [--seeds K] [--sweep FILE] [--out DIR] [--resume DIR] [--physics ENGINE]\n"
         "                [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
         "                [--<config path> VALUE ...]",
         description="Train a follower with soft actor-critic, export it to NumPy and judge it against `copy`.",
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
-        allow_abbrev=False,
     )
     names = ", ".join(config.PRESETS)
     result.add_argument("preset", nargs="?", metavar="PRESET", help=f"one of {names} (default transport)")
@@ -54,7 +53,6 @@ def parser() -> cli.Parser:
     result.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
     result.add_argument("--processes", type=int, metavar="N", help="how many processes there are, with --coordinator")
     result.add_argument("--process", type=int, metavar="I", help="this process's number, 0 .. N - 1")
-    result.add_argument("--version", action="version", version=f"mjxball {__version__}")
     cli.add_config_flags(result)
     return result
 
@@ -82,11 +80,11 @@ def _train(options: argparse.Namespace, command: str) -> int:
         if meeting:
             processes.leave()
     if writes and code is None and (out / "eval" / CELLS).exists():
-        print(f"{out} was finished and evaluated before; nothing is left to do")  # noqa: T201
+        print(f"{out} was finished and evaluated before; nothing is left to do")
         return 0
     if not writes or code == 1:
         return code or 0
-    print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)  # noqa: T201
+    print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)
     if code:
         return code
     draw_training(out, settings, out / "eval" / "training.png")
@@ -105,7 +103,7 @@ def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: boo
     state = restore_state(out, settings, origin) if resume else None
     if resume and processes.is_writer():
         steps = 0 if state is None else int(np.ravel(state.steps)[0])
-        print(f"continuing {out} after {steps:,} of {settings.sac.steps:,} steps", file=sys.stderr)  # noqa: T201
+        print(f"continuing {out} after {steps:,} of {settings.sac.steps:,} steps", file=sys.stderr)
     if state is not None and int(np.ravel(state.steps)[0]) >= settings.sac.steps:
         return None
     try:
@@ -114,7 +112,7 @@ def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: boo
         if processes.is_writer():
             kept = any(path.name.isdigit() for path in (out / CHECKPOINTS).glob("*"))
             where = f"the last good policy and checkpoint are in {out}" if kept else "no checkpoint came before"
-            print(f"training diverged: {error}; {where}", file=sys.stderr)  # noqa: T201
+            print(f"training diverged: {error}; {where}", file=sys.stderr)
         return 1
 
 
@@ -187,7 +185,7 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
     cells = run_cells(settings, policies, _scenarios(settings)[-1:], origin["physics"])
-    print(table(cells))  # noqa: T201
+    print(table(cells))
     judged = ("rmse", "settling_time", "x_peak", "overshoot")
     chosen = load_file(out / POLICY)
     seeds = [int(cell.follower.removeprefix("seed")) for cell in cells]
@@ -197,7 +195,7 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
     for name in judged:
         values = sorted(math.inf if value is None else value for value in spread[name])
         low, middle, high = values[0], statistics.median(values), values[-1]
-        print(f"{name}: median {middle:.4g}, best {low:.4g}, worst {high:.4g} of {len(values)}")  # noqa: T201
+        print(f"{name}: median {middle:.4g}, best {low:.4g}, worst {high:.4g} of {len(values)}")
     (out / "eval").mkdir(exist_ok=True)
     draw_members(out, out / "eval" / "members.png")
 
@@ -225,12 +223,12 @@ def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) ->
     scenarios = _scenarios(settings)
     trained = load_policy(policy, settings)
     cells = run_cells(settings, [make_baseline("copy", settings), trained], scenarios, physics)
-    print(table(cells))  # noqa: T201
+    print(table(cells))
     write_report(cells, out / "eval")
     reference = next(cell for cell in cells if cell.follower == trained.name and cell.scenario == scenarios[-1])
     misses = check_bounds(trained, reference.metrics)
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
-    print(f"{policy} {verdict}; figures in {out / 'eval'}")  # noqa: T201
+    print(f"{policy} {verdict}; figures in {out / 'eval'}")
     return 0
 
 

@@ -1,0 +1,29 @@
+"""Entry points of `mjxball-train` and `mjxball-eval`, and of train.py and eval.py; imports nothing heavy by itself."""
+
+from __future__ import annotations
+
+from mjxball.cli import quit_on_interrupt, run_command
+
+
+def train() -> int:
+    """Run `train.py`; return its exit code."""
+    quit_on_interrupt()  # until training starts there is nothing to save
+
+    def command() -> int:
+        from mjxball.commands.train import main
+
+        return main()
+
+    return run_command(command)
+
+
+def evaluate() -> int:
+    """Run `eval.py`; return its exit code."""
+    quit_on_interrupt()  # there is nothing to save
+
+    def command() -> int:
+        from mjxball.commands.evaluate import main
+
+        return main()
+
+    return run_command(command)

@@ -1,0 +1,208 @@
+"""Imports run one way, along the data: config -> control -> policy | assembly -> physics -> env -> train -> evaluate.
+
+Read from the syntax tree of every module, so that a lazy import inside a function counts as well.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from command_line import REPOSITORY, environment
+
+# Floor by floor: a part imports itself and what stands on lower floors, never a neighbour or what is above.
+FLOORS = (
+    {"errors"},
+    {"config"},
+    {"cli", "cache", "quiet", "plotting"},
+    {"control"},
+    {"policy"},
+    {"assembly"},
+    {"physics"},
+    {"rewards", "sensing"},
+    {"scenario", "nuisance"},
+    {"rollout", "env"},
+    {"train"},
+    {"evaluate"},
+    {"fly", "gym", "view"},
+    {"commands", "export"},
+    {"entry"},
+)
+FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}
+GROUND = {"errors", "config", "control"}  # all of our own that `control` and `policy` may import
+BASE = ("errors", "config", "cli", "control", "policy", "entry")  # what the base install runs: NumPy alone
+OURS = "mjxball"
+
+
+class Module(NamedTuple):
+    """One module's imports: dotted names, lazily made ones included, those for type checkers alone left out."""
+
+    name: str  # mjxball.control.leader
+    eager: set[str]  # at import time
+    lazy: set[str]  # inside functions
+
+    @property
+    def part(self) -> str:
+        """First name below the package, '' for the package itself."""
+        return part_of(self.name)
+
+
+def part_of(name: str) -> str:
+    return name.split(".")[1] if "." in name else ""
+
+
+def imports_in(node: ast.AST, lazy: bool, found: tuple[set[str], set[str]]) -> None:
+    if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+        for child in node.orelse:
+            imports_in(child, lazy, found)
+        return
+    if isinstance(node, ast.Import):
+        found[lazy].update(alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        assert node.level == 0, "relative imports hide where a name comes from"
+        found[lazy].update(f"{node.module}.{alias.name}" for alias in node.names)
+    inner = lazy or isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+    for child in ast.iter_child_nodes(node):
+        imports_in(child, inner, found)
+
+
+def read(package: Path) -> dict[str, Module]:
+    """Every module below the directory `package`, by name."""
+    modules = {}
+    for path in sorted(package.rglob("*.py")):
+        parts = path.relative_to(package.parent).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        found: tuple[set[str], set[str]] = (set(), set())
+        imports_in(ast.parse(path.read_text()), False, found)
+        modules[name] = Module(name, *found)
+    return modules
+
+
+def own(names: set[str]) -> set[str]:
+    return {name for name in names if name.split(".")[0] == OURS}
+
+
+def foreign(names: set[str]) -> set[str]:
+    """Top-level names of other packages; the standard library is nobody's."""
+    return {name.split(".")[0] for name in names - own(names)} - sys.stdlib_module_names - {"__future__"}
+
+
+def direction_faults(modules: dict[str, Module]) -> list[str]:
+    """What breaks the one-way flow, one sentence each. The package itself may be imported for its version alone."""
+    faults = []
+    for module in modules.values():
+        if module.part and module.part not in FLOOR:
+            faults.append(f"{module.name}: give the part {module.part!r} a floor in FLOORS")
+            continue
+        for target in own(module.eager | module.lazy) if module.part else ():
+            there = part_of(target)
+            if target == f"{OURS}.__version__" or there == module.part:
+                continue
+            if FLOOR.get(there, len(FLOORS)) >= FLOOR[module.part]:
+                faults.append(f"{module.name} imports {target}, which is not below it")
+            if module.part in ("control", "policy") and there not in (GROUND | {"policy"}):
+                faults.append(f"{module.name} imports {target}: the ground floor imports {sorted(GROUND)} only")
+    return faults
+
+
+def loaded_by(modules: dict[str, Module], name: str) -> set[str]:
+    """Our modules that importing `name` loads, itself and the packages around included."""
+    seen: set[str] = set()
+    waiting = [name]
+    while waiting:
+        current = waiting.pop()
+        while current and current not in modules:  # `mjxball.errors.InputError` is a name in mjxball.errors
+            current = current.rpartition(".")[0]
+        if not current or current in seen:
+            continue
+        seen.add(current)
+        waiting += [*own(modules[current].eager), current.rpartition(".")[0]]
+    return seen
+
+
+def needs(modules: dict[str, Module], name: str) -> set[str]:
+    """Other packages that importing `name` loads."""
+    return set().union(*(foreign(modules[one].eager) for one in loaded_by(modules, name)))
+
+
+@pytest.fixture(scope="module")
+def modules() -> dict[str, Module]:
+    return read(REPOSITORY / OURS)
+
+
+def test_imports_run_one_way(modules: dict[str, Module]) -> None:
+    assert direction_faults(modules) == []
+
+
+@pytest.mark.parametrize("part", BASE)
+def test_the_base_install_imports_numpy_alone(modules: dict[str, Module], part: str) -> None:
+    members = [name for name, module in modules.items() if module.part == part]
+    assert members
+    for name in members:
+        assert needs(modules, name) <= {"numpy"}, name
+
+
+@pytest.mark.parametrize("part", ["control", "policy"])
+def test_the_ground_floor_never_imports_jax_or_mujoco_not_even_lazily(modules: dict[str, Module], part: str) -> None:
+    for name, module in modules.items():
+        if module.part == part:
+            assert foreign(module.eager | module.lazy) <= {"numpy"}, name
+
+
+def test_what_flies_loads_no_jax(modules: dict[str, Module]) -> None:
+    for name, module in modules.items():
+        if module.part == "fly":
+            assert not needs(modules, name) & {"jax", "jaxlib", "flax", "brax"}, name
+            assert "jax" not in foreign(module.lazy), name
+
+
+def test_the_flight_path_loads_no_jax_in_truth() -> None:
+    """The same of the running interpreter: a dynamic import would escape the syntax tree."""
+    script = (
+        "import sys, mjxball.policy, mjxball.control.followers, mjxball.cli, mjxball.entry\n"
+        "print([name for name in ('jax', 'mujoco', 'scipy', 'matplotlib') if name in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment(), cwd=REPOSITORY
+    )
+    assert done.stdout.strip() == "[]"
+
+
+class TestTheReader:
+    """The reader sees what it must see: each fault is planted in a small package and found."""
+
+    def package(self, place: Path, **files: str) -> dict[str, Module]:
+        for name, text in {"__init__": "", **files}.items():
+            path = place / OURS / f"{name}.py"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+        return read(place / OURS)
+
+    def test_upward(self, tmp_path: Path) -> None:
+        found = direction_faults(self.package(tmp_path, control="from mjxball.train import sac", train=""))
+        assert any("not below it" in fault for fault in found)
+
+    def test_lazily_upward(self, tmp_path: Path) -> None:
+        text = "def f():\n    import mjxball.evaluate\n"
+        assert direction_faults(self.package(tmp_path, train=text, evaluate=""))
+
+    def test_between_neighbours(self, tmp_path: Path) -> None:
+        assert direction_faults(self.package(tmp_path, env="import mjxball.rollout", rollout=""))
+
+    def test_unknown_part(self, tmp_path: Path) -> None:
+        (fault,) = direction_faults(self.package(tmp_path, attic=""))
+        assert "floor" in fault
+
+    def test_through_another_module(self, tmp_path: Path) -> None:
+        modules = self.package(tmp_path, policy="from mjxball.control import mean", control="import jax.numpy as jnp")
+        assert needs(modules, "mjxball.policy") == {"jax"}
+
+    def test_sound(self, tmp_path: Path) -> None:
+        text = "import numpy\nfrom mjxball.control import mean\nfrom mjxball import __version__"
+        modules = self.package(tmp_path, policy=text, control="def mean(): ...")
+        assert direction_faults(modules) == []
+        assert needs(modules, "mjxball.policy") == {"numpy"}
