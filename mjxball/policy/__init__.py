@@ -6,5 +6,14 @@ roll, pitch, vertical_acceleration = policy(observation)  # SI units
 
 from mjxball.policy.file import PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.policy import Policy
+from mjxball.policy.shipped import shipped_policies, shipped_policy
 
-__all__ = ["Policy", "PolicyFile", "PolicyFileError", "load_file", "save_file"]
+__all__ = [
+    "Policy",
+    "PolicyFile",
+    "PolicyFileError",
+    "load_file",
+    "save_file",
+    "shipped_policies",
+    "shipped_policy",
+]
