@@ -20,7 +20,8 @@ from mjxball.policy import Policy
 from mjxball.policy.file import load_file
 from mjxball.train import program as programs
 from mjxball.train.members import best_member, read_members
-from mjxball.train.population import Population, read_sweep
+from mjxball.train.population import Population
+from mjxball.train.sweep import read_sweep
 
 REPOSITORY = Path(__file__).parents[1]
 SMALL = {

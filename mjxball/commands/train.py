@@ -26,9 +26,8 @@ from mjxball.scenario import Scenario, check_scenario
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
 from mjxball.train.provenance import commit, differences, source_hash, versions
-from mjxball.train.record import CHECKPOINTS, POLICY
-
-MOST_MEMBERS = 4096
+from mjxball.train.record import CHECKPOINTS, LARGEST_SEED, MOST_MEMBERS, POLICY
+from mjxball.train.sweep import read_sweep
 
 
 def parser() -> cli.Parser:
@@ -136,8 +135,8 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     """Configuration, origin and directory of a new run; everything that can be refused is refused here."""
     name, seed = options.preset or "transport", options.seed or 0
     settings = cli.apply_config_flags(config.preset(name), options)
-    if not 0 <= seed < 2**31:
-        raise InputError(f"--seed must be between 0 and {2**31 - 1}, not {seed}")
+    if not 0 <= seed <= LARGEST_SEED:
+        raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
     out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     _scenarios(settings)
     members = 1 if options.seeds is None else options.seeds
@@ -171,8 +170,6 @@ def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
 def _read_sweep(path: Path | None, members: int, settings: config.Config) -> dict[str, list[float]] | None:
     if path is None:
         return None
-    from mjxball.train.population import read_sweep
-
     return read_sweep(path, members, settings)
 
 

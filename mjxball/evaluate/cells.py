@@ -89,8 +89,8 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     expected = dataclasses.asdict(config.plant)
     made_for = {key: tuple(v) if isinstance(v, list) else v for key, v in policy.card["plant"].items()}
     for key, value in expected.items():
-        if key != "object_mass" and made_for.get(key, getattr(Plant(), key)) != value:
-            raise InputError(f"{path} was made for another plant: {key} is {made_for[key]}, not {value}")
+        if key != "object_mass" and made_for.setdefault(key, getattr(Plant(), key)) != value:
+            raise InputError(f"{path} was made for another plant: {key} is {made_for[key]!r}, not {value!r}")
     if compare_laws:
         _refuse_other_laws(path, policy.card, config)
     return policy
@@ -106,7 +106,7 @@ def _refuse_other_laws(path: Path, card: dict[str, Any], config: Config) -> None
             made_for = (trained.get(section) or {}).get(key, value)
             made_for = tuple(made_for) if isinstance(made_for, list) else made_for
             if made_for != value:
-                raise InputError(f"{path} was trained with {section}.{key} {made_for}, not {value}")
+                raise InputError(f"{path} was trained with {section}.{key} {made_for!r}, not {value!r}")
 
 
 def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:

@@ -4,7 +4,8 @@ policy = Policy.load("policies/transport.npz")
 roll, pitch, vertical_acceleration = policy(observation)  # SI units
 """
 
-from mjxball.policy.file import PolicyFile, PolicyFileError, load_file, save_file
+from mjxball.policy.container import PolicyFileError
+from mjxball.policy.file import PolicyFile, load_file, save_file
 from mjxball.policy.policy import Policy
 from mjxball.policy.shipped import shipped_policies, shipped_policy
 

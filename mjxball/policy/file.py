@@ -1,11 +1,10 @@
-"""The policy file: one `.npz` without pickles (design section 10). Reading verifies everything it uses."""
+"""The policy file: one `.npz` without pickles (docs/policy-file.md). Reading verifies everything it uses."""
 
 from __future__ import annotations
 
 import io
 import json
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,11 @@ import numpy as np
 
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE
 from mjxball.control.recall import Recall
-from mjxball.errors import InputError
+from mjxball.policy.container import PolicyFileError, read_arrays
 
 FORMAT_VERSION = 1
-MAX_BYTES = 64 * 2**20
-MAX_LAYERS = 32
+READ_OF_CONFIG = ("leader", "attitude", "reward")  # by the judge, where a card has the configuration
+MAX_CARD = 2**20  # characters
 # Metrics that a card may bound, all of them the better the smaller.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
 MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
@@ -42,10 +41,6 @@ CARD_FIELDS: dict[str, type] = {
     "training_steps": int,
     "bounds": dict,
 }
-
-
-class PolicyFileError(InputError):
-    """A policy file that cannot be used; the message names the file and what is wrong."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +94,7 @@ def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
 def load_file(path: str | os.PathLike[str]) -> PolicyFile:
     """Read and verify a policy file; raise PolicyFileError with one sentence on anything unsound."""
     name = str(path)
-    arrays = _read_arrays(name)
+    arrays = read_arrays(name)
     for needed in ("observation_mean", "observation_scale", "action_scale", "card"):
         if needed not in arrays:
             raise PolicyFileError(f"{name} is not a policy file: it has no {needed}")
@@ -124,34 +119,11 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
     return policy
 
 
-def _read_arrays(name: str) -> dict[str, np.ndarray]:
-    try:
-        with zipfile.ZipFile(name) as archive:
-            entries = archive.infolist()
-        if len(entries) > 2 * MAX_LAYERS + 4 or sum(entry.file_size for entry in entries) > MAX_BYTES:
-            raise PolicyFileError(f"{name} is not a policy file: it unpacks to more than {MAX_BYTES >> 20} MiB")
-        with np.load(name, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in data.files}
-    except FileNotFoundError:
-        raise PolicyFileError(f"policy file {name} does not exist") from None
-    except PolicyFileError:
-        raise
-    except IsADirectoryError:
-        raise PolicyFileError(f"policy file {name} is a directory") from None
-    except OSError as error:
-        raise PolicyFileError(f"policy file {name} cannot be read: {error.strerror or error}") from None
-    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for damaged bytes
-        reason = "it holds a pickle" if "pickle" in str(error).lower() else "it is damaged or not an .npz"
-        raise PolicyFileError(f"policy file {name} cannot be read: {reason}") from None
-    for key, array in arrays.items():
-        if not isinstance(array, np.ndarray):  # NumPy hands out an entry without the NPY magic as bytes
-            raise PolicyFileError(f"{name}: entry {key!r} is not an array")
-    return arrays
-
-
 def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
     if text.ndim != 0 or text.dtype.kind != "U":
         raise PolicyFileError(f"{name}: the card is not one string")
+    if text.dtype.itemsize > 4 * MAX_CARD:  # JSON takes fifty times its own length in memory
+        raise PolicyFileError(f"{name}: the card is longer than {MAX_CARD} characters")
     try:
         card = json.loads(str(text))
     except (ValueError, RecursionError):
@@ -215,6 +187,9 @@ def _check_card(card: dict[str, Any], name: str) -> None:
         raise PolicyFileError(f"{name} was made for another observation than this version's 18 numbers")
     if card["action"] != [list(slot) for slot in ACTION]:
         raise PolicyFileError(f"{name} was made for another action than roll, pitch, vertical acceleration")
+    config = card.get("config", {})
+    if not isinstance(config, dict) or not all(isinstance(config.get(part, {}), dict) for part in READ_OF_CONFIG):
+        raise PolicyFileError(f"{name}: card field config is not a configuration")
     _check_card_numbers(card, name)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.train.members import read_members
+from mjxball.train.reading import read_rows
 from mjxball.train.record import METRICS
 
 PANELS = {
@@ -46,8 +46,7 @@ def training_curve(run: Path, seed: int) -> dict[str, list[float]]:
 
 
 def _rows(run: Path) -> list[dict[str, str]]:
-    with (run / METRICS).open(newline="") as stream:
-        return list(csv.DictReader(stream))
+    return read_rows(run / METRICS)
 
 
 def draw_training(run: Path, config: Config, path: Path) -> None:

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from mjxball.errors import InputError
+from mjxball.train.reading import read_rows
+
 LOG = "members.csv"
 POLICIES = "members"
 COLUMNS = (
@@ -56,12 +59,15 @@ class MemberLog:
 
 def read_members(run: Path) -> list[dict[str, float]]:
     """Rows of a run's `members.csv`; none if it has no such file."""
-    path = run / LOG
-    if not path.exists():
+    try:
+        texts = read_rows(run / LOG)
+    except FileNotFoundError:
         return []
-    with path.open(newline="") as stream:
-        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
-    return [{**row, "steps": int(row["steps"]), "seed": int(row["seed"])} for row in rows]
+    try:
+        rows = [{name: float(row[name]) for name in COLUMNS} for row in texts]
+        return [{**row, "steps": int(row["steps"]), "seed": int(row["seed"])} for row in rows]
+    except (KeyError, ValueError, OverflowError):
+        raise InputError(f"{run / LOG} holds something else than the numbers of a population") from None
 
 
 def best_member(rows: list[dict[str, float]]) -> int:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -21,47 +19,14 @@ from mjxball.train.program import Mode, Program, Shards, Tally, TrainState, pref
 from mjxball.train.provenance import source_hash, versions
 from mjxball.train.replay import Replay
 from mjxball.train.sac import Losses
+from mjxball.train.sweep import Sweep
 from mjxball.train.traced import Traced
 
 Array = Any
 # Settings that enter the compiled program as numbers, and may therefore differ between members.
-SWEEPABLE = (
-    "sac.learning_rate",
-    "sac.alpha_learning_rate",
-    "sac.learning_rate_end",
-    "sac.discount",
-    "sac.target_rate",
-    "sac.alpha",
-    "sac.target_entropy",
-    "sac.reward_scale",
-    "sac.policy_average",
-    "follower.tilt_limit",
-    "follower.vertical_limit",
-    *(f"reward.{name}" for name in ("error", "error_scale", "velocity", "tilt", "rates", "effort", "smoothness")),
-)
 # Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
 # (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/results.md.)
 GPU_OPTIONS = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
-Sweep = Mapping[str, Sequence[float]]
-
-
-def read_sweep(path: Path, members: int, config: Config) -> dict[str, list[float]]:
-    """A sweep file: JSON {"<config path>": [one number for each member], ...}. Raises InputError if unsound."""
-    try:
-        sweep = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(f"sweep file {path} cannot be read: {error}") from None
-    if not isinstance(sweep, dict) or not sweep:
-        raise InputError(f"sweep file {path} must hold an object of settings")
-    for name, values in sweep.items():
-        if name not in SWEEPABLE:
-            raise InputError(f"sweep file {path}: {name} cannot differ between members; {', '.join(SWEEPABLE)} can")
-        if not isinstance(values, list) or len(values) != members:
-            raise InputError(f"sweep file {path}: {name} needs {members} numbers, one for each seed")
-        for value in values:
-            number = float(value) if isinstance(value, int) and not isinstance(value, bool) else value
-            configs.validate(configs.replace(config, name, number))
-    return sweep
 
 
 class Executables(NamedTuple):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from mjxball.quiet import import_tensorboard_writer
+from mjxball.train.reading import read_rows
 
 EVENTS = "tensorboard"  # directory beside metrics.csv
 
@@ -129,7 +130,6 @@ def _metres(value: float | None) -> str:
 def _rows_until(path: Path, steps: int) -> list[dict[str, str]]:
     if not steps or not path.exists():
         return []
-    names = [item.name for item in fields(Row)]
-    with path.open(newline="") as stream:
-        rows = [row for row in csv.DictReader(stream) if set(row) == set(names) and (row["steps"] or "").isdigit()]
-    return [row for row in rows if int(row["steps"]) <= steps]
+    names = {item.name for item in fields(Row)}
+    rows = [row for row in read_rows(path) if set(row) == names and row["steps"].isdecimal()]
+    return [row for row in rows if len(row["steps"]) < 20 and int(row["steps"]) <= steps]
