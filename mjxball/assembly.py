@@ -30,7 +30,7 @@ def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
     """Return the model's MjSpec: the object's shell, two welded drones, and the moving mass on a slide joint.
 
     The drones' centres sit at their mounts. In the reference plant the shell is massless and the ball carries
-    the object's whole mass with the box's inertia (design section 4). The root is free, or on a stand: a
+    the object's whole mass with the box's inertia. The root is free, or on a stand: a
     hinge along x (`pivot`), or a vertical slide and that hinge (`heave`). Eight `motor` actuators, in the
     order leader 1..4, follower 1..4, take rotor forces in newtons; their gear holds the yaw moment.
     `timestep` [s] matters only to viewers and to MuJoCo's own integrator.

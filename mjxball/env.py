@@ -60,7 +60,7 @@ class Orders(NamedTuple):
 
 
 class CoupledPairEnv(Env):
-    """Two drones, one object with a moving CG: the follower acts, the leader flies its PID (design section 5).
+    """Two drones, one object with a moving CG: the follower acts, the leader flies its PID.
 
     `reset` draws goal, start, CG motion and object mass anew. `step` takes the network's action in
     [-1, 1] (3,). An episode terminates at |e_o| > d_term or when the world diverges, and is truncated at

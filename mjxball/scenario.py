@@ -15,7 +15,7 @@ from mjxball.sensing import Disturbance, Vector3
 
 @dataclass(frozen=True)
 class Scenario:
-    """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal (design section 9).
+    """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal.
 
     How the CG moves (sine, waveform, rolling ball) is the configuration's `motion`; a sine's numbers are here.
     """

@@ -17,7 +17,7 @@ from mjxball.control.followers import BASELINES
 from mjxball.policy.shipped import shipped_policies
 
 FAST = ["--physics", "newton-euler"]
-# Keys of design section 9, with the types that JSON gives back.
+# The fixed keys, with the types that JSON gives back.
 SCENARIO_KEYS = {"omega": float, "amplitude": float, "mass": float, "believed_mass": float}
 NUMBERS = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
@@ -66,7 +66,7 @@ def test_cells_have_the_fixed_keys_and_types(standard: list[dict[str, Any]]) -> 
         assert cell["believed_mass"] == cell["mass"] == 0.2
 
 
-# Design section 6, from an independent simulation that runs its attitude loop at 500 Hz; 5 % covers the difference.
+# From an independent simulation that runs its attitude loop at 500 Hz; 5 % covers the difference.
 @pytest.mark.parametrize(("omega", "x_peak"), zip(SPEEDS, (0.296, 0.258, 0.163, 0.050, 0.023), strict=True))
 def test_copy_sways_as_the_reference_says(standard: list[dict[str, Any]], omega: float, x_peak: float) -> None:
     cell = one(standard, follower="copy", omega=omega, amplitude=0.05)

@@ -126,7 +126,7 @@ def test_float64_agrees(name, compiled):
     with jax.enable_x64(True):
         result = (jax.jit(law) if compiled else law)(*map(jax.numpy.asarray, arrays))
         assert result.dtype == np.float64
-    # Design section 1. Both round to 1e-16; sin and cos of the two libraries differ by an ulp.
+    # Both round to 1e-16; sin and cos of the two libraries differ by an ulp.
     assert difference(result, expected) < 1e-10
 
 
@@ -138,7 +138,7 @@ def test_float32_agrees(name, compiled):
     on_numpy = law(*single)
     on_jax = (jax.jit(law) if compiled else law)(*map(jax.numpy.asarray, single))
     assert on_numpy.dtype == on_jax.dtype == np.float32
-    # Design section 1: float32 rounding, about 1e-5 of full scale.
+    # float32 rounding, about 1e-5 of full scale.
     assert difference(on_jax, on_numpy) < 1e-5
     assert difference(on_numpy, law(*arrays)) < 1e-5
 

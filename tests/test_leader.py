@@ -1,4 +1,4 @@
-"""The leader's PD law (paper eq. 5) and the attitude gains of design section 3, by hand."""
+"""The leader's PD law (paper eq. 5) and the attitude gains, by hand."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_command_is_clipped_to_its_limits_with_its_sign():
 def test_attitude_gains_are_those_of_the_design():
     gains = plant_constants(Plant(), Attitude()).gains
     inertia = 2 * np.array(gains.kp) / np.array([10.0, 10.0, 4.0]) ** 2  # Kp = J_O wn^2 / 2
-    # Design section 3 prints three digits: equal to half a unit of the last one.
+    # The published gains print three digits: equal to half a unit of the last one.
     for value, printed in (
         (inertia, ("0.00481", "0.0644", "0.0679")),
         (gains.kp, ("0.240", "3.22", "0.543")),

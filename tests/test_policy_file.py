@@ -73,7 +73,7 @@ class TestInference:
         found = Policy.load(saved).scaled(seen)
         assert found.dtype == np.float32
         assert np.ptp(found) > 0.1  # the actions differ from world to world
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)  # design section 10
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)  # docs/policy-file.md
 
     def test_float64_agrees_with_flax(self, trained, saved):
         """The file's numbers are float32, so the network is given its mean and scale; then both are exact."""
@@ -89,7 +89,7 @@ class TestInference:
             expected = np.asarray(flax_mean(trained, learner, jnp.asarray(OBSERVATIONS)))
         found = Policy(contents, "wide", np.float64).scaled(OBSERVATIONS)
         assert found.dtype == expected.dtype == np.float64
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)  # design section 10
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)  # docs/policy-file.md
 
     def test_command_is_the_scaled_action_on_top_of_the_copy_law(self, trained, saved):
         config = trained.config
@@ -130,7 +130,7 @@ class TestInference:
                 with jax.default_matmul_precision("highest"):
                     expected = flax_mean(remembering, remembering.learner, state.obs)
                 found = policy.scaled(np.asarray(state.obs[: layout.OBSERVATION_SIZE]))
-                # 1e-5 for the network (design section 10); its own rounding returns through the last action.
+                # 1e-5 for the network (docs/policy-file.md); its own rounding returns through the last action.
                 np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)
                 state = remembering_pair.step(state, jnp.asarray(expected))
 

@@ -77,7 +77,7 @@ def test_believed_mass_moves_the_hover_thrust_only() -> None:
         for m in (0.2, 0.1)
     )
     assert np.abs(right.position).max() < 1e-9
-    # Sag dm g / (2 m^ kp), m^ = m_i + m^_o / 2 (design section 6); 1e-3: what 40 s leave of the transient
+    # Sag dm g / (2 m^ kp), m^ = m_i + m^_o / 2; 1e-3: what 40 s leave of the transient
     assert wrong.position[-1, 2] == pytest.approx(-0.1 * 9.81 / (2 * 1.05 * 0.5), rel=1e-3)
 
 

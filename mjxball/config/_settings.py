@@ -28,7 +28,7 @@ def setting(
 
 @dataclass(frozen=True)
 class Plant:
-    """The rigid assembly: two drones, one object. Defaults are the `paper` plant (design section 3)."""
+    """The rigid assembly: two drones, one object. Defaults are the `paper` plant (docs/model.md)."""
 
     leader_mass: float = setting(1.0, "mass of the leader [kg]", above=0)
     follower_mass: float = setting(1.0, "mass of the follower [kg]", above=0)
@@ -78,7 +78,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Attitude:
-    """The PD attitude loop that each drone runs once per physics step (design section 3, ours)."""
+    """The PD attitude loop that each drone runs once per physics step (ours)."""
 
     natural_frequency: Vector3 = setting(
         (10.0, 10.0, 4.0), "closed-loop roll, pitch, yaw natural frequency [rad/s]", above=0

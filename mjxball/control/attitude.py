@@ -19,7 +19,7 @@ class AttitudeGains(NamedTuple):
 def design_gains(inertia: Array, natural_frequency: Array, damping: float) -> AttitudeGains:
     """Gains of one of two equal drones for the assembly's inertia about O (3,) [kg m2]: each takes half.
 
-    Kp = J wn^2 / 2, Kd = J zeta wn (design section 3, ours).
+    Kp = J wn^2 / 2, Kd = J zeta wn (ours).
     """
     kp = tuple(0.5 * j * w * w for j, w in zip(inertia, natural_frequency, strict=True))
     kd = tuple(j * damping * w for j, w in zip(inertia, natural_frequency, strict=True))

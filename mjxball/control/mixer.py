@@ -1,4 +1,4 @@
-"""Plus-layout mixer: rotors 1 at +x, 2 at +y, 3 at -x, 4 at -y (paper eq. 2, design section 2)."""
+"""Plus-layout mixer: rotors 1 at +x, 2 at +y, 3 at -x, 4 at -y (paper eq. 2)."""
 
 from __future__ import annotations
 

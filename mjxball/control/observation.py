@@ -8,7 +8,7 @@ from mjxball.control import leader, rotations
 
 Array = Any
 
-# (name, unit) of every slot, in order (design section 5; body rates instead of the paper's Euler rates).
+# (name, unit) of every slot, in order (the paper's; body rates instead of the paper's Euler rates).
 OBSERVATION: tuple[tuple[str, str], ...] = (
     ("follower_x", "m"),
     ("follower_y", "m"),

@@ -55,7 +55,7 @@ def cross(a: Array, b: Array) -> Array:
 def matrix_from_euler(euler: Array) -> Array:
     """R = Rz(psi) Rx(phi) Ry(theta) from `euler` = (phi, theta, psi) (..., 3) [rad] -> (..., 3, 3).
 
-    The paper's Z-X-Y convention (design section 2).
+    The paper's Z-X-Y convention.
     """
     xp = euler.__array_namespace__()
     cf, ct, cp = (xp.cos(euler[..., i]) for i in range(3))

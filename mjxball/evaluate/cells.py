@@ -18,7 +18,7 @@ from mjxball.rollout import Trajectory, simulate_batch
 from mjxball.scenario import Scenario
 
 REFERENCE = Scenario()
-# Design section 6: copy without CG motion, then five speeds of the CG.
+# Copy without CG motion, then five speeds of the CG.
 STANDARD = (
     dataclasses.replace(REFERENCE, amplitude=0.0),
     *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.31, 0.62, 1.0, 2.0, 3.1)),
@@ -40,7 +40,7 @@ class Cell:
     motion: str = "sine"  # how the CG moved: sine, waveform or rolling
 
     def record(self) -> dict[str, Any]:
-        """The cell as `eval.py --json` writes it (design section 9).
+        """The cell as `eval.py --json` writes it (keys: docs/metrics.md).
 
         Flights beyond that contract say so: another motion than a sine (omega and amplitude are then None) and
         mass changes have keys of their own.

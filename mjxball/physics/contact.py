@@ -1,4 +1,4 @@
-"""Wrenches that the drones exert on the object at their mounts (paper eqs. 1-2, design section 4)."""
+"""Wrenches that the drones exert on the object at their mounts (paper eqs. 1-2, docs/model.md)."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ CREEP = 0.005  # [m/s] below which rolling friction fades to zero, so that its s
 
 
 def sine(time: Array, amplitude: Array, speed: Array, phase: Array) -> CgState:
-    """c = A sin(Omega t + phase) and its two derivatives; `speed` is Omega [rad/s] (design section 4)."""
+    """c = A sin(Omega t + phase) and its two derivatives; `speed` is Omega [rad/s]."""
     angle = speed * time + phase
     xp = angle.__array_namespace__()
     offset = amplitude * xp.sin(angle)

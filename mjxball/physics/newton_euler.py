@@ -1,4 +1,4 @@
-"""Closed-form accelerations of the assembly (design section 4: the paper's section II, corrected)."""
+"""Closed-form accelerations of the assembly (the paper's section II, corrected: docs/model.md)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _terms(
     cg: CgState,
     added: Array | None,
 ) -> tuple[Array, tuple[Array, Array, Array, Array, Array, Array]]:
-    """R, and (M, S, J_O, u, f, n) of design section 4 without the term of c''."""
+    """R, and (M, S, J_O, u, f, n) of docs/model.md without the term of c''."""
     rates = state.rates
     xp = rates.__array_namespace__()
     axis, share = "xy".index(plant.cg_axis), plant.moving_fraction

@@ -55,22 +55,21 @@ def read_arrays(name: str) -> dict[str, np.ndarray]:
 
 def _read_file(name: str) -> bytes:
     try:
-        mode = Path(name).stat().st_mode
-        if stat.S_ISDIR(mode):
+        status = Path(name).stat()
+        if stat.S_ISDIR(status.st_mode):
             raise PolicyFileError(f"policy file {name} is a directory")
-        if not stat.S_ISREG(mode):  # a pipe would wait for ever
+        if not stat.S_ISREG(status.st_mode):  # a pipe would wait for ever
             raise PolicyFileError(f"policy file {name} is not a regular file")
+        if status.st_size > MAX_BYTES:
+            raise PolicyFileError(f"{name} is not a policy file: it is larger than {MAX_BYTES >> 20} MiB")
         with Path(name).open("rb") as stream:
-            content = stream.read(MAX_BYTES + 1)
+            return stream.read(status.st_size)
     except FileNotFoundError:
         raise PolicyFileError(f"policy file {name} does not exist") from None
     except OSError as error:
         raise PolicyFileError(f"policy file {name} cannot be read: {error.strerror or error}") from None
     except ValueError:
         raise PolicyFileError(f"policy file {name!r} has an impossible name") from None
-    if len(content) > MAX_BYTES:
-        raise PolicyFileError(f"{name} is not a policy file: it is larger than {MAX_BYTES >> 20} MiB")
-    return content
 
 
 def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:

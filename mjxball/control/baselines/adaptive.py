@@ -1,4 +1,4 @@
-"""An adaptive follower that estimates the CG's moment and its rate (ours, Slotine-Li style, design section 7)."""
+"""An adaptive follower that estimates the CG's moment and its rate (ours, Slotine-Li style)."""
 
 from __future__ import annotations
 

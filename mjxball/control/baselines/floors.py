@@ -16,7 +16,7 @@ DRAWS = 4096
 
 
 class Copy:
-    """The leader's PD law on the follower's own observation: the optimum of the paper's reward (design section 5)."""
+    """The leader's PD law on the follower's own observation: the optimum of the paper's reward."""
 
     name = "copy"
     needs_truth = False

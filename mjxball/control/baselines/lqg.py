@@ -1,7 +1,7 @@
 """A follower, told the plant, that takes the loop over from its leader: LQR and a Kalman filter for the CG's torque.
 
 The pair obeys the sum of both drones' commands, so the follower commands twice what the pair should do less what the
-leader does, which it computes from its own observation (ours, design section 7).
+leader does, which it computes from its own observation (ours).
 """
 
 from __future__ import annotations

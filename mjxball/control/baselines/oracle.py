@@ -1,4 +1,4 @@
-"""Feed-forward from the true CG: what a follower could do that knew everything (ours, design section 7)."""
+"""Feed-forward from the true CG: what a follower could do that knew everything (ours)."""
 
 from __future__ import annotations
 
