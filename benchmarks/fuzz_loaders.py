@@ -171,6 +171,8 @@ def fuzz_records(run: Path, files: int, seed: int) -> list[Count]:
 
 def fuzz_checkpoints(run: Path, files: int, seed: int) -> list[Count]:
     """A run directory of which one file of one checkpoint is damaged or gone."""
+    import jax
+
     from mjxball.train.checkpoint import Checkpoints
     from mjxball.train.population import Population
 
@@ -179,14 +181,28 @@ def fuzz_checkpoints(run: Path, files: int, seed: int) -> list[Count]:
     kinds = {**ANY, "emptied": lambda draw, content: b"", "gone": None, "json: text": JSON["json: text"]}
     counts = [Count(f"checkpoint, {kind}") for kind in kinds]
 
-    def load(directory: Path) -> None:
+    def restored(directory: Path) -> Any:
         checkpoints = Checkpoints(directory)
         try:
-            if checkpoints.restore(template, lambda text: None, discard=False) is None:
-                raise InputError("no checkpoint can be read")
+            return checkpoints.restore(template, lambda text: None, discard=False)
         finally:
             checkpoints.close()
 
+    def load(directory: Path) -> None:
+        state = restored(directory)
+        if state is None:
+            raise InputError("no checkpoint can be read")
+        leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(state)]
+        if leaves not in sound:
+            raise ArithmeticError("a damaged checkpoint was restored as if it were sound")
+
+    sound = []  # the states of both checkpoints, the newest first; every damaged one must give one of them or none
+    for step in sorted((run / "checkpoints").iterdir(), key=lambda path: -int(path.name)):
+        sound.append([np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(restored(run))])
+        step.rename(run / f"aside-{step.name}")
+    (run / "checkpoints").mkdir(exist_ok=True)
+    for aside in run.glob("aside-*"):
+        aside.rename(run / "checkpoints" / aside.name.removeprefix("aside-"))
     load(run)
     for number in range(files):
         draw, mutate = random.Random(f"{seed} {number}"), [*kinds.values()][number % len(kinds)]

@@ -164,6 +164,10 @@ BAD_ARGUMENTS = {
     "no time": ["--followers", "copy", "--seconds", 0],
     "endless": ["--followers", "copy", "--seconds", "inf"],
     "negative stiffness": ["--followers", "copy", "--wn-pitch", -1],
+    "a rolling ball at a sine's speed": ["--followers", "copy", "--rolling", 0.05, "--omega", 1],
+    "a rolling ball of a sine's amplitude": ["--followers", "copy", "--amplitude", 0.05, "--rolling", 0.05],
+    "a waveform at a sine's speed": ["--followers", "copy", "--omega", 1, "--waveform", "note.txt"],
+    "a waveform that rolls": ["--followers", "copy", "--rolling", 0.05, "--waveform", "note.txt"],
     "same name twice": [TRANSPORT, TRANSPORT],
     "check without a policy": ["--followers", "copy", "--seconds", 0.1, "--check"],
 }

@@ -177,14 +177,23 @@ def _setup(options: argparse.Namespace) -> config.Config:
     if options.wn_pitch is not None:
         roll, _, yaw = setup.attitude.natural_frequency
         setup = config.replace(setup, "attitude.natural_frequency", (roll, options.wn_pitch, yaw))
-    if options.waveform and options.rolling is not None:
-        raise InputError("--waveform and --rolling exclude each other")
+    _refuse_two_motions(options)
     if options.waveform:
         times, offsets = read_waveform(options.waveform)
         setup = dataclasses.replace(setup, motion=config.Motion(kind="waveform", times=times, offsets=offsets))
     if options.rolling is not None:
         setup = dataclasses.replace(setup, motion=config.Motion(kind="rolling"))
     return config.validate(setup)
+
+
+def _refuse_two_motions(options: argparse.Namespace) -> None:
+    """The CG moves in one way: as a waveform, as a rolling ball, or as a sine of some speed and amplitude."""
+    ways = {"waveform": "waveform", "rolling": "rolling", "omega": "sine", "amplitude": "sine"}
+    given = {name: way for name, way in ways.items() if getattr(options, name) is not None}
+    if len(set(given.values())) > 1:
+        first, *others = given
+        second = next(name for name in others if given[name] != given[first])
+        raise InputError(f"--{first} and --{second} exclude each other: the CG moves in one way")
 
 
 def _scenarios(options: argparse.Namespace) -> Sequence[Scenario]:

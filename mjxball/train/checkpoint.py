@@ -22,7 +22,7 @@ from mjxball.train.program import TrainState
 from mjxball.train.record import CHECKPOINTS, read_config
 
 KEEP = 2
-logging.getLogger("absl").setLevel(logging.ERROR)
+logging.getLogger("absl").setLevel(logging.CRITICAL)  # what is wrong with a checkpoint is said here, in one line
 
 
 class Checkpoints:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.config import Config
+from mjxball.errors import InputError
 from mjxball.train.members import read_members
 from mjxball.train.reading import read_rows
 from mjxball.train.record import METRICS
@@ -23,9 +24,17 @@ BLUE, GREY = "#1b6ca8", "#9a9a9a"
 
 
 def told_by_the_run(run: Path, seed: int) -> dict[str, Any]:
-    """What a policy's card says of the run directory `run` so far: its `curve` and the `seconds` it has taken."""
-    rows = _rows(run)
-    return {"curve": training_curve(run, seed), "seconds": round(float(rows[-1]["seconds"])) if rows else 0}
+    """What a policy's card says of the run directory `run` so far: its `curve` and the `seconds` it has taken.
+
+    Raises InputError if its tables are damaged.
+    """
+    try:
+        rows = _rows(run)
+        return {"curve": training_curve(run, seed), "seconds": round(float(rows[-1]["seconds"])) if rows else 0}
+    except (KeyError, ValueError, OverflowError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{run / METRICS} holds something else than the numbers of a run") from None
 
 
 def training_curve(run: Path, seed: int) -> dict[str, list[float]]:

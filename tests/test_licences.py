@@ -1,0 +1,52 @@
+"""docs/licences.md names the licence of every pinned package; the GPL stays out of what installs unasked."""
+
+from __future__ import annotations
+
+import importlib.util
+from importlib import metadata
+from types import ModuleType
+
+import pytest
+from command_line import REPOSITORY
+
+
+@pytest.fixture(scope="module")
+def licences() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("licences", REPOSITORY / "docs" / "licences.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def listed(licences: ModuleType) -> dict[str, tuple[str, str]]:
+    """Package -> (licence, who installs it), as the page says."""
+    rows = [line.strip("| ").split(" | ") for line in licences.PAGE.read_text().splitlines() if line.startswith("| ")]
+    return {name: (licence, asked) for name, licence, asked in rows[1:]}
+
+
+def test_every_pinned_package_is_listed_and_no_other(licences: ModuleType, listed: dict[str, tuple[str, str]]) -> None:
+    assert list(listed) == licences.pinned()
+
+
+def test_the_page_says_what_the_installed_packages_say(
+    licences: ModuleType, listed: dict[str, tuple[str, str]]
+) -> None:
+    installed = {licences.plain(found.metadata["Name"]) for found in metadata.distributions()}
+    compared = [name for name in listed if licences.plain(name) in installed]
+    assert len(compared) > 20
+    for name in compared:
+        assert licences.licence(name) == listed[name][0], name
+
+
+def test_copyleft_is_an_extra_that_must_be_asked_for(listed: dict[str, tuple[str, str]]) -> None:
+    copyleft = {
+        name: asked for name, (licence, asked) in listed.items() if "GPL" in licence or "General Public" in licence
+    }
+    assert copyleft == {"cflib": "fly"}
+
+
+def test_every_licence_is_stated(listed: dict[str, tuple[str, str]]) -> None:
+    assert all(licence and licence != "not stated" and asked for licence, asked in listed.values())
