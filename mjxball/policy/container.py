@@ -64,6 +64,8 @@ def _read_file(name: str) -> bytes:
             raise PolicyFileError(f"{name} is not a policy file: it is larger than {MAX_BYTES >> 20} MiB")
         with Path(name).open("rb") as stream:
             return stream.read(status.st_size)
+    except PolicyFileError:
+        raise
     except FileNotFoundError:
         raise PolicyFileError(f"policy file {name} does not exist") from None
     except OSError as error:

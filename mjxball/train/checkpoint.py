@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from mjxball.train.program import TrainState
 from mjxball.train.record import CHECKPOINTS, read_config
 
 KEEP = 2
+CHECKSUMS = "checksums"
 logging.getLogger("absl").setLevel(logging.CRITICAL)  # what is wrong with a checkpoint is said here, in one line
 
 
@@ -40,7 +42,11 @@ class Checkpoints:
         )
         place = (run / CHECKPOINTS).absolute()
         place.mkdir(parents=True, exist_ok=True)
-        self._manager = ocp.CheckpointManager(place, options=options)
+        try:
+            self._manager = ocp.CheckpointManager(place, options=options)
+        except (ValueError, OSError, RecursionError) as error:
+            why = str(error).splitlines()[0][:200]
+            raise InputError(f"the checkpoints in {place} cannot be read: {why}") from None
 
     def save(self, state: TrainState) -> None:
         """Start writing `state`, NumPy arrays; a step that is already there is not written again."""
@@ -48,6 +54,7 @@ class Checkpoints:
         if step in self._manager.all_steps():
             return
         arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(state).items()}
+        arrays[CHECKSUMS] = _checksums(arrays)
         if not self._manager.save(step, args=ocp.args.StandardSave(arrays)):
             raise RuntimeError(f"Orbax refused to save checkpoint {step}")
 
@@ -65,7 +72,7 @@ class Checkpoints:
         unreadable = []
         for step in self.steps():
             try:
-                state = _rebuild(template, self._manager.restore(step, args=ocp.args.StandardRestore(wanted)))
+                state = _rebuild(template, self._read(step, wanted))
             except Exception as error:  # Orbax and TensorStore raise many kinds for damaged files
                 warn(f"checkpoint {step} cannot be read and is skipped: {str(error).splitlines()[0][:200]}")
                 unreadable.append(step)
@@ -76,10 +83,28 @@ class Checkpoints:
             return state
         return None
 
+    def _read(self, step: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
+        """The arrays of one checkpoint; ValueError if one of them is not what was written."""
+        told = {**wanted, CHECKSUMS: np.empty(len(wanted), np.uint32)}
+        try:
+            arrays = self._manager.restore(step, args=ocp.args.StandardRestore(told))
+        except Exception:  # checkpoints before 0.2 have no checksums; of others this fails once more
+            return self._manager.restore(step, args=ocp.args.StandardRestore(wanted))
+        checksums = arrays.pop(CHECKSUMS)
+        if (checksums != _checksums(arrays)).any():
+            raise ValueError("its arrays are not what was written")
+        return arrays
+
     def close(self) -> None:
         """Wait until everything is on disk."""
         self._manager.wait_until_finished()
         self._manager.close()
+
+
+def _checksums(arrays: dict[str, Any]) -> np.ndarray:
+    """CRC-32 of every array in the order of their names (n,): TensorStore does not notice every damaged byte."""
+    flat = (np.ascontiguousarray(arrays[name]).reshape(-1).view(np.uint8).data for name in sorted(arrays))
+    return np.array([zlib.crc32(part) for part in flat], np.uint32)
 
 
 def _name(path: Any) -> str:

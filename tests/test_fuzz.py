@@ -1,0 +1,226 @@
+"""Damaged files load right or are refused in one sentence: the suite's share of `benchmarks/fuzz_loaders.py`."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import random
+import sys
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from command_line import REPOSITORY, TRANSPORT
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mjxball import config as configs
+from mjxball.errors import InputError
+from mjxball.policy import Policy, PolicyFileError, shipped_policies
+from mjxball.train.record import read_config, write_config
+
+
+@pytest.fixture(scope="module")
+def fuzz() -> Iterator[ModuleType]:
+    """benchmarks/fuzz_loaders.py, which is a script."""
+    place = str(REPOSITORY / "benchmarks")
+    sys.path.insert(0, place)
+    try:
+        import fuzz_loaders
+
+        yield fuzz_loaders
+    finally:
+        sys.path.remove(place)
+
+
+@pytest.fixture(scope="module")
+def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The records of a run of two members, without its checkpoints."""
+    run = tmp_path_factory.mktemp("run")
+    origin = {"seed": 0, "physics": "mjx", "seeds": 2, "sweep": None, "command": "train"}
+    write_config(run, configs.preset("transport"), origin)
+    header = "steps,seconds,rate,episode_return,eval_return"
+    (run / "metrics.csv").write_text(f"{header}\n1024,0.5,2000.0,-3.5,\n2048,1.0,2000.0,-2.5,-1.25\n")
+    members = "steps,seed,eval_return,eval_steady_error,eval_peak,eval_tilt_error,eval_vertical_error"
+    (run / "members.csv").write_text(f"{members}\n2048,0,-1.5,0.1,0.2,0.01,0.1\n2048,1,-1.0,0.1,0.2,0.01,0.1\n")
+    return run
+
+
+def test_damaged_policies(fuzz: ModuleType, tmp_path: Path) -> None:
+    """280 files, 20 of each kind of damage. Seed 1: the benchmark's own files are others."""
+    counts = fuzz.fuzz_policies(280, 1, tmp_path)
+    assert [count for count in counts if count.faults] == []
+    assert sum(count.files for count in counts) == 280
+    assert sum(count.loaded for count in counts) > 5, "nothing loads: the mutations are not what they say"
+    assert sum(count.refused for count in counts) > 200
+
+
+def test_damaged_records_of_a_run(fuzz: ModuleType, run_directory: Path) -> None:
+    fuzz.read_records(run_directory)
+    counts = fuzz.fuzz_records(run_directory, 57, 1)
+    assert [count for count in counts if count.faults] == []
+    assert sum(count.loaded for count in counts) > 5
+    assert sum(count.refused for count in counts) > 20
+
+
+class TestTheJudge:
+    """What judges the loaders sees every fault."""
+
+    @pytest.mark.parametrize(
+        ("load", "word"),
+        [
+            (lambda path: (_ for _ in ()).throw(KeyError("x")), "KeyError"),
+            (lambda path: (_ for _ in ()).throw(InputError("two\nlines")), "not one line"),
+            (lambda path: bytearray(300 * 2**20), "took 300 MiB"),
+            (lambda path: os.environ.__setitem__("MJXBALL_FUZZ_WITNESS", "x"), "ran code"),
+            (lambda path: (_ for _ in ()).throw(MemoryError()), "MemoryError"),
+        ],
+        ids=["traceback", "two lines", "memory", "code", "no memory"],
+    )
+    def test_fault(self, fuzz: ModuleType, load, word: str, tmp_path: Path) -> None:
+        count = fuzz.Count("planted")
+        assert word in fuzz.measured(load, tmp_path, count)
+        assert (count.files, count.faults) == (1, 1)
+
+    def test_hang(self, fuzz: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.setattr(fuzz, "PATIENCE", 0.2)
+
+        def hang(path: Path) -> None:
+            while True:
+                try:
+                    while True:
+                        pass
+                except Exception:  # as a loader's own clause would
+                    continue
+
+        assert fuzz.outcome(hang, tmp_path) == "it hung"
+
+    def test_a_pickle_would_be_seen(self, fuzz: ModuleType, tmp_path: Path) -> None:
+        import mutations
+
+        path = tmp_path / "pickle.npz"
+        path.write_bytes(mutations.pickled(random.Random(3), TRANSPORT.read_bytes()))
+        for name in ("card", "weight_0", "observation_mean", "extra"):
+            with np.load(path, allow_pickle=True) as data:
+                try:
+                    data[name]
+                except Exception:
+                    continue
+        assert os.environ.pop("MJXBALL_FUZZ_WITNESS", None) == "executed"
+        with pytest.raises(PolicyFileError):
+            Policy.load(path)
+        assert "MJXBALL_FUZZ_WITNESS" not in os.environ
+
+
+class TestFoundHoles:
+    """What the fuzzers found, each with the file that showed it."""
+
+    def rewritten(self, place: Path, name: str, content: bytes, method: int = zipfile.ZIP_STORED) -> Path:
+        path = place / "hole.npz"
+        with zipfile.ZipFile(TRANSPORT) as old, zipfile.ZipFile(path, "w", method) as new:
+            for entry in old.namelist():
+                if entry != name:
+                    new.writestr(entry, old.read(entry))
+            new.writestr(name, content)
+        return path
+
+    def refused(self, path: Path, word: str) -> None:
+        with pytest.raises(PolicyFileError, match=word):
+            Policy.load(path)
+
+    def test_flipped_weight(self, tmp_path: Path) -> None:
+        """One bit of a weight: NumPy reads it unnoticed, the zip's checksum knows."""
+        content = bytearray(TRANSPORT.read_bytes())
+        content[content.index(b"weight_0.npy") + 1000] ^= 1
+        path = tmp_path / "bit.npz"
+        path.write_bytes(content)
+        self.refused(path, "damaged")
+
+    def test_terabyte_by_header(self, tmp_path: Path, fuzz: ModuleType) -> None:
+        stream = io.BytesIO()
+        np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": (2**28,)})
+        path = self.rewritten(tmp_path, "weight_0.npy", stream.getvalue() + bytes(4096))
+        count = fuzz.Count("header")
+        assert fuzz.measured(Policy.load, path, count) == "refused"
+        assert count.memory < 5  # [MiB]; 1 GiB if the header were believed
+
+    def test_lzma_dictionary(self, tmp_path: Path) -> None:
+        path = self.rewritten(tmp_path, "extra.npy", b"x", zipfile.ZIP_LZMA)
+        self.refused(path, "another method")
+
+    def test_wide_card(self, tmp_path: Path, fuzz: ModuleType) -> None:
+        """JSON of two million empty lists: 60 times its own length in memory, if it were parsed."""
+        stream = io.BytesIO()
+        np.save(stream, np.array("[" + "[]," * 2_000_000 + "[]]"))
+        path = self.rewritten(tmp_path, "card.npy", stream.getvalue(), zipfile.ZIP_DEFLATED)
+        count = fuzz.Count("card")
+        assert fuzz.measured(Policy.load, path, count) == "refused"
+        assert count.memory < 120  # [MiB]: the text itself, 24 MiB, a few times; 250 more if it were parsed
+
+    def test_pipe(self, tmp_path: Path) -> None:
+        path = tmp_path / "pipe.npz"
+        os.mkfifo(path)
+        self.refused(path, "regular file")
+
+    def test_entry_twice(self, tmp_path: Path) -> None:
+        path = tmp_path / "twice.npz"
+        path.write_bytes(TRANSPORT.read_bytes())
+        with (
+            zipfile.ZipFile(TRANSPORT) as old,
+            zipfile.ZipFile(path, "a") as new,
+            pytest.warns(UserWarning, match="Duplicate name"),
+        ):
+            new.writestr("bias_0.npy", old.read("bias_0.npy"))
+        self.refused(path, "more than once")
+
+    @pytest.mark.parametrize("config", [[], {"leader": [1]}, {"reward": 3}, "x"])
+    def test_card_with_another_configuration(self, config: object, tmp_path: Path) -> None:
+        with np.load(TRANSPORT) as data:
+            arrays = dict(data)
+        card = {**json.loads(str(arrays.pop("card"))), "config": config}
+        np.savez(tmp_path / "config.npz", **arrays, card=np.array(json.dumps(card)))
+        self.refused(tmp_path / "config.npz", "config")
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "[" * 100_000,
+            '{"config": {}, "seed": 0}',
+            "null",
+            '{"config": ' + "9" * 5000 + "}",
+            "\xff\xfe{",
+        ],
+        ids=["deep", "empty", "null", "long number", "not UTF-8"],
+    )
+    def test_configuration_of_a_run(self, text: str, tmp_path: Path) -> None:
+        (tmp_path / "config.json").write_text(text, encoding="latin-1")
+        with pytest.raises(InputError) as error:
+            read_config(tmp_path)
+        assert str(error.value).isprintable()
+
+    @pytest.mark.parametrize(("name", "value"), [("seeds", 10**9), ("seed", -1), ("sweep", {"plant.arm": [1, 2]})])
+    def test_a_run_of_a_billion_members(self, name: str, value: object, run_directory: Path, tmp_path: Path) -> None:
+        record = json.loads((run_directory / "config.json").read_text())
+        (tmp_path / "config.json").write_text(json.dumps({**record, name: value}))
+        with pytest.raises(InputError, match=r"sound seed|cannot differ"):
+            read_config(tmp_path)
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    content=st.binary(max_size=2000), head=st.sampled_from([b"", b"PK\x03\x04", b"PK\x05\x06", b"\x93NUMPY\x01\x00"])
+)
+def test_any_bytes_are_refused(content: bytes, head: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "any.npz"
+    path.write_bytes(head + content)
+    with pytest.raises(PolicyFileError) as error:
+        Policy.load(path)
+    assert str(error.value).isprintable()
+
+
+def test_shipped_policies_load() -> None:
+    assert {"paper", "robust", "transport"} <= {Policy.load(path).name for path in shipped_policies()}

@@ -1,0 +1,106 @@
+"""The wheel and the sdist hold what they must, and what is installed from the wheel finds its policies."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tarfile
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from command_line import REPOSITORY
+
+from mjxball import __version__
+from mjxball.policy import Policy, shipped_policies, shipped_policy
+from mjxball.policy.file import load_file
+
+PARTS = ("mjxball", "policies", "docs", "tests", "benchmarks")
+FILES = ("*.toml", "*.md", "*.py", "*.cff", "LICENSE", "MANIFEST.in", "constraints.txt")
+BUILD = "import sys; from setuptools import build_meta; getattr(build_meta, f'build_{sys.argv.pop()}')(sys.argv.pop())"
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Directory with the wheel and the sdist, built offline from a copy of the tree by pyproject.toml's backend."""
+    if int(metadata.version("setuptools").split(".")[0]) < 77:
+        pytest.skip("setuptools 77 or later builds this project; the dev extra has it")
+    place = tmp_path_factory.mktemp("packaging")
+    tree = place / "tree"
+    tree.mkdir()
+    for part in PARTS:
+        shutil.copytree(REPOSITORY / part, tree / part, ignore=shutil.ignore_patterns("__pycache__"))
+    for pattern in FILES:
+        for path in REPOSITORY.glob(pattern):
+            shutil.copy2(path, tree)
+    out = place / "dist"
+    out.mkdir()
+    for kind in ("wheel", "sdist"):
+        command = [sys.executable, "-c", BUILD, str(out), kind]
+        subprocess.run(command, check=True, cwd=tree, capture_output=True, timeout=120)
+    return out
+
+
+@pytest.fixture(scope="module")
+def wheel(built: Path) -> Path:
+    (path,) = built.glob("*.whl")
+    return path
+
+
+def test_the_wheel_holds_every_module_and_policy_and_nothing_else(wheel: Path) -> None:
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    modules = {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "mjxball").rglob("*.py")}
+    policies = {f"mjxball/{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "policies").rglob("*.npz")}
+    assert len(policies) >= 3
+    assert held == modules | policies | {"mjxball/py.typed"}
+
+
+def test_the_wheel_says_what_it_is(wheel: Path) -> None:
+    assert wheel.name == f"mjxball-{__version__}-py3-none-any.whl"
+    archive = zipfile.ZipFile(wheel)
+    told = archive.read(f"mjxball-{__version__}.dist-info/METADATA").decode()
+    assert "License-Expression: Apache-2.0\n" in told
+    assert "Requires-Python: >=3.11\n" in told
+    needed = [line for line in told.splitlines() if line.startswith("Requires-Dist:") and "extra ==" not in line]
+    assert needed == ["Requires-Dist: numpy<3,>=2.1"]  # the base install is NumPy alone
+    commands = archive.read(f"mjxball-{__version__}.dist-info/entry_points.txt").decode()
+    assert "mjxball-train = mjxball.entry:train" in commands
+    assert "mjxball-eval = mjxball.entry:evaluate" in commands
+
+
+def test_the_unpacked_wheel_finds_its_own_policies(wheel: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(wheel).extractall(tmp_path)
+    script = (
+        "from mjxball.policy import Policy, shipped_policies, shipped_policy\n"
+        "from mjxball.policy.shipped import stand_policies\n"
+        "assert all(Policy.load(path) for path in shipped_policies())\n"
+        "print(shipped_policy('transport'), len(shipped_policies()), len(stand_policies()))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path, timeout=60
+    )
+    expected = tmp_path / "mjxball" / "policies" / "transport.npz"
+    stand = len([*(REPOSITORY / "policies" / "stand").glob("*.npz")])
+    assert done.stdout.split() == [str(expected), str(len(shipped_policies())), str(stand)]
+
+
+def test_the_sdist_builds_the_same_package(built: Path) -> None:
+    (path,) = built.glob("*.tar.gz")
+    with tarfile.open(path) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    needed = {"setup.py", "pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "constraints.txt"}
+    needed |= {str(file.relative_to(REPOSITORY)) for file in (REPOSITORY / "policies").rglob("*.npz")}
+    needed |= {str(file.relative_to(REPOSITORY)) for file in (REPOSITORY / "mjxball").rglob("*.py")}
+    assert needed <= held
+
+
+def test_a_source_tree_finds_the_policies_beside_it() -> None:
+    assert {path.parent for path in shipped_policies()} == {REPOSITORY / "policies"}
+    assert Policy(load_file(shipped_policy("transport")), "transport").name == "transport"
+
+
+def test_an_unknown_policy_is_refused_with_the_names_of_those_there_are() -> None:
+    with pytest.raises(ValueError, match="no shipped policy is called 'nobody'; there are paper, robust, transport"):
+        shipped_policy("nobody")
