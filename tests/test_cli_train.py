@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -169,6 +170,17 @@ def test_export_of_an_interrupted_run(interrupted: Path, tmp_path: Path) -> None
     done = run(["-m", "mjxball.export", interrupted, "exported.npz"], tmp_path)
     assert done.returncode == 0, done.stderr
     np.testing.assert_array_equal(command_of(tmp_path / "exported.npz"), command_of(interrupted / "policy.npz"))
+
+
+def test_a_run_quit_while_it_compiled_is_started_anew(finished: Path, tmp_path: Path) -> None:
+    """Ctrl-C twice before the first checkpoint leaves `config.json` and an empty table: enough to resume from."""
+    run_directory = tmp_path / "run"
+    (run_directory / "checkpoints").mkdir(parents=True)
+    shutil.copy(finished / "config.json", run_directory)
+    (run_directory / "metrics.csv").write_text((finished / "metrics.csv").read_text().splitlines()[0] + "\n")
+    done = run([script("train.py"), "--resume", "run"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_array_equal(command_of(run_directory / "policy.npz"), command_of(finished / "policy.npz"))
 
 
 def test_resume_finishes_an_interrupted_run(interrupted: Path) -> None:

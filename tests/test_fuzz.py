@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import itertools
 import json
 import os
 import random
@@ -11,8 +13,10 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
 from command_line import REPOSITORY, TRANSPORT
 from hypothesis import HealthCheck, given, settings
@@ -21,6 +25,7 @@ from hypothesis import strategies as st
 from mjxball import config as configs
 from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFileError, shipped_policies
+from mjxball.train.checkpoint import Checkpoints
 from mjxball.train.record import read_config, write_config
 
 
@@ -51,12 +56,12 @@ def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_damaged_policies(fuzz: ModuleType, tmp_path: Path) -> None:
-    """280 files, 20 of each kind of damage. Seed 1: the benchmark's own files are others."""
-    counts = fuzz.fuzz_policies(280, 1, tmp_path)
+    """210 files, 15 of each kind of damage. Seed 1: the benchmark's own files are others."""
+    counts = fuzz.fuzz_policies(210, 1, tmp_path)
     assert [count for count in counts if count.faults] == []
-    assert sum(count.files for count in counts) == 280
+    assert sum(count.files for count in counts) == 210
     assert sum(count.loaded for count in counts) > 5, "nothing loads: the mutations are not what they say"
-    assert sum(count.refused for count in counts) > 200
+    assert sum(count.refused for count in counts) > 150
 
 
 def test_damaged_records_of_a_run(fuzz: ModuleType, run_directory: Path) -> None:
@@ -208,6 +213,68 @@ class TestFoundHoles:
         (tmp_path / "config.json").write_text(json.dumps({**record, name: value}))
         with pytest.raises(InputError, match=r"sound seed|cannot differ"):
             read_config(tmp_path)
+
+
+class State(NamedTuple):
+    """As much of a training state as its checkpoints ask for."""
+
+    steps: np.ndarray
+    weights: np.ndarray
+    replay: np.ndarray
+
+
+class TestCheckpoints:
+    """Every damaged file of a checkpoint is noticed: restored is what was written, or nothing."""
+
+    state = State(np.array(7), np.linspace(-1, 1, 64, dtype=np.float32).reshape(8, 8), np.arange(500, dtype=np.float32))
+
+    @pytest.fixture
+    def written(self, tmp_path: Path) -> Path:
+        with contextlib.closing(Checkpoints(tmp_path / "run")) as checkpoints:
+            checkpoints.save(self.state)
+        return tmp_path / "run"
+
+    def restored(self, run: Path) -> State | None:
+        with contextlib.suppress(InputError), contextlib.closing(Checkpoints(run)) as checkpoints:
+            return checkpoints.restore(self.state, lambda text: None, discard=False)
+        return None
+
+    def assert_whole(self, found: State) -> None:
+        for mine, other in zip(self.state, found, strict=True):
+            np.testing.assert_array_equal(mine, other)
+
+    def test_every_file_damaged(self, fuzz: ModuleType, written: Path) -> None:
+        import mutations
+
+        self.assert_whole(self.restored(written))
+        lost = 0
+        files = sorted(path for path in (written / "checkpoints").rglob("*") if path.is_file())
+        for number, (path, kind) in enumerate(itertools.product(files, ["overwritten", "truncated", "flipped_bits"])):
+            content = path.read_bytes()
+            path.write_bytes(getattr(mutations, kind)(random.Random(number), content or b"x"))
+            found = self.restored(written)
+            path.write_bytes(content)
+            lost += found is None
+            if found is not None:
+                self.assert_whole(found)
+        assert lost >= 5
+        self.assert_whole(self.restored(written))
+
+    def test_changed_numbers_behind_sound_files(self, written: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """What TensorStore does not notice, the checksums do."""
+        monkeypatch.setattr("mjxball.train.checkpoint._checksums", lambda arrays: np.zeros(3, np.uint32))
+        assert self.restored(written) is None
+
+    def test_a_checkpoint_without_checksums_is_read(self, tmp_path: Path) -> None:
+        """Such are those of runs before there were any."""
+        with contextlib.closing(Checkpoints(tmp_path)) as checkpoints:
+            checkpoints._manager.save(7, args=ocp.args.StandardSave(self.state._asdict()))
+        self.assert_whole(self.restored(tmp_path))
+
+    def test_deep_metadata(self, written: Path) -> None:
+        for path in (written / "checkpoints").rglob("_*METADATA"):
+            path.write_text("[" * 200_000)
+        assert self.restored(written) is None
 
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -1,0 +1,50 @@
+"""The house files say what is so: local hooks, a workflow that runs `.ci/run`, documents without dead ends."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from command_line import REPOSITORY
+
+DOCUMENTS = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md")])
+
+
+def test_hooks_are_local() -> None:
+    (repository,) = yaml.safe_load((REPOSITORY / ".pre-commit-config.yaml").read_text())["repos"]
+    assert repository["repo"] == "local"
+    assert {hook["language"] for hook in repository["hooks"]} == {"system"}
+    assert {hook["entry"].split()[0] for hook in repository["hooks"]} == {"ruff", "mypy"}
+
+
+def test_the_workflow_runs_ci_on_every_supported_python() -> None:
+    (job,) = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"].values()
+    assert job["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13"]
+    assert job["steps"][-1]["run"] == ".ci/run"
+
+
+def test_ci_checks_style_and_types() -> None:
+    text = (REPOSITORY / ".ci" / "run").read_text()
+    for command in ("ruff check .", "ruff format --check .", "mypy"):
+        assert f".venv/bin/{command}\n" in text
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_links_lead_somewhere(path: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", path.read_text()):
+        if "://" not in target:
+            assert (path.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_scripts_that_documents_name_exist(path: Path) -> None:
+    for name in re.findall(r"(?:python |`)((?:benchmarks|docs|tests)/[\w/]+\.py)", path.read_text()):
+        assert (REPOSITORY / name).exists(), name
+
+
+def test_no_document_cites_what_readers_do_not_have() -> None:
+    sources = [*DOCUMENTS, *REPOSITORY.glob("*.py"), *(REPOSITORY / "mjxball").rglob("*.py")]
+    cited = [path for path in sources if re.search(r"\bdesign section \d", path.read_text(), re.IGNORECASE)]
+    assert cited == []
