@@ -1,0 +1,158 @@
+"""Bytes on the wire <-> numbers in SI units: the packed state of a drone and the setpoint it is sent.
+
+Every sign and scale of the Crazyflie's protocol lives here and nowhere else. Pure; NumPy and the standard library.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import NamedTuple
+
+import numpy as np
+
+# One log packet holds everything that is known about a drone: 26 bytes, the protocol's limit.
+STATE_VARIABLES: tuple[tuple[str, str], ...] = (
+    ("stateEstimateZ.x", "int16_t"),  # [mm]
+    ("stateEstimateZ.y", "int16_t"),
+    ("stateEstimateZ.z", "int16_t"),
+    ("stateEstimateZ.vx", "int16_t"),  # [mm/s]
+    ("stateEstimateZ.vy", "int16_t"),
+    ("stateEstimateZ.vz", "int16_t"),
+    ("stateEstimateZ.quat", "uint32_t"),  # body -> world, compressed
+    ("stateEstimateZ.rateRoll", "int16_t"),  # [mrad/s]
+    ("stateEstimateZ.ratePitch", "int16_t"),  # [mrad/s], positive nose up: minus the rate about +y
+    ("stateEstimateZ.rateYaw", "int16_t"),  # [mrad/s]
+    ("supervisor.info", "uint16_t"),
+    ("pm.vbatMV", "uint16_t"),  # [mV]
+)
+_STATE = struct.Struct("<6hI3hHH")
+STATE_SIZE = _STATE.size
+_SETPOINT = struct.Struct("<fffH")
+SETPOINT_SIZE = _SETPOINT.size
+MILLI = 1e-3
+
+CAN_ARM, ARMED, AUTO_ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
+THRUST_FLOOR, THRUST_CEILING = 10001, 60000  # [thrust units] what the firmware's documentation allows
+
+
+class PacketError(ValueError):
+    """Bytes that are no packet of the expected kind."""
+
+
+class DroneState(NamedTuple):
+    """What one drone reports about itself."""
+
+    position: np.ndarray  # (3,) in the world [m]
+    velocity: np.ndarray  # (3,) in the world [m/s]
+    quaternion: np.ndarray  # (4,) body -> world (w, x, y, z)
+    rates: np.ndarray  # (3,) about the body axes [rad/s]
+    info: int  # bits of the firmware's supervisor, see `CAN_ARM` and following
+    battery: float  # [V]
+
+
+class Setpoint(NamedTuple):
+    """What one drone is sent, in the wire's units and signs (`send_setpoint` negates pitch; this is after that).
+
+    Positive roll moves toward -y, *negative* pitch moves toward +x, positive yaw rate turns clockwise from above.
+    """
+
+    roll: float  # [deg]
+    pitch: float  # [deg], wire sign
+    yaw_rate: float  # [deg/s], wire sign
+    thrust: int  # [thrust units] 0 .. 65535
+
+
+ZERO = Setpoint(0.0, 0.0, 0.0, 0)
+
+
+def setpoint(roll: float, pitch: float, yaw_rate: float, thrust: float) -> Setpoint:
+    """Setpoint for Z-X-Y `roll`, `pitch` [rad] and `yaw_rate` about +z [rad/s]; `thrust` is rounded to units.
+
+    Raises PacketError for a number that is not finite or a thrust beyond 16 bits: such a one is never packed.
+    """
+    if not all(map(math.isfinite, (roll, pitch, yaw_rate, thrust))):
+        raise PacketError("a command is not finite")
+    units = round(thrust)
+    if not 0 <= units <= 0xFFFF:
+        raise PacketError(f"thrust {units} does not fit 16 bits")
+    return Setpoint(math.degrees(roll), -math.degrees(pitch), -math.degrees(yaw_rate), units)
+
+
+def angles(value: Setpoint) -> tuple[float, float, float]:
+    """(roll, pitch [rad], yaw rate [rad/s]) of a setpoint, in the conventions of `control`."""
+    return math.radians(value.roll), -math.radians(value.pitch), -math.radians(value.yaw_rate)
+
+
+def pack_setpoint(value: Setpoint) -> bytes:
+    """The 14 bytes of port 3, channel 0. Raises PacketError as `setpoint` does."""
+    if not all(map(math.isfinite, value)) or not 0 <= value.thrust <= 0xFFFF:
+        raise PacketError("a setpoint is not finite or its thrust does not fit 16 bits")
+    return _SETPOINT.pack(*value)
+
+
+def unpack_setpoint(data: bytes) -> Setpoint:
+    """The setpoint in 14 bytes; its floats may be anything. Raises PacketError for another length."""
+    if len(data) != SETPOINT_SIZE:
+        raise PacketError(f"a setpoint has {SETPOINT_SIZE} bytes, not {len(data)}")
+    return Setpoint(*_SETPOINT.unpack(data))
+
+
+def pack_state(state: DroneState) -> bytes:
+    """The 26 bytes of `STATE_VARIABLES`; values beyond their range saturate, as far as 16 bits reach."""
+    rates = state.rates * np.array([1.0, -1.0, 1.0])
+    counts = [_int16(value / MILLI) for value in (*state.position, *state.velocity, *rates)]
+    battery = min(max(round(state.battery / MILLI), 0), 0xFFFF)
+    quaternion = compress_quaternion(state.quaternion)
+    return _STATE.pack(*counts[:6], quaternion, *counts[6:], state.info & 0xFFFF, battery)
+
+
+def unpack_state(data: bytes) -> DroneState:
+    """The drone's state in 26 bytes. Raises PacketError for another length or a quaternion that is none."""
+    if len(data) != STATE_SIZE:
+        raise PacketError(f"a state has {STATE_SIZE} bytes, not {len(data)}")
+    x, y, z, vx, vy, vz, compressed, roll, pitch, yaw, info, battery = _STATE.unpack(data)
+    position, velocity = MILLI * np.array([x, y, z], float), MILLI * np.array([vx, vy, vz], float)
+    rates = MILLI * np.array([roll, -pitch, yaw], float)
+    return DroneState(position, velocity, decompress_quaternion(compressed), rates, info, MILLI * battery)
+
+
+_STEPS = 511  # a component takes 9 bits and a sign
+
+
+def compress_quaternion(quaternion: np.ndarray) -> int:
+    """32 bits: index of the largest component, then the three others in units of sqrt(1/2) / 511.
+
+    `quaternion` is (w, x, y, z); the wire's order is (x, y, z, w) and its largest component is positive.
+    """
+    wire = np.array([quaternion[1], quaternion[2], quaternion[3], quaternion[0]], float)
+    wire /= math.sqrt(float(wire @ wire))
+    largest = int(np.argmax(np.abs(wire)))
+    if wire[largest] < 0:
+        wire = -wire
+    packed = largest
+    for index in range(4):
+        if index != largest:
+            size = min(int(_STEPS * abs(wire[index]) * math.sqrt(2) + 0.5), _STEPS)
+            packed = packed << 10 | (int(wire[index] < 0) << 9) | size
+    return packed
+
+
+def decompress_quaternion(packed: int) -> np.ndarray:
+    """(w, x, y, z) of 32 bits. Raises PacketError where the three small components leave nothing for the largest."""
+    largest, wire = packed >> 30, [0.0] * 4
+    for index in (3, 2, 1, 0):
+        if index != largest:
+            size = (packed & _STEPS) / (_STEPS * math.sqrt(2))
+            wire[index] = -size if packed & 0x200 else size
+            packed >>= 10
+    rest = 1.0 - sum(value * value for value in wire)
+    # Three components of sqrt(1/3) or less belong to a unit quaternion whose largest is the fourth; half a step spare.
+    if rest < 0.24:
+        raise PacketError("the quaternion is not one of unit length")
+    wire[largest] = math.sqrt(rest)
+    return np.array([wire[3], wire[0], wire[1], wire[2]])
+
+
+def _int16(value: float) -> int:
+    return min(max(round(value), -0x8000), 0x7FFF) if math.isfinite(value) else 0

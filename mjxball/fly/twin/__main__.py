@@ -1,0 +1,33 @@
+"""`python -m mjxball.fly.twin`: the twin as a process of its own. Prints its two URIs as one line of JSON.
+
+It ends when its standard input closes, so that it never outlives whoever started it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from mjxball.fly.twin.pairs import make_pair
+from mjxball.fly.twin.server import Twin, TwinSettings
+
+
+def main() -> int:
+    """Serve until standard input ends."""
+    parser = argparse.ArgumentParser(prog="python -m mjxball.fly.twin", description=__doc__)
+    parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
+    parser.add_argument("--span", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"), help="mount [m]")
+    options = parser.parse_args()
+    with Twin(make_pair(options.span), TwinSettings(ports=tuple(options.ports))) as twin:
+        print(json.dumps({"uris": twin.uris}), flush=True)  # noqa: T201
+        try:
+            while sys.stdin.readline():
+                pass
+        except KeyboardInterrupt:
+            pass
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,183 @@
+"""The twin in real time: one thread, two UDP sockets on loopback, physics in between."""
+
+from __future__ import annotations
+
+import select
+import socket
+import threading
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjxball.fly.twin.body import Pair, PairState
+from mjxball.fly.twin.drone import TwinDrone, drone_state
+from mjxball.fly.twin.firmware import FirmwareTimes
+
+HOST = "127.0.0.1"
+MOST_BEHIND = 0.1  # [s] of physics that a twin that was held up makes good; the rest of the time it stands still
+
+
+@dataclass(frozen=True)
+class TwinSettings:
+    """How the twin runs."""
+
+    period: float = 0.005  # of physics, firmware and sockets [s]
+    ports: tuple[int, int] = (0, 0)  # of leader and follower, 0: any free one
+    seed: int = 0  # of the link's faults
+    times: FirmwareTimes = FirmwareTimes()
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What really happens at one moment, whatever the link says."""
+
+    time: float  # [s] of the twin
+    state: PairState
+    thrust: tuple[int, int]  # [thrust units] that reach the motors
+    last_wire_thrust: tuple[int, int]  # [thrust units] of the last setpoint received
+    info: tuple[int, int]
+
+
+class Twin:
+    """Two drones that answer at `uris`. A context manager; `inject` works while it runs."""
+
+    def __init__(self, pair: Pair, settings: TwinSettings = TwinSettings()):  # noqa: B008 (frozen)
+        self._pair, self._settings = pair, settings
+        self._state = pair.start()
+        self.drones = tuple(
+            TwinDrone(
+                settings.times, 2 * settings.seed + n, lambda name, value, n=n: pair.set_parameter(n, name, value)
+            )
+            for n in range(2)
+        )
+        self._sockets = [self._bound(port) for port in settings.ports]
+        self._clients: list[tuple[str, int] | None] = [None, None]
+        self.uris = tuple(f"udp://{HOST}:{sock.getsockname()[1]}" for sock in self._sockets)
+        self._dead = [False, False]
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="twin", daemon=True)
+        self.truth = self._seen(0.0)
+        self.history: list[Truth] = []  # one in ten steps
+        self.failure: BaseException | None = None
+
+    @staticmethod
+    def _bound(port: int) -> socket.socket:
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.bind((HOST, port))
+        sock.setblocking(False)
+        return sock
+
+    def __enter__(self) -> Twin:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join(timeout=5)
+        for sock in self._sockets:
+            sock.close()
+
+    def set_link(self, drone: int, faults: object) -> None:
+        """Replace the `LinkFaults` of a drone's link."""
+        self.drones[drone].link = faults
+
+    def set_faults(self, drone: int, faults: object) -> None:
+        """Replace the `DroneFaults` of a drone."""
+        self.drones[drone].faults = faults
+
+    def crash(self, drone: int) -> None:
+        """The firmware of a drone finds that it has crashed: its motors stop."""
+        self.drones[drone].firmware.crashed = True
+
+    def kill(self, drone: int) -> None:
+        """A drone loses its power: its motors stop and its address answers nothing, not even that it is closed."""
+        with self._lock:
+            self._dead[drone] = True
+            self.drones[drone].firmware.dead = True
+
+    def close_port(self, drone: int) -> None:
+        """A drone's radio task ends while its motors run on: the laptop's datagrams are refused."""
+        with self._lock:
+            self._dead[drone] = True
+            self._sockets[drone].close()
+
+    def reboot(self, drone: int) -> None:
+        """A drone's power fails for a moment."""
+        with self._lock:
+            self.drones[drone].reboot()
+
+    def _run(self) -> None:
+        try:
+            self._loop()
+        except BaseException as failure:  # kept, so that a test that looks sees what ended the twin
+            self.failure = failure
+            raise
+
+    def _loop(self) -> None:
+        period, begun = self._settings.period, time.monotonic()
+        step, skipped = 0, 0.0
+        while not self._stop.is_set():
+            now = time.monotonic() - begun - skipped
+            due = (step + 1) * period
+            if now < due:
+                self._wait(due - now)
+                continue
+            if now - due > MOST_BEHIND:
+                skipped += now - due
+            step += 1
+            with self._lock:
+                self._step(step * period)
+            if step % 10 == 0:
+                self.history.append(self.truth)
+
+    def _wait(self, seconds: float) -> None:
+        """Sleep until the next step, or until a datagram comes, which is taken in at once."""
+        alive = [n for n in range(2) if not self._dead[n]]
+        readable, _, _ = select.select([self._sockets[n] for n in alive], [], [], seconds)
+        for number in alive:
+            if self._sockets[number] in readable:
+                with self._lock:
+                    self._receive(number)
+
+    def _receive(self, number: int) -> None:
+        for _ in range(50):
+            if self._dead[number]:
+                return
+            try:
+                datagram, client = self._sockets[number].recvfrom(2048)
+            except (BlockingIOError, ConnectionError):
+                return
+            self._clients[number] = client
+            drone, now = self.drones[number], self.truth.time
+            drone.receive(datagram, now)
+            # Requests are answered at once: a table of contents is a hundred of them, one after the other.
+            drone.step(drone_state(self._state, number), float(self._state.specific_force[number, 2]), now)
+            self._transmit(number, drone.down.due(now))
+
+    def _step(self, now: float) -> None:
+        setpoints = []
+        for number, drone in enumerate(self.drones):
+            state = drone_state(self._state, number)
+            setpoints.append(drone.step(state, float(self._state.specific_force[number, 2]), now))
+        self._state = self._pair.advance(np.array(setpoints, float), self._settings.period)
+        self.truth = self._seen(now)
+        for number, drone in enumerate(self.drones):
+            self._transmit(number, drone.send(now))
+
+    def _transmit(self, number: int, datagrams: list[bytes]) -> None:
+        client = self._clients[number]
+        if client is None or self._dead[number]:
+            return
+        for datagram in datagrams:
+            try:
+                self._sockets[number].sendto(datagram, client)
+            except OSError:  # nobody listens any more, or the buffer is full: the radio forgets it too
+                return
+
+    def _seen(self, now: float) -> Truth:
+        drones = self.drones
+        last = tuple(drone.firmware._last.thrust for drone in drones)
+        info = tuple(drone.firmware.info for drone in drones)
+        return Truth(now, self._state, tuple(drone.setpoint.thrust for drone in drones), last, info)

@@ -1,0 +1,115 @@
+"""A stand-in for the coupled pair: one rigid stick whose attitude follows the commands as a damped oscillator.
+
+It is not a Crazyflie: no motors apart, no cascade, no rolling ball. It exists so that protocol, safety and loop can be
+tested without MuJoCo; numbers flown on it say nothing about a real pair.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mjxball.control import rotations
+from mjxball.fly.command import ForceCurve
+from mjxball.fly.packets import Setpoint, angles
+from mjxball.fly.twin.body import PairState
+
+FASTEST = 30.0  # [rad/s] bound on the body rates: beyond it the oscillator is no model of anything
+
+
+@dataclass(frozen=True)
+class StandInPlant:
+    """Numbers of the stand-in."""
+
+    mass: float = 0.07  # of all [kg]
+    mounts: tuple[tuple[float, float, float], tuple[float, float, float]] = ((0.0, -0.15, 0.0), (0.0, 0.15, 0.0))  # [m]
+    inertia: float = 1.5e-3  # about the axes across the stick [kg m2]
+    frequency: float = 9.0  # of the attitude with both drones' motors on [rad/s]
+    damping: float = 0.9  # ratio
+    motor_lag: float = 0.05  # [s]
+    curve: ForceCurve = ForceCurve()
+    gravity: float = 9.81  # [m/s2]
+    full: float = 4.1  # battery without load [V]
+    sag: float = 0.35  # at full thrust [V]
+    drain: float = 0.0008  # at full thrust [V/s]
+
+
+class StandIn:
+    """See `body.Pair`."""
+
+    def __init__(self, plant: StandInPlant = StandInPlant()):  # noqa: B008 (frozen)
+        self.plant = plant
+        self._mounts = np.array(plant.mounts)
+        self._span = self._mounts[1] - self._mounts[0]
+        self.start()
+
+    def start(self) -> PairState:
+        """See `Pair.start`."""
+        self._position, self._velocity = np.zeros(3), np.zeros(3)
+        self._quaternion, self._rates = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+        self._thrust = np.zeros(2)  # of each drone [N]
+        self._charge = np.full(2, self.plant.full)
+        return self._state(np.zeros(3))
+
+    def set_parameter(self, drone: int, name: str, value: float) -> None:
+        """The stand-in has no gains."""
+
+    def advance(self, setpoints: np.ndarray, dt: float) -> PairState:
+        """See `Pair.advance`."""
+        plant = self.plant
+        wanted = np.array([plant.curve.force(float(np.clip(row[3], 0, 60000))) for row in setpoints])
+        self._thrust += (wanted - self._thrust) * -np.expm1(-dt / plant.motor_lag)
+        matrix = rotations.matrix_from_quaternion(self._quaternion)
+        force = self._thrust.sum() * matrix[:, 2] / plant.mass - np.array([0.0, 0.0, plant.gravity])
+        self._rates = np.clip(self._rates + dt * self._turning(setpoints, matrix), -FASTEST, FASTEST)
+        self._quaternion = rotations.integrate_quaternion(self._quaternion, dt * self._rates)
+        self._velocity = self._velocity + dt * force
+        self._position = self._position + dt * self._velocity
+        if self._position[2] <= 0:
+            force = self._rest(force)
+        return self._state(force)
+
+    def _turning(self, setpoints: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+        """Angular acceleration (3,) [rad/s2]: both drones' attitude loops, and the moment of unequal thrusts."""
+        plant, euler = self.plant, rotations.euler_from_matrix(matrix)
+        turning = np.zeros(3)
+        on = self._thrust > 0.01
+        for row, running in zip(setpoints, on, strict=True):
+            if running:
+                roll, pitch, yaw_rate = angles(Setpoint(*(float(value) for value in row[:3]), 0))
+                tilt = plant.frequency**2 * (np.array([roll, pitch]) - euler[:2])
+                turning += 0.5 * np.append(tilt, 5.0 * (yaw_rate - self._rates[2]))
+        turning[:2] -= on.mean() * 2 * plant.damping * plant.frequency * self._rates[:2]
+        lifts = self._mounts[:, :2] * self._thrust[:, None]
+        moment = np.array([lifts[:, 1].sum(), -lifts[:, 0].sum()])
+        turning[:2] += moment / plant.inertia
+        return turning
+
+    def _rest(self, force: np.ndarray) -> np.ndarray:
+        """The ground stops everything and levels the stick; it pushes but does not pull."""
+        lifting = force[2] > 0
+        self._position = np.append(self._position[:2], 0.0)
+        self._velocity = np.array([0.0, 0.0, max(self._velocity[2], 0.0) if lifting else 0.0])
+        upside_down = rotations.matrix_from_quaternion(self._quaternion)[2, 2] < 0
+        if not upside_down:
+            yaw = rotations.euler_from_matrix(rotations.matrix_from_quaternion(self._quaternion))[2]
+            self._quaternion = rotations.quaternion_from_euler(np.array([0.0, 0.0, yaw]))
+        self._rates = np.zeros(3)
+        return force if lifting else np.zeros(3)
+
+    def _state(self, acceleration: np.ndarray) -> PairState:
+        plant, matrix = self.plant, rotations.matrix_from_quaternion(self._quaternion)
+        arms = self._mounts @ matrix.T
+        spin = matrix @ self._rates
+        load = self._thrust / plant.curve.force(65535)
+        self._charge = self._charge - plant.drain * load * 1e-3
+        felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        return PairState(
+            position=self._position + arms,
+            velocity=self._velocity + np.cross(spin, arms),
+            quaternion=np.stack([self._quaternion] * 2),
+            rates=np.stack([self._rates] * 2),
+            specific_force=np.stack([felt] * 2),
+            battery=self._charge - plant.sag * load,
+        )
