@@ -30,6 +30,10 @@ class ForceCurve:
         return 65535 * p
 
 
+LINEAR = ForceCurve()
+OLDER = ForceCurve(0.0915, 0.0677)  # firmware before 2026.04
+
+
 @dataclass(frozen=True)
 class CommandMap:
     """How a drone's command becomes thrust units, and the bounds of every setpoint.
@@ -43,7 +47,7 @@ class CommandMap:
     per_acceleration: float = 1000.0  # k_pz [thrust units per m/s2], of the paper
     carried_mass: float = 0.035  # the drone and its share of the object [kg]
     gravity: float = 9.81  # [m/s2]
-    curve: ForceCurve = ForceCurve()
+    curve: ForceCurve = LINEAR
     tilt_limit: float = math.radians(15)  # of every commanded roll and pitch [rad]
     tilt_slew: float = math.radians(200)  # [rad/s]
     thrust_slew: float = 120_000.0  # [thrust units/s]

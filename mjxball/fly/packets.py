@@ -117,6 +117,23 @@ def unpack_state(data: bytes) -> DroneState:
     return DroneState(position, velocity, decompress_quaternion(compressed), rates, info, MILLI * battery)
 
 
+class Packet(NamedTuple):
+    """One CRTP packet for a drone."""
+
+    port: int
+    channel: int
+    data: bytes
+
+
+def setpoint_packet(value: Setpoint) -> Packet:
+    """The packet that `send_setpoint` of cflib would send. Raises PacketError as `pack_setpoint` does."""
+    return Packet(3, 0, pack_setpoint(value))
+
+
+STOP = Packet(7, 0, b"\0")  # motors off, at once, not locked
+EMERGENCY_STOP = Packet(9, 1, b"\x03")  # motors off and locked until reboot
+ARM, DISARM = Packet(9, 1, b"\x01\x01"), Packet(9, 1, b"\x01\x00")
+
 _STEPS = 511  # a component takes 9 bits and a sign
 
 

@@ -35,4 +35,4 @@ class Pair(Protocol):
         """
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
-        """Parameter `name` ("pid_attitude.roll_kp") of `drone` (0 leader, 1 follower) was written; ignore unknown ones."""
+        """Parameter `name`, "pid_attitude.roll_kp", of `drone` (0 leader, 1 follower) was written; ignore others."""

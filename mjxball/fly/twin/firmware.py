@@ -1,4 +1,4 @@
-"""What one drone's firmware does with what it is sent: thrust lock, arming, watchdog, tumble, stops. Pure but for its own state.
+"""What one drone's firmware does with what it is sent: thrust lock, arming, watchdog, tumble, stops. No clock.
 
 Times and thresholds are those measured on the real firmware (crazyflie.md); the order of the checks is ours.
 """
@@ -29,7 +29,7 @@ class FirmwareTimes:
 class Firmware:
     """Supervisor and commander of one drone. Time comes in, setpoints for the physics come out."""
 
-    def __init__(self, times: FirmwareTimes = FirmwareTimes()):  # noqa: B008 (frozen)
+    def __init__(self, times: FirmwareTimes = FirmwareTimes()):
         self.times = times
         self.reboot()
 

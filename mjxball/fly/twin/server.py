@@ -15,6 +15,7 @@ from mjxball.fly.twin.drone import TwinDrone, drone_state
 from mjxball.fly.twin.firmware import FirmwareTimes
 
 HOST = "127.0.0.1"
+FIRMWARE = FirmwareTimes()
 MOST_BEHIND = 0.1  # [s] of physics that a twin that was held up makes good; the rest of the time it stands still
 
 
@@ -25,7 +26,7 @@ class TwinSettings:
     period: float = 0.005  # of physics, firmware and sockets [s]
     ports: tuple[int, int] = (0, 0)  # of leader and follower, 0: any free one
     seed: int = 0  # of the link's faults
-    times: FirmwareTimes = FirmwareTimes()
+    times: FirmwareTimes = FIRMWARE
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Truth:
 class Twin:
     """Two drones that answer at `uris`. A context manager; `inject` works while it runs."""
 
-    def __init__(self, pair: Pair, settings: TwinSettings = TwinSettings()):  # noqa: B008 (frozen)
+    def __init__(self, pair: Pair, settings: TwinSettings = TwinSettings()):
         self._pair, self._settings = pair, settings
         self._state = pair.start()
         self.drones = tuple(

@@ -15,6 +15,7 @@ from mjxball.fly.command import ForceCurve
 from mjxball.fly.packets import Setpoint, angles
 from mjxball.fly.twin.body import PairState
 
+CURVE = ForceCurve()
 FASTEST = 30.0  # [rad/s] bound on the body rates: beyond it the oscillator is no model of anything
 
 
@@ -28,7 +29,7 @@ class StandInPlant:
     frequency: float = 9.0  # of the attitude with both drones' motors on [rad/s]
     damping: float = 0.9  # ratio
     motor_lag: float = 0.05  # [s]
-    curve: ForceCurve = ForceCurve()
+    curve: ForceCurve = CURVE
     gravity: float = 9.81  # [m/s2]
     full: float = 4.1  # battery without load [V]
     sag: float = 0.35  # at full thrust [V]
@@ -38,7 +39,7 @@ class StandInPlant:
 class StandIn:
     """See `body.Pair`."""
 
-    def __init__(self, plant: StandInPlant = StandInPlant()):  # noqa: B008 (frozen)
+    def __init__(self, plant: StandInPlant = StandInPlant()):
         self.plant = plant
         self._mounts = np.array(plant.mounts)
         self._span = self._mounts[1] - self._mounts[0]
@@ -60,6 +61,7 @@ class StandIn:
         plant = self.plant
         wanted = np.array([plant.curve.force(float(np.clip(row[3], 0, 60000))) for row in setpoints])
         self._thrust += (wanted - self._thrust) * -np.expm1(-dt / plant.motor_lag)
+        self._charge = self._charge - dt * plant.drain * self._thrust / plant.curve.force(65535)
         matrix = rotations.matrix_from_quaternion(self._quaternion)
         force = self._thrust.sum() * matrix[:, 2] / plant.mass - np.array([0.0, 0.0, plant.gravity])
         self._rates = np.clip(self._rates + dt * self._turning(setpoints, matrix), -FASTEST, FASTEST)
@@ -103,7 +105,6 @@ class StandIn:
         arms = self._mounts @ matrix.T
         spin = matrix @ self._rates
         load = self._thrust / plant.curve.force(65535)
-        self._charge = self._charge - plant.drain * load * 1e-3
         felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
         return PairState(
             position=self._position + arms,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 # Type numbers of the two tables, each with its struct code (crazyflie.md).
 LOG_TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int8_t": (4, "b"), "int16_t": (5, "h")}
 LOG_TYPES |= {"int32_t": (6, "i"), "float": (7, "f"), "FP16": (8, "e")}
-LOG_CODES = {number: code for number, code in LOG_TYPES.values()}
+LOG_CODES = dict(LOG_TYPES.values())
 PARAM_TYPES = {"uint8_t": (8, "B"), "uint16_t": (9, "H"), "uint32_t": (10, "I"), "int8_t": (0, "b")}
 PARAM_TYPES |= {"int16_t": (1, "h"), "int32_t": (2, "i"), "float": (6, "f")}
 READ_ONLY, EXTENDED = 0x40, 0x10

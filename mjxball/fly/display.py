@@ -1,0 +1,79 @@
+"""The terminal while flying: a few lines, redrawn by a thread of their own so that a slow terminal delays nothing."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+from collections.abc import Callable
+from typing import TextIO
+
+import numpy as np
+
+from mjxball.control import rotations
+from mjxball.fly.flight import View
+from mjxball.fly.limits import NAMES, Limits
+from mjxball.fly.supervisor import ENDED, GUIDED, State
+
+RED, YELLOW, GREEN, PLAIN = "\x1b[1;37;41m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
+PERIOD = 0.2  # [s]
+
+
+def lines(view: View, bounds: Limits, colour: bool = True) -> list[str]:
+    """What is shown of `view`; danger is white on red."""
+
+    def painted(text: str, code: str) -> str:
+        return f"{code}{text}{PLAIN}" if colour else text
+
+    state = view.supervisor.state
+    code = GREEN if state in GUIDED and view.supervisor.cause is None else YELLOW
+    code = RED if view.supervisor.cause is not None or state in (State.HOLD, State.KILL) else code
+    cause = view.supervisor.cause
+    why = f" {cause.event.name} {cause.detail}" if cause else ""
+    timing = painted(f"loop {1000 * view.late:5.2f} ms late, {view.missed} missed/s", RED if view.missed else "")
+    shown = [f"{view.time:7.2f} s  {painted(f' {state.value.upper()}{why} ', code)}  {timing}"]
+    for name, drone, age, sent in zip(NAMES, view.states, view.ages, view.wanted, strict=True):
+        roll, pitch, yaw = np.degrees(rotations.euler_from_matrix(rotations.matrix_from_quaternion(drone.quaternion)))
+        x, y, z = drone.position
+        low = drone.battery < bounds.battery + 0.1
+        old = age > bounds.state_age / 2
+        parts = [
+            f"{name:8} ({x:+.2f}, {y:+.2f}, {z:+.2f}) m",
+            f"roll {roll:+5.1f} pitch {pitch:+5.1f} yaw {yaw:+5.1f}",
+            painted(f"{drone.battery:.2f} V", RED if low else ""),
+            painted(f"state {1000 * age:4.0f} ms" if math.isfinite(age) else "state never", RED if old else ""),
+            f"thrust {sent.thrust:5d}",
+        ]
+        shown.append("  ".join(parts))
+    return shown
+
+
+class Display:
+    """Redraws what `view` returns until it is left. A context manager; without a terminal it prints nothing."""
+
+    def __init__(self, view: Callable[[], View | None], bounds: Limits, stream: TextIO = sys.stdout):
+        self._view, self._bounds, self._stream = view, bounds, stream
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._draw_all, name="display", daemon=True)
+        self._drawn = 0
+
+    def __enter__(self) -> Display:
+        if self._stream.isatty():
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=1)
+
+    def _draw_all(self) -> None:
+        while not self._done.wait(PERIOD):
+            view = self._view()
+            if view is None or (view.supervisor.state in ENDED and not self._drawn):
+                continue
+            text = lines(view, self._bounds)
+            up = f"\x1b[{self._drawn}A" if self._drawn else ""
+            self._stream.write(up + "".join(f"\x1b[2K{line}\n" for line in text))
+            self._stream.flush()
+            self._drawn = len(text)

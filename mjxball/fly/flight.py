@@ -1,0 +1,313 @@
+"""One flight, tick by tick: states in, faults to the supervisor, setpoints out to both drones. No clock, no thread."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from mjxball.fly import command, limits, maneuver, packets, pair
+from mjxball.fly.command import CommandMap, Mapped
+from mjxball.fly.limits import Limits, Sustained
+from mjxball.fly.maneuver import Times
+from mjxball.fly.packets import ZERO, DroneState, Packet, PacketError, Setpoint
+from mjxball.fly.pilot import Commands, Pilot
+from mjxball.fly.supervisor import AIRBORNE, BEFORE_MOTORS, GUIDED, Event, Fault, State, Supervisor
+from mjxball.fly.telemetry import Telemetry
+
+LIMITS, TIMES = Limits(), Times()
+
+
+class DroneLink(Protocol):
+    """What a flight needs of `link.Link`."""
+
+    telemetry: Telemetry
+    lost: str | None
+
+    def send(self, packet: Packet) -> None:
+        """Newest setpoint, without blocking."""
+
+    def command(self, packet: Packet) -> None:
+        """Before any setpoint, without blocking."""
+
+    def stuck_for(self, now: float) -> float:
+        """How long something has waited to be sent [s]."""
+
+
+class Guard(Protocol):
+    """What a flight needs of the watchdog process."""
+
+    def beat(self, flying: bool, thrusts: tuple[int, int], height: float) -> bool:
+        """Tell it that we live; false if it does not."""
+
+
+class Notes(Protocol):
+    """What a flight needs of `journal.Journal`."""
+
+    def note(self, kind: str, t: float | None = None, **fields: Any) -> None:
+        """Add a record, without blocking."""
+
+
+@dataclass(frozen=True)
+class FlightSettings:
+    """What is flown and within which bounds."""
+
+    seconds: float = 20.0  # in State.FLY
+    goal: tuple[float, float, float] = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
+    dry_run: bool = False  # zeros are sent, whatever is wanted
+    period: float = 0.01  # of the loop [s]
+    limits: Limits = LIMITS
+    times: Times = TIMES
+
+
+class View(NamedTuple):
+    """What a display may show; replaced as a whole at every tick."""
+
+    time: float  # [s] since the start
+    supervisor: Supervisor
+    states: list[DroneState]
+    ages: list[float]
+    goal: np.ndarray
+    wanted: tuple[Setpoint, Setpoint]
+    late: float  # [s]
+    missed: int
+
+
+class Flight:
+    """See the module. `tick` is called once per period until it returns false."""
+
+    def __init__(
+        self,
+        links: Sequence[DroneLink],
+        pilot: Pilot,
+        maps: Sequence[CommandMap],
+        rig: pair.Rig,
+        settings: FlightSettings,
+        notes: Notes,
+        guard: Guard | None = None,
+    ):
+        self.links, self.pilot, self.maps, self.rig = links, pilot, maps, rig
+        self.settings, self.notes, self.guard = settings, notes, guard
+        self.supervisor = Supervisor()
+        self.interrupts = 0
+        self.kill = False
+        self.ready: bool | None = None  # checks before flight: not known yet, passed, failed
+        self.refusal = ""
+        self.view: View | None = None
+        self._sent: list[Setpoint] = [ZERO, ZERO]
+        self._trims = [0.0 for _ in maps]  # thrust that hovers [units]: a running average of what was sent
+        self._commands: Commands | None = None
+        self._every = max(round(pilot.period / settings.period), 1)
+        self._count = 0
+        self._origin = np.zeros(3)
+        self._start = 0.0
+        self._low = [Sustained(settings.limits.battery_time) for _ in links]
+        self._saturated = Sustained(settings.limits.saturation_time)
+        self._hold_for = settings.times.drone_watchdog
+        self._land_height = 0.0
+        self.worst_age = 0.0
+
+    def begin(self, now: float) -> None:
+        """Where the pair stands now is where it starts; both links must have a state."""
+        self._start = now
+        self._origin = pair.object_state(self._states(), self.rig).position
+        self.supervisor = Supervisor(State.CHECK, now)
+
+    def tick(self, now: float, late: float = 0.0, missed: int = 0, gap: float = 0.0) -> bool:
+        """Everything that happens in one period; false once the flight is done.
+
+        `late` [s] is this tick's, `missed` the deadlines missed within the last second, `gap` [s] the time since the
+        tick before.
+        """
+        states, ages = self._states(), [link.telemetry.age(now) for link in self.links]
+        self.worst_age = max(ages)
+        faults = self._outside(now, ages, missed, gap)
+        if not any(fault.event is Event.STALE for fault in faults):
+            faults += self._from_states(states, now)
+        mapped, broken = self._guided(states, now)
+        faults += broken + self._progress(states, now)
+        self._advance(faults, now, ages, states)
+        wanted = self._wanted(mapped, states, now)
+        self._transmit(wanted)
+        self._record(now, states, ages, wanted, late, missed)
+        self._count += 1
+        return self.supervisor.state is not State.DONE
+
+    # What is wrong.
+
+    def _states(self) -> list[DroneState]:
+        samples = [link.telemetry.newest for link in self.links]
+        return [sample.state for sample in samples if sample is not None]
+
+    def _outside(self, now: float, ages: list[float], missed: int, gap: float) -> list[Fault]:
+        bounds, faults = self.settings.limits, []
+        if self.kill or self.interrupts > 1:
+            faults.append(Fault(Event.KEY_KILL, "asked for on the laptop"))
+        elif self.interrupts:
+            faults.append(Fault(Event.INTERRUPT, "asked for on the laptop"))
+        for name, link in zip(limits.NAMES, self.links, strict=True):
+            if link.lost:
+                faults.append(Fault(Event.LINK_LOST, f"{name}: {link.lost}"))
+            elif link.stuck_for(now) > bounds.state_age:
+                faults.append(Fault(Event.LINK_LOST, f"{name}: nothing can be sent"))
+        faults += limits.age_faults(ages, bounds)
+        if missed > bounds.missed_deadlines or gap > bounds.longest_gap:
+            faults.append(Fault(Event.DEADLINES, f"{missed} missed in a second, longest gap {1000 * gap:.0f} ms"))
+        if self.guard is not None and not self._beat():
+            faults.append(Fault(Event.WATCHDOG))
+        return faults
+
+    def _beat(self) -> bool:
+        states = self._states()
+        height = pair.object_state(states, self.rig).position[2] - self._origin[2] if len(states) == 2 else math.nan
+        flying = self.supervisor.state in AIRBORNE and not self.settings.dry_run
+        thrusts = tuple(round(trim) for trim in self._trims)
+        return self.guard is None or self.guard.beat(flying, (thrusts[0], thrusts[1]), float(height))
+
+    def _from_states(self, states: list[DroneState], now: float) -> list[Fault]:
+        armed = self.supervisor.state not in BEFORE_MOTORS and not self.settings.dry_run
+        faults = limits.state_faults(states, self._origin, self.rig.span, self.settings.limits, armed)
+        for name, state, low in zip(limits.NAMES, states, self._low, strict=True):
+            if low.update(state.battery < self.settings.limits.battery, now):
+                faults.append(Fault(Event.BATTERY, f"{name} at {state.battery:.2f} V"))
+        return faults
+
+    # What the laws want.
+
+    def _guided(self, states: list[DroneState], now: float) -> tuple[list[Mapped] | None, list[Fault]]:
+        """Setpoints of both laws while they are in command, and what is wrong with them."""
+        if self.supervisor.state not in GUIDED:
+            return None, []
+        try:
+            if self._commands is None or self._count % self._every == 0:
+                self._commands = self.pilot.step(pair.object_state(states, self.rig), self.goal(now))
+            laws = (self._commands.leader, self._commands.follower)
+            mapped = [
+                command.to_setpoint(law, pair.yaw_of(state), last, self.settings.period, constants)
+                for law, state, last, constants in zip(laws, states, self._sent, self.maps, strict=True)
+            ]
+        except (PacketError, ValueError, FloatingPointError) as error:
+            return None, [Fault(Event.BAD_STATE, str(error))]
+        if self._saturated.update(any(one.saturated for one in mapped), now):
+            return mapped, [Fault(Event.SATURATED, f"for {self.settings.limits.saturation_time:g} s")]
+        return mapped, []
+
+    def goal(self, now: float) -> np.ndarray:
+        """Goal of O (3,) at `now` [m]; while landing it sinks, far below the ground, since the laws lag behind it."""
+        goal = self._origin + np.array(self.settings.goal)
+        if self.supervisor.state is State.LAND:
+            sunk = self.settings.times.land_speed * (now - self.supervisor.since)
+            goal[2] = max(self._origin[2] + self._land_height - sunk, self._origin[2] - 1.0)
+        return goal
+
+    # What comes next.
+
+    def _progress(self, states: list[DroneState], now: float) -> list[Fault]:
+        """Events of time and place."""
+        state, elapsed, times = self.supervisor.state, now - self.supervisor.since, self.settings.times
+        events = []
+        if state is State.CHECK and self.ready is not None:
+            events.append(Fault(Event.READY if self.ready else Event.REFUSED, self.refusal))
+        if state is State.ARM and elapsed >= times.arm and self._armed(states):
+            events.append(Fault(Event.ARMED))
+        if state is State.RAMP and elapsed >= times.ramp:
+            events.append(Fault(Event.HOVERING))
+        if state is State.FLY and elapsed >= self.settings.seconds:
+            events.append(Fault(Event.TIME_UP))
+        if state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._stands(states):
+            events.append(Fault(Event.TOUCHED_DOWN))
+        if elapsed >= self._limit(state):
+            events.append(Fault(Event.TIMEOUT, f"{state.value} lasted {elapsed:.1f} s"))
+        return events
+
+    def _armed(self, states: list[DroneState]) -> bool:
+        needed = packets.ARMED | packets.CAN_FLY
+        return self.settings.dry_run or all(state.info & needed == needed for state in states)
+
+    def _stands(self, states: list[DroneState]) -> bool:
+        now = pair.object_state(states, self.rig)
+        times = self.settings.times
+        return now.position[2] - self._origin[2] < times.near_ground and abs(now.velocity[2]) < times.still
+
+    def _limit(self, state: State) -> float:
+        """How long a state may last [s]."""
+        times = self.settings.times
+        landing = (self._land_height + 0.3) / times.land_speed + times.land_spare
+        known = {
+            State.ARM: times.arm_limit,
+            State.RAMP: times.ramp + 1.0,
+            State.FLY: self.settings.seconds + 1.0,
+            State.LAND: landing,
+            State.DESCEND: times.descend_limit,
+            State.HOLD: self._hold_for,
+            State.STOP: times.stop,
+            State.KILL: times.stop,
+        }
+        return known.get(state, math.inf)
+
+    def _advance(self, faults: list[Fault], now: float, ages: list[float], states: list[DroneState]) -> None:
+        before = self.supervisor
+        self.supervisor = before.after(faults, now)
+        if self.supervisor.state is before.state:
+            return
+        entered = self.supervisor.state
+        names = [f"{fault.event.name}: {fault.detail}" if fault.detail else fault.event.name for fault in faults]
+        self.notes.note("transition", now, before=before.state.value, after=entered.value, events=names)
+        if entered is State.FLY:
+            self.pilot.reset()
+            self._commands = None
+        if entered is State.LAND:
+            self._land_height = float(pair.object_state(states, self.rig).position[2] - self._origin[2])
+        if entered is State.HOLD:
+            age = max((value for value in ages if math.isfinite(value)), default=0.0)
+            self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
+
+    # What is sent.
+
+    def _wanted(self, mapped: list[Mapped] | None, states: list[DroneState], now: float) -> list[Setpoint]:
+        state, elapsed = self.supervisor.state, now - self.supervisor.since
+        if state in GUIDED:
+            return [one.setpoint for one in mapped] if mapped else list(self._sent)
+        if state is State.RAMP:
+            return [maneuver.ramp(elapsed, self.settings.times, *part) for part in self._parts()]
+        if state in (State.DESCEND, State.HOLD):
+            return [self._sinking(number, states, elapsed) for number in range(2)]
+        return [ZERO, ZERO]
+
+    def _parts(self) -> list[tuple[CommandMap, Setpoint, float]]:
+        return [(constants, sent, self.settings.period) for constants, sent in zip(self.maps, self._sent, strict=True)]
+
+    def _sinking(self, number: int, states: list[DroneState], elapsed: float) -> Setpoint:
+        thrust = self._trims[number]
+        if self.supervisor.state is State.DESCEND:
+            climb = float(pair.object_state(states, self.rig).velocity[2])
+            thrust = maneuver.sink(thrust, climb, elapsed, self.settings.times)
+        return maneuver.level(thrust, self._sent[number], self.settings.period, self.maps[number])
+
+    def _transmit(self, wanted: list[Setpoint]) -> None:
+        state, period = self.supervisor.state, self.settings.period
+        if state in (State.RAMP, *GUIDED):
+            self._trims = [maneuver.smoothed(t, s.thrust, period) for t, s in zip(self._trims, wanted, strict=True)]
+        self._sent = wanted
+        for link, value in zip(self.links, wanted, strict=True):
+            if state is State.STOP:
+                link.command(packets.STOP)
+            elif state is State.KILL:
+                link.command(packets.EMERGENCY_STOP)
+            elif state is State.ARM and not self.settings.dry_run and self._count % 10 == 0:
+                link.command(packets.ARM)
+            link.send(packets.setpoint_packet(ZERO if self.settings.dry_run else value))
+
+    def _record(
+        self, now: float, states: list[DroneState], ages: list[float], sent: list[Setpoint], late: float, missed: int
+    ) -> None:
+        goal = self.goal(now)
+        laws = self._commands if self.supervisor.state in GUIDED else None
+        fields = {} if laws is None else laws._asdict()
+        self.notes.note(
+            "tick", now, state=self.supervisor.state.value, goal=goal, sent=sent, ages=ages, late=late, **fields
+        )
+        self.view = View(now - self._start, self.supervisor, states, ages, goal, (sent[0], sent[1]), late, missed)

@@ -1,0 +1,66 @@
+"""The clock of the control loop: monotonic deadlines, and how well they were met."""
+
+from __future__ import annotations
+
+import collections
+import time
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Lateness of the loop's ticks against their deadlines [s]."""
+
+    ticks: int
+    missed: int  # deadlines that passed before the tick before was done
+    median: float
+    p99: float
+    largest: float
+
+
+class Metronome:
+    """Wakes once per period. A tick that is late does not shift the later ones; deadlines passed over are counted."""
+
+    def __init__(self, period: float):
+        self.period = period
+        self.missed = 0
+        self._late: list[float] = []
+        self._misses: collections.deque[float] = collections.deque()
+        self._deadline = time.monotonic()
+        self._before = self._deadline
+
+    def start(self) -> None:
+        """The first deadline is one period from now."""
+        self._before = time.monotonic()
+        self._deadline = self._before + self.period
+
+    def wait(self) -> float:
+        """Sleep until the next deadline; returns the monotonic time [s]."""
+        while (left := self._deadline - time.monotonic()) > 0:
+            time.sleep(left)
+        now = time.monotonic()
+        self._late.append(now - self._deadline)
+        passed = int((now - self._deadline) / self.period)
+        self.missed += passed
+        self._misses.extend([now] * min(passed, 100))
+        self._deadline += (passed + 1) * self.period
+        self.gap, self._before = now - self._before, now
+        return now
+
+    gap = 0.0  # [s] between the last two ticks
+
+    def missed_lately(self, now: float) -> int:
+        """Deadlines missed in the last second."""
+        while self._misses and now - self._misses[0] > 1:
+            self._misses.popleft()
+        return len(self._misses)
+
+    @property
+    def lateness(self) -> float:
+        """Of the last tick [s]."""
+        return self._late[-1] if self._late else 0.0
+
+    def timing(self) -> Timing:
+        """Statistics of all ticks so far."""
+        late = sorted(self._late) or [0.0]
+        return Timing(len(self._late), self.missed, late[len(late) // 2], late[int(0.99 * (len(late) - 1))], late[-1])

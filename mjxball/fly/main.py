@@ -1,0 +1,108 @@
+"""Command line of `python -m mjxball.fly`: fly a policy with two Crazyflies, or rehearse it with their twin."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import math
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mjxball.cli import Parser, run_command
+from mjxball.errors import InputError
+from mjxball.fly import pair
+from mjxball.fly.command import LINEAR, OLDER, CommandMap
+from mjxball.fly.flight import FlightSettings
+from mjxball.fly.pilot import Pilot
+from mjxball.fly.preflight import Preflight, read_gains
+from mjxball.fly.rehearse import Rehearsal
+from mjxball.fly.session import Crew, fly
+from mjxball.policy import Policy
+
+URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
+LOOP_RATE = 100.0  # [Hz]
+CURVES = {"linear": LINEAR, "older": OLDER}
+
+
+def make_parser() -> Parser:
+    """The flags; the first two lines of them are fixed (design section 9)."""
+    parser = Parser(prog="python -m mjxball.fly", description=__doc__)
+    parser.add_argument("policy", type=Path, metavar="POLICY.npz", help="the follower")
+    parser.add_argument("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
+    parser.add_argument("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")
+    parser.add_argument(
+        "--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="connect, log, and send zeros only")
+    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
+    parser.add_argument("--log", type=Path, metavar="FILE", help="write everything to this new file")
+    parser.add_argument(
+        "--goal", type=float, nargs=3, default=(0.0, 0.0, 0.4), metavar=("X", "Y", "Z"), help="m (0 0 0.4)"
+    )
+    parser.add_argument("--gains", type=Path, metavar="FILE", help="JSON of firmware parameters to write and read back")
+    parser.add_argument("--thrust", choices=("calibrated", "paper"), default="calibrated", help="law from az to thrust")
+    parser.add_argument("--hover", type=float, default=46000.0, metavar="UNITS", help="paper law: thrust at hover")
+    parser.add_argument("--curve", choices=tuple(CURVES), default="linear", help="calibrated law: force of a motor")
+    parser.add_argument(
+        "--mass", type=float, default=0.07, metavar="KG", help="calibrated law: of all that flies (0.07)"
+    )
+    return parser
+
+
+def command_maps(options: argparse.Namespace, policy: Policy, rig: pair.Rig) -> tuple[CommandMap, CommandMap]:
+    """Command maps of leader and follower: each carries its share of the mass."""
+    gravity = float(policy.card["gravity"])
+    leader, follower = (
+        CommandMap(options.thrust, options.hover, 1000.0, share * options.mass, gravity, CURVES[options.curve])
+        for share in rig.weights
+    )
+    return leader, follower
+
+
+def check_options(options: argparse.Namespace) -> None:
+    """Raise InputError for anything unsound."""
+    if importlib.util.find_spec("cflib") is None:
+        raise InputError("cflib is not installed; pip install 'mjxball[fly]'")
+    for flag in ("leader", "follower"):
+        uri = getattr(options, flag)
+        if uri is None and not options.rehearse:
+            raise InputError(f"--{flag} URI is needed, or --rehearse to fly the software twin")
+        match = URI.fullmatch(uri) if uri is not None else None
+        if uri is not None and (match is None or int(match[2] or 1) not in range(1, 65536)):
+            raise InputError(f"--{flag} {uri} is no URI such as radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
+        if uri is not None and options.rehearse and not uri.startswith("udp://127.0.0.1:"):
+            raise InputError(f"--{flag} {uri}: the twin of --rehearse answers at udp://127.0.0.1:PORT only")
+    if options.leader is not None and options.leader == options.follower:
+        raise InputError("--leader and --follower are the same drone")
+    for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0)):
+        if not low <= getattr(options, name) <= high:
+            raise InputError(f"--{name} must be {low:g} to {high:g}, not {getattr(options, name):g}")
+    if not all(math.isfinite(value) and abs(value) <= 5 for value in options.goal):
+        raise InputError("--goal must be three numbers within 5 m")
+    if options.log is not None and (options.log.exists() or not options.log.absolute().parent.is_dir()):
+        raise InputError(f"log file {options.log} exists or its directory does not; choose another name")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly; exit code 0 if nothing went wrong, 1 after a fault, 2 on bad input."""
+    options = make_parser().parse_args(arguments)
+
+    def command() -> int:
+        check_options(options)
+        policy = Policy.load(options.policy)
+        gains = read_gains(options.gains) if options.gains else {}
+        rig = pair.Rig.of_card(policy.card)
+        period = 1 / max(LOOP_RATE, 1 / policy.control_period)
+        settings = FlightSettings(options.seconds, tuple(options.goal), options.dry_run, period)
+        crew = Crew(Pilot(policy, rig), command_maps(options, policy, rig), rig, gains, Preflight())
+        with contextlib.ExitStack() as stack:
+            uris = (options.leader, options.follower)
+            if options.rehearse:
+                ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
+                uris = stack.enter_context(Rehearsal(rig.leader_mount, ports)).uris
+            return fly(uris, crew, settings, options.log, list(sys.argv if arguments is None else arguments))
+
+    return run_command(command)

@@ -1,0 +1,48 @@
+"""The twin as a child process, so that a rehearsal shares no interpreter lock with the control loop."""
+
+from __future__ import annotations
+
+import json
+import select
+import subprocess
+import sys
+from collections.abc import Sequence
+
+from mjxball.errors import InputError
+
+
+class Rehearsal:
+    """A running twin. A context manager; `uris` are leader and follower."""
+
+    def __init__(self, mount: Sequence[float], ports: Sequence[int] = (0, 0), start_limit: float = 30.0):
+        """Start the twin of a rig whose leader sits at `mount` (3,) [m]. Raises InputError if it does not start."""
+        arguments = ["--ports", *map(str, ports), "--span", *(f"{value:.9g}" for value in mount)]
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "mjxball.fly.twin", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+            text=True,
+        )
+        assert self._process.stdout is not None
+        readable, _, _ = select.select([self._process.stdout], [], [], start_limit)
+        line = self._process.stdout.readline() if readable else ""
+        if not line:
+            self.close()
+            raise InputError("the twin did not start; are the ports of --leader and --follower free?")
+        leader, follower = json.loads(line)["uris"]
+        self.uris: tuple[str, str] = (leader, follower)
+
+    def __enter__(self) -> Rehearsal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the twin."""
+        try:
+            self._process.communicate(timeout=5)  # closes its input, which ends it
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate(timeout=5)

@@ -1,0 +1,136 @@
+"""A flight from the first connection to the last line of the log: where threads, clocks and printing come together."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mjxball import __version__
+from mjxball.errors import InputError
+from mjxball.fly import pair
+from mjxball.fly.command import CommandMap
+from mjxball.fly.display import Display
+from mjxball.fly.flight import Flight, FlightSettings
+from mjxball.fly.journal import Journal
+from mjxball.fly.keys import listening
+from mjxball.fly.limits import NAMES
+from mjxball.fly.link import Link
+from mjxball.fly.loop import Metronome, Timing
+from mjxball.fly.pilot import Pilot
+from mjxball.fly.preflight import Preflight, check, prepare
+from mjxball.fly.supervisor import FAULTS, Event
+from mjxball.fly.watchdog import Watchdog
+
+SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Who flies, and what with."""
+
+    pilot: Pilot
+    maps: tuple[CommandMap, CommandMap]
+    rig: pair.Rig
+    gains: Mapping[str, float]
+    preflight: Preflight
+
+
+def fly(
+    uris: Sequence[str], crew: Crew, settings: FlightSettings, log: Path | None, command: Sequence[str] = ()
+) -> int:
+    """Fly once; 0 if nothing went wrong, 1 after a fault. Raises InputError if a drone cannot be had.
+
+    Prints the checks and how it ended. `command` goes into the log's header.
+    """
+    header = {"command": list(command), "version": __version__, "uris": list(uris), "settings": str(settings)}
+    header |= {"policy": crew.pilot.policy.name, "config_hash": crew.pilot.policy.card["config_hash"]}
+    before = sys.getswitchinterval()
+    with Journal(log, **header) as journal:
+        links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]
+        try:
+            sys.setswitchinterval(SWITCH_INTERVAL)
+            with Watchdog(uris) as guard:
+                prepare(links, crew.gains, crew.preflight)
+                flight = Flight(links, crew.pilot, crew.maps, crew.rig, settings, journal, guard)
+                flight.ready = _checked(links, crew, settings, journal)
+                flight.refusal = "" if flight.ready else "see the checks"
+                timing = run(flight)
+                return _ended(flight, timing, journal)
+        except (InputError, OSError) as error:
+            journal.note("refused", text=str(error))
+            raise
+        finally:
+            for link in links:
+                link.close()
+            sys.setswitchinterval(before)
+
+
+def run(flight: Flight) -> Timing:
+    """Tick until the flight is done; Ctrl-C, SIGTERM and keys are obeyed. Never raises: a bug lands too."""
+    metronome = Metronome(flight.settings.period)
+
+    def land() -> None:
+        flight.interrupts += 1
+
+    def kill() -> None:
+        flight.kill = True
+
+    with listening(land, kill), Display(lambda: flight.view, flight.settings.limits):
+        metronome.start()
+        flight.begin(time.monotonic())
+        going = True
+        while going:
+            now = metronome.wait()
+            try:
+                going = flight.tick(now, metronome.lateness, metronome.missed_lately(now), metronome.gap)
+            except Exception as error:  # nothing in here may leave thrust on
+                flight.notes.note("error", text=f"{type(error).__name__}: {error}")
+                flight.kill = True
+                going = _emergency(flight)
+    return metronome.timing()
+
+
+def _emergency(flight: Flight) -> bool:
+    """A tick failed: stop both drones without the flight's help. Returns false: it is over."""
+    from mjxball.fly import packets
+    from mjxball.fly.supervisor import Fault, State, Supervisor
+
+    for _ in range(50):
+        for link in flight.links:
+            link.command(packets.EMERGENCY_STOP)
+            link.send(packets.setpoint_packet(packets.ZERO))
+        time.sleep(0.01)
+    flight.supervisor = Supervisor(State.DONE, time.monotonic(), Fault(Event.BAD_STATE, "the runner itself failed"))
+    return False
+
+
+def _checked(links: Sequence[Link], crew: Crew, settings: FlightSettings, journal: Journal) -> bool:
+    checks = check(links, crew.rig, settings.limits, crew.preflight)
+    for one in checks:
+        journal.note("check", name=one.name, passed=one.passed, found=one.found)
+        _say(f"{'good' if one.passed else 'BAD '}  {one.name}: {one.found}")
+    return all(one.passed for one in checks)
+
+
+def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
+    supervisor = flight.supervisor
+    cause = supervisor.cause
+    code = 1 if cause is not None and cause.event in FAULTS else 0
+    sent = [getattr(link, "overwritten", 0) for link in flight.links]
+    journal.note("end", code=code, cause=str(cause) if cause else "", timing=timing, overwritten=sent)
+    if cause is not None:
+        _say(f"ended by {cause.event.name.lower().replace('_', ' ')}{': ' + cause.detail if cause.detail else ''}")
+    late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
+    _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
+    if journal.failure:
+        _say(f"the log is not complete: {journal.failure}")
+    return code
+
+
+def _say(text: str) -> None:
+    with contextlib.suppress(OSError, ValueError):  # a closed terminal must not end a flight
+        print(text, flush=True)  # noqa: T201

@@ -1,0 +1,149 @@
+"""The safety supervisor: a pure state machine. `TRANSITIONS` is all of it; `docs/flying.md` prints the same table.
+
+States say what both drones are sent, and always both: any fault on one of them brings both down together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import NamedTuple
+
+
+class State(Enum):
+    """What both drones are sent."""
+
+    CHECK = "check"  # zeros, while the checks before flight run
+    ARM = "arm"  # zeros, which open the firmware's thrust lock while it arms
+    RAMP = "ramp"  # level, thrust rising to hover
+    FLY = "fly"  # leader PID and follower policy
+    LAND = "land"  # the same laws toward a goal that sinks
+    DESCEND = "descend"  # level, thrust held to a sinking speed where it is known, else ramped down
+    HOLD = "hold"  # a drone is not heard: level, each its last trim, until that drone's own watchdog stops it
+    STOP = "stop"  # zeros and stop setpoints
+    KILL = "kill"  # emergency stop, repeated; the firmware stays locked until reboot
+    DONE = "done"  # motors off, disarmed; nothing more is sent
+
+    @property
+    def severity(self) -> int:
+        """Order in which states may follow each other; aborts never go back."""
+        return list(State).index(self)
+
+
+class Event(Enum):
+    """What may happen."""
+
+    READY = "all checks before flight passed"
+    REFUSED = "a check before flight failed"
+    ARMED = "both drones armed with the thrust lock open"
+    HOVERING = "the thrust ramp ended"
+    TIME_UP = "the flight time is over"
+    INTERRUPT = "Ctrl-C or SIGTERM"
+    KEY_KILL = "kill key, or Ctrl-C again"
+    STALE = "a drone's state is older than 100 ms by the host's or the firmware's clock"
+    LINK_LOST = "a link reported its end"
+    BAD_STATE = "a state or a command is not finite"
+    FENCE = "a drone left the geofence"
+    TILT = "a drone tilts beyond the limit"
+    STICK = "the two positions contradict the stick: its length or its tilt"
+    BATTERY = "a battery is low"
+    SATURATED = "thrust has been at its bound for too long"
+    DEADLINES = "the loop missed too many deadlines"
+    WATCHDOG = "the watchdog process ended"
+    DRONE_DOWN = "a drone's firmware is locked, crashed, tumbled or cannot fly"
+    TOUCHED_DOWN = "the pair stands on the ground"
+    TIMEOUT = "the state has lasted as long as it may"
+
+
+class Fault(NamedTuple):
+    """An event with what is known about it."""
+
+    event: Event
+    detail: str = ""
+
+
+S, E = State, Event
+BEFORE_MOTORS = (S.CHECK, S.ARM)
+GUIDED = (S.FLY, S.LAND)  # leader and follower laws are in command
+AIRBORNE = (S.RAMP, S.FLY, S.LAND, S.DESCEND, S.HOLD)
+ENDED = (S.STOP, S.KILL, S.DONE)
+
+
+def _table() -> dict[tuple[State, Event], State]:
+    """Every pair that changes the state; all others keep it."""
+    table = {
+        (S.CHECK, E.READY): S.ARM,
+        (S.ARM, E.ARMED): S.RAMP,
+        (S.RAMP, E.HOVERING): S.FLY,
+        (S.FLY, E.TIME_UP): S.LAND,
+        (S.FLY, E.INTERRUPT): S.LAND,
+        (S.FLY, E.BATTERY): S.LAND,
+        (S.FLY, E.WATCHDOG): S.LAND,
+        (S.RAMP, E.WATCHDOG): S.DESCEND,
+        (S.RAMP, E.INTERRUPT): S.DESCEND,
+        (S.RAMP, E.BATTERY): S.DESCEND,
+    }
+    # Before the motors turn, whatever is wrong ends it.
+    harmless = {E.READY, E.ARMED, E.HOVERING, E.TIME_UP, E.TOUCHED_DOWN, E.SATURATED, E.DEADLINES}
+    for state in BEFORE_MOTORS:
+        for event in E:
+            if event not in harmless:
+                table[state, event] = S.STOP
+    # In the air: what can still be flown sinks level, what cannot be heard is mirrored, what is lost is cut.
+    for state in AIRBORNE:
+        table[state, E.DRONE_DOWN] = S.STOP
+        table[state, E.TILT] = S.STOP
+        table[state, E.STICK] = S.STOP
+        for event in (E.STALE, E.LINK_LOST):
+            table[state, event] = S.HOLD
+    for state in (S.RAMP, *GUIDED):
+        for event in (E.BAD_STATE, E.FENCE, E.SATURATED, E.DEADLINES):
+            table[state, event] = S.DESCEND
+    table[S.RAMP, E.TIMEOUT] = S.DESCEND
+    table[S.FLY, E.TIMEOUT] = S.LAND
+    table[S.LAND, E.TIMEOUT] = S.DESCEND
+    for state in (S.LAND, S.DESCEND):
+        table[state, E.TOUCHED_DOWN] = S.STOP
+    for state in (S.DESCEND, S.HOLD):
+        table[state, E.TIMEOUT] = S.STOP
+        table[state, E.BAD_STATE] = S.STOP if state is S.DESCEND else S.HOLD
+    table[S.STOP, E.TIMEOUT] = S.DONE
+    table[S.KILL, E.TIMEOUT] = S.DONE
+    for state in S:
+        if state not in (S.KILL, S.DONE):
+            table[state, E.KEY_KILL] = S.KILL
+    return table
+
+
+TRANSITIONS = {pair: state for pair, state in _table().items() if pair[0] is not state}
+# Of several events at once the one that leads furthest counts; the flight's exit code is 1 after any of these.
+FAULTS = frozenset(E) - {E.READY, E.ARMED, E.HOVERING, E.TIME_UP, E.INTERRUPT, E.TOUCHED_DOWN, E.TIMEOUT}
+
+
+@dataclass(frozen=True)
+class Supervisor:
+    """State and when it was entered. Immutable: `after` returns the next one."""
+
+    state: State = State.CHECK
+    since: float = 0.0  # [s]
+    cause: Fault | None = None  # what began the abort
+
+    def after(self, faults: list[Fault], now: float) -> Supervisor:
+        """The supervisor after everything that happened in one tick ending at `now` [s]."""
+        best, why = self.state, None
+        for fault in faults:
+            reached = TRANSITIONS.get((self.state, fault.event), self.state)
+            if why is not None and why.event is Event.KEY_KILL:
+                break  # nobody who pressed it wants anything else
+            if reached.severity > best.severity or (reached is not best and fault.event is Event.KEY_KILL):
+                best, why = reached, fault
+        if why is None:
+            return self
+        first = self.cause or (why if why.event in FAULTS else None)
+        return Supervisor(best, now, first)
+
+
+def table_rows() -> list[tuple[str, str, str]]:
+    """(state, event, next state) of every transition, in the order of the enumerations: what the docs print."""
+    order = [(state, event) for state in State for event in Event]
+    return [(s.value, e.value, TRANSITIONS[s, e].value) for s, e in order if (s, e) in TRANSITIONS]

@@ -1,0 +1,172 @@
+"""The watchdog: a process of its own that brings both drones down if the runner dies or hangs in the air.
+
+The runner writes a frame at every tick. A closed pipe is its death, a silent one while flying a hang: it is then
+killed, so that its radio is free, and the watchdog opens both links itself and flies the blind way down: level, a
+little less than the last trim, then stop. It uses cflib's drivers alone: no tables, no parameters, no waiting.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from mjxball.fly import maneuver, packets
+from mjxball.fly.packets import Packet, Setpoint
+
+FRAME = struct.Struct("<BHHf")  # what is going on, trims of leader and follower [thrust units], height [m]
+IDLE, FLYING, GOODBYE = 0, 1, 2
+SILENCE = 0.3  # [s] without a frame while flying: the firmware levels at 0.5 s and stops at 2 s
+PERIOD = 0.02  # [s] of the setpoints on the way down
+STOPPING = 0.5  # [s] for which stops are repeated
+OPENING = 2.0  # [s] for which a link is tried: then the firmware has stopped by itself
+
+
+class Watchdog:
+    """The runner's end. A context manager; `beat` never blocks."""
+
+    def __init__(self, uris: Sequence[str], start_limit: float = 15.0):
+        """Start the process and wait until it is ready. Raises OSError if it is not within `start_limit` [s]."""
+        arguments = [sys.executable, "-m", "mjxball.fly.watchdog", str(os.getpid()), *uris]
+        # A session of its own: Ctrl-C and a closing terminal are for the runner.
+        self._process = subprocess.Popen(
+            arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._pipe = self._process.stdin.fileno()
+        readable, _, _ = select.select([self._process.stdout], [], [], start_limit)
+        if not readable or not self._process.stdout.read(1):
+            self._process.kill()
+            raise OSError(f"the watchdog process was not ready within {start_limit:g} s")
+        os.set_blocking(self._pipe, False)
+
+    @property
+    def pid(self) -> int:
+        """Of the watchdog process."""
+        return self._process.pid
+
+    def beat(self, flying: bool, thrusts: tuple[int, int], height: float) -> bool:
+        """We live, and this is what it would take over; false if the watchdog has ended."""
+        return self._write(FRAME.pack(FLYING if flying else IDLE, *thrusts, height))
+
+    def _write(self, frame: bytes) -> bool:
+        try:
+            os.write(self._pipe, frame)
+        except BlockingIOError:  # it does not read: its pipe holds 64 KiB, a minute of frames
+            return False
+        except OSError:
+            return False
+        return True
+
+    def __enter__(self) -> Watchdog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._write(FRAME.pack(GOODBYE, 0, 0, 0.0))
+        with contextlib.suppress(OSError):
+            assert self._process.stdin is not None
+            self._process.stdin.close()
+        try:
+            self._process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(timeout=5)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+
+def watch(pipe: int, runner: int) -> tuple[int, int, float] | None:
+    """Read frames from `pipe` until the runner is gone; (trims, height) to take over with, None if all is well."""
+    state, thrusts, height = IDLE, (0, 0), 0.0
+    waiting = b""
+    while True:
+        readable, _, _ = select.select([pipe], [], [], SILENCE if state == FLYING else None)
+        if not readable:  # it hangs in the air: only its death frees the radio
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(runner, signal.SIGKILL)
+            return (*thrusts, height)
+        received = os.read(pipe, 4096)
+        if not received:
+            return (*thrusts, height) if state == FLYING else None
+        waiting += received
+        while len(waiting) >= FRAME.size:
+            state, leader, follower, height = FRAME.unpack(waiting[: FRAME.size])
+            thrusts, waiting = (leader, follower), waiting[FRAME.size :]
+            if state == GOODBYE:
+                return None
+
+
+def way_down(trim: int, height: float) -> list[Packet]:
+    """What one drone is sent, one packet per period: level and sinking, then stops and zeros."""
+    thrust = min(max(round(maneuver.BLIND_THRUST * trim), 0), packets.THRUST_CEILING)
+    sinking = packets.setpoint_packet(Setpoint(0.0, 0.0, 0.0, thrust))
+    count = round(maneuver.blind_time(height) / PERIOD) if thrust else 0
+    ending = [packets.STOP, packets.setpoint_packet(packets.ZERO)] * round(STOPPING / PERIOD / 2)
+    return [sinking] * count + ending + [packets.STOP]
+
+
+def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
+    """Open the link at `uri` and send `plan` by the clock from `start` [s], so that both drones stay together."""
+    import cflib.crtp
+    from cflib.crtp.crtpstack import CRTPPacket
+
+    driver = _open(cflib.crtp, uri)
+    if driver is None:
+        return
+    for number, packet in enumerate(plan):
+        wait = start + number * PERIOD - time.monotonic()
+        if wait < -PERIOD and number < len(plan) - 5:
+            continue  # the time of this one passed while the link was opened
+        time.sleep(max(wait, 0.0))
+        wire = CRTPPacket()
+        wire.set_header(packet.port, packet.channel)
+        wire.data = packet.data
+        with contextlib.suppress(Exception):
+            driver.send_packet(wire)
+    with contextlib.suppress(Exception):
+        driver.close()
+
+
+def _open(crtp: Any, uri: str) -> Any:
+    """The driver for `uri`; tried again while the dead runner's radio is not free yet."""
+    deadline = time.monotonic() + OPENING
+    while time.monotonic() < deadline:
+        with contextlib.suppress(Exception):
+            return crtp.get_link_driver(uri, lambda statistics: None, lambda error: None)
+        time.sleep(0.05)
+    return None
+
+
+def main(arguments: Sequence[str]) -> int:
+    """`python -m mjxball.fly.watchdog RUNNER_PID URI URI`: watch standard input."""
+    import cflib.crtp
+
+    runner, uris = int(arguments[0]), arguments[1:]
+    cflib.crtp.init_drivers()
+    os.write(sys.stdout.fileno(), b"\n")
+    left = watch(sys.stdin.fileno(), runner)
+    if left is None:
+        return 0
+    start, height = time.monotonic(), left[2]
+    threads = [
+        threading.Thread(target=bring_down, args=(uri, way_down(int(trim), height), start), daemon=True)
+        for uri, trim in zip(uris, left[:2], strict=True)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=OPENING + 5)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
