@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjxball.control import rotations
 from mjxball.fly import packets
 from mjxball.fly.packets import DroneState
 from mjxball.fly.supervisor import Event, Fault
@@ -79,7 +78,7 @@ def stick_faults(states: list[DroneState], span: np.ndarray, limits: Limits) -> 
 
 def tilt_of(state: DroneState) -> float:
     """Angle between body z and up [rad]."""
-    return math.acos(min(max(float(rotations.matrix_from_quaternion(state.quaternion)[2, 2]), -1.0), 1.0))
+    return math.acos(min(max(packets.level_share(state.quaternion), -1.0), 1.0))
 
 
 def down_reason(info: int, armed: bool = True) -> str:

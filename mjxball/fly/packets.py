@@ -171,5 +171,10 @@ def decompress_quaternion(packed: int) -> np.ndarray:
     return np.array([wire[3], wire[0], wire[1], wire[2]])
 
 
+def level_share(quaternion: np.ndarray) -> float:
+    """Cosine of the angle between body z and up, of a unit `quaternion` (w, x, y, z)."""
+    return 1.0 - 2.0 * (float(quaternion[1]) ** 2 + float(quaternion[2]) ** 2)
+
+
 def _int16(value: float) -> int:
     return min(max(round(value), -0x8000), 0x7FFF) if math.isfinite(value) else 0

@@ -130,13 +130,14 @@ class Supervisor:
 
     def after(self, faults: list[Fault], now: float) -> Supervisor:
         """The supervisor after everything that happened in one tick ending at `now` [s]."""
-        best, why = self.state, None
-        for fault in faults:
-            reached = TRANSITIONS.get((self.state, fault.event), self.state)
-            if why is not None and why.event is Event.KEY_KILL:
-                break  # nobody who pressed it wants anything else
-            if reached.severity > best.severity or (reached is not best and fault.event is Event.KEY_KILL):
-                best, why = reached, fault
+        led = [
+            (TRANSITIONS[self.state, fault.event], fault)
+            for fault in faults
+            if (self.state, fault.event) in TRANSITIONS
+        ]
+        # Whoever pressed the kill key wants nothing else.
+        asked = [pair for pair in led if pair[1].event is Event.KEY_KILL]
+        best, why = max(asked or led, key=lambda pair: pair[0].severity, default=(self.state, None))
         if why is None:
             return self
         first = self.cause or (why if why.event in FAULTS else None)

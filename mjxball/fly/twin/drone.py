@@ -48,11 +48,11 @@ class TwinDrone:
         for datagram in self.up.due(now):
             for answer in self.peer.receive(datagram, now):
                 self.down.push(answer, now, self.link, self.link.silent_down)
-        upright = rotations.matrix_from_quaternion(state.quaternion)[2, 2] > 0
-        self.setpoint = self.firmware.step(now, force_z, bool(upright))
+        self.setpoint = self.firmware.step(now, force_z, packets.level_share(state.quaternion) > 0)
         if not self.faults.clock_stopped:
             self._stamp = now
-        if not self.faults.frozen:
+        # Every variable is computed only when a packet is due: a twin that is never late needs the time.
+        if not self.faults.frozen and self.peer.is_due(now):
             self._readings = self._read(state, force_z, now)
         self._readings["supervisor.info"] = self.firmware.info
         return self.setpoint

@@ -81,6 +81,10 @@ class Peer:
         """A datagram that prints `text` on the laptop."""
         return bytes([header(CONSOLE, 0)]) + text.encode()[:MAX_DATA]
 
+    def is_due(self, now: float) -> bool:
+        """True if `log_data` has something to send at `now` [s]."""
+        return any(block.period and now >= block.due for block in self.blocks.values())
+
     def log_data(self, readings: Mapping[str, float], now: float) -> list[bytes]:
         """The datagrams of all blocks that are due at `now`; their time stamp is `now` in ms."""
         sent = []

@@ -93,9 +93,9 @@ class StandIn:
         lifting = force[2] > 0
         self._position = np.append(self._position[:2], 0.0)
         self._velocity = np.array([0.0, 0.0, max(self._velocity[2], 0.0) if lifting else 0.0])
-        upside_down = rotations.matrix_from_quaternion(self._quaternion)[2, 2] < 0
-        if not upside_down:
-            yaw = rotations.euler_from_matrix(rotations.matrix_from_quaternion(self._quaternion))[2]
+        matrix = rotations.matrix_from_quaternion(self._quaternion)
+        if matrix[2, 2] > 0:  # else it lies on its back
+            yaw = rotations.euler_from_matrix(matrix)[2]
             self._quaternion = rotations.quaternion_from_euler(np.array([0.0, 0.0, yaw]))
         self._rates = np.zeros(3)
         return force if lifting else np.zeros(3)
@@ -103,12 +103,12 @@ class StandIn:
     def _state(self, acceleration: np.ndarray) -> PairState:
         plant, matrix = self.plant, rotations.matrix_from_quaternion(self._quaternion)
         arms = self._mounts @ matrix.T
-        spin = matrix @ self._rates
+        swing = rotations.cross(self._rates, self._mounts) @ matrix.T
         load = self._thrust / plant.curve.force(65535)
         felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
         return PairState(
             position=self._position + arms,
-            velocity=self._velocity + np.cross(spin, arms),
+            velocity=self._velocity + swing,
             quaternion=np.stack([self._quaternion] * 2),
             rates=np.stack([self._rates] * 2),
             specific_force=np.stack([felt] * 2),

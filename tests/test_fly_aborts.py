@@ -1,0 +1,165 @@
+"""Aborts in virtual time: every kind of fault, at either drone, brings both down in the way the table says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from fly_virtual import World, thrusts
+
+from mjxball.fly.flight import FlightSettings
+from mjxball.fly.maneuver import Times
+from mjxball.fly.packets import THRUST_CEILING
+from mjxball.fly.supervisor import Event, State
+
+
+def silence_down(world: World, number: int) -> None:
+    world.disturb(number, silent_down=True)
+
+
+def silence_up(world: World, number: int) -> None:
+    world.disturb(number, silent_up=True)
+
+
+def silence(world: World, number: int) -> None:
+    world.disturb(number, silent_up=True, silent_down=True)
+
+
+def frozen(world: World, number: int) -> None:
+    world.spoil(number, frozen=True)
+
+
+def clock(world: World, number: int) -> None:
+    world.spoil(number, clock_stopped=True)
+
+
+def slow(world: World, number: int) -> None:
+    world.disturb(number, delay=0.25)
+
+
+def jump(world: World, number: int) -> None:
+    world.spoil(number, offset=(0.0, 0.0, 0.4))
+
+
+def away(world: World, number: int) -> None:
+    for drone in range(2):
+        world.spoil(drone, offset=(3.0, 0.0, 0.0))
+
+
+def empty(world: World, number: int) -> None:
+    world.spoil(number, battery=-1.2)
+
+
+def crash(world: World, number: int) -> None:
+    world.drones[number].firmware.crashed = True
+
+
+def reboot(world: World, number: int) -> None:
+    world.drones[number].reboot()
+
+
+def lost(world: World, number: int) -> None:
+    world.links[number].lost = "dongle unplugged"
+
+
+def stuck(world: World, number: int) -> None:
+    world.links[number].stuck = 0.5
+
+
+def broken_policy(world: World, number: int) -> None:
+    world.flight.pilot.policy.reset()
+    world.flight.pilot.policy._biases[-1][:] = math.nan
+
+
+def interrupt(world: World, number: int) -> None:
+    world.flight.interrupts = 1
+
+
+def kill(world: World, number: int) -> None:
+    world.flight.kill = True
+
+
+# What is done, whether at one drone or both, the event it shows as, the first state of the abort.
+FAULTS: dict[Callable[[World, int], None], tuple[Event | None, str]] = {
+    silence_down: (Event.STALE, "hold"),
+    silence: (Event.STALE, "hold"),
+    slow: (Event.STALE, "hold"),
+    clock: (Event.STALE, "hold"),
+    reboot: (Event.STALE, "hold"),
+    lost: (Event.LINK_LOST, "hold"),
+    stuck: (Event.LINK_LOST, "hold"),
+    jump: (Event.STICK, "stop"),
+    crash: (Event.DRONE_DOWN, "stop"),
+    away: (Event.FENCE, "descend"),
+    broken_policy: (Event.BAD_STATE, "descend"),
+    empty: (Event.BATTERY, "land"),
+    interrupt: (None, "land"),
+    kill: (Event.KEY_KILL, "kill"),
+}
+QUICK = Times(arm=0.1, ramp=0.5, stop=0.2)
+SECONDS = 8.0
+SAFE_WITHIN = 9.0  # [s] battery_time 5, then LAND; all others are far below
+
+
+@pytest.mark.parametrize("number", [0, 1])
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_any_fault_brings_both_down(fault: Callable[[World, int], None], number: int) -> None:
+    event, first = FAULTS[fault]
+    world = World(FlightSettings(seconds=SECONDS + 10, times=QUICK))
+    world.fly_until(State.FLY)
+    world.fly_for(1.0)
+    fault(world, number)
+    world.fly_for(SECONDS + SAFE_WITHIN)
+    assert world.flight.supervisor.state is State.DONE
+    assert world.notes.transitions()[3] == first
+    cause = world.flight.supervisor.cause
+    assert (cause.event if cause else None) is event
+    world.advance(2.5)  # beyond the firmware's own watchdog
+    assert world.running() == [False, False]
+    assert world.state.position[:, 2].max() < 0.35  # on the ground; the stick has a length, the drones none
+    for drone in range(2):
+        assert thrusts(world, drone)[-1][1] == 0  # high thrust is never the last command
+        assert max(thrust for _, thrust in thrusts(world, drone)) <= THRUST_CEILING
+
+
+@pytest.mark.parametrize("fault", [silence, lost, silence_up], ids=lambda fault: fault.__name__)
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
+    fault: Callable[[World, int], None], number: int
+) -> None:
+    world = World(FlightSettings(seconds=20.0))
+    world.fly_until(State.FLY)
+    world.fly_for(2.5)
+    fault(world, number)
+    if fault is silence_up:
+        world.disturb(number, silent_up=True, silent_down=True)
+    began = world.now
+    world.fly_until(State.STOP)
+    # The firmware of the lost drone stops it 2 s after its last setpoint; the other must not have stopped long before.
+    assert world.now - began == pytest.approx(2.0, abs=0.15)
+    tilt = [world.state.quaternion[0, 1], world.state.quaternion[0, 2]]
+    assert 2 * np.abs(tilt).max() < math.radians(20)
+
+
+def test_a_drone_that_hears_nothing_but_is_heard_levels_and_locks() -> None:
+    world = World(FlightSettings(seconds=20.0))
+    world.fly_until(State.FLY)
+    world.fly_for(1.0)
+    silence_up(world, 1)
+    world.fly_until(State.DONE)
+    # Over a radio this cannot be: states come with the acknowledgements. Here the flight finds it by what follows.
+    assert world.flight.supervisor.cause is not None
+    world.advance(2.5)
+    assert world.running() == [False, False]
+
+
+def test_a_frozen_estimator_is_found() -> None:
+    world = World(FlightSettings(seconds=20.0, goal=(0.8, 0.5, 0.8)))
+    world.fly_until(State.FLY)
+    world.fly_for(0.4)
+    frozen(world, 0)
+    world.fly_until(State.DONE)
+    assert world.flight.supervisor.cause is not None
+    assert world.running() == [False, False]

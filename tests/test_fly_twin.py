@@ -1,0 +1,169 @@
+"""The twin as the unmodified cflib sees it: connection, tables, parameters, log, supervisor, and both ends' signs."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjxball.control import rotations
+from mjxball.fly import packets
+from mjxball.fly.packets import Setpoint
+from mjxball.fly.twin import tables
+from mjxball.fly.twin.body import PairState
+from mjxball.fly.twin.server import HOST, Twin
+from mjxball.fly.twin.standin import StandIn
+
+cflib = pytest.importorskip("cflib")
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
+    """True once `condition` holds; false after `seconds`."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+class Told(StandIn):
+    """The stand-in, and what it was told."""
+
+    def __init__(self) -> None:
+        self.parameters: list[tuple[int, str, float]] = []
+        self.setpoints = np.zeros((2, 4))
+        super().__init__()
+
+    def set_parameter(self, drone: int, name: str, value: float) -> None:
+        self.parameters.append((drone, name, value))
+
+    def advance(self, setpoints: np.ndarray, dt: float) -> PairState:
+        self.setpoints = setpoints
+        return super().advance(setpoints, dt)
+
+
+@pytest.fixture(scope="module")
+def flown() -> Iterator[tuple[Twin, Told, Any]]:
+    """A twin, its physics, and cflib connected to the leader."""
+    import cflib.crtp
+    from cflib.crazyflie import Crazyflie
+
+    if not cflib.crtp.CLASSES:
+        cflib.crtp.init_drivers()
+    physics = Told()
+    with Twin(physics) as twin:
+        crazyflie, ready = Crazyflie(), threading.Event()
+        crazyflie.fully_connected.add_callback(lambda uri: ready.set())
+        crazyflie.open_link(twin.uris[0])
+        assert ready.wait(10)
+        yield twin, physics, crazyflie
+        crazyflie.close_link()
+    assert twin.failure is None
+
+
+def test_cflib_finds_every_table_entry(flown: tuple[Twin, Told, Any]) -> None:
+    crazyflie = flown[2]
+    assert crazyflie.platform.get_protocol_version() == 12
+    for name, kind in tables.LOG_VARIABLES:
+        assert crazyflie.log.toc.get_element_by_complete_name(name).ctype == kind
+    for parameter in tables.PARAMETERS:
+        element = crazyflie.param.toc.get_element_by_complete_name(parameter.name)
+        assert element.ctype == parameter.kind
+        assert element.is_persistent() == parameter.persistent
+        assert (element.access == element.RO_ACCESS) == parameter.read_only
+        assert float(crazyflie.param.get_value(parameter.name)) == pytest.approx(parameter.default)
+
+
+def test_a_parameter_is_written_read_back_and_reaches_the_physics(flown: tuple[Twin, Told, Any]) -> None:
+    _, physics, crazyflie = flown
+    crazyflie.param.set_value("pid_attitude.roll_kp", 4.5)
+    assert wait_for(lambda: crazyflie.param.get_value("pid_attitude.roll_kp") == "4.5")
+    assert (0, "pid_attitude.roll_kp", 4.5) in physics.parameters
+    defaults: list[Any] = []
+    crazyflie.param.get_default_value("pid_attitude.roll_kp", lambda name, value: defaults.append(value))
+    assert wait_for(lambda: bool(defaults))
+    assert defaults == [6.0]
+
+
+def test_all_of_a_state_comes_in_one_packet_at_100_hz(flown: tuple[Twin, Told, Any]) -> None:
+    from cflib.crazyflie.log import LogConfig
+
+    _, _, crazyflie = flown
+    block, seen = LogConfig("state", 10), []
+    for name, kind in packets.STATE_VARIABLES:
+        block.add_variable(name, kind)
+    block.data_received_cb.add_callback(lambda stamp, values, config: seen.append((stamp, values)))
+    crazyflie.log.add_config(block)
+    block.start()
+    assert wait_for(lambda: len(seen) >= 30)
+    block.stop()
+    block.delete()
+    assert set(seen[-1][1]) == {name for name, _ in packets.STATE_VARIABLES}
+    stamps = np.array([stamp for stamp, _ in seen])
+    assert set(np.diff(stamps)) <= {5, 10, 15}  # the twin's own clock, whatever this machine's does
+    assert seen[-1][1]["stateEstimateZ.y"] == pytest.approx(-150, abs=1)
+    assert seen[-1][1]["supervisor.info"] & packets.CAN_FLY
+
+
+def test_setpoints_and_supervisor(flown: tuple[Twin, Told, Any]) -> None:
+    twin, physics, crazyflie = flown
+    crazyflie.commander.send_setpoint(0, 0, 0, 0)
+    crazyflie.commander.send_setpoint(1.0, 2.0, 3.0, 12000)
+    assert wait_for(lambda: physics.setpoints[0, 3] == 12000)
+    assert physics.setpoints[0].tolist() == [1.0, -2.0, 3.0, 12000]
+    crazyflie.commander.send_stop_setpoint()
+    assert wait_for(lambda: physics.setpoints[0, 3] == 0)
+    assert crazyflie.supervisor.is_armed
+    assert crazyflie.supervisor.can_fly
+    crazyflie.supervisor.send_emergency_stop()
+    assert wait_for(lambda: bool(twin.truth.info[0] & packets.LOCKED))
+    assert wait_for(lambda: crazyflie.supervisor.is_locked)
+    assert not twin.truth.info[1] & packets.LOCKED
+
+
+def test_a_scan_is_answered(flown: tuple[Twin, Told, Any]) -> None:
+    port = int(flown[0].uris[1].rsplit(":", 1)[1])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.settimeout(2)
+        sock.sendto(b"\xff", (HOST, port))
+        assert sock.recv(64)
+
+
+@pytest.mark.parametrize(
+    ("wire", "axis", "sign"),
+    [((8, 0, 0), 1, -1), ((0, -8, 0), 0, +1)],  # crazyflie.md: +8 roll moves toward -y, +8 pitch toward +x
+)
+def test_tilts_move_the_way_a_crazyflie_moves(wire: tuple[float, float, float], axis: int, sign: int) -> None:
+    pair = StandIn()
+    row = Setpoint(*wire, round(pair.plant.curve.thrust(pair.plant.mass * 9.81 / 2)) + 3000)
+    for _ in range(200):
+        state = pair.advance(np.array([row, row], float), 0.005)
+    assert sign * state.velocity[0, axis] > 0.2
+    tilt = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion[0]))
+    assert np.degrees(tilt[:2]) == pytest.approx([wire[0], -wire[1]], abs=0.5)
+
+
+def test_a_positive_yaw_rate_turns_clockwise() -> None:
+    pair = StandIn()
+    row = Setpoint(0, 0, 40.0, round(pair.plant.curve.thrust(pair.plant.mass * 9.81 / 2)) + 3000)
+    for _ in range(200):
+        state = pair.advance(np.array([row, row], float), 0.005)
+    assert np.degrees(state.rates[0, 2]) == pytest.approx(-40, abs=2)
+
+
+def test_the_stick_is_rigid_and_what_falls_falls() -> None:
+    pair = StandIn()
+    for number in range(400):
+        thrust = 50000 if number < 200 else 0
+        row = Setpoint(5.0, 3.0, 20.0, thrust)
+        state = pair.advance(np.array([row, row], float), 0.005)
+        assert np.linalg.norm(state.position[0] - state.position[1]) == pytest.approx(0.3, abs=1e-9)
+        if thrust and state.position[0, 2] > 0.05:
+            assert state.specific_force[0, 2] > 0.5 * 9.81
+    assert state.velocity[0, 2] < 0 or state.position[:, 2].max() < 0.01
