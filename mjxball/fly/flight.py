@@ -109,6 +109,7 @@ class Flight:
         self._hold_for = settings.times.drone_watchdog
         self._land_height = 0.0
         self.worst_age = 0.0
+        self.highest = [0, 0]  # thrust of each drone that was wanted [units]
 
     def begin(self, now: float) -> None:
         """Where the pair stands now is where it starts; both links must have a state."""
@@ -292,6 +293,7 @@ class Flight:
         if state in (State.RAMP, *GUIDED):
             self._trims = [maneuver.smoothed(t, s.thrust, period) for t, s in zip(self._trims, wanted, strict=True)]
         self._sent = wanted
+        self.highest = [max(most, value.thrust) for most, value in zip(self.highest, wanted, strict=True)]
         for link, value in zip(self.links, wanted, strict=True):
             if state is State.STOP:
                 link.command(packets.STOP)

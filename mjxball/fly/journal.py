@@ -81,7 +81,7 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
         for line in stream:
             if not line.endswith(b"\n"):
                 return
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, RecursionError):
                 record = json.loads(line)
                 if isinstance(record, dict) and "t" in record and "kind" in record:
                     yield record

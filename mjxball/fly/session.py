@@ -19,7 +19,7 @@ from mjxball.fly.journal import Journal
 from mjxball.fly.keys import listening
 from mjxball.fly.limits import NAMES
 from mjxball.fly.link import Link
-from mjxball.fly.loop import Metronome, Timing
+from mjxball.fly.loop import Metronome, Timing, urgent
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, check, prepare
 from mjxball.fly.supervisor import FAULTS, Event
@@ -53,7 +53,8 @@ def fly(
         links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]
         try:
             sys.setswitchinterval(SWITCH_INTERVAL)
-            with Watchdog(uris) as guard:
+            with urgent() as priority, Watchdog(uris) as guard:
+                journal.note("priority", granted=priority)
                 prepare(links, crew.gains, crew.preflight)
                 flight = Flight(links, crew.pilot, crew.maps, crew.rig, settings, journal, guard)
                 flight.ready = _checked(links, crew, settings, journal)
@@ -124,6 +125,9 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     journal.note("end", code=code, cause=str(cause) if cause else "", timing=timing, overwritten=sent)
     if cause is not None:
         _say(f"ended by {cause.event.name.lower().replace('_', ' ')}{': ' + cause.detail if cause.detail else ''}")
+    if flight.settings.dry_run and flight.highest:
+        text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
+        _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
     late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
     _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
     if journal.failure:

@@ -1,0 +1,219 @@
+"""One drone over the real cflib: deadlines, parameters, ages, and links that die in every way."""
+
+from __future__ import annotations
+
+import dataclasses
+import socket
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from mjxball.errors import InputError
+from mjxball.fly import packets
+from mjxball.fly.link import Deadlines, Link, LinkError
+from mjxball.fly.packets import Setpoint
+from mjxball.fly.telemetry import WRAP, FirmwareClock
+from mjxball.fly.twin.faults import DroneFaults, LinkFaults
+from mjxball.fly.twin.server import HOST, Twin
+from mjxball.fly.twin.standin import StandIn
+
+pytest.importorskip("cflib")
+SHORT = Deadlines(connect=1.5, parameter=0.5, first_state=0.7, close=1.0)
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 3.0) -> bool:
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def nothing(kind: str, **fields: Any) -> None:
+    """In the place of the flight log."""
+
+
+@pytest.fixture
+def twin() -> Iterator[Twin]:
+    with Twin(StandIn()) as running:
+        yield running
+    assert running.failure is None
+
+
+@pytest.fixture
+def links() -> Iterator[Callable[..., Link]]:
+    made: list[Link] = []
+
+    def make(uri: str, deadlines: Deadlines = SHORT) -> Link:
+        made.append(Link(uri, "leader", nothing, deadlines))
+        return made[-1]
+
+    yield make
+    for link in made:
+        link.close()
+
+
+@pytest.fixture
+def link(twin: Twin, links: Callable[..., Link]) -> Link:
+    """An open link that sends states."""
+    opened = links(twin.uris[0], dataclasses.replace(SHORT, connect=10.0, first_state=5.0, parameter=3.0))
+    opened.open()
+    opened.start_states()
+    return opened
+
+
+def test_states_arrive_and_are_young(link: Link) -> None:
+    before = link.telemetry.received
+    assert wait_for(lambda: link.telemetry.received >= before + 50)
+    assert link.telemetry.age(time.monotonic()) < 0.1
+    assert link.telemetry.newest is not None
+    assert link.telemetry.newest.state.position[1] == pytest.approx(-0.15, abs=1e-3)
+    assert link.firmware["protocol"] == "12"
+
+
+def test_only_the_newest_setpoint_counts_and_commands_go_first(twin: Twin, link: Link) -> None:
+    link.send(packets.setpoint_packet(packets.ZERO))
+    assert wait_for(lambda: link.sent > 0)
+    for thrust in range(11000, 11100):
+        link.send(packets.setpoint_packet(Setpoint(0, 0, 0, thrust)))
+    assert wait_for(lambda: twin.truth.last_wire_thrust[0] == 11099)
+    assert link.sent + link.overwritten == 101
+    link.command(packets.EMERGENCY_STOP)
+    assert wait_for(lambda: bool(twin.truth.info[0] & packets.LOCKED))
+
+
+def test_parameters_are_written_and_read_back(twin: Twin, link: Link) -> None:
+    link.write_parameters({"pid_rate.pitch_kd": 3.25, "kalman.resetEstimation": 1.0})
+    assert twin.drones[0].peer.values["pid_rate.pitch_kd"] == 3.25
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("pid_rate.no_such", 1.0, "pid_rate.no_such"),
+        ("firmware.revision0", 1.0, "firmware.revision0"),
+        ("commander.enHighLevel", 300.0, "commander.enHighLevel"),
+    ],
+)
+def test_parameters_that_cannot_be_written_are_named(link: Link, name: str, value: float, reason: str) -> None:
+    with pytest.raises(LinkError, match=reason):
+        link.write_parameters({name: value})
+
+
+def test_a_parameter_that_does_not_stick_is_found(twin: Twin, link: Link) -> None:
+    values = twin.drones[0].peer.values
+
+    class Stubborn(dict):  # acknowledges the write and keeps the old value
+        def __setitem__(self, key: str, value: float) -> None:
+            pass
+
+    twin.drones[0].peer.values = Stubborn(values)
+    with pytest.raises(LinkError, match="reads 250"):
+        link.write_parameters({"pid_rate.roll_kp": 100.0})
+
+
+def test_a_parameter_that_is_never_confirmed_has_a_deadline(twin: Twin, link: Link) -> None:
+    twin.set_link(0, LinkFaults(silent_down=True))
+    with pytest.raises(LinkError, match="did not confirm"):
+        link.write_parameters({"pid_rate.roll_kp": 100.0})
+
+
+def test_nobody_there() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind((HOST, 0))
+        port = free.getsockname()[1]
+    link = Link(f"udp://{HOST}:{port}", "leader", nothing, SHORT)
+    with pytest.raises(InputError, match="cannot be reached"):
+        link.open()
+
+
+def test_somebody_who_never_answers() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mute:
+        mute.bind((HOST, 0))
+        link = Link(f"udp://{HOST}:{mute.getsockname()[1]}", "leader", nothing, SHORT)
+        started = time.monotonic()
+        with pytest.raises(InputError, match=r"no answer within 1\.5 s"):
+            link.open()
+        assert time.monotonic() - started < 10  # connect 1.5 and close 1.0, with slack for a busy machine
+
+
+def test_a_reply_that_is_lost_while_connecting_has_a_deadline(twin: Twin, links: Callable[..., Link]) -> None:
+    twin.set_link(0, LinkFaults(loss=0.3))  # of two hundred exchanges: one is lost for certain
+    with pytest.raises(LinkError, match="cannot be reached"):
+        links(twin.uris[0]).open()
+
+
+def test_silence_makes_the_state_old(twin: Twin, link: Link) -> None:
+    twin.set_link(0, LinkFaults(silent_down=True))
+    assert wait_for(lambda: link.telemetry.age(time.monotonic()) > 0.2)
+    assert link.lost is None  # a silent peer gives no error at all: only the age tells
+    twin.set_link(0, LinkFaults())
+    assert wait_for(lambda: link.telemetry.age(time.monotonic()) < 0.1)
+
+
+def test_delay_shows_in_the_firmwares_clock(twin: Twin, link: Link) -> None:
+    twin.set_link(0, LinkFaults(delay=0.3))
+    assert wait_for(lambda: link.telemetry.age(time.monotonic()) < 0.1)
+    time.sleep(0.5)
+    newest = link.telemetry.newest
+    assert newest is not None
+    now = time.monotonic()
+    assert now - newest.arrival < 0.25  # packets keep coming
+    assert link.telemetry.age(now) > 0.25  # and are old
+
+
+def test_a_stopped_clock_makes_the_state_old(twin: Twin, link: Link) -> None:
+    twin.set_faults(0, DroneFaults(clock_stopped=True))
+    assert wait_for(lambda: link.telemetry.age(time.monotonic()) > 0.3)
+
+
+def test_a_refused_datagram_ends_the_link_and_nothing_hangs(twin: Twin, link: Link) -> None:
+    twin.close_port(0)
+    for _ in range(30):
+        link.send(packets.setpoint_packet(packets.ZERO))
+        time.sleep(0.01)
+    assert wait_for(lambda: link.lost is not None)
+    started = time.monotonic()
+    link.close()
+    assert time.monotonic() - started < 5
+
+
+def test_loss_and_jitter_leave_states_in_order(twin: Twin, link: Link) -> None:
+    twin.set_link(0, LinkFaults(loss=0.2, jitter=0.03))
+    stamps = []
+    end = time.monotonic() + 1.0
+    while time.monotonic() < end:
+        assert link.telemetry.newest is not None
+        stamps.append(link.telemetry.newest.stamp)
+        time.sleep(0.002)
+    assert stamps == sorted(stamps)
+    assert len(set(stamps)) > 20
+    assert link.telemetry.late > 0  # the overtaken ones are counted and not used
+
+
+def test_the_firmware_clock_wraps() -> None:
+    clock = FirmwareClock()
+    assert clock.update(WRAP - 20, 100.0) == 0.0
+    assert clock.update(WRAP - 10, 100.01) == pytest.approx(0.01)
+    assert clock.update(5, 100.025) == pytest.approx(0.025)
+    assert clock.age(0.025, 100.03) == pytest.approx(0.005, abs=1e-5)
+
+
+def test_a_restarted_firmware_is_never_young_again() -> None:
+    clock = FirmwareClock()
+    clock.update(500_000, 100.0)
+    assert clock.update(20, 100.01) is None
+    assert clock.restarted
+    assert clock.age(0.0, 100.02) == float("inf")
+
+
+def test_a_slow_clock_is_no_delay() -> None:
+    clock, arrival = FirmwareClock(), 0.0
+    for number in range(60_000):  # ten minutes, 50 parts in a million slow
+        arrival = 0.01 * number * (1 + 50e-6)
+        seconds = clock.update(10 * number, arrival)
+        assert seconds is not None
+    assert clock.age(seconds, arrival) < 1e-3

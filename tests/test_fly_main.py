@@ -1,0 +1,180 @@
+"""The command line: refusals, a rehearsal from end to end, a dry run, and Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment, run
+
+from mjxball.fly import journal
+from mjxball.fly.main import main
+
+pytest.importorskip("cflib")
+URIS = ("--leader", "udp://127.0.0.1:19850", "--follower", "udp://127.0.0.1:19851")
+REFUSALS = [
+    ([TRANSPORT], "--leader URI is needed"),
+    ([TRANSPORT, "--leader", "udp://127.0.0.1:19850"], "--follower URI is needed"),
+    ([TRANSPORT, "--leader", "udp://127.0.0.1:1", "--follower", "udp://127.0.0.1:1"], "same drone"),
+    ([TRANSPORT, "--leader", "http://x", "--follower", "udp://127.0.0.1:1"], "no URI such as"),
+    ([TRANSPORT, "--leader", "udp://127.0.0.1:99999", "--follower", "udp://127.0.0.1:1"], "no URI such as"),
+    ([TRANSPORT, "--rehearse", "--leader", "radio://0/80/2M/E7E7E7E7E7"], "udp://127.0.0.1:PORT only"),
+    (["nowhere.npz", *URIS], "does not exist"),
+    ([TRANSPORT, *URIS, "--seconds", "-1"], "--seconds must be"),
+    ([TRANSPORT, *URIS, "--seconds", "nan"], "--seconds must be"),
+    ([TRANSPORT, *URIS, "--hover", "70000"], "--hover must be"),
+    ([TRANSPORT, *URIS, "--mass", "0"], "--mass must be"),
+    ([TRANSPORT, *URIS, "--goal", "0", "0", "inf"], "--goal must be"),
+    ([TRANSPORT, *URIS, "--log", TRANSPORT], "choose another name"),
+    ([TRANSPORT, *URIS, "--log", "/no/such/place/log.jsonl"], "choose another name"),
+    ([TRANSPORT, *URIS, "--gains", "/no/such/gains.json"], "cannot be read"),
+    ([TRANSPORT, *URIS, "--thrust", "guess"], "invalid choice"),
+    ([], "POLICY.npz"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "reason"), REFUSALS, ids=[reason for _, reason in REFUSALS])
+def test_refusals(arguments: list[object], reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(main, arguments) == 2
+    errors = capsys.readouterr().err
+    assert reason in errors
+    assert_one_line(errors)
+
+
+@pytest.mark.parametrize("text", ["[1]", "{", '{"a": 1}', '{"a.b": "x"}', '{"a.b": true}', '{"a.b": NaN}'])
+def test_gain_files_that_are_none(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "gains.json"
+    path.write_text(text)
+    assert call(main, [TRANSPORT, *URIS, "--gains", path]) == 2
+    assert "gain file" in capsys.readouterr().err
+
+
+def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
+    modules = ["main", "link", "session", "watchdog", "display", "twin.server", "twin.pairs", "rehearse"]
+    imports = ", ".join(f"mjxball.fly.{name}" for name in modules)
+    heavy = ("jax", "jaxlib", "mujoco", "flax", "brax", "cflib")
+    script = f"import sys, {imports}; print([name for name in {heavy!r} if name in sys.modules])"
+    done = run(["-c", f"import sys; sys.path.insert(0, {str(REPOSITORY)!r}); {script}"], tmp_path)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+class Ended(NamedTuple):
+    """How a flight of the command line ended."""
+
+    code: int
+    out: str
+    err: str
+    records: list[dict]
+
+    def states(self) -> list[str]:
+        return [record["after"] for record in self.records if record["kind"] == "transition"]
+
+    def ticks(self, state: str) -> list[dict]:
+        return [record for record in self.records if record["kind"] == "tick" and record["state"] == state]
+
+
+KINDS = {
+    "rehearsed": ["--seconds", "2", "--gains", "gains.json"],
+    "dry": ["--seconds", "1", "--dry-run"],
+    "interrupted": ["--seconds", "60"],
+    "terminated": ["--seconds", "60", "--thrust", "paper", "--hover", "47000"],
+}
+SIGNALS = {"interrupted": signal.SIGINT, "terminated": signal.SIGTERM}
+
+
+def started(name: str, place: Path) -> subprocess.Popen:
+    command = [sys.executable, "-m", "mjxball.fly", TRANSPORT, "--rehearse", "--log", f"{name}.jsonl", *KINDS[name]]
+    surroundings = {**environment(), "PYTHONPATH": str(REPOSITORY)}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([str(part) for part in command], cwd=place, env=surroundings, text=True, **pipes)
+
+
+@pytest.fixture(scope="module")
+def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Ended]:
+    """Four flights, two at a time, each with a twin of its own: rehearsed with gains, dry, interrupted, terminated."""
+    place = tmp_path_factory.mktemp("flights")
+    (place / "gains.json").write_text(json.dumps({"pid_attitude.roll_kp": 4.5, "pid_rate.roll_kd": 3.0}))
+    ended = {}
+    for names in (("rehearsed", "interrupted"), ("dry", "terminated")):
+        running = {name: started(name, place) for name in names}
+        try:
+            for name in names:
+                log, process = place / f"{name}.jsonl", running[name]
+                if name in SIGNALS and reaches(log, "fly", process):
+                    process.send_signal(SIGNALS[name])
+            for name, process in running.items():
+                out, err = process.communicate(timeout=60)
+                ended[name] = Ended(process.returncode, out, err, list(journal.read(place / f"{name}.jsonl")))
+        finally:
+            for process in running.values():
+                process.kill()
+                process.communicate()
+    return ended
+
+
+def reaches(log: Path, state: str, process: subprocess.Popen) -> bool:
+    """True once the log says that `state` was entered, false if the flight ends before."""
+    while process.poll() is None:
+        if log.exists() and f'"after": "{state}"' in log.read_text(encoding="utf-8"):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def flown(flight: Ended) -> Ended:
+    """`flight`, which must have ended safely; skips if this machine was too busy to fly it, which rightly aborts."""
+    assert flight.err == ""
+    assert flight.states()[-2:] == ["stop", "done"]
+    assert flight.ticks("done")[-1]["sent"] == [[0.0, 0.0, 0.0, 0]] * 2
+    events = {event.split(":")[0] for record in flight.records for event in record.get("events", [])}
+    if events & {"DEADLINES", "STALE", "REFUSED"}:
+        assert flight.code == 1
+        pytest.skip(f"the machine was too busy: {sorted(events)}")
+    return flight
+
+
+NORMAL = ["arm", "ramp", "fly", "land", "stop", "done"]
+
+
+def test_a_rehearsal(flights: dict[str, Ended]) -> None:
+    flight = flown(flights["rehearsed"])
+    assert (flight.code, flight.states()) == (0, NORMAL)
+    parameters = [record for record in flight.records if record["kind"] == "parameter"]
+    written = {(record["drone"], record["name"]): record["value"] for record in parameters}
+    for drone in ("leader", "follower"):
+        assert written[drone, "pid_attitude.roll_kp"] == 4.5
+        assert written[drone, "pid_rate.roll_kd"] == 3.0
+    errors = [abs(value) for value in flight.ticks("fly")[-1]["observation"][12:15]]
+    assert max(errors) < 0.1  # the pair has gone where it was sent
+
+
+def test_the_log_holds_everything(flights: dict[str, Ended]) -> None:
+    flight = flown(flights["rehearsed"])
+    kinds = {record["kind"] for record in flight.records}
+    assert {"header", "connected", "parameter", "check", "state", "transition", "tick", "end"} <= kinds
+    tick = flight.ticks("fly")[-1]
+    assert len(tick["observation"]) == 18
+    assert len(tick["leader"]) == len(tick["follower"]) == 3
+    assert len(tick["sent"]) == len(tick["ages"]) == 2
+    assert all(len(bytes.fromhex(record["raw"])) == 30 for record in flight.records if record["kind"] == "state")
+
+
+def test_a_dry_run(flights: dict[str, Ended]) -> None:
+    flight = flown(flights["dry"])
+    assert (flight.code, flight.states()) == (0, NORMAL)
+    assert "would have sent" in flight.out
+    assert any(tick["sent"][0][3] > 10000 for tick in flight.ticks("fly"))
+    assert max(tick["observation"][2] for tick in flight.ticks("fly")[1:]) < 0.01  # nothing has lifted
+
+
+@pytest.mark.parametrize("name", list(SIGNALS))
+def test_signals_land(flights: dict[str, Ended], name: str) -> None:
+    flight = flown(flights[name])
+    assert (flight.code, flight.states()) == (0, NORMAL)
+    assert any("INTERRUPT: asked for on the laptop" in record.get("events", []) for record in flight.records)
