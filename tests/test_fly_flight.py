@@ -11,7 +11,7 @@ from fly_virtual import World, thrusts
 
 from mjxball.fly import packets
 from mjxball.fly.flight import FlightSettings
-from mjxball.fly.maneuver import Times
+from mjxball.fly.maneuver import Glimpse, Times
 from mjxball.fly.supervisor import AIRBORNE, Event, State
 from mjxball.fly.twin.firmware import FirmwareTimes
 
@@ -99,19 +99,20 @@ def test_failed_checks_never_turn_a_motor() -> None:
 def test_a_watchdog_that_dies_ends_the_flight() -> None:
     world = World(FlightSettings(seconds=20.0))
     alive = [True]
-    beats: list[tuple[bool, tuple[int, int], float]] = []
+    beats: list[tuple[bool, Glimpse]] = []
 
     class Guard:
-        def beat(self, flying: bool, thrusts: tuple[int, int], height: float) -> bool:
-            beats.append((flying, thrusts, height))
+        def beat(self, flying: bool, seen: Glimpse) -> bool:
+            beats.append((flying, seen))
             return alive[0]
 
     world.flight.guard = Guard()
     world.fly_until(State.FLY)
     world.fly_for(2.0)
-    flying, trims, height = beats[-1]
+    flying, (trims, height, climb, _) = beats[-1]
     assert flying
     assert height == pytest.approx(world.state.position[:, 2].mean(), abs=0.05)
+    assert climb == pytest.approx(world.state.velocity[:, 2].mean(), abs=0.05)
     hover = world.flight.maps[0].hover_thrust
     assert all(abs(trim - hover) < 0.1 * hover for trim in trims)
     alive[0] = False

@@ -12,7 +12,7 @@ import numpy as np
 from mjxball.fly import command, limits, maneuver, packets, pair
 from mjxball.fly.command import CommandMap, Mapped
 from mjxball.fly.limits import Limits, Sustained
-from mjxball.fly.maneuver import Times
+from mjxball.fly.maneuver import Glimpse, Times
 from mjxball.fly.packets import ZERO, DroneState, Packet, PacketError, Setpoint
 from mjxball.fly.pilot import Commands, Pilot
 from mjxball.fly.supervisor import AIRBORNE, BEFORE_MOTORS, GUIDED, Event, Fault, State, Supervisor
@@ -40,7 +40,7 @@ class DroneLink(Protocol):
 class Guard(Protocol):
     """What a flight needs of the watchdog process."""
 
-    def beat(self, flying: bool, thrusts: tuple[int, int], height: float) -> bool:
+    def beat(self, flying: bool, seen: Glimpse) -> bool:
         """Tell it that we live; false if it does not."""
 
 
@@ -157,16 +157,20 @@ class Flight:
         faults += limits.age_faults(ages, bounds)
         if missed > bounds.missed_deadlines or gap > bounds.longest_gap:
             faults.append(Fault(Event.DEADLINES, f"{missed} missed in a second, longest gap {1000 * gap:.0f} ms"))
-        if self.guard is not None and not self._beat():
+        if not self._beat():
             faults.append(Fault(Event.WATCHDOG))
         return faults
 
     def _beat(self) -> bool:
-        states = self._states()
-        height = pair.object_state(states, self.rig).position[2] - self._origin[2] if len(states) == 2 else math.nan
-        flying = self.supervisor.state in AIRBORNE and not self.settings.dry_run
-        thrusts = tuple(round(trim) for trim in self._trims)
-        return self.guard is None or self.guard.beat(flying, (thrusts[0], thrusts[1]), float(height))
+        """Tell the watchdog what it would take over; false if there is none any more."""
+        if self.guard is None:
+            return True
+        now = pair.object_state(self._states(), self.rig)
+        trim = sum(self._trims)
+        lift = maneuver.GRAVITY * (sum(sent.thrust for sent in self._sent) / trim - 1) if trim else 0.0
+        trims = (round(self._trims[0]), round(self._trims[1]))
+        seen = Glimpse(trims, float(now.position[2] - self._origin[2]), float(now.velocity[2]), lift)
+        return self.guard.beat(self.supervisor.state in AIRBORNE and not self.settings.dry_run, seen)
 
     def _from_states(self, states: list[DroneState], now: float) -> list[Fault]:
         armed = self.supervisor.state not in BEFORE_MOTORS and not self.settings.dry_run
@@ -290,8 +294,11 @@ class Flight:
 
     def _transmit(self, wanted: list[Setpoint]) -> None:
         state, period = self.supervisor.state, self.settings.period
-        if state in (State.RAMP, *GUIDED):
-            self._trims = [maneuver.smoothed(t, s.thrust, period) for t, s in zip(self._trims, wanted, strict=True)]
+        if state is State.RAMP:
+            self._trims = [float(value.thrust) for value in wanted]
+        elif state in GUIDED:
+            parts = zip(self._trims, wanted, self.maps, strict=True)
+            self._trims = [maneuver.smoothed(trim, s.thrust, period, c.hover_thrust) for trim, s, c in parts]
         self._sent = wanted
         self.highest = [max(most, value.thrust) for most, value in zip(self.highest, wanted, strict=True)]
         for link, value in zip(self.links, wanted, strict=True):

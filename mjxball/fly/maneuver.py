@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from mjxball.fly.command import CommandMap, slewed
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, Setpoint, setpoint
@@ -50,17 +51,42 @@ def level(thrust: float, last: Setpoint, period: float, constants: CommandMap) -
     return slewed(setpoint(0.0, 0.0, 0.0, bounded), last, period, constants)
 
 
-def smoothed(trim: float, thrust: float, period: float, constant: float = 0.3) -> float:
-    """Running average of the thrust that hovers, with a time `constant` [s]."""
-    return trim - math.expm1(-period / constant) * (thrust - trim)
+def smoothed(trim: float, thrust: float, period: float, hover: float) -> float:
+    """Running average over a second of the thrust that hovers, no further than 15 % from what the rig should need.
+
+    A climb that has just begun must not pass for hovering: the bound keeps what is flown blind near the truth.
+    """
+    moved = trim - math.expm1(-period) * (thrust - trim)
+    return min(max(moved, 0.85 * hover), 1.15 * hover)
 
 
-# The blind way down, when nothing but the last trims and the last height is known.
-BLIND_THRUST = 0.93  # of the trim: 0.7 m/s2 down
-BLIND_SINKING = (1 - BLIND_THRUST) * 9.81  # [m/s2]
+class Glimpse(NamedTuple):
+    """What is known of the pair at the moment when nothing more will be heard of it."""
+
+    trims: tuple[int, int]  # thrust that hovers, leader and follower [thrust units]
+    height: float  # of O above where it stood [m]
+    climb: float  # its vertical speed [m/s]
+    lift: float  # its vertical acceleration under the setpoints that were sent last [m/s2]
 
 
-def blind_time(height: float) -> float:
-    """How long a blind descent from `height` [m] takes, with 0.2 s to spare, at most 2.5 s."""
-    known = height if math.isfinite(height) else 0.0
-    return min(math.sqrt(2 * max(known, 0.0) / BLIND_SINKING) + 0.2, 2.5)
+GRAVITY = 9.81
+BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
+BLIND_LIMIT = 2.5  # [s] that it lasts at most
+
+
+def blind_shares(seen: Glimpse, unheard: float, period: float) -> list[float]:
+    """Shares of the trim for a descent that is flown blind, one per `period` [s], all below 1.
+
+    The first `unheard` seconds went by under the last setpoints. From there the pair's height is computed, not
+    measured: sink at `BLIND_SPEED` until it must stand, and 0.1 s more.
+    """
+    known = [value if math.isfinite(value) else 0.0 for value in (seen.height, seen.climb, seen.lift)]
+    lift = min(max(known[2], -3.0), 3.0)
+    height = known[0] + known[1] * unheard + 0.5 * lift * unheard**2
+    climb, shares = known[1] + lift * unheard, []
+    while height > 0 and len(shares) * period < BLIND_LIMIT:
+        wanted = min(max(3 * (-BLIND_SPEED - climb), -3.0), -0.15)
+        shares.append(1 + wanted / GRAVITY)
+        climb += wanted * period
+        height += climb * period
+    return shares + [0.9] * round(0.1 / period)

@@ -19,15 +19,24 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from mjxball.fly import maneuver, packets
+from mjxball.fly import packets
+from mjxball.fly.maneuver import Glimpse, blind_shares
 from mjxball.fly.packets import Packet, Setpoint
 
-FRAME = struct.Struct("<BHHf")  # what is going on, trims of leader and follower [thrust units], height [m]
+FRAME = struct.Struct("<BHHfff")  # what is going on, then `Glimpse`
 IDLE, FLYING, GOODBYE = 0, 1, 2
 SILENCE = 0.3  # [s] without a frame while flying: the firmware levels at 0.5 s and stops at 2 s
 PERIOD = 0.02  # [s] of the setpoints on the way down
 STOPPING = 0.5  # [s] for which stops are repeated
 OPENING = 2.0  # [s] for which a link is tried: then the firmware has stopped by itself
+
+
+NOTHING = Glimpse((0, 0), 0.0, 0.0, 0.0)
+
+
+def packed(state: int, seen: Glimpse) -> bytes:
+    """One frame."""
+    return FRAME.pack(state, *seen.trims, seen.height, seen.climb, seen.lift)
 
 
 class Watchdog:
@@ -54,9 +63,9 @@ class Watchdog:
         """Of the watchdog process."""
         return self._process.pid
 
-    def beat(self, flying: bool, thrusts: tuple[int, int], height: float) -> bool:
+    def beat(self, flying: bool, seen: Glimpse) -> bool:
         """We live, and this is what it would take over; false if the watchdog has ended."""
-        return self._write(FRAME.pack(FLYING if flying else IDLE, *thrusts, height))
+        return self._write(packed(FLYING if flying else IDLE, seen))
 
     def _write(self, frame: bytes) -> bool:
         try:
@@ -71,7 +80,7 @@ class Watchdog:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._write(FRAME.pack(GOODBYE, 0, 0, 0.0))
+        self._write(packed(GOODBYE, NOTHING))
         with contextlib.suppress(OSError):
             assert self._process.stdin is not None
             self._process.stdin.close()
@@ -84,34 +93,39 @@ class Watchdog:
         self._process.stdout.close()
 
 
-def watch(pipe: int, runner: int) -> tuple[int, int, float] | None:
-    """Read frames from `pipe` until the runner is gone; (trims, height) to take over with, None if all is well."""
-    state, thrusts, height = IDLE, (0, 0), 0.0
-    waiting = b""
+def watch(pipe: int, runner: int) -> tuple[Glimpse, float] | None:
+    """Read frames from `pipe` until the runner is gone; None if all is well, else what to take over with.
+
+    That is the last glimpse and how long ago it was taken [s].
+    """
+    state, seen, waiting = IDLE, NOTHING, b""
     while True:
         readable, _, _ = select.select([pipe], [], [], SILENCE if state == FLYING else None)
         if not readable:  # it hangs in the air: only its death frees the radio
             with contextlib.suppress(ProcessLookupError):
                 os.kill(runner, signal.SIGKILL)
-            return (*thrusts, height)
+            return seen, SILENCE
         received = os.read(pipe, 4096)
         if not received:
-            return (*thrusts, height) if state == FLYING else None
+            return (seen, 0.0) if state == FLYING else None
         waiting += received
         while len(waiting) >= FRAME.size:
-            state, leader, follower, height = FRAME.unpack(waiting[: FRAME.size])
-            thrusts, waiting = (leader, follower), waiting[FRAME.size :]
+            state, leader, follower, *rest = FRAME.unpack(waiting[: FRAME.size])
+            seen, waiting = Glimpse((leader, follower), *rest), waiting[FRAME.size :]
             if state == GOODBYE:
                 return None
 
 
-def way_down(trim: int, height: float) -> list[Packet]:
-    """What one drone is sent, one packet per period: level and sinking, then stops and zeros."""
-    thrust = min(max(round(maneuver.BLIND_THRUST * trim), 0), packets.THRUST_CEILING)
-    sinking = packets.setpoint_packet(Setpoint(0.0, 0.0, 0.0, thrust))
-    count = round(maneuver.blind_time(height) / PERIOD) if thrust else 0
+def way_down(number: int, seen: Glimpse, unheard: float) -> list[Packet]:
+    """What drone `number` is sent, one packet per period: level and sinking, then stops and zeros.
+
+    Both drones' lists are equally long, so that they stay together.
+    """
+    shares = blind_shares(seen, unheard, PERIOD)
+    thrusts = [min(round(share * seen.trims[number]), packets.THRUST_CEILING) for share in shares]
+    sinking = [packets.setpoint_packet(Setpoint(0.0, 0.0, 0.0, thrust)) for thrust in thrusts]
     ending = [packets.STOP, packets.setpoint_packet(packets.ZERO)] * round(STOPPING / PERIOD / 2)
-    return [sinking] * count + ending + [packets.STOP]
+    return [*sinking, *ending, packets.STOP]
 
 
 def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
@@ -156,10 +170,10 @@ def main(arguments: Sequence[str]) -> int:
     left = watch(sys.stdin.fileno(), runner)
     if left is None:
         return 0
-    start, height = time.monotonic(), left[2]
+    start = time.monotonic()
     threads = [
-        threading.Thread(target=bring_down, args=(uri, way_down(int(trim), height), start), daemon=True)
-        for uri, trim in zip(uris, left[:2], strict=True)
+        threading.Thread(target=bring_down, args=(uri, way_down(number, *left), start), daemon=True)
+        for number, uri in enumerate(uris)
     ]
     for thread in threads:
         thread.start()

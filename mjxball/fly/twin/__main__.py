@@ -9,6 +9,7 @@ import argparse
 import json
 import sys
 
+from mjxball.fly.loop import urgent
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
 
@@ -19,7 +20,7 @@ def main() -> int:
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
     parser.add_argument("--span", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"), help="mount [m]")
     options = parser.parse_args()
-    with Twin(make_pair(options.span), TwinSettings(ports=tuple(options.ports))) as twin:
+    with urgent(), Twin(make_pair(options.span), TwinSettings(ports=tuple(options.ports))) as twin:
         print(json.dumps({"uris": twin.uris}), flush=True)  # noqa: T201
         try:
             while sys.stdin.readline():
