@@ -107,6 +107,7 @@ class Flight:
         self._low = [Sustained(settings.limits.battery_time) for _ in links]
         self._saturated = Sustained(settings.limits.saturation_time)
         self._hold_for = settings.times.drone_watchdog
+        self._shares = [1.0]  # of the trims, tick by tick, in State.HOLD
         self._land_height = 0.0
         self.worst_age = 0.0
         self.highest = [0, 0]  # thrust of each drone that was wanted [units]
@@ -165,12 +166,15 @@ class Flight:
         """Tell the watchdog what it would take over; false if there is none any more."""
         if self.guard is None:
             return True
+        return self.guard.beat(self.supervisor.state in AIRBORNE and not self.settings.dry_run, self._glimpse())
+
+    def _glimpse(self) -> Glimpse:
+        """What is known now of how the pair moves."""
         now = pair.object_state(self._states(), self.rig)
         trim = sum(self._trims)
         lift = maneuver.GRAVITY * (sum(sent.thrust for sent in self._sent) / trim - 1) if trim else 0.0
         trims = (round(self._trims[0]), round(self._trims[1]))
-        seen = Glimpse(trims, float(now.position[2] - self._origin[2]), float(now.velocity[2]), lift)
-        return self.guard.beat(self.supervisor.state in AIRBORNE and not self.settings.dry_run, seen)
+        return Glimpse(trims, float(now.position[2] - self._origin[2]), float(now.velocity[2]), lift)
 
     def _from_states(self, states: list[DroneState], now: float) -> list[Fault]:
         armed = self.supervisor.state not in BEFORE_MOTORS and not self.settings.dry_run
@@ -269,6 +273,8 @@ class Flight:
         if entered is State.HOLD:
             age = max((value for value in ages if math.isfinite(value)), default=0.0)
             self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
+            # Gently: a drone that does not hear keeps its thrust, and the other must not sink away from it.
+            self._shares = maneuver.blind_shares(self._glimpse(), age, self.settings.period, maneuver.GENTLE)
 
     # What is sent.
 
@@ -290,6 +296,8 @@ class Flight:
         if self.supervisor.state is State.DESCEND:
             climb = float(pair.object_state(states, self.rig).velocity[2])
             thrust = maneuver.sink(thrust, climb, elapsed, self.settings.times)
+        else:
+            thrust *= self._shares[min(int(elapsed / self.settings.period), len(self._shares) - 1)]
         return maneuver.level(thrust, self._sent[number], self.settings.period, self.maps[number])
 
     def _transmit(self, wanted: list[Setpoint]) -> None:

@@ -72,21 +72,22 @@ class Glimpse(NamedTuple):
 GRAVITY = 9.81
 BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
 BLIND_LIMIT = 2.5  # [s] that it lasts at most
+BRISK, GENTLE = 3.0, 0.7  # [m/s2] downward at most: where both drones hear, and where one may not
 
 
-def blind_shares(seen: Glimpse, unheard: float, period: float) -> list[float]:
+def blind_shares(seen: Glimpse, unheard: float, period: float, hardest: float = BRISK) -> list[float]:
     """Shares of the trim for a descent that is flown blind, one per `period` [s], all below 1.
 
     The first `unheard` seconds went by under the last setpoints. From there the pair's height is computed, not
-    measured: sink at `BLIND_SPEED` until it must stand, and 0.1 s more.
+    measured: sink at `BLIND_SPEED`, gained with at most `hardest` [m/s2], until it must stand, and 0.1 s more.
     """
     known = [value if math.isfinite(value) else 0.0 for value in (seen.height, seen.climb, seen.lift)]
     lift = min(max(known[2], -3.0), 3.0)
     height = known[0] + known[1] * unheard + 0.5 * lift * unheard**2
     climb, shares = known[1] + lift * unheard, []
     while height > 0 and len(shares) * period < BLIND_LIMIT:
-        wanted = min(max(3 * (-BLIND_SPEED - climb), -3.0), -0.15)
+        wanted = min(max(3 * (-BLIND_SPEED - climb), -hardest), -0.15)
         shares.append(1 + wanted / GRAVITY)
         climb += wanted * period
         height += climb * period
-    return shares + [0.9] * round(0.1 / period)
+    return shares + [1 - hardest / GRAVITY] * round(0.1 / period)

@@ -19,7 +19,7 @@ class State(Enum):
     FLY = "fly"  # leader PID and follower policy
     LAND = "land"  # the same laws toward a goal that sinks
     DESCEND = "descend"  # level, thrust held to a sinking speed where it is known, else ramped down
-    HOLD = "hold"  # a drone is not heard: level, each its last trim, until that drone's own watchdog stops it
+    HOLD = "hold"  # a drone is not heard: level, a little less than the trims, until its own watchdog must stop it
     STOP = "stop"  # zeros and stop setpoints
     KILL = "kill"  # emergency stop, repeated; the firmware stays locked until reboot
     DONE = "done"  # motors off, disarmed; nothing more is sent
@@ -148,3 +148,13 @@ def table_rows() -> list[tuple[str, str, str]]:
     """(state, event, next state) of every transition, in the order of the enumerations: what the docs print."""
     order = [(state, event) for state in State for event in Event]
     return [(s.value, e.value, TRANSITIONS[s, e].value) for s, e in order if (s, e) in TRANSITIONS]
+
+
+def markdown() -> str:
+    """The table as Markdown, an event a line and a state a column; an empty cell keeps the state."""
+    states = [state for state in State if state is not State.DONE]
+    lines = ["| event | " + " | ".join(state.value for state in states) + " |", "|---" * (len(states) + 1) + "|"]
+    for event in Event:
+        cells = [TRANSITIONS[state, event].value if (state, event) in TRANSITIONS else "" for state in states]
+        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
