@@ -27,12 +27,12 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.fly import journal, packets, pair
+from mjxball.fly import journal, packets
 from mjxball.fly.loop import urgent
 from mjxball.fly.twin.faults import DroneFaults, LinkFaults
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Truth, Twin
-from mjxball.policy import Policy
+from mjxball.policy import load_file
 
 ROOT = Path(__file__).parents[1]
 POLICY = ROOT / "policies" / "transport.npz"
@@ -102,9 +102,8 @@ def trial(job: tuple[int, str, int]) -> dict[str, Any]:
     number, kind, seed = job
     random = np.random.default_rng([seed, number])
     which, moment = int(random.integers(2)), float(random.uniform(0, LATEST))
-    mount = pair.Rig.of_card(Policy.load(POLICY).card).leader_mount
     row: dict[str, Any] = {"kind": kind, "drone": which, "moment": moment}
-    with tempfile.TemporaryDirectory() as place, urgent(), Twin(make_pair(mount)) as twin:
+    with tempfile.TemporaryDirectory() as place, urgent(), Twin(make_pair(load_file(POLICY).card)) as twin:
         log = Path(place) / "flight.jsonl"
         uris = ["--leader", twin.uris[0], "--follower", twin.uris[1]]
         command = [sys.executable, "-m", "mjxball.fly", str(POLICY), *uris, "--seconds", str(FLOWN), "--log", str(log)]

@@ -28,8 +28,10 @@ def test_a_flight_from_start_to_end() -> None:
     world.fly_until(State.DONE)
     assert world.notes.transitions() == NORMAL
     assert world.flight.supervisor.cause is None
+    world.advance(0.05)
     assert world.running() == [False, False]
     assert world.state.position[:, 2].max() < 0.01
+    assert [drone.firmware.armed for drone in world.drones] == [False, False]
     # The firmware is not locked: it may fly again without a reboot.
     assert [drone.firmware.locked for drone in world.drones] == [False, False]
 
@@ -51,7 +53,8 @@ def test_a_dry_run_sends_zeros_and_never_arms() -> None:
     world.fly_until(State.DONE)
     for number in range(2):
         assert {thrust for _, thrust in thrusts(world, number)} == {0}
-        assert packets.ARM not in [packet for _, packet in world.links[number].packets]
+        others = {packet for _, packet in world.links[number].packets if packet.port != 3}
+        assert others <= {packets.STOP}
     assert world.running() == [False, False]
 
 

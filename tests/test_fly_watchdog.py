@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, environment
 
-from mjxball.fly import journal, packets, pair, watchdog
+from mjxball.fly import journal, packets, watchdog
+from mjxball.fly.loop import urgent
 from mjxball.fly.maneuver import Glimpse, blind_shares
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Twin
 from mjxball.fly.watchdog import FLYING, GOODBYE, IDLE, NOTHING, packed
-from mjxball.policy import Policy
+from mjxball.policy import load_file
 
 pytest.importorskip("cflib")
 SEEN = Glimpse((45000, 46000), 0.5, 0.25, -1.0)  # numbers that float32 holds exactly
@@ -90,8 +91,7 @@ def test_a_blind_descent_ends_on_the_ground(height: float, climb: float, error: 
 
 def lost_in_the_air(number: signal.Signals, log: Path) -> Twin | None:
     """Fly, send the runner `number` in the air, wait until the twin's motors are off; None if it never took off."""
-    rig = pair.Rig.of_card(Policy.load(TRANSPORT).card)
-    with Twin(make_pair(rig.leader_mount)) as twin:
+    with urgent(), Twin(make_pair(load_file(TRANSPORT).card)) as twin:
         uris = ["--leader", twin.uris[0], "--follower", twin.uris[1]]
         command = [sys.executable, "-m", "mjxball.fly", str(TRANSPORT), *uris, "--seconds", "60", "--log", str(log)]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}

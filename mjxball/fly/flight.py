@@ -35,6 +35,7 @@ class DroneLink(Protocol):
 
     def stuck_for(self, now: float) -> float:
         """How long something has waited to be sent [s]."""
+        ...
 
 
 class Guard(Protocol):
@@ -42,6 +43,7 @@ class Guard(Protocol):
 
     def beat(self, flying: bool, seen: Glimpse) -> bool:
         """Tell it that we live; false if it does not."""
+        ...
 
 
 class Notes(Protocol):
@@ -314,6 +316,8 @@ class Flight:
                 link.command(packets.STOP)
             elif state is State.KILL:
                 link.command(packets.EMERGENCY_STOP)
+            elif state is State.DONE and not self.settings.dry_run:
+                link.command(packets.DISARM)
             elif state is State.ARM and not self.settings.dry_run and self._count % 10 == 0:
                 link.command(packets.ARM)
             link.send(packets.setpoint_packet(ZERO if self.settings.dry_run else value))

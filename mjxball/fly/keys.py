@@ -43,12 +43,15 @@ def listening(land: Callable[[], None], kill: Callable[[], None]) -> Iterator[No
 def _raw_terminal() -> Iterator[int | None]:
     """Standard input with single keys readable, None if it is no terminal."""
     try:
-        number = sys.stdin.fileno()
         import termios
         import tty
-
+    except ImportError:  # not on Windows
+        yield None
+        return
+    try:
+        number = sys.stdin.fileno()
         before = termios.tcgetattr(number)
-    except (OSError, ValueError, ImportError, AttributeError, termios.error):
+    except (OSError, ValueError, AttributeError, termios.error):
         yield None
         return
     tty.setcbreak(number)

@@ -216,9 +216,12 @@ class Link:
                     self._wake.wait()
                 if self._closing and not self._commands:
                     return
-                packet = self._commands.popleft() if self._commands else self._setpoint
-                if not self._commands and packet is self._setpoint:
-                    self._setpoint = None
+                if self._commands:
+                    packet = self._commands.popleft()
+                else:
+                    packet, self._setpoint = self._setpoint, None
+            if packet is None:
+                continue
             wire = CRTPPacket()
             wire.set_header(packet.port, packet.channel)
             wire.data = packet.data

@@ -23,7 +23,7 @@ from mjxball.fly.session import Crew, fly
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
-LOOP_RATE = 100.0  # [Hz]
+LOOP_RATE = 100.0  # [Hz] at least: the policy's period is a whole number of ticks
 CURVES = {"linear": LINEAR, "older": OLDER}
 
 
@@ -95,14 +95,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         policy = Policy.load(options.policy)
         gains = read_gains(options.gains) if options.gains else {}
         rig = pair.Rig.of_card(policy.card)
-        period = 1 / max(LOOP_RATE, 1 / policy.control_period)
+        period = policy.control_period / math.ceil(policy.control_period * LOOP_RATE - 1e-9)
         settings = FlightSettings(options.seconds, tuple(options.goal), options.dry_run, period)
         crew = Crew(Pilot(policy, rig), command_maps(options, policy, rig), rig, gains, Preflight())
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
             if options.rehearse:
                 ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
-                uris = stack.enter_context(Rehearsal(rig.leader_mount, ports)).uris
+                uris = stack.enter_context(Rehearsal(options.policy, ports)).uris
             return fly(uris, crew, settings, options.log, list(sys.argv if arguments is None else arguments))
 
     return run_command(command)

@@ -27,9 +27,10 @@ class Pilot:
         self.policy, self.period = policy, policy.control_period
         self._mount = np.array(rig.follower_mount)
         gains = card.get("config", {}).get("leader", {})  # files from before it was recorded have no integral gain
-        self._gains = tuple(np.array(gain, float) for gain in (card["leader_kp"], card["leader_kd"]))
+        self._kp, self._kd = (np.array(card[name], float) for name in ("leader_kp", "leader_kd"))
         self._ki = np.array(gains.get("ki", (0.0, 0.0, 0.0)), float)
-        self._gravity, self._limits = float(card["gravity"]), tuple(card["command_limits"])
+        self._gravity = float(card["gravity"])
+        self._tilt_limit, self._vertical_limit = (float(limit) for limit in card["command_limits"])
         self.reset()
 
     def reset(self) -> None:
@@ -41,7 +42,7 @@ class Pilot:
         """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
         seen = observation.observe(state.position, state.matrix, state.velocity, state.rates, goal, self._mount)
         error, rate = seen[observation.ERROR], seen[observation.ERROR_RATE]
-        wanted = leader.desired_acceleration(error, rate, self._integral, *self._gains, self._ki)
-        led = leader.command(wanted, 0.0, self._gravity, *self._limits)
+        wanted = leader.desired_acceleration(error, rate, self._integral, self._kp, self._kd, self._ki)
+        led = leader.command(wanted, 0.0, self._gravity, self._tilt_limit, self._vertical_limit)
         self._integral = self._integral + self.period * error
         return Commands(led, np.asarray(self.policy(seen), float), seen)

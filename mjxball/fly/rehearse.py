@@ -7,6 +7,7 @@ import select
 import subprocess
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from mjxball.errors import InputError
 
@@ -14,9 +15,9 @@ from mjxball.errors import InputError
 class Rehearsal:
     """A running twin. A context manager; `uris` are leader and follower."""
 
-    def __init__(self, mount: Sequence[float], ports: Sequence[int] = (0, 0), start_limit: float = 30.0):
-        """Start the twin of a rig whose leader sits at `mount` (3,) [m]. Raises InputError if it does not start."""
-        arguments = ["--ports", *map(str, ports), "--span", *(f"{value:.9g}" for value in mount)]
+    def __init__(self, policy: Path, ports: Sequence[int] = (0, 0), start_limit: float = 30.0):
+        """Start the twin of the rig that `policy` was made for. Raises InputError if it does not start."""
+        arguments = ["--ports", *map(str, ports), "--policy", str(policy)]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "mjxball.fly.twin", *arguments],
             stdin=subprocess.PIPE,

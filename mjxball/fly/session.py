@@ -61,6 +61,10 @@ def fly(
                 flight.refusal = "" if flight.ready else "see the checks"
                 timing = run(flight)
                 return _ended(flight, timing, journal)
+        except KeyboardInterrupt:  # before take-off; afterwards Ctrl-C is the flight's own
+            journal.note("refused", text="interrupted")
+            _say("interrupted before take-off")
+            return 1
         except (InputError, OSError) as error:
             journal.note("refused", text=str(error))
             raise

@@ -8,19 +8,22 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 
 from mjxball.fly.loop import urgent
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
+from mjxball.policy import load_file
 
 
 def main() -> int:
     """Serve until standard input ends."""
     parser = argparse.ArgumentParser(prog="python -m mjxball.fly.twin", description=__doc__)
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
-    parser.add_argument("--span", type=float, nargs=3, default=None, metavar=("X", "Y", "Z"), help="mount [m]")
+    parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
     options = parser.parse_args()
-    with urgent(), Twin(make_pair(options.span), TwinSettings(ports=tuple(options.ports))) as twin:
+    card = load_file(options.policy).card if options.policy else None
+    with urgent(), Twin(make_pair(card), TwinSettings(ports=tuple(options.ports))) as twin:
         print(json.dumps({"uris": twin.uris}), flush=True)  # noqa: T201
         try:
             while sys.stdin.readline():

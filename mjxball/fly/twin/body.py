@@ -26,6 +26,7 @@ class Pair(Protocol):
 
     def start(self) -> PairState:
         """Put everything back to rest on the ground (stand: at its lowest) and return that state."""
+        ...
 
     def advance(self, setpoints: np.ndarray, dt: float) -> PairState:
         """Move `dt` [s] on, under `setpoints` (2, 4), and return the new state.
@@ -33,6 +34,7 @@ class Pair(Protocol):
         A row is (roll [deg], pitch [deg], yaw rate [deg/s], thrust 0 .. 65535) as decoded from the wire: negative
         pitch moves toward +x, positive yaw rate turns clockwise from above. Thrust 0 means motors off.
         """
+        ...
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
         """Parameter `name`, "pid_attitude.roll_kp", of `drone` (0 leader, 1 follower) was written; ignore others."""

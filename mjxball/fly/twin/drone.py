@@ -96,5 +96,7 @@ class TwinDrone:
 
 def drone_state(pair: PairState, number: int) -> DroneState:
     """State of drone `number` of the pair."""
-    parts = (leaf[number] for leaf in (pair.position, pair.velocity, pair.quaternion, pair.rates))
-    return DroneState(*parts, 0, float(pair.battery[number]))
+    position, velocity, quaternion, rates = (
+        leaf[number] for leaf in (pair.position, pair.velocity, pair.quaternion, pair.rates)
+    )
+    return DroneState(position, velocity, quaternion, rates, 0, float(pair.battery[number]))

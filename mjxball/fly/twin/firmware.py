@@ -102,7 +102,8 @@ class Firmware:
         self.flying = self.running and thrust > 20000
         # The real controller takes a number that is not finite as a kick; the physics gets the largest tilt instead.
         angles = (part if math.isfinite(part) else 30.0 for part in value[:3])
-        return Setpoint(*(min(max(part, -180.0), 180.0) for part in angles), thrust)
+        roll, pitch, yaw_rate = (min(max(part, -180.0), 180.0) for part in angles)
+        return Setpoint(roll, pitch, yaw_rate, thrust)
 
     def _watch_tumble(self, now: float, force_z: float, upright: bool) -> None:
         self.tumbled = not upright
@@ -112,6 +113,11 @@ class Firmware:
             self._falling_since = now
         elif now - self._falling_since > self.times.tumble_time:
             self.crashed = True
+
+    @property
+    def last_thrust(self) -> int:
+        """Of the last setpoint that was received, whatever became of it [thrust units]."""
+        return self._last.thrust
 
     @property
     def info(self) -> int:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Any
 
+from mjxball.fly.pair import Rig
 from mjxball.fly.twin.body import Pair
 from mjxball.fly.twin.standin import StandIn, StandInPlant
 
 
-def make_pair(leader_mount: Sequence[float] | None = None) -> Pair:
-    """Physics of a pair whose leader sits at `leader_mount` (3,) [m] from O, the follower opposite."""
-    if leader_mount is None:
+def make_pair(card: Mapping[str, Any] | None = None) -> Pair:
+    """Physics of the rig that a policy's `card` describes; whatever is heavy is imported here, not above."""
+    if card is None:
         return StandIn()
-    x, y, z = (float(value) for value in leader_mount)
-    return StandIn(StandInPlant(mounts=((x, y, z), (-x, -y, -z))))
+    rig = Rig.of_card(card)
+    return StandIn(StandInPlant(mounts=(rig.leader_mount, rig.follower_mount)))

@@ -12,6 +12,7 @@ import numpy as np
 
 from mjxball.fly.twin.body import Pair, PairState
 from mjxball.fly.twin.drone import TwinDrone, drone_state
+from mjxball.fly.twin.faults import DroneFaults, LinkFaults
 from mjxball.fly.twin.firmware import FirmwareTimes
 
 HOST = "127.0.0.1"
@@ -80,11 +81,11 @@ class Twin:
         for sock in self._sockets:
             sock.close()
 
-    def set_link(self, drone: int, faults: object) -> None:
+    def set_link(self, drone: int, faults: LinkFaults) -> None:
         """Replace the `LinkFaults` of a drone's link."""
         self.drones[drone].link = faults
 
-    def set_faults(self, drone: int, faults: object) -> None:
+    def set_faults(self, drone: int, faults: DroneFaults) -> None:
         """Replace the `DroneFaults` of a drone."""
         self.drones[drone].faults = faults
 
@@ -178,7 +179,7 @@ class Twin:
                 return
 
     def _seen(self, now: float) -> Truth:
-        drones = self.drones
-        last = tuple(drone.firmware._last.thrust for drone in drones)
-        info = tuple(drone.firmware.info for drone in drones)
-        return Truth(now, self._state, tuple(drone.setpoint.thrust for drone in drones), last, info)
+        one, other = self.drones
+        thrust = (one.setpoint.thrust, other.setpoint.thrust)
+        last = (one.firmware.last_thrust, other.firmware.last_thrust)
+        return Truth(now, self._state, thrust, last, (one.firmware.info, other.firmware.info))

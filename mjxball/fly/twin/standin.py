@@ -79,7 +79,7 @@ class StandIn:
         on = self._thrust > 0.01
         for row, running in zip(setpoints, on, strict=True):
             if running:
-                roll, pitch, yaw_rate = angles(Setpoint(*(float(value) for value in row[:3]), 0))
+                roll, pitch, yaw_rate = angles(Setpoint(float(row[0]), float(row[1]), float(row[2]), 0))
                 tilt = plant.frequency**2 * (np.array([roll, pitch]) - euler[:2])
                 turning += 0.5 * np.append(tilt, 5.0 * (yaw_rate - self._rates[2]))
         turning[:2] -= on.mean() * 2 * plant.damping * plant.frequency * self._rates[:2]

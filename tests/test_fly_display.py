@@ -1,0 +1,107 @@
+"""What the person at the keyboard sees and can do."""
+
+from __future__ import annotations
+
+import io
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import environment
+
+from mjxball.fly.display import RED, Display, lines
+from mjxball.fly.flight import View
+from mjxball.fly.limits import Limits
+from mjxball.fly.packets import ZERO, DroneState
+from mjxball.fly.supervisor import Event, Fault, State, Supervisor
+
+LIMITS = Limits()
+
+
+def view(state: State = State.FLY, cause: Fault | None = None, battery: float = 4.0, age: float = 0.01) -> View:
+    drone = DroneState(np.array([0.1, -0.2, 0.3]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), 0, battery)
+    return View(1.0, Supervisor(state, 0.0, cause), [drone] * 2, [age] * 2, np.zeros(3), (ZERO, ZERO), 0.0, 0)
+
+
+def test_a_good_flight_has_no_red() -> None:
+    shown = "\n".join(lines(view(), LIMITS))
+    assert RED not in shown
+    assert "FLY" in shown
+    assert "leader" in shown
+    assert "follower" in shown
+    assert "+0.30" in shown
+
+
+@pytest.mark.parametrize(
+    "danger",
+    [
+        view(State.HOLD),
+        view(State.LAND, Fault(Event.BATTERY, "leader at 3.1 V")),
+        view(battery=3.25),
+        view(age=0.09),
+        view(age=float("inf")),
+    ],
+)
+def test_danger_is_red(danger: View) -> None:
+    assert RED in "\n".join(lines(danger, LIMITS))
+
+
+def test_without_colour_there_are_no_escapes() -> None:
+    assert "\x1b" not in "\n".join(lines(view(State.HOLD, Fault(Event.STALE), age=1.0), LIMITS, colour=False))
+
+
+def test_what_is_no_terminal_gets_nothing() -> None:
+    stream = io.StringIO()
+    with Display(view, LIMITS, stream):
+        time.sleep(0.3)
+    assert stream.getvalue() == ""
+
+
+SCRIPT = """
+import sys, time
+from mjxball.fly.keys import listening
+heard = []
+with listening(lambda: heard.append("land"), lambda: heard.append("kill")):
+    print("ready", flush=True)
+    end = time.monotonic() + 20
+    while len(heard) < 3 and time.monotonic() < end:
+        time.sleep(0.01)
+print("heard", *heard, flush=True)
+"""
+
+
+def read_until(number: int, wanted: bytes, seconds: float = 20) -> bytes:
+    end, data = time.monotonic() + seconds, b""
+    while wanted not in data and time.monotonic() < end:
+        data += os.read(number, 1024)
+    return data
+
+
+@pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGTERM, signal.SIGHUP)])
+def test_signals_land_without_a_terminal(signals: tuple[signal.Signals, ...]) -> None:
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", SCRIPT], env=environment(), text=True, **pipes) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "ready\n"
+        for number in signals:
+            child.send_signal(number)
+            time.sleep(0.1)
+        assert child.stdout.readline() == "heard land land land\n"
+
+
+def test_keys_in_a_terminal(tmp_path: Path) -> None:
+    ours, theirs = pty.openpty()
+    with subprocess.Popen([sys.executable, "-c", SCRIPT], stdin=theirs, stdout=theirs, env=environment()):
+        os.close(theirs)
+        assert b"ready" in read_until(ours, b"ready")
+        for key in (b"x", b" ", b"l", b"k"):
+            os.write(ours, key)
+            time.sleep(0.3)
+        assert b"heard kill land kill" in read_until(ours, b"heard kill land kill")
+    os.close(ours)
