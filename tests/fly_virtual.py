@@ -11,7 +11,8 @@ from command_line import TRANSPORT
 
 from mjxball.fly import packets, pair
 from mjxball.fly.command import CommandMap
-from mjxball.fly.flight import Flight, FlightSettings
+from mjxball.fly.contract import FlightSettings
+from mjxball.fly.flight import Flight
 from mjxball.fly.packets import Packet
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.supervisor import State

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fly_virtual import World, thrusts
 
-from mjxball.fly.flight import FlightSettings
+from mjxball.fly.contract import FlightSettings
 from mjxball.fly.maneuver import Times
 from mjxball.fly.packets import THRUST_CEILING
 from mjxball.fly.supervisor import Event, State

@@ -10,7 +10,7 @@ import pytest
 from fly_virtual import World, thrusts
 
 from mjxball.fly import packets
-from mjxball.fly.flight import FlightSettings
+from mjxball.fly.contract import FlightSettings
 from mjxball.fly.maneuver import Glimpse, Times
 from mjxball.fly.supervisor import AIRBORNE, Event, State
 from mjxball.fly.twin.firmware import FirmwareTimes

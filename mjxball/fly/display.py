@@ -11,7 +11,7 @@ from typing import TextIO
 import numpy as np
 
 from mjxball.control import rotations
-from mjxball.fly.flight import View
+from mjxball.fly.contract import View
 from mjxball.fly.limits import NAMES, Limits
 from mjxball.fly.supervisor import ENDED, GUIDED, State
 

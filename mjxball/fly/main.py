@@ -15,7 +15,7 @@ from mjxball.cli import Parser, run_command
 from mjxball.errors import InputError
 from mjxball.fly import pair
 from mjxball.fly.command import LINEAR, OLDER, CommandMap
-from mjxball.fly.flight import FlightSettings
+from mjxball.fly.contract import FlightSettings
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.rehearse import Rehearsal

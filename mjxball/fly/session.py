@@ -11,10 +11,11 @@ from pathlib import Path
 
 from mjxball import __version__
 from mjxball.errors import InputError
-from mjxball.fly import pair
+from mjxball.fly import packets, pair
 from mjxball.fly.command import CommandMap
+from mjxball.fly.contract import FlightSettings
 from mjxball.fly.display import Display
-from mjxball.fly.flight import Flight, FlightSettings
+from mjxball.fly.flight import Flight
 from mjxball.fly.journal import Journal
 from mjxball.fly.keys import listening
 from mjxball.fly.limits import NAMES
@@ -22,7 +23,7 @@ from mjxball.fly.link import Link
 from mjxball.fly.loop import Metronome, Timing, urgent
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, check, prepare
-from mjxball.fly.supervisor import FAULTS, Event
+from mjxball.fly.supervisor import FAULTS, Event, Fault, State, Supervisor
 from mjxball.fly.watchdog import Watchdog
 
 SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
@@ -101,9 +102,6 @@ def run(flight: Flight) -> Timing:
 
 def _emergency(flight: Flight) -> bool:
     """A tick failed: stop both drones without the flight's help. Returns false: it is over."""
-    from mjxball.fly import packets
-    from mjxball.fly.supervisor import Fault, State, Supervisor
-
     for _ in range(50):
         for link in flight.links:
             link.command(packets.EMERGENCY_STOP)

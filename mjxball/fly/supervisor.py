@@ -69,50 +69,48 @@ AIRBORNE = (S.RAMP, S.FLY, S.LAND, S.DESCEND, S.HOLD)
 ENDED = (S.STOP, S.KILL, S.DONE)
 
 
-def _table() -> dict[tuple[State, Event], State]:
-    """Every pair that changes the state; all others keep it."""
-    table = {
+def _planned() -> dict[tuple[State, Event], State]:
+    """A flight in which nothing is wrong, and who may end it early."""
+    return {
         (S.CHECK, E.READY): S.ARM,
         (S.ARM, E.ARMED): S.RAMP,
         (S.RAMP, E.HOVERING): S.FLY,
         (S.FLY, E.TIME_UP): S.LAND,
+        (S.FLY, E.TIMEOUT): S.LAND,
         (S.FLY, E.INTERRUPT): S.LAND,
-        (S.FLY, E.BATTERY): S.LAND,
-        (S.FLY, E.WATCHDOG): S.LAND,
-        (S.RAMP, E.WATCHDOG): S.DESCEND,
         (S.RAMP, E.INTERRUPT): S.DESCEND,
-        (S.RAMP, E.BATTERY): S.DESCEND,
+        (S.LAND, E.TOUCHED_DOWN): S.STOP,
+        (S.DESCEND, E.TOUCHED_DOWN): S.STOP,
+        (S.STOP, E.TIMEOUT): S.DONE,
+        (S.KILL, E.TIMEOUT): S.DONE,
     }
-    # Before the motors turn, whatever is wrong ends it.
+
+
+def _on_the_ground() -> dict[tuple[State, Event], State]:
+    """Before the motors turn, whatever is wrong ends it."""
     harmless = {E.READY, E.ARMED, E.HOVERING, E.TIME_UP, E.TOUCHED_DOWN, E.SATURATED, E.DEADLINES}
-    for state in BEFORE_MOTORS:
-        for event in E:
-            if event not in harmless:
-                table[state, event] = S.STOP
-    # In the air: what can still be flown sinks level, what cannot be heard is mirrored, what is lost is cut.
-    for state in AIRBORNE:
-        table[state, E.DRONE_DOWN] = S.STOP
-        table[state, E.TILT] = S.STOP
-        table[state, E.STICK] = S.STOP
-        for event in (E.STALE, E.LINK_LOST):
-            table[state, event] = S.HOLD
-    for state in (S.RAMP, *GUIDED):
-        for event in (E.BAD_STATE, E.FENCE, E.SATURATED, E.DEADLINES):
-            table[state, event] = S.DESCEND
-    table[S.RAMP, E.TIMEOUT] = S.DESCEND
-    table[S.FLY, E.TIMEOUT] = S.LAND
+    return {(state, event): S.STOP for state in BEFORE_MOTORS for event in E if event not in harmless}
+
+
+def _in_the_air() -> dict[tuple[State, Event], State]:
+    """What can still be flown lands or sinks level, what cannot be heard is mirrored, what is lost is cut."""
+    table = {(S.FLY, event): S.LAND for event in (E.BATTERY, E.WATCHDOG)}
+    table |= {(S.RAMP, event): S.DESCEND for event in (E.BATTERY, E.WATCHDOG, E.TIMEOUT)}
     table[S.LAND, E.TIMEOUT] = S.DESCEND
-    for state in (S.LAND, S.DESCEND):
-        table[state, E.TOUCHED_DOWN] = S.STOP
-    for state in (S.DESCEND, S.HOLD):
-        table[state, E.TIMEOUT] = S.STOP
-        table[state, E.BAD_STATE] = S.STOP if state is S.DESCEND else S.HOLD
-    table[S.STOP, E.TIMEOUT] = S.DONE
-    table[S.KILL, E.TIMEOUT] = S.DONE
-    for state in S:
-        if state not in (S.KILL, S.DONE):
-            table[state, E.KEY_KILL] = S.KILL
+    for state in (S.RAMP, *GUIDED):
+        table |= {(state, event): S.DESCEND for event in (E.BAD_STATE, E.FENCE, E.SATURATED, E.DEADLINES)}
+    for state in AIRBORNE:
+        table |= {(state, event): S.STOP for event in (E.DRONE_DOWN, E.TILT, E.STICK)}
+        table |= {(state, event): S.HOLD for event in (E.STALE, E.LINK_LOST)}
+    table |= {(state, E.TIMEOUT): S.STOP for state in (S.DESCEND, S.HOLD)}
+    table[S.DESCEND, E.BAD_STATE] = S.STOP
     return table
+
+
+def _table() -> dict[tuple[State, Event], State]:
+    """Every pair that changes the state; all others keep it. A kill is possible until everything is over."""
+    kill = {(state, E.KEY_KILL): S.KILL for state in S if state is not S.DONE}
+    return _planned() | _on_the_ground() | _in_the_air() | kill
 
 
 TRANSITIONS = {pair: state for pair, state in _table().items() if pair[0] is not state}
