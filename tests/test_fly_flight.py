@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fly_virtual import World, thrusts
 
-from mjxball.fly import packets
+from mjxball.fly import packets, session
 from mjxball.fly.contract import FlightSettings
 from mjxball.fly.maneuver import Glimpse, Times
 from mjxball.fly.supervisor import AIRBORNE, Event, State
@@ -139,3 +139,20 @@ def test_an_abort_during_the_ramp_does_not_jump_to_hover() -> None:
 def test_every_state_has_a_time_limit_in_the_air() -> None:
     world = World(FlightSettings(times=Times(), seconds=3.0))
     assert all(math.isfinite(world.flight._limit(state)) for state in AIRBORNE)
+
+
+def test_a_bug_in_the_runner_stops_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World()
+    world.fly_until(State.FLY)
+    assert world.running() == [True, True]
+
+    def broken(*_: object) -> bool:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(world.flight, "tick", broken)
+    session.run(world.flight)
+    world.advance(0.05)
+    assert world.running() == [False, False]
+    assert world.flight.supervisor.state is State.DONE
+    assert world.flight.supervisor.cause is not None
+    assert any("RuntimeError: a bug" in record.get("text", "") for record in world.notes.records)
