@@ -143,6 +143,22 @@ def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
     assert 2 * np.abs(tilt).max() < math.radians(20)
 
 
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> None:
+    world = World(FlightSettings(seconds=20.0, times=QUICK))
+    world.fly_until(State.FLY)
+    world.fly_for(2.0)
+    silence(world, number)
+    world.drones[number].firmware.dead = True
+    began = world.now
+    world.fly_until(State.STOP)
+    # It cannot be told from one that only is not heard, but for the stick that tips: 100 ms to miss it, then its fall.
+    assert world.now - began < 0.6
+    assert world.notes.transitions()[3:5] == ["hold", "stop"]
+    world.fly_until(State.DONE)
+    assert world.running() == [False, False]
+
+
 def test_a_drone_that_hears_nothing_but_is_heard_levels_and_locks() -> None:
     world = World(FlightSettings(seconds=20.0))
     world.fly_until(State.FLY)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -49,6 +50,8 @@ class Flight:
         self._saturated = Sustained(settings.limits.saturation_time)
         self._hold_for = settings.times.drone_watchdog
         self._shares = [1.0]  # of the trims, tick by tick, in State.HOLD
+        bounds = settings.limits
+        self._hold_limits = dataclasses.replace(bounds, tilt=min(bounds.hold_tilt, bounds.tilt))
         self._land_height = 0.0
         self.worst_age = 0.0
         self.highest = [0, 0]  # thrust of each drone that was wanted [units]
@@ -68,8 +71,7 @@ class Flight:
         states, ages = self._states(), [link.telemetry.age(now) for link in self.links]
         self.worst_age = max(ages)
         faults = self._outside(now, ages, missed, gap)
-        if not any(fault.event is Event.STALE for fault in faults):
-            faults += self._from_states(states, now)
+        faults += self._from_states(states, [age <= self.settings.limits.state_age for age in ages], now)
         mapped, broken = self._guided(states, now)
         faults += broken + self._progress(states, now)
         self._advance(faults, now, ages, states)
@@ -117,9 +119,10 @@ class Flight:
         trims = (round(self._trims[0]), round(self._trims[1]))
         return Glimpse(trims, float(now.position[2] - self._origin[2]), float(now.velocity[2]), lift)
 
-    def _from_states(self, states: list[DroneState], now: float) -> list[Fault]:
+    def _from_states(self, states: list[DroneState], fresh: list[bool], now: float) -> list[Fault]:
         armed = self.supervisor.state not in BEFORE_MOTORS and not self.settings.dry_run
-        faults = limits.state_faults(states, self._origin, self.rig.span, self.settings.limits, armed)
+        bounds = self._hold_limits if self.supervisor.state is State.HOLD else self.settings.limits
+        faults = limits.state_faults(states, self._origin, self.rig.span, bounds, armed, fresh)
         for name, state, low in zip(limits.NAMES, states, self._low, strict=True):
             if low.update(state.battery < self.settings.limits.battery, now):
                 faults.append(Fault(Event.BATTERY, f"{name} at {state.battery:.2f} V"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ class Limits:
     fence_low: tuple[float, float, float] = (-1.5, -1.5, -0.3)  # of every drone from where O stood at the start [m]
     fence_high: tuple[float, float, float] = (1.5, 1.5, 1.5)  # [m]
     tilt: float = math.radians(40)  # of either drone from level [rad]
+    hold_tilt: float = math.radians(25)  # the same while the other one is not heard: it may be off [rad]
     stick_tilt: float = math.radians(30)  # of the line between the drones from level [rad]
     stick_error: float = 0.1  # of the distance between the drones [m]
     battery: float = 3.2  # [V]; 3.35 for the brushless
@@ -38,15 +40,22 @@ def age_faults(ages: list[float], limits: Limits) -> list[Fault]:
 
 
 def state_faults(
-    states: list[DroneState], origin: np.ndarray, span: np.ndarray, limits: Limits, armed: bool = True
+    states: list[DroneState],
+    origin: np.ndarray,
+    span: np.ndarray,
+    limits: Limits,
+    armed: bool = True,
+    fresh: Sequence[bool] = (True, True),
 ) -> list[Fault]:
     """Everything wrong with two states; `origin` (3,) [m] is where O stood, `span` (3,) [m] leader from follower.
 
-    Before they are `armed`, drones need not be able to fly.
+    Before they are `armed`, drones need not be able to fly; a state that is not `fresh` is not judged.
     """
     faults = []
     low, high = np.array(limits.fence_low), np.array(limits.fence_high)
-    for name, state in zip(NAMES, states, strict=True):
+    for name, state, known in zip(NAMES, states, fresh, strict=True):
+        if not known:
+            continue
         numbers = np.concatenate([state.position, state.velocity, state.quaternion, state.rates])
         if not np.isfinite(numbers).all():
             faults.append(Fault(Event.BAD_STATE, f"state of the {name} is not finite"))
@@ -61,7 +70,7 @@ def state_faults(
         down = down_reason(state.info, armed)
         if down:
             faults.append(Fault(Event.DRONE_DOWN, f"{name} {down}"))
-    return faults + stick_faults(states, span, limits)
+    return faults + (stick_faults(states, span, limits) if all(fresh) else [])
 
 
 def stick_faults(states: list[DroneState], span: np.ndarray, limits: Limits) -> list[Fault]:
