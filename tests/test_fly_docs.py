@@ -42,6 +42,7 @@ def test_every_flag_is_named() -> None:
         f"fence ±{BOUNDS.fence_high[0]:g} m and {BOUNDS.fence_low[2]:g} .. {BOUNDS.fence_high[2]:g} m",
         f"tilt {math.degrees(BOUNDS.tilt):.0f} degrees; stick {math.degrees(BOUNDS.stick_tilt):.0f} degrees",
         f"{100 * BOUNDS.stick_error:.0f} cm too long",
+        f"in *hold* {math.degrees(BOUNDS.hold_tilt):.0f} degrees of the drone that is heard",
         f"battery below {BOUNDS.battery:g} V for {BOUNDS.battery_time:g} s",
         f"at a bound for {BOUNDS.saturation_time:g} s",
         f"more than {BOUNDS.missed_deadlines} deadlines missed in a second or {1000 * BOUNDS.longest_gap:.0f} ms",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from fly_virtual import World, thrusts
 
-from mjxball.fly import packets, session
+from mjxball.fly import packets, sortie
 from mjxball.fly.contract import FlightSettings
 from mjxball.fly.maneuver import Glimpse, Times
 from mjxball.fly.supervisor import AIRBORNE, Event, State
@@ -150,7 +150,7 @@ def test_a_bug_in_the_runner_stops_both(monkeypatch: pytest.MonkeyPatch) -> None
         raise RuntimeError("a bug")
 
     monkeypatch.setattr(world.flight, "tick", broken)
-    session.run(world.flight)
+    sortie.run(world.flight)
     world.advance(0.05)
     assert world.running() == [False, False]
     assert world.flight.supervisor.state is State.DONE

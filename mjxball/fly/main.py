@@ -19,7 +19,7 @@ from mjxball.fly.contract import FlightSettings
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.rehearse import Rehearsal
-from mjxball.fly.session import Crew, fly
+from mjxball.fly.sortie import Crew, fly
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
