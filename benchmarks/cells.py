@@ -5,7 +5,7 @@
 A cell is flown from the origin to (1, 1, 1) m for 45 s from several CG phases, with the mass known to the hover thrust
 or believed to be 0.2 kg (then adaptive adapts its mass), undisturbed and with noise at level 1 and 40 ms of delay. All
 policies fly where the mass is known, the robust ones where it is not; of several, as of the seeds of one run, the
-distribution is printed as well. Wanted, of medians over the phases; a follower that fails in any of them loses the cell:
+distribution is printed as well. Wanted, of medians over the phases; who fails in any of them loses the cell:
 
 - peak: the largest |e| of any axis after 20 s at most the adaptive follower's in the same flights plus 3 mm
 - overshoot: at most the adaptive follower's in the same flights
@@ -107,7 +107,7 @@ def show(where: str, name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
         "all four": whole,
         **won,
         "failed": failed,
-        "peak": peaks,
+        "median peaks": peaks,
     }
 
 
