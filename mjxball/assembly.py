@@ -14,6 +14,7 @@ import numpy as np
 
 from mjxball.cli import make_parser, output_file, quit_on_interrupt, run_command
 from mjxball.config import Attitude, Plant
+from mjxball.control import mixer
 from mjxball.control.constants import ROLLING_INERTIA, plant_constants
 
 ASSEMBLY = "assembly"
@@ -21,8 +22,6 @@ LEADER = "leader"
 FOLLOWER = "follower"
 BALL = "ball"
 BALL_JOINT = "cg"
-ROTOR_AXES = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])  # plus layout
-ROTOR_SPIN = (1, -1, 1, -1)  # sign of the yaw moment of a positive force
 COLOURS = {LEADER: (0.85, 0.25, 0.2, 1.0), FOLLOWER: (0.2, 0.4, 0.85, 1.0)}
 
 
@@ -133,8 +132,9 @@ def _add_drone(
         name=name, pos=mount, mass=mass, explicitinertial=True, ipos=[0, 0, 0], inertia=list(inertia)
     )
     _add_visual(drone, f"{name}_hub", mujoco.mjtGeom.mjGEOM_BOX, [0.035, 0.035, 0.015], COLOURS[name])
-    for number, (axis, spin) in enumerate(zip(ROTOR_AXES, ROTOR_SPIN, strict=True), start=1):
-        place = plant.arm * axis
+    places, spins = mixer.PLACES[plant.layout], mixer.SPIN[plant.layout]
+    for number, (axis, spin) in enumerate(zip(places, spins, strict=True), start=1):
+        place = mixer.lever(plant.arm, plant.layout) * np.array([*axis, 0.0])
         label = f"{name}_rotor{number}"
         arm = _add_visual(drone, f"{label}_arm", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.005], COLOURS[name])
         arm.fromto[:] = [0, 0, 0, *place]

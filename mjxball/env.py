@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxball.config import Config
-from mjxball.control import leader, observation, rotations
+from mjxball.config import Config, ball_reach
+from mjxball.control import observation, rotations
 from mjxball.control.constants import plant_constants, trim_reach
 from mjxball.control.recall import recall_of
 from mjxball.nuisance import Nuisances
@@ -22,6 +22,7 @@ from mjxball.physics.step import ControlStep, make_cg_offset, make_control_step,
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.quiet import import_brax_env
 from mjxball.rewards import paper_reward, task_reward
+from mjxball.wiring import Wiring
 
 Array = Any
 if TYPE_CHECKING:
@@ -74,7 +75,8 @@ class CoupledPairEnv(Env):
         self.config = config
         self._backend = physics
         self._control_step = _make_step(config, physics)
-        self._mount = jnp.asarray(config.plant.follower_mount, jnp.float32)
+        self._wiring = Wiring(config)
+        self._ball_reach = ball_reach(config.plant)
         self._recall = recall_of(config)
         self._nuisances = Nuisances(config)
         scenario = config.scenario
@@ -188,7 +190,7 @@ class CoupledPairEnv(Env):
         sound = jnp.all(jnp.isfinite(action))
         action = jnp.where(sound, action, jnp.zeros_like(action))
         seen = state.obs[: observation.OBSERVATION_SIZE]
-        led = self._leader_command(world)
+        led = self._wiring.leader_command(world.plant, world.goal, world.integral)
         followed = self._follower_command(action, seen)
         load = world.load._replace(push=world.nuisance.push) if self._nuisances.present else world.load
         return Orders(led, followed, action, sound, seen), load
@@ -214,7 +216,7 @@ class CoupledPairEnv(Env):
         moved = world._replace(
             plant=plant,
             nuisance=nuisance,
-            integral=world.integral + timing.control_period * (world.goal - world.plant.position),
+            integral=world.integral + timing.control_period * self._wiring.leader_error(world.plant, world.goal)[0],
             memory=self._recall.next(world.memory, seen, action),
             action=action,
             steps=steps,
@@ -238,8 +240,7 @@ class CoupledPairEnv(Env):
         )
 
     def _observe(self, plant: PlantState, goal: Array) -> Array:
-        matrix = rotations.matrix_from_quaternion(plant.quaternion)
-        return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, self._mount)
+        return self._wiring.observe(plant, goal)
 
     def _trimmed(self, load: Load) -> Array:
         """CG amplitude that can be trimmed before and after the mass changes [m]; negative: none."""
@@ -294,13 +295,6 @@ class CoupledPairEnv(Env):
         clean = observation.OBSERVATION_SIZE - 3 + 5 if self._nuisances.present else 0
         return SECRETS + clean + (6 if self._varies else 0)
 
-    def _leader_command(self, world: World) -> Array:
-        law = self.config.leader
-        gains = (jnp.asarray(gain, jnp.float32) for gain in (law.kp, law.kd, law.ki))
-        error = world.goal - world.plant.position
-        wanted = leader.desired_acceleration(error, -world.plant.velocity, world.integral, *gains)
-        return leader.command(wanted, 0.0, self.config.plant.gravity, law.tilt_limit, law.vertical_limit)
-
     def _follower_command(self, action: Array, seen: Array) -> Array:
         follower, law = self.config.follower, self.config.leader
         return observation.follower_command(
@@ -321,12 +315,15 @@ class CoupledPairEnv(Env):
             reward = paper_reward(led, followed)
         else:
             euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
-            reward = task_reward(self.config.reward, error, plant.velocity, euler, plant.rates, action, last)
+            weights = self.config.reward
+            reward = task_reward(weights, error, plant.velocity, euler, plant.rates, action, last)
+            if weights.ball:
+                reward = reward - weights.ball * (plant.ball_offset / self._ball_reach) ** 2
         return reward - jnp.where(ended, self.config.reward.termination, 0.0)
 
     @staticmethod
     def _diverged(plant: PlantState) -> Array:
-        finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in plant]))
+        finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(plant)]))
         return jnp.logical_or(~finite, jnp.linalg.norm(plant.rates) > RATE_BOUND)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Config, Plant, preset, validate
-from mjxball.control import leader, observation, rotations
+from mjxball.control import rotations
 from mjxball.control.baselines.law import Brief
 from mjxball.control.constants import plant_constants
 from mjxball.control.followers import Baseline, Follower
@@ -23,6 +24,7 @@ from mjxball.physics.step import make_accelerations, make_cg_offset, pushed, sta
 from mjxball.physics.stepper import make_stepper
 from mjxball.scenario import Scenario, check_scenario
 from mjxball.sensing import Senses
+from mjxball.wiring import Wiring
 
 Array = Any
 Act = Callable[[np.ndarray, Brief], np.ndarray]  # observations (n, 18), what is known -> commands (n, 3)
@@ -154,19 +156,17 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
 def fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Iterator[Tick]:
     """Every control step of all scenarios at once, the start first; `act` is the followers' laws."""
     step, cg_offset, brief = make_stepper(config, physics), make_cg_offset(config), make_brief(config)
-    period = config.timing.control_period
+    wiring, period = Wiring(config), config.timing.control_period
     count = round(scenarios[0].seconds / period)
     load, target = load_of(scenarios), targets(scenarios, count, period)
     state = start_of(config, scenarios)
     senses = Senses([scenario.disturbance for scenario in scenarios], count, period)
     integral, diverged, memory = np.zeros_like(state.position), np.zeros(len(scenarios), bool), None
-    mount = np.array(config.plant.follower_mount)
     for number in range(count + 1):
         goal = target[number]
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         euler = rotations.euler_from_matrix(matrix)
-        seen = observation.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
-        led = leader_command(config, goal, state, integral)
+        seen, led = wiring.observe(state, goal), wiring.leader_command(state, goal, integral)
         memory = memory or senses.start(seen)
         noise, arrives = (None if table is None else table[number] for table in (senses.noise, senses.arrives))
         memory, seen = senses.step(memory, number, seen, noise, arrives)
@@ -175,11 +175,11 @@ def fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -
         flown = (state.position, goal, euler, state.rotor_force, led, followed, diverged)
         yield Tick(number * period, *flown, state, seen, cg_offset(state, load))
         if number < count:
-            integral = integral + period * (goal - state.position)
+            integral = integral + period * wiring.leader_error(state, goal)[0]
             acting = load if senses.pushes is None else load._replace(push=senses.pushes[number])
             moved = step(state, np.stack([led, followed], axis=1), acting)
             diverged = diverged | has_diverged(moved)
-            state = PlantState(*(keep(diverged, old, new) for old, new in zip(state, moved, strict=True)))
+            state = state.each(functools.partial(keep, diverged), moved)
 
 
 def _record(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -> Trajectory:
@@ -192,7 +192,8 @@ def _record(config: Config, scenarios: Sequence[Scenario], act: Act, physics: st
         for name in ("target", "euler", "leader_command", "follower_command", "observation", "cg_offset")
     )
     diverged = ticks[-1].diverged
-    flown = PlantState(*(np.stack(leaves) for leaves in zip(*(tick.state for tick in ticks), strict=True)))
+    states = [tick.state for tick in ticks if tick.state is not None]
+    flown = states[0].each(lambda *leaves: np.stack(leaves), *states[1:])
     flown = flown._replace(time=np.broadcast_to(grid[:, None], flown.time.shape))
     load = load._replace(push=pushes)
     force, torque = flown_contact_wrenches(config, flown, load, physics)
@@ -252,7 +253,9 @@ def flown_contact_wrenches(
         return measured(config, flown, load)
     constants = plant_constants(config.plant, config.attitude)
     accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
-    wrench = total_wrench(np, flown.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust)
+    wrench = total_wrench(
+        np, flown.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust, config.plant.layout
+    )
     linear, angular, _ = accelerate(flown, pushed(wrench, flown, load), load)
     return contact_wrenches(config.plant, constants, flown, linear, angular)
 
@@ -293,19 +296,10 @@ def load_of(scenarios: Sequence[Scenario]) -> Load:
     return Load(mass, np.array(believed, float), amplitude, omega, phase, changes[..., 1], changes[..., 0])
 
 
-def leader_command(config: Config, goal: Array, state: PlantState, integral: Array) -> Array:
-    """The leader's command (n, 3) at `state`, `integral` (n, 3) of its error so far."""
-    xp = goal.__array_namespace__()
-    law = config.leader
-    gains = (xp.asarray(gain, dtype=goal.dtype) for gain in (law.kp, law.kd, law.ki))
-    wanted = leader.desired_acceleration(goal - state.position, -state.velocity, integral, *gains)
-    return leader.command(wanted, 0.0, config.plant.gravity, law.tilt_limit, law.vertical_limit)
-
-
 def has_diverged(state: PlantState) -> Array:
     """(n,) true where a value of `state` is not finite or beyond any bound."""
     xp = state.position.__array_namespace__()
-    flat = xp.concat([xp.reshape(leaf, (leaf.shape[0], -1)) for leaf in state], axis=1)
+    flat = xp.concat([xp.reshape(leaf, (leaf.shape[0], -1)) for leaf in state if leaf is not None], axis=1)
     with np.errstate(invalid="ignore"):
         far = (xp.abs(state.position) > DIVERGED_POSITION).any(-1) | (xp.abs(state.rates) > DIVERGED_RATE).any(-1)
     return far | ~xp.isfinite(flat).all(-1)

@@ -19,7 +19,7 @@ from mjxball.fly.pair import Rig
 from mjxball.fly.pilot import Pilot
 from mjxball.physics.engine import PlantState
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.rollout import leader_command
+from mjxball.wiring import Wiring
 
 small = st.floats(-0.5, 0.5)
 triples = st.tuples(small, small, small)
@@ -74,7 +74,7 @@ def test_a_flight_of_the_pilot_is_a_flight_of_the_simulation() -> None:
         np.testing.assert_allclose(flown.observation, seen, atol=1e-12)
         zero = np.zeros(())
         simulated = PlantState(*(zero for _ in PlantState._fields))._replace(position=position, velocity=velocity)
-        np.testing.assert_allclose(flown.leader, leader_command(config, goal, simulated, integral), atol=1e-10)
+        np.testing.assert_allclose(flown.leader, Wiring(config).leader_command(simulated, goal, integral), atol=1e-10)
         np.testing.assert_allclose(flown.follower, follower(seen), atol=1e-5)  # float32 inference (design section 1)
         integral = integral + config.timing.control_period * (goal - position)
 

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from mjxball.config import preset
-from mjxball.control import attitude, leader, mixer, observation, rotations
+from mjxball.config import Autopilot, preset
+from mjxball.control import attitude, crazyflie, leader, mixer, observation, rotations
 from mjxball.control.attitude import AttitudeGains
 from mjxball.control.baselines.law import Brief
 from mjxball.control.followers import LAWS as FOLLOWERS
@@ -54,6 +54,14 @@ def flown(name: str) -> Callable[..., Any]:
     return commands
 
 
+COMMANDS = random.uniform(0, 65535, (WORLDS, 4))
+CASCADE = (
+    np.concatenate([0.1 * normal(6), 20 * normal(7)], axis=-1),
+    np.concatenate([5 * normal(3), random.uniform(1e4, 6e4, (WORLDS, 1)).round()], axis=-1),
+    0.2 * EULER,
+    0.1 * normal(3),
+)
+
 # name -> (law of arrays alone, its arrays). Clipping happens in some worlds and not in others.
 LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.rotate": (rotations.rotate, (MATRIX, normal(3))),
@@ -77,6 +85,19 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "leader.clip_command": (lambda c: leader.clip_command(c, *LIMITS), (normal(3),)),
     "mixer.wrench_from_rotors": (lambda f: mixer.wrench_from_rotors(f, 0.12, 0.02), (normal(4),)),
     "mixer.rotors_from_wrench": (lambda w: mixer.rotors_from_wrench(w, 0.12, 0.02), (normal(4),)),
+    "mixer.wrench_from_rotors x": (lambda f: mixer.wrench_from_rotors(f, 0.046, 0.006, "x"), (normal(4),)),
+    "mixer.rotors_from_wrench x": (lambda w: mixer.rotors_from_wrench(w, 0.046, 0.006, "x"), (normal(4),)),
+    "crazyflie.to_firmware": (crazyflie.to_firmware, (EULER,)),
+    "crazyflie.start_loops": (crazyflie.start_loops, (EULER, normal(3))),
+    "crazyflie.motor_force": (lambda c: crazyflie.motor_force((0.0915, 0.0677), c), (COMMANDS,)),
+    "crazyflie.motor_command": (lambda f: crazyflie.motor_command((0.0915, 0.0677), f), (COMMANDS / 4e5,)),
+    "crazyflie.setpoints": (
+        lambda a, m: crazyflie.setpoints(Autopilot(), a, m, G),
+        (0.3 * ACTION, random.uniform(0.03, 0.04, WORLDS)),
+    ),
+    "crazyflie.cascade loops": (lambda *a: crazyflie.cascade(Autopilot(), *a)[0], CASCADE),
+    "crazyflie.cascade motors": (lambda *a: crazyflie.cascade(Autopilot(), *a)[1], CASCADE),
+    "crazyflie.mix": (crazyflie.mix, (COMMANDS[:, 0], 6e3 * normal(3))),
     "attitude.rotor_commands": (
         lambda c, e, w, m: attitude.rotor_commands(c, e, w, m, GAINS, G, 0.12, 0.02, 5.5),
         (ACTION, EULER, normal(3), random.uniform(0.9, 1.3, WORLDS)),
@@ -97,7 +118,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     **{f"baseline {name}": (flown(name), (FLIGHT, *BRIEF)) for name in FOLLOWERS},
 }
 # Computed once in NumPy float64, from the config, not from arrays.
-NOT_LAWS = {"attitude.design_gains"}
+NOT_LAWS = {"attitude.design_gains", "mixer.lever", "mixer.torque_reach", "crazyflie.unpack", "crazyflie.cascade"}
 each_law = pytest.mark.parametrize("name", LAWS)
 
 
@@ -111,7 +132,7 @@ def difference(first: Any, second: Any) -> float:
 def test_every_law_is_compared():
     public = {
         f"{module.__name__.rsplit('.', 1)[1]}.{name}"
-        for module in (rotations, leader, mixer, attitude, observation)
+        for module in (rotations, leader, mixer, attitude, observation, crazyflie)
         for name, member in inspect.getmembers(module, inspect.isfunction)
         if member.__module__ == module.__name__ and not name.startswith("_")
     }

@@ -6,6 +6,7 @@ Importing it needs the standard library only.
 from mjxball.config._presets import PRESETS, preset
 from mjxball.config._settings import (
     Attitude,
+    Autopilot,
     Bounds,
     Config,
     Follower,
@@ -23,6 +24,7 @@ from mjxball.config._validate import ball_reach, cg_reach, validate
 __all__ = [
     "PRESETS",
     "Attitude",
+    "Autopilot",
     "Bounds",
     "Config",
     "Follower",

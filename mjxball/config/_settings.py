@@ -47,13 +47,17 @@ class Plant:
         high=1,
     )
     ball_radius: float = setting(0.02, "radius of the moving ball [m]", above=0)
+    ball_stop: float = setting(0.0, "ball's centre from O at an end stop, 0: it touches the object's end [m]", low=0)
     cg_axis: Literal["x", "y"] = setting("x", "body axis along which the CG moves and the drones are mounted")
     stand: Literal["free", "pivot", "heave"] = setting(
         "free", "free flight; pivot: O fixed, only roll free; heave: roll and height free"
     )
     leader_mount: Vector3 = setting((0.17, 0.0, 0.0), "centre of the leader from O, body axes [m]")
     follower_mount: Vector3 = setting((-0.17, 0.0, 0.0), "centre of the follower from O, body axes [m]")
-    arm: float = setting(0.12, "centre of a drone to each rotor, plus layout [m]", above=0)
+    arm: float = setting(0.12, "centre of a drone to each rotor [m]", above=0)
+    layout: Literal["plus", "x"] = setting(
+        "plus", "rotors on the body axes, 1 at +x, 2 at +y; or between them as on a Crazyflie, 1 at +x -y, 2 at -x -y"
+    )
     rotor_force_max: float = setting(5.5, "largest force of one rotor [N]", above=0)
     rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", above=0)
     yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", above=0)
@@ -90,6 +94,32 @@ class Attitude:
 
 
 @dataclass(frozen=True)
+class Autopilot:
+    """What each drone's own computer runs. `ideal` is the PD loop of `Attitude`; `crazyflie` is its firmware's
+    cascade, with the gains kp, ki, kd of its parameters pid_attitude.* and pid_rate.*, defaults as delivered.
+    """
+
+    kind: Literal["ideal", "crazyflie"] = setting("ideal", "ideal: PD of `attitude`; crazyflie: the firmware's cascade")
+    roll: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.roll_kp, ki, kd [1/s, 1/s2, 1]", low=0)
+    pitch: Vector3 = setting((6.0, 3.0, 0.0), "pid_attitude.pitch_kp, ki, kd", low=0)
+    yaw: Vector3 = setting((6.0, 1.0, 0.35), "pid_attitude.yaw_kp, ki, kd", low=0)
+    roll_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.roll_kp, ki, kd [motor command per deg/s]", low=0)
+    pitch_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.pitch_kp, ki, kd", low=0)
+    yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0)
+    attitude_limits: Vector3 = setting((20.0, 20.0, 360.0), "limits of the attitude integrals [deg s]", above=0)
+    rate_limits: Vector3 = setting((33.3, 33.3, 166.7), "limits of the rate integrals [deg]", above=0)
+    motor_curve: Range = setting(
+        (0.0915, 0.0677), "force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]", low=0
+    )
+    thrust_law: Literal["calibrated", "paper"] = setting(
+        "calibrated", "calibrated: the motor curve at m (g + az); paper: hover_thrust + thrust_per_acceleration az"
+    )
+    hover_thrust: float = setting(46000.0, "thr_hov of the paper's law, calibrated for each rig", low=0, high=60000)
+    thrust_per_acceleration: float = setting(1000.0, "k_pz of the paper's law [1/(m/s2)]", low=0)
+    sag: float = setting(0.0, "share of the force lost in a second of flight as the battery empties [1/s]", low=0)
+
+
+@dataclass(frozen=True)
 class Leader:
     """The leader's PID law (paper eq. 5) and its command limits."""
 
@@ -98,6 +128,9 @@ class Leader:
     ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0)
     tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", above=0, high=1.2)
     vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", above=0)
+    error: Literal["object", "own"] = setting(
+        "object", "what it flies on: e_o of the object, or e_l of its own place, goal + its mount (the paper's stand)"
+    )
 
 
 @dataclass(frozen=True)
@@ -109,6 +142,9 @@ class Follower:
     )
     tilt_limit: float = setting(0.2, "reach of the network's roll and pitch action [rad]", above=0, high=1.2)
     vertical_limit: float = setting(2.0, "reach of the network's vertical action [m/s2]", above=0)
+    error: Literal["object", "leader"] = setting(
+        "object", "what the slots of the object's error carry: e_o, or the leader's e_l"
+    )
     history: int = setting(1, "observations that the network sees, the newest included", low=1, high=100)
     ignore_position: bool = setting(
         True, "the network's input omits the absolute position: the dynamics do not depend on it"
@@ -182,6 +218,7 @@ class Reward:
     rates: float = setting(0.05, "weight of the squared body rates [s2/rad2]", low=0)
     effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0)
     smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0)
+    ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0)
     termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0)
 
 
@@ -239,6 +276,7 @@ class Config:
     plant: Plant = Plant()
     motion: Motion = Motion()
     attitude: Attitude = Attitude()
+    autopilot: Autopilot = Autopilot()
     leader: Leader = Leader()
     follower: Follower = Follower()
     timing: Timing = Timing()

@@ -66,6 +66,7 @@ def validate(config: Config) -> Config:
             owner = getattr(owner, part)
         _check_leaf(path, value, item, _types_of(owner)[item.name])
     _validate_plant(config.plant)
+    _validate_autopilot(config)
     _validate_motion(config)
     start, goal = config.scenario.start_position, config.scenario.goal_reach
     farthest = math.sqrt(3) * (start + goal)
@@ -97,6 +98,46 @@ def _validate_plant(plant: Plant) -> None:
             f"plant.ball_radius {plant.ball_radius:g} m makes a ball larger than the object, "
             f"which is {plant.object_size[along]:g} m long"
         )
+    end = plant.object_size[along] / 2 - plant.ball_radius
+    if plant.ball_stop > end + 1e-12:
+        raise InputError(f"plant.ball_stop {plant.ball_stop:g} m lies off the object, where a ball reaches {end:.4g} m")
+
+
+THRUST_MARGIN = 0.3  # share of a Crazyflie's thrust that a hover must leave
+
+
+def thrust_margin(config: Config) -> float:
+    """Share of the weaker drone's full thrust that hovering the heaviest object leaves; negative: it cannot hover."""
+    plant, most = config.plant, 4 * sum(config.autopilot.motor_curve)
+    along = "xy".index(plant.cg_axis)
+    ahead, behind = plant.leader_mount[along], plant.follower_mount[along]
+    mass = config.scenario.object_mass[1] + max(config.scenario.mass_change[1], 0.0)
+    carried = (
+        plant.leader_mass - behind / (ahead - behind) * mass,
+        plant.follower_mass + ahead / (ahead - behind) * mass,
+    )
+    return 1 - max(carried) * plant.gravity / most
+
+
+def _validate_autopilot(config: Config) -> None:
+    if config.autopilot.kind == "ideal":
+        return
+    if abs(config.physics_step - 0.002) > 1e-9:
+        raise InputError(
+            f"timing gives physics steps of {config.physics_step * 1e3:.3g} ms, but a Crazyflie's loops run at 500 Hz: "
+            "control_period over physics_steps must be 2 ms"
+        )
+    most = sum(config.autopilot.motor_curve)
+    if config.plant.layout != "x" or abs(config.plant.rotor_force_max - most) > 1e-3 * most:
+        raise InputError(
+            f"a Crazyflie has plant.layout x and, with this autopilot.motor_curve, plant.rotor_force_max {most:.4g} N"
+        )
+    margin = thrust_margin(config)
+    if margin < THRUST_MARGIN:
+        raise InputError(
+            f"hovering takes {1 - margin:.0%} of a drone's thrust and leaves {margin:.0%}, where 30% are needed: "
+            "make the rig lighter or the motors stronger"
+        )
 
 
 def cg_reach(plant: Plant) -> float:
@@ -106,7 +147,7 @@ def cg_reach(plant: Plant) -> float:
 
 def ball_reach(plant: Plant) -> float:
     """Offset of a rolling ball at which it touches an end stop [m]."""
-    return plant.object_size["xy".index(plant.cg_axis)] / 2 - plant.ball_radius
+    return plant.ball_stop or plant.object_size["xy".index(plant.cg_axis)] / 2 - plant.ball_radius
 
 
 def _validate_motion(config: Config) -> None:

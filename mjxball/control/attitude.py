@@ -36,6 +36,7 @@ def rotor_commands(
     arm: float,
     yaw_per_thrust: float,
     rotor_force_max: float,
+    layout: str = "plus",
 ) -> Array:
     """Clipped rotor forces (..., 4) [N] for `command` = (roll, pitch [rad], vertical acceleration [m/s2]) (..., 3).
 
@@ -49,5 +50,5 @@ def rotor_commands(
     thrust = carried_mass * (gravity + command[..., 2]) / level
     desired = xp.stack([command[..., 0], command[..., 1], xp.zeros_like(command[..., 0])], axis=-1)
     torque = kp * (desired - euler) - kd * rates
-    rotors = mixer.rotors_from_wrench(xp.concat([thrust[..., None], torque], axis=-1), arm, yaw_per_thrust)
+    rotors = mixer.rotors_from_wrench(xp.concat([thrust[..., None], torque], axis=-1), arm, yaw_per_thrust, layout)
     return xp.clip(rotors, 0.0, rotor_force_max)

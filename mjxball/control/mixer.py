@@ -1,24 +1,45 @@
-"""Plus-layout mixer: rotors 1 at +x, 2 at +y, 3 at -x, 4 at -y (paper eq. 2)."""
+"""Mixers: rotor forces of one drone <-> its wrench, for rotors on the body axes (plus) or between them (x)."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 Array = Any
+# Rotors 1..4 along x and y, times `lever`: plus (paper eq. 2), and x as on a Crazyflie, front right first.
+PLACES = {"plus": ((1, 0), (0, 1), (-1, 0), (0, -1)), "x": ((1, -1), (-1, -1), (-1, 1), (1, 1))}
+SPIN = {"plus": (1, -1, 1, -1), "x": (-1, 1, -1, 1)}  # sign of the yaw moment of a positive force
 
 
-def wrench_from_rotors(force: Array, arm: float, yaw_per_thrust: float) -> Array:
+def lever(arm: float, layout: str) -> float:
+    """Distance of a rotor from the body axes that it lies off [m]; `arm` is that from the drone's centre."""
+    return arm if layout == "plus" else arm / math.sqrt(2)
+
+
+def wrench_from_rotors(force: Array, arm: float, yaw_per_thrust: float, layout: str = "plus") -> Array:
     """(T, tau_x, tau_y, tau_z) (..., 4) [N, N m] of rotor forces F1..F4 (..., 4) [N], about the drone's centre."""
     xp = force.__array_namespace__()
     f1, f2, f3, f4 = (force[..., i] for i in range(4))
-    return xp.stack(
-        [f1 + f2 + f3 + f4, arm * (f2 - f4), arm * (f3 - f1), yaw_per_thrust * (f1 - f2 + f3 - f4)], axis=-1
-    )
+    thrust, side = f1 + f2 + f3 + f4, lever(arm, layout)
+    if layout == "plus":
+        return xp.stack([thrust, side * (f2 - f4), side * (f3 - f1), yaw_per_thrust * (f1 - f2 + f3 - f4)], axis=-1)
+    roll, pitch, yaw = f3 + f4 - f1 - f2, f2 + f3 - f1 - f4, f2 + f4 - f1 - f3
+    return xp.stack([thrust, side * roll, side * pitch, yaw_per_thrust * yaw], axis=-1)
 
 
-def rotors_from_wrench(wrench: Array, arm: float, yaw_per_thrust: float) -> Array:
+def rotors_from_wrench(wrench: Array, arm: float, yaw_per_thrust: float, layout: str = "plus") -> Array:
     """Rotor forces F1..F4 (..., 4) [N] that give `wrench` = (T, tau_x, tau_y, tau_z) (..., 4); the exact inverse."""
     xp = wrench.__array_namespace__()
     thrust, tx, ty, tz = (wrench[..., i] / 4 for i in range(4))
-    roll, pitch, yaw = 2 * tx / arm, 2 * ty / arm, tz / yaw_per_thrust
-    return xp.stack([thrust - pitch + yaw, thrust + roll - yaw, thrust + pitch + yaw, thrust - roll - yaw], axis=-1)
+    side = lever(arm, layout)
+    if layout == "plus":
+        roll, pitch, yaw = 2 * tx / side, 2 * ty / side, tz / yaw_per_thrust
+        return xp.stack([thrust - pitch + yaw, thrust + roll - yaw, thrust + pitch + yaw, thrust - roll - yaw], axis=-1)
+    roll, pitch, yaw = tx / side, ty / side, tz / yaw_per_thrust
+    rotors = [thrust - roll - pitch - yaw, thrust - roll + pitch + yaw]
+    return xp.stack([*rotors, thrust + roll + pitch - yaw, thrust + roll - pitch + yaw], axis=-1)
+
+
+def torque_reach(arm: float, layout: str) -> float:
+    """Roll or pitch torque per force [m] that a drone has: times (F_max - T / 4) it is the largest at thrust T."""
+    return (2 if layout == "plus" else 4) * lever(arm, layout)

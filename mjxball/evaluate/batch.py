@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,7 @@ import numpy as np
 from mjxball import rollout
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
-from mjxball.control import observation, rotations
+from mjxball.control import rotations
 from mjxball.control.baselines.law import Law
 from mjxball.control.followers import Baseline, Follower
 from mjxball.errors import InputError
@@ -26,6 +27,7 @@ from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.scenario import Scenario, check_scenario
 from mjxball.sensing import Senses
+from mjxball.wiring import Wiring
 
 Array = Any
 
@@ -63,7 +65,7 @@ class Batch:
         step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
         self._step = jax.vmap(step)
         self._brief = rollout.make_brief(config)
-        self._mount = np.array(config.plant.follower_mount, np.float32)
+        self._wiring = Wiring(config)
         self._compiled: dict[Any, Any] = {}
 
     def fly(self, scenarios: Sequence[Scenario]) -> list[Metrics]:
@@ -91,7 +93,7 @@ class Batch:
         return self._compiled[key]
 
     def _all(self, senses: Senses, start: PlantState, load: Load, draws: Draws) -> metrics.Tally:
-        seen = self._observe(start, draws.target[0])
+        seen = self._wiring.observe(start, draws.target[0])
         noise, arrives = (None if t is None else t[0] for t in (draws.noise, draws.arrives))
         memory = senses.start(seen)
         _, first = senses.step(memory, jnp.zeros((), jnp.int32), seen, noise, arrives)
@@ -105,16 +107,12 @@ class Batch:
         )
         return jax.lax.scan(lambda c, d: (self._tick(senses, load, c, d), None), carry, draws)[0].tally
 
-    def _observe(self, plant: PlantState, goal: Array) -> Array:
-        matrix = rotations.matrix_from_quaternion(plant.quaternion)
-        return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, jnp.asarray(self._mount))
-
     def _tick(self, senses: Senses, load: Load, carry: Carry, draws: Draws) -> Carry:
         config, plant, goal = self._config, carry.plant, draws.target
         period = config.timing.control_period
-        seen = self._observe(plant, goal)
+        seen = self._wiring.observe(plant, goal)
         memory, seen = senses.step(carry.senses, draws.number, seen, draws.noise, draws.arrives)
-        led = rollout.leader_command(config, goal, plant, carry.integral)
+        led = self._wiring.leader_command(plant, goal, carry.integral)
         follower, command = self._law.step(carry.follower, seen, self._brief(plant, load))
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         time = draws.number * jnp.float32(period)
@@ -124,8 +122,8 @@ class Batch:
         moved = self._step(plant, jnp.stack([led, command], axis=1), load._replace(push=draws.push))
         diverged = carry.diverged | rollout.has_diverged(moved)
         return Carry(
-            plant=PlantState(*(rollout.keep(diverged, old, new) for old, new in zip(plant, moved, strict=True))),
-            integral=carry.integral + period * (goal - plant.position),
+            plant=plant.each(functools.partial(rollout.keep, diverged), moved),
+            integral=carry.integral + period * self._wiring.leader_error(plant, goal)[0],
             follower=follower,
             senses=memory,
             diverged=diverged,

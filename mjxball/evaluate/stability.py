@@ -25,6 +25,7 @@ from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_control_step, start_state
 from mjxball.scenario import Scenario
+from mjxball.wiring import Wiring
 
 Array = Any
 SETTLE, NEWTON = 3000, 8  # control steps flown towards the fixed point, then steps of Newton's method
@@ -94,12 +95,11 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
     """
     period = config.timing.control_period
     advance = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), mjx.jax_repeat)
-    brief, mount = rollout.make_brief(config), jnp.asarray(config.plant.follower_mount)
+    brief, wiring = rollout.make_brief(config), Wiring(config)
     goal = jnp.zeros(3)
 
     def seen_in(plant: PlantState) -> Array:
-        matrix = rotations.matrix_from_quaternion(plant.quaternion)
-        return observation.observe(plant.position, matrix, plant.velocity, plant.rates, goal, mount)
+        return wiring.observe(plant, goal)
 
     def flat(plant: PlantState, memory: Any, past: Array) -> tuple[Array, Any]:
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
@@ -120,11 +120,13 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
         zero = jnp.zeros(())
         plant = PlantState(position, rotations.quaternion_from_euler(euler), velocity, rates, rotors, zero, zero, zero)
         queue = jnp.concatenate([seen_in(plant)[None], past])
-        led = rollout.leader_command(config, goal, plant, jnp.zeros(3))
+        led = wiring.leader_command(plant, goal, jnp.zeros(3))
         memory, followed = law.step(memory, queue[-1], brief(plant, load))
         moved = advance(plant, jnp.stack([led, followed]), load)
         return flat(moved._replace(time=zero), memory, queue[:-1])[0]
 
+    if config.autopilot.kind != "ideal":
+        raise ValueError("a firmware's whole numbers have no derivative: only the ideal autopilot is linearised")
     if config.leader.ki != (0.0, 0.0, 0.0):
         raise ValueError(f"the leader's integral term {config.leader.ki} has no place in this loop of {period:g} s")
     return start, step

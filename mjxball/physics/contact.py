@@ -25,7 +25,7 @@ def contact_wrenches(
     matrix = rotations.matrix_from_quaternion(state.quaternion)
     rates, down = state.rates, matrix[..., 2, :]
     body = rotations.rotate_back(matrix, linear)
-    rotors = mixer.wrench_from_rotors(state.rotor_force, plant.arm, plant.yaw_per_thrust)
+    rotors = mixer.wrench_from_rotors(state.rotor_force, plant.arm, plant.yaw_per_thrust, plant.layout)
     forces, torques = [], []
     for drone, inertia in enumerate((plant.leader_inertia, plant.follower_inertia)):
         mass = float(constants.drone_mass[drone])

@@ -19,6 +19,12 @@ class PlantState(NamedTuple):
     time: Array  # (...) since the start of the episode [s]
     ball_offset: Array  # (...) of a rolling ball from O along the CG axis [m]; unused by prescribed motions
     ball_rate: Array  # (...) [m/s]
+    loops: Array | None = None  # (..., 2, 13) what a Crazyflie's own loops carry, see `control.crazyflie`; None: ideal
+
+    def each(self, function: Callable[..., Any], *others: PlantState) -> PlantState:
+        """`function` of every leaf that there is, and of the same leaf of `others`."""
+        rows = zip(self, *others, strict=True)
+        return PlantState(*(None if row[0] is None else function(*row) for row in rows))
 
 
 class CgState(NamedTuple):

@@ -11,13 +11,13 @@ from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import ControlStep, Repeat, make_control_step, python_repeat
 
 Array = Any
-STATE_AXES = PlantState(1, 1, 1, 1, 2, 0, 0, 0)  # trailing axes of every leaf
+STATE_AXES = PlantState(1, 1, 1, 1, 2, 0, 0, 0, 2)  # trailing axes of every leaf
 LOAD_AXES = (0, 0, 0, 0, 0, 1, 1)  # of the leaves that every load has
 
 
 def split_state(state: PlantState) -> PlantState:
     """Every leaf of `state` as `Components`."""
-    return PlantState(*map(split, state, STATE_AXES))
+    return state.each(split, STATE_AXES)
 
 
 def split_load(load: Load) -> Load:
@@ -30,7 +30,7 @@ def split_load(load: Load) -> Load:
 
 def join_state(state: PlantState) -> PlantState:
     """The inverse of `split_state`."""
-    return PlantState(*map(join, state))
+    return state.each(join)
 
 
 def make_split_step(config: Config, repeat: Repeat = python_repeat) -> ControlStep:
@@ -38,12 +38,12 @@ def make_split_step(config: Config, repeat: Repeat = python_repeat) -> ControlSt
     engine = newton_euler.make_engine(config.plant, config.attitude)
 
     def arrays_only(body: Any, count: int, value: PlantState) -> PlantState:
-        return repeat(lambda state: PlantState(*map(Namespace.asarray, body(state))), count, value)
+        return repeat(lambda state: body(state).each(Namespace.asarray), count, value)
 
     step = make_control_step(config, engine, arrays_only)
 
     def control_step(state: PlantState, commands: Array, load: Load) -> PlantState:
-        return PlantState(*(Namespace.asarray(leaf) for leaf in step(state, commands, load)))
+        return step(state, commands, load).each(Namespace.asarray)
 
     return control_step
 
@@ -51,9 +51,9 @@ def make_split_step(config: Config, repeat: Repeat = python_repeat) -> ControlSt
 def make_fused_step(config: Config) -> ControlStep:
     """Return the closed form's control step for JAX arrays of any batch shape; equal to the plain one to rounding.
 
-    A waveform's table look-up does not split, so such a motion takes the plain road.
+    A waveform's table look-up and a Crazyflie's loops do not split: they take the plain road.
     """
-    if config.motion.kind == "waveform":
+    if config.motion.kind == "waveform" or config.autopilot.kind != "ideal":
         engine = newton_euler.make_engine(config.plant, config.attitude)
         return make_control_step(config, engine, python_repeat)
     step = make_split_step(config)

@@ -138,7 +138,9 @@ class MujocoWorld:
     def load_drones(self, state: PlantState, rotor_force: Array) -> None:
         """Apply each drone's rotor wrench to its own body, so that the welds carry it to the object."""
         matrix = rotations.matrix_from_quaternion(state.quaternion)
-        wrenches = mixer.wrench_from_rotors(rotor_force, self._plant.arm, self._plant.yaw_per_thrust)
+        wrenches = mixer.wrench_from_rotors(
+            rotor_force, self._plant.arm, self._plant.yaw_per_thrust, self._plant.layout
+        )
         for body, wrench in zip(self._drones, wrenches, strict=True):
             self.data.xfrc_applied[body, :3] = matrix[:, 2] * wrench[0]
             self.data.xfrc_applied[body, 3:] = matrix @ wrench[1:]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjxball.config import Config
-from mjxball.control import attitude, mixer, rotations
+from mjxball.control import attitude, crazyflie, mixer, rotations
 from mjxball.control.constants import plant_constants
 from mjxball.physics import motion
 from mjxball.physics.engine import Engine, Load, PlantState, Wrench
@@ -15,6 +15,8 @@ from mjxball.physics.engine import Engine, Load, PlantState, Wrench
 Array = Any
 # control_step(state, commands (..., 2, 3) of leader and follower, load) -> state one control period later
 ControlStep = Callable[[PlantState, Array, Load], PlantState]
+# autopilot(state, commands, load) -> (loops, rotor forces asked for)
+Autopilot = Callable[[PlantState, Array, Load], tuple[Any, Array]]
 # repeat(body, count, value): apply `body` to `value` `count` times
 Repeat = Callable[[Callable[[PlantState], PlantState], int, PlantState], PlantState]
 
@@ -41,9 +43,11 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
     nominal = math.exp(-h / plant.rotor_lag)  # share of the old rotor force left after a step
     accelerate = make_accelerations(config, engine)
 
+    autopilot = make_autopilot(config)
+
     def physics_step(state: PlantState, commands: Array, load: Load) -> PlantState:
         xp = commands.__array_namespace__()
-        target = rotor_targets(config, constants, state, commands, load.believed_mass)
+        loops, target = autopilot(state, commands, load)
         keep, mean = nominal, plant.rotor_lag / h * (1 - nominal)  # `mean`: its mean share over the step
         if load.rotor_lag_scale is not None:
             lag = (plant.rotor_lag * load.rotor_lag_scale)[..., None, None]
@@ -53,7 +57,7 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
             target = target * load.thrust_scale[..., None]
         acting = target + mean * (state.rotor_force - target)
         middle = _drift(state, h / 2)
-        rotors = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust)
+        rotors = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust, plant.layout)
         wrench = pushed(rotors, middle, load)
         linear, angular, ball = accelerate(middle, wrench, load)
         kicked = middle._replace(
@@ -61,6 +65,7 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
             rates=state.rates + h * angular,
             rotor_force=target + keep * (state.rotor_force - target),
             ball_rate=state.ball_rate + h * ball,
+            loops=loops,
         )
         return _drift(kicked, h / 2)
 
@@ -119,12 +124,37 @@ def rotor_targets(config: Config, constants: Any, state: PlantState, commands: A
         plant.arm,
         plant.yaw_per_thrust,
         plant.rotor_force_max,
+        plant.layout,
     )
 
 
-def total_wrench(xp: Any, rotor_force: Array, mounts: Array, arm: float, yaw_per_thrust: float) -> Wrench:
+def make_autopilot(config: Config) -> Autopilot:
+    """Return `autopilot(state, commands (..., 2, 3), load)` -> (loops, rotor forces (..., 2, 4) asked for [N])."""
+    constants = plant_constants(config.plant, config.attitude)
+    if config.autopilot.kind == "ideal":
+        return lambda state, commands, load: (
+            state.loops,
+            rotor_targets(config, constants, state, commands, load.believed_mass),
+        )
+
+    def firmware(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
+        xp, law, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
+        own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
+        sent = crazyflie.setpoints(law, commands, own + share * load.believed_mass[..., None], gravity)
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
+        both = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
+        loops, motors = crazyflie.cascade(law, state.loops, sent, *both)
+        left = xp.maximum(1.0 - law.sag * state.time, xp.zeros_like(state.time))[..., None, None]
+        return loops, left * crazyflie.motor_force(law.motor_curve, motors)
+
+    return firmware
+
+
+def total_wrench(
+    xp: Any, rotor_force: Array, mounts: Array, arm: float, yaw_per_thrust: float, layout: str = "plus"
+) -> Wrench:
     """Wrench about O of all rotors, `rotor_force` (..., 2, 4) [N], drones at `mounts` (2, 3) [m]."""
-    drones = mixer.wrench_from_rotors(rotor_force, arm, yaw_per_thrust)  # (..., 2, 4)
+    drones = mixer.wrench_from_rotors(rotor_force, arm, yaw_per_thrust, layout)  # (..., 2, 4)
     thrust = drones[..., 0]
     zero = xp.zeros_like(thrust[..., 0])
     lever_x, lever_y = (xp.asarray(mounts[:, i], dtype=rotor_force.dtype) for i in (0, 1))
@@ -167,7 +197,12 @@ def start_state(
         free = xp.asarray([0.0, 0.0, float(config.plant.stand == "heave")], dtype=position.dtype)
         position, velocity = position * free, velocity * free
         euler = euler * xp.asarray([1.0, 0.0, 0.0], dtype=euler.dtype)
+    loops = None
+    if config.autopilot.kind == "crazyflie":
+        both = xp.stack([euler, euler], axis=-2)
+        loops = crazyflie.start_loops(both, xp.zeros_like(both))
     return PlantState(
+        loops=loops,
         position=position,
         quaternion=rotations.quaternion_from_euler(euler),
         velocity=velocity,

@@ -44,7 +44,7 @@ def _jax_stepper(config: Config, physics: str) -> ControlStep:
 
     def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
         with jax.enable_x64(True), on_the_host():
-            return PlantState(*map(np.asarray, compiled(state, commands, load)))
+            return PlantState(*compiled(state, commands, load)).each(np.asarray)
 
     return stepper
 

@@ -9,13 +9,10 @@ import numpy as np
 
 from mjxball import config as configs
 from mjxball.config import Config, Leader, Plant
-from mjxball.control import leader, observation, rotations
-from mjxball.control.followers import Baseline, Follower
-from mjxball.physics.engine import PlantState
-from mjxball.physics.step import make_cg_offset
-from mjxball.physics.stepper import make_stepper
-from mjxball.rollout import has_diverged, keep, load_of, make_brief, start_of
-from mjxball.scenario import Scenario, check_scenario
+from mjxball.control import rotations
+from mjxball.control.followers import Follower
+from mjxball.rollout import simulate
+from mjxball.scenario import Scenario
 
 STANDS = {"pivot": "pivot at O", "heave": "roll and height free"}  # the two readings of "p_o is restricted"
 LEVEL = 0.08  # height of the leader at rest on the level stand, its goal p_l^d (paper) [m]
@@ -55,29 +52,9 @@ def fly_stand(
     The leader's law is eq. 5 on e_l = p_l^d - p_l, p_l^d its place when the stick is level and O at its goal. A flight
     that diverges stays where it did.
     """
-    check_scenario(config, scenario)
-    period, law = config.timing.control_period, config.leader
-    mounts = np.array([config.plant.leader_mount, config.plant.follower_mount])
-    step, brief, cg_offset = make_stepper(config, physics), make_brief(config), make_cg_offset(config)
-    load, state, goal = load_of([scenario]), start_of(config, [scenario]), np.array([scenario.goal])
-    follower.reset()
-    integral, rows = np.zeros((1, 3)), []
-    for number in range(round(scenario.seconds / period) + 1):
-        matrix = rotations.matrix_from_quaternion(state.quaternion)
-        seen = observation.observe(state.position, matrix, state.velocity, state.rates, goal, mounts[1])
-        lever, sweep = (rotations.rotate(matrix, v) for v in (mounts[0], rotations.cross(state.rates, mounts[0])))
-        error, error_rate = goal + mounts[0] - state.position - lever, -state.velocity - sweep
-        gains = (np.array(gain) for gain in (law.kp, law.kd, law.ki))
-        wanted = leader.desired_acceleration(error, error_rate, integral, *gains)
-        led = leader.command(wanted, 0.0, config.plant.gravity, law.tilt_limit, law.vertical_limit)
-        if leader_error:
-            seen[:, observation.ERROR], seen[:, observation.ERROR_RATE] = error, error_rate
-        if isinstance(follower, Baseline):
-            follower.brief = brief(state, load)
-        followed = np.asarray(follower(seen), float)
-        roll = rotations.euler_from_matrix(matrix)[0, 0]
-        rows.append((number * period, LEVEL - error[0, 2], roll, followed[0, 2], cg_offset(state, load)[0]))
-        integral = integral + period * error
-        moved = step(state, np.stack([led, followed], axis=1), load)
-        state = PlantState(*(keep(has_diverged(moved), old, new) for old, new in zip(state, moved, strict=True)))
-    return StandFlight(*np.array(rows).T)
+    config = configs.replace(config, "leader.error", "own")
+    config = configs.replace(config, "follower.error", "leader" if leader_error else "object")
+    flown = simulate(config, follower, scenario, physics)
+    lever = rotations.rotate(rotations.matrix_from_quaternion(flown.quaternion), np.array(config.plant.leader_mount))
+    rise = flown.position[:, 2] - flown.target[:, 2] + lever[:, 2] - config.plant.leader_mount[2]
+    return StandFlight(flown.time, LEVEL + rise, flown.euler[:, 0], flown.follower_command[:, 2], flown.cg_offset)

@@ -1,0 +1,151 @@
+"""A Crazyflie's own control: setpoint, cascade of attitude and rate PIDs, mixing, motor curve. NumPy and JAX.
+
+Written from what the firmware does (bitcraze/crazyflie-firmware 2026.08), in its units: degrees, degrees a second,
+motor commands 0 .. 65535. Its pitch and pitch rate are ours with the opposite sign; its yaw output as well. What one
+drone's loops carry is one array, so that many worlds of two drones are stepped at once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from mjxball.config import Autopilot
+
+Array = Any
+PERIOD = 0.002  # [s] of the attitude and rate loops: 500 Hz
+FULL = 65535.0  # motor command of full power
+THRUST_FLOOR, THRUST_CEILING = 10001, 60000  # what the laptop sends while flying; the firmware caps at the second
+IDLE = 1000.0  # thrust below which the firmware stops the motors
+TILT_LIMIT = 15.0  # of every roll and pitch that is sent [deg]
+LARGEST = 32767.0  # of a rate loop's output
+SIGNS = (1.0, -1.0, 1.0)  # ours -> firmware's roll, pitch, yaw
+LOOPS = 13  # numbers that the loops of one drone carry, see `Loops`
+
+
+class Loops(NamedTuple):
+    """What the cascade of one drone carries, firmware axes; the last axis of the array is these in order."""
+
+    attitude_integral: Array  # (..., 3) [deg s]
+    rate_integral: Array  # (..., 3) [deg]
+    attitude: Array  # (..., 3) as last measured [deg]
+    rates: Array  # (..., 3) as last measured [deg/s]
+    yaw: Array  # (..., 1) to hold [deg]
+
+
+def unpack(loops: Array) -> Loops:
+    """`loops` (..., 13) by name."""
+    parts = (loops[..., 0:3], loops[..., 3:6], loops[..., 6:9], loops[..., 9:12], loops[..., 12:13])
+    return Loops(*parts)
+
+
+def start_loops(euler: Array, rates: Array) -> Array:
+    """Loops (..., 13) as after a reset: no integral, the yaw held that there is. `euler` [rad], `rates` [rad/s]."""
+    xp = euler.__array_namespace__()
+    attitude, turning = to_firmware(euler), to_firmware(rates)
+    return xp.concat([xp.zeros_like(euler), xp.zeros_like(euler), attitude, turning, attitude[..., 2:]], axis=-1)
+
+
+def to_firmware(angles: Array) -> Array:
+    """Ours (..., 3) [rad] or [rad/s] in the firmware's axes and degrees."""
+    xp = angles.__array_namespace__()
+    return angles * xp.asarray([sign * 180.0 / math.pi for sign in SIGNS], dtype=angles.dtype)
+
+
+def motor_force(curve: tuple[float, float], command: Array) -> Array:
+    """Force (...) [N] of a motor at `command` (...) 0 .. 65535: a p^2 + b p of p = command / 65535."""
+    p = command / FULL
+    return (curve[0] * p + curve[1]) * p
+
+
+def motor_command(curve: tuple[float, float], force: Array) -> Array:
+    """Command (...) at which a motor gives `force` (...) [N]; the inverse of `motor_force`, not bounded above."""
+    xp = force.__array_namespace__()
+    a, b = curve
+    force = xp.maximum(force, xp.zeros_like(force))
+    return FULL * (force / b if a == 0 else (xp.sqrt(b * b + 4 * a * force) - b) / (2 * a))
+
+
+def setpoints(autopilot: Autopilot, command: Array, carried_mass: Array, gravity: float) -> Array:
+    """What is sent, (..., 4): roll, pitch [deg], yaw rate [deg/s], thrust, firmware's signs, as the wire carries it.
+
+    `command` (..., 3) is roll, pitch [rad] and vertical acceleration [m/s2]. Thrust is the paper's, thr_hov + k_pz az,
+    or calibrated: the motor curve at T = m (g + az) / (cos roll cos pitch), `carried_mass` m (...) [kg].
+    """
+    xp = command.__array_namespace__()
+    limit = math.radians(TILT_LIMIT)
+    roll, pitch = (xp.clip(command[..., i], -limit, limit) for i in (0, 1))
+    vertical = command[..., 2]
+    if autopilot.thrust_law == "paper":
+        thrust = autopilot.hover_thrust + autopilot.thrust_per_acceleration * vertical
+    else:
+        force = carried_mass * (gravity + vertical) / (xp.cos(roll) * xp.cos(pitch))
+        thrust = motor_command(autopilot.motor_curve, force / 4)
+    thrust = xp.round(xp.clip(thrust, THRUST_FLOOR, THRUST_CEILING))
+    return xp.stack([xp.rad2deg(roll), -xp.rad2deg(pitch), xp.zeros_like(roll), thrust], axis=-1)
+
+
+def cascade(autopilot: Autopilot, loops: Array, setpoint: Array, euler: Array, rates: Array) -> tuple[Array, Array]:
+    """(loops (..., 13), motor commands (..., 4)) one tick of 2 ms on.
+
+    `setpoint` (..., 4) as from `setpoints`, `euler` (..., 3) [rad] and body `rates` (..., 3) [rad/s] as they are.
+    Without thrust the motors stop and the loops are reset.
+    """
+    xp = euler.__array_namespace__()
+    old, attitude, turning = unpack(loops), to_firmware(euler), to_firmware(rates)
+    # The wire's yaw rate has the opposite sign; the firmware integrates it into a yaw angle.
+    yaw = _wrapped(old.yaw - PERIOD * setpoint[..., 2:3])
+    wanted = xp.concat([setpoint[..., :2], yaw], axis=-1)
+    outer = (autopilot.roll, autopilot.pitch, autopilot.yaw)
+    inner = (autopilot.roll_rate, autopilot.pitch_rate, autopilot.yaw_rate)
+    errors = wanted - attitude
+    error = xp.concat([errors[..., :2], _wrapped(errors[..., 2:])], axis=-1)
+    moved = attitude - old.attitude
+    moved = xp.concat([moved[..., :2], _wrapped(moved[..., 2:])], axis=-1)
+    held, asked = _pid(outer, autopilot.attitude_limits, old.attitude_integral, error, moved)
+    kept, output = _pid(inner, autopilot.rate_limits, old.rate_integral, asked - turning, turning - old.rates)
+    output = xp.trunc(xp.clip(output, -LARGEST, LARGEST))
+    thrust = setpoint[..., 3]
+    on = (thrust >= IDLE)[..., None]
+    motors = mix(xp.minimum(thrust, xp.asarray(float(THRUST_CEILING), dtype=thrust.dtype)), output)
+    reset = start_loops(euler, rates)
+    after = xp.concat([held, kept, attitude, turning, yaw], axis=-1)
+    return xp.where(on, after, reset), xp.where(on, motors, xp.zeros_like(motors))
+
+
+def mix(thrust: Array, output: Array) -> Array:
+    """Motor commands (..., 4) of `thrust` (...) and the rate loops' `output` (..., 3).
+
+    M1 front right, M2 back right, M3 back left, M4 front left. What is beyond full power is taken off all four.
+    """
+    xp = thrust.__array_namespace__()
+    roll, pitch = xp.trunc(output[..., 0] / 2), xp.trunc(output[..., 1] / 2)
+    yaw = -output[..., 2]
+    motors = xp.stack(
+        [
+            thrust - roll + pitch + yaw,
+            thrust - roll - pitch - yaw,
+            thrust + roll - pitch + yaw,
+            thrust + roll + pitch - yaw,
+        ],
+        axis=-1,
+    )
+    excess = xp.maximum(xp.max(motors, axis=-1, keepdims=True) - FULL, xp.zeros_like(motors[..., :1]))
+    return xp.clip(motors - excess, 0.0, FULL)
+
+
+def _pid(
+    gains: tuple[Any, Any, Any], limits: tuple[float, float, float], integral: Array, error: Array, moved: Array
+) -> tuple[Array, Array]:
+    """(integral, output) (..., 3) of three PIDs whose derivative is that of the measurement, which `moved` [deg]."""
+    xp = error.__array_namespace__()
+    kp, ki, kd = (xp.asarray(column, dtype=error.dtype) for column in zip(*gains, strict=True))
+    bound = xp.asarray(limits, dtype=error.dtype)
+    integral = xp.clip(integral + PERIOD * error, -bound, bound)
+    return integral, kp * error + ki * integral - kd / PERIOD * moved
+
+
+def _wrapped(angle: Array) -> Array:
+    """`angle` (...) [deg] within +-180."""
+    xp = angle.__array_namespace__()
+    return angle - 360.0 * xp.round(angle / 360.0)
