@@ -5,6 +5,7 @@ from __future__ import annotations
 import types
 from dataclasses import replace
 
+from mjxball.config._crazyflie import flight, stand
 from mjxball.config._settings import Bounds, Config, Follower, Reward, Sac, Scenario
 from mjxball.errors import InputError
 
@@ -121,7 +122,7 @@ def _robust() -> Config:
 
 
 PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
-    {made.preset: made for made in (_transport(), _paper(), _transport_large(), _robust())}
+    {made.preset: made for made in (_transport(), _paper(), _transport_large(), _robust(), stand(), flight())}
 )
 
 

@@ -1,0 +1,168 @@
+"""Two Crazyflies on a stick with a ball: the rig, its variants, and the presets `stand` and `flight`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from mjxball.config._settings import (
+    Autopilot,
+    Bounds,
+    Config,
+    Follower,
+    Leader,
+    Motion,
+    Plant,
+    Reward,
+    Sac,
+    Scenario,
+    Timing,
+)
+
+# mass [kg], motor curve [N], newest firmware (2026.04 on: linear, with battery compensation) and before.
+DRONES = {
+    "2.1": (0.029, (0.0915, 0.0677)),
+    "2.1-linear": (0.029, (0.0, 0.12)),
+    "thrust-upgrade": (0.0345, (0.0, 0.18)),
+    "brushless": (0.0393, (0.0, 0.20)),
+}  # with a positioning deck where it is not part of the drone
+
+
+def rig(drone: str = "2.1") -> Plant:
+    """Two drones 0.30 m apart on a carbon stick along body y, 10 g with its mounts, and a 7.5 g ball that it guides.
+
+    Weighs 75.5 g with the 2.1, which hovers at 46 000 of 65 535, the paper's thr_hov.
+    """
+    mass, curve = DRONES[drone]
+    return Plant(
+        leader_mass=mass,
+        follower_mass=mass,
+        object_mass=0.0175,
+        leader_inertia=(1.66e-5, 1.66e-5, 2.93e-5),
+        follower_inertia=(1.66e-5, 1.66e-5, 2.93e-5),
+        object_size=(0.02, 0.30, 0.01),
+        moving_fraction=0.0075 / 0.0175,
+        ball_radius=0.006,
+        ball_stop=0.08,
+        cg_axis="y",
+        leader_mount=(0.0, 0.15, 0.0),
+        follower_mount=(0.0, -0.15, 0.0),
+        arm=0.046,
+        layout="x",
+        rotor_force_max=sum(curve),
+        rotor_lag=0.05,
+        yaw_per_thrust=0.006,
+    )
+
+
+def autopilot(drone: str = "2.1") -> Autopilot:
+    """The firmware with gains for the coupled pair: the stick makes roll and yaw 50 times heavier."""
+    return Autopilot(
+        kind="crazyflie",
+        motor_curve=DRONES[drone][1],
+        roll=(3.0, 0.3, 0.0),
+        roll_rate=(700.0, 350.0, 20.0),
+        yaw=(2.0, 0.2, 0.0),
+        yaw_rate=(2000.0, 300.0, 0.0),
+    )
+
+
+PAIR = Config(
+    plant=rig(),
+    autopilot=autopilot(),
+    timing=Timing(control_period=0.01, physics_steps=5, episode_steps=1500),
+    leader=Leader(kp=(1.0, 1.0, 1.0), kd=(1.6, 1.6, 1.6), tilt_limit=0.26, vertical_limit=3.0),
+)
+
+
+def stand() -> Config:
+    """The paper's experiment: roll and height free, pitch locked, a rolling ball, the paper's gains and thrust law."""
+    return replace(
+        PAIR,
+        preset="stand",
+        plant=replace(PAIR.plant, stand="heave"),
+        motion=Motion(kind="rolling"),
+        autopilot=replace(PAIR.autopilot, thrust_law="paper"),
+        leader=Leader(
+            kp=(1.0, 1.0, 0.1),
+            kd=(2.0, 2.0, 5.0),
+            ki=(0.2, 0.1, 0.1),
+            tilt_limit=0.26,
+            vertical_limit=3.0,
+            error="own",
+        ),
+        follower=Follower(
+            action="residual", tilt_limit=0.2, vertical_limit=3.0, filters=(0.05, 0.2, 1.0), ignore_position=True
+        ),
+        scenario=Scenario(
+            goal_reach=0.0,
+            start_position=0.03,
+            start_tilt=0.1,
+            cg_amplitude=(0.0, 0.0),
+            object_mass=(0.0175, 0.0175),
+            ball_start=0.06,
+            noise=(0.0, 1.0),
+            delay=(0.0, 0.03),
+            rotor_lag_scale=(0.6, 2.0),
+            thrust_scale=(0.95, 1.05),
+            inertia_scale=(0.6, 1.4),
+            termination_distance=1.0,
+        ),
+        reward=Reward(error_scale=0.02, velocity=2.0, tilt=20.0, rates=0.2, ball=1.0, termination=50.0),
+        bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.05),
+        sac=Sac(
+            steps=3_072_000,
+            worlds=512,
+            batch=512,
+            updates=16,
+            replay=512_000,
+            policy_layers=(128, 128),
+            critic_layers=(128, 128),
+            privileged=True,
+            discount=0.98,
+            return_steps=10,
+            learning_rate=2e-3,
+            learning_rate_end=0.02,
+        ),
+    )
+
+
+def flight() -> Config:
+    """The pair in free flight with a moving ball, the paper's future work."""
+    return replace(
+        PAIR,
+        preset="flight",
+        follower=Follower(tilt_limit=0.2, vertical_limit=3.0, filters=(0.05, 0.2, 1.0)),
+        scenario=Scenario(
+            goal_reach=0.5,
+            start_velocity=0.1,
+            start_tilt=0.05,
+            cg_speed=(0.2, 1.2),
+            cg_amplitude=(0.0, 0.034),
+            object_mass=(0.015, 0.02),
+            mass_known=False,
+            noise=(0.0, 1.0),
+            delay=(0.0, 0.03),
+            gust=(0.0, 0.01),
+            rotor_lag_scale=(0.6, 2.0),
+            thrust_scale=(0.8, 1.2),
+            inertia_scale=(0.6, 1.4),
+            cg_visits=0.3,
+            termination_distance=1.5,
+        ),
+        reward=Reward(error_scale=0.02, velocity=8.0),
+        bounds=Bounds(x_peak=0.05, settling_time=5.0, rmse=0.25),
+        sac=Sac(
+            steps=3_072_000,
+            worlds=512,
+            batch=512,
+            updates=16,
+            replay=512_000,
+            policy_layers=(128, 128),
+            critic_layers=(128, 128),
+            privileged=True,
+            discount=0.98,
+            return_steps=10,
+            learning_rate=2e-3,
+            learning_rate_end=0.02,
+        ),
+    )
