@@ -80,7 +80,12 @@ class CoupledPairEnv(Env):
         self._recall = recall_of(config)
         self._nuisances = Nuisances(config)
         scenario = config.scenario
-        scales = (scenario.rotor_lag_scale, scenario.thrust_scale, scenario.inertia_scale)
+        scales = (
+            scenario.rotor_lag_scale,
+            scenario.thrust_scale,
+            scenario.thrust_common,
+            scenario.inertia_scale,
+        )
         self._varies = any(scale != (1.0, 1.0) for scale in scales)
         constants = plant_constants(config.plant, config.attitude)
         self._drones = np.asarray(config.plant.leader_inertia) + config.plant.follower_inertia
@@ -247,19 +252,25 @@ class CoupledPairEnv(Env):
         masses = (load.object_mass, load.object_mass + load.mass_change[0])
         margin, plant = self.config.scenario.trim_margin, self.config.plant
         thrust = (1.0, 1.0) if load.thrust_scale is None else (load.thrust_scale[0], load.thrust_scale[1])
-        reaches = (trim_reach(plant, mass, margin, load.believed_mass, thrust) for mass in masses)
+        if self.config.leader.ki[2] > 0:  # it finds the thrust for its share of the weight by itself
+            reaches = (trim_reach(plant, mass, margin, None, (1.0, thrust[1])) for mass in masses)
+        else:
+            reaches = (trim_reach(plant, mass, margin, load.believed_mass, thrust) for mass in masses)
         return jnp.minimum(*reaches)
 
     def _varied(self, load: Load, key: Array) -> Load:
         """`load` with rotors and inertia of its own."""
-        scenario, share = self.config.scenario, jax.random.uniform(key, (4,))
-        ranges = (scenario.rotor_lag_scale, scenario.inertia_scale, scenario.thrust_scale, scenario.thrust_scale)
-        lag, inertia, *thrust = (low + (high - low) * u for (low, high), u in zip(ranges, share, strict=True))
+        scenario, share = self.config.scenario, jax.random.uniform(key, (5,))
+        each = (scenario.thrust_scale, scenario.thrust_scale)
+        ranges = (scenario.rotor_lag_scale, scenario.inertia_scale, *each, scenario.thrust_common)
+        drawn = (low + (high - low) * u for (low, high), u in zip(ranges, share, strict=True))
+        lag, inertia, leader, follower, common = drawn
+        thrust = common * jnp.stack([leader, follower])
         own = jnp.asarray(self._drones) + jnp.asarray(self._object) * load.object_mass
         load = load._replace(
-            rotor_lag_scale=lag, thrust_scale=jnp.stack(thrust), added_inertia=((inertia - 1.0) * own).astype(own.dtype)
+            rotor_lag_scale=lag, thrust_scale=thrust, added_inertia=((inertia - 1.0) * own).astype(own.dtype)
         )
-        if scenario.thrust_scale == (1.0, 1.0):
+        if scenario.thrust_scale == scenario.thrust_common == (1.0, 1.0):
             return load
         # A leader that lifts too little can leave more than any follower trims: its world is drawn back towards 1.
         for _ in range(DRAWN_BACK):

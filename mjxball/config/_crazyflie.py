@@ -70,7 +70,9 @@ PAIR = Config(
     plant=rig(),
     autopilot=autopilot(),
     timing=Timing(control_period=0.01, physics_steps=5, episode_steps=1500),
-    leader=Leader(kp=(1.0, 1.0, 1.0), kd=(1.6, 1.6, 1.6), tilt_limit=0.26, vertical_limit=3.0),
+    # Stiff in height and with an integral term, so that the leader finds the thrust for its share of the weight: what
+    # the two lift apart acts over half the stick, and beyond 4 % of hover no drone's rotors hold that about roll.
+    leader=Leader(kp=(1.0, 1.0, 4.0), kd=(1.6, 1.6, 3.5), ki=(0.1, 0.1, 2.0), tilt_limit=0.26, vertical_limit=3.0),
 )
 
 
@@ -103,7 +105,8 @@ def stand() -> Config:
             noise=(0.0, 1.0),
             delay=(0.0, 0.03),
             rotor_lag_scale=(0.6, 2.0),
-            thrust_scale=(0.95, 1.05),
+            thrust_scale=(0.99, 1.01),
+            thrust_common=(0.99, 1.01),
             inertia_scale=(0.6, 1.4),
             termination_distance=1.0,
         ),
@@ -144,7 +147,8 @@ def flight() -> Config:
             delay=(0.0, 0.03),
             gust=(0.0, 0.01),
             rotor_lag_scale=(0.6, 2.0),
-            thrust_scale=(0.8, 1.2),
+            thrust_scale=(0.97, 1.03),
+            thrust_common=(0.8, 1.2),
             inertia_scale=(0.6, 1.4),
             cg_visits=0.3,
             termination_distance=1.5,

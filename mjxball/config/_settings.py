@@ -193,6 +193,9 @@ class Scenario:
     gust: Range = setting((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0, ordered=True)
     rotor_lag_scale: Range = setting((1.0, 1.0), "factor on the rotors' time constant", above=0, ordered=True)
     thrust_scale: Range = setting((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0, ordered=True)
+    thrust_common: Range = setting(
+        (1.0, 1.0), "factor on the rotor forces of both drones alike (batteries, air)", above=0, ordered=True
+    )
     inertia_scale: Range = setting(
         (1.0, 1.0),
         "factor on the inertia of drones and object about their own centres, one factor for all",
