@@ -19,10 +19,9 @@ import numpy as np
 from mjxball import __version__, cli, config
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
-from mjxball.evaluate.cells import REFERENCE, STANDARD
+from mjxball.evaluate.cells import standard_scenarios
 from mjxball.evaluate.report import CELLS
 from mjxball.physics.stepper import TRAINING_ENGINES
-from mjxball.scenario import Scenario, check_scenario
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
 from mjxball.train.provenance import commit, differences, source_hash, versions
@@ -138,7 +137,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
     out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
-    _scenarios(settings)
+    standard_scenarios(settings)
     members = 1 if options.seeds is None else options.seeds
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--seeds must be between 1 and {MOST_MEMBERS}, not {members}")
@@ -181,7 +180,7 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
     from mjxball.train.members import POLICIES, draw_members
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
-    cells = run_cells(settings, policies, _scenarios(settings)[-1:], origin["physics"])
+    cells = run_cells(settings, policies, standard_scenarios(settings)[-1:], origin["physics"])
     print(table(cells))
     judged = ("rmse", "settling_time", "x_peak", "overshoot")
     chosen = load_file(out / POLICY)
@@ -217,7 +216,7 @@ def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) ->
     from mjxball.evaluate.report import write_report
     from mjxball.evaluate.table import table
 
-    scenarios = _scenarios(settings)
+    scenarios = standard_scenarios(settings)
     trained = load_policy(policy, settings)
     cells = run_cells(settings, [make_baseline("copy", settings), trained], scenarios, physics)
     print(table(cells))
@@ -227,30 +226,3 @@ def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) ->
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
     print(f"{policy} {verdict}; figures in {out / 'eval'}")
     return 0
-
-
-def _scenarios(settings: config.Config) -> tuple[Scenario, ...]:
-    """The standard scenarios as far as the plant allows them, the reference one last; checked before training.
-
-    The object has the plant's mass, the CG stays on the object, a stand's locked axes have goal 0, and the goal
-    is drawn in to what training may draw. A waveform or a rolling ball makes one scenario.
-    """
-    plant = settings.plant
-    reach = min(REFERENCE.goal[0], settings.scenario.goal_reach)
-    free = {"free": (1, 1, 1), "pivot": (0, 0, 0), "heave": (0, 0, 1)}[plant.stand]
-    common: dict[str, Any] = {"mass": plant.object_mass, "goal": tuple(reach * float(axis) for axis in free)}
-    reference = dataclasses.replace(
-        REFERENCE,
-        amplitude=min(REFERENCE.amplitude, config.cg_reach(plant)),
-        ball_start=min(settings.scenario.ball_start, config.ball_reach(plant)),
-        **common,
-    )
-    others = [
-        dataclasses.replace(reference, omega=s.omega, amplitude=min(s.amplitude, reference.amplitude))
-        for s in STANDARD
-        if s != REFERENCE and settings.motion.kind == "sine"
-    ]
-    scenarios = (*others, reference)
-    for scenario in scenarios:
-        check_scenario(settings, scenario)
-    return scenarios

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mjxball.config import Config, Plant
+from mjxball.config import Config, Plant, ball_reach, cg_reach
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics, measure_batch
 from mjxball.policy import Policy
 from mjxball.rollout import Trajectory, simulate_batch
-from mjxball.scenario import Scenario
+from mjxball.scenario import Scenario, check_scenario
 
 REFERENCE = Scenario()
 # Copy without CG motion, then five speeds of the CG.
@@ -67,6 +67,33 @@ def cross(
     """Full cross product of the lists, in the given order."""
     cells = itertools.product(omegas, amplitudes, masses)
     return tuple(Scenario(omega=w, amplitude=a, mass=m, **common) for w, a, m in cells)
+
+
+def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
+    """The standard scenarios as far as the plant allows them, the reference one last; raise InputError if unsound.
+
+    The object has the plant's mass, the CG keeps to the object and to what training draws, a stand's locked axes have
+    goal 0, and the goal is drawn in to what training may draw. A waveform or a rolling ball makes one scenario.
+    """
+    plant = settings.plant
+    reach = min(REFERENCE.goal[0], settings.scenario.goal_reach)
+    free = {"free": (1, 1, 1), "pivot": (0, 0, 0), "heave": (0, 0, 1)}[plant.stand]
+    common: dict[str, Any] = {"mass": plant.object_mass, "goal": tuple(reach * float(axis) for axis in free)}
+    reference = dataclasses.replace(
+        REFERENCE,
+        amplitude=min(REFERENCE.amplitude, cg_reach(plant), settings.scenario.cg_amplitude[1]),
+        ball_start=min(settings.scenario.ball_start, ball_reach(plant)),
+        **common,
+    )
+    others = [
+        dataclasses.replace(reference, omega=s.omega, amplitude=min(s.amplitude, reference.amplitude))
+        for s in STANDARD
+        if s != REFERENCE and settings.motion.kind == "sine"
+    ]
+    scenarios = (*others, reference)
+    for scenario in scenarios:
+        check_scenario(settings, scenario)
+    return scenarios
 
 
 def run_cells(config: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str) -> list[Cell]:
