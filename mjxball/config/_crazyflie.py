@@ -59,10 +59,10 @@ def autopilot(drone: str = "2.1") -> Autopilot:
     return Autopilot(
         kind="crazyflie",
         motor_curve=DRONES[drone][1],
-        roll=(3.0, 0.3, 0.0),
-        roll_rate=(700.0, 350.0, 20.0),
-        yaw=(2.0, 0.2, 0.0),
-        yaw_rate=(2000.0, 300.0, 0.0),
+        roll=(3.25, 0.0, 0.0),
+        roll_rate=(937.0, 454.0, 28.1),
+        yaw=(1.61, 0.0, 0.0),
+        yaw_rate=(1160.0, 17.6, 0.0),
     )
 
 
@@ -101,8 +101,8 @@ def stand() -> Config:
             start_tilt=0.1,
             cg_amplitude=(0.0, 0.0),
             object_mass=(0.0175, 0.0175),
-            ball_start=0.06,
-            noise=(0.0, 1.0),
+            ball_start=0.05,
+            noise=(0.0, 0.5),
             delay=(0.0, 0.03),
             rotor_lag_scale=(0.6, 2.0),
             thrust_scale=(0.99, 1.01),
@@ -110,7 +110,7 @@ def stand() -> Config:
             inertia_scale=(0.6, 1.4),
             termination_distance=1.0,
         ),
-        reward=Reward(error_scale=0.02, velocity=2.0, tilt=20.0, rates=0.2, ball=1.0, termination=50.0),
+        reward=Reward(error_scale=0.05, velocity=2.0, tilt=5.0, rates=0.2, ball=10.0, termination=200.0),
         bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.05),
         sac=Sac(
             steps=3_072_000,
@@ -121,7 +121,7 @@ def stand() -> Config:
             policy_layers=(128, 128),
             critic_layers=(128, 128),
             privileged=True,
-            discount=0.985,
+            discount=0.99,
             return_steps=15,
             learning_rate=2e-3,
             learning_rate_end=0.02,
