@@ -9,12 +9,23 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from mjxball import cli, config
-from mjxball.control.followers import BASELINES, LAWS, Follower, make_baseline
+from mjxball.control.followers import BASELINES, LAWS, Baseline, Follower, make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate import families
-from mjxball.evaluate.cells import REFERENCE, STANDARD, Cell, check_bounds, cross, load_policy, run_cells
+from mjxball.evaluate.cells import (
+    REFERENCE,
+    STANDARD,
+    Cell,
+    check_bounds,
+    cross,
+    load_policy,
+    run_cells,
+    standard_scenarios,
+)
+from mjxball.evaluate.homes import by_home
 from mjxball.evaluate.judging import judge_families, scores_of, write_judgement
 from mjxball.evaluate.paper import command as paper
 from mjxball.evaluate.report import to_json, write_report
@@ -119,38 +130,111 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     listed = [name for name in (*options.followers, *(options.families or [])) if name.endswith(".npz")]
     files = [*options.policies, *map(Path, listed)]
     named = [name for name in options.followers if not name.endswith(".npz")]
-    paths = files if files or named else shipped_policies()
-    names = named if files or named else list(LAWS if chosen else BASELINES)
+    asked = bool(files or named)
+    paths = files if asked else shipped_policies()
     if options.check and not paths:
         raise InputError("--check needs a policy")
-    # A pitch frequency that was asked for is an experiment, not a mistake.
-    policies = _load(paths, lambda path: setup, options)
-    unbounded = [policy.name for policy in policies if options.check and not policy.card["bounds"]]
-    if unbounded:
-        raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
-    followers: list[Follower] = [*(make_baseline(name, setup) for name in dict.fromkeys(names)), *policies]
-    _refuse_same_names([follower.name for follower in followers])
-
+    here, homes = (paths, []) if options.force else by_home(paths)
+    if chosen and homes:
+        if asked:
+            raise InputError(f"families fly the paper's plant, and {homes[0][1][0]} was made for two Crazyflies")
+        homes = []
+    # Only what was made for Crazyflies: then nothing flies on the paper's plant.
+    groups = [] if homes and not here and not named else [Group(setup, scenarios, named, here, asked)]
+    groups += [Group(home, _home_scenarios(options, home), named or ["copy"], there, True) for home, there in homes]
     command = shlex.join(["python", "eval.py", *arguments])
     if chosen:
-        seeds = 3 if options.seeds is None else options.seeds
-        scores = judge_families(setup, followers, chosen, seeds, options.physics)
-        if options.json:
-            options.json.write_text(json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
-        if options.out:
-            write_judgement(options.out, setup, scores, chosen, policies, command, versions())
-            print(f"the report is {options.out / 'report.html'}")  # noqa: T201
-        return 0
-    cells = run_cells(setup, followers, scenarios, options.physics)
-    print(table(cells))  # noqa: T201
+        return _judge(groups[0], chosen, options, command)
+    return _compare(groups, options, command)
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Followers that fly the same plant."""
+
+    setup: config.Config
+    scenarios: Sequence[Scenario]
+    named: list[str]  # baselines
+    paths: list[Path]  # policies
+    asked: bool  # false: every baseline
+
+    def policies(self, options: argparse.Namespace) -> list[Policy]:
+        """The policies, loaded to fit the plant; raise InputError for bounds that are wanted and missing."""
+        # A pitch frequency that was asked for is an experiment, not a mistake.
+        found = _load(self.paths, lambda path: self.setup, options)
+        unbounded = [policy.name for policy in found if options.check and not policy.card["bounds"]]
+        if unbounded:
+            raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
+        return found
+
+    def baselines(self, every: Sequence[str]) -> list[Baseline]:
+        """The baselines, `every` one if none was asked for."""
+        return [make_baseline(name, self.setup) for name in dict.fromkeys(self.named if self.asked else every)]
+
+
+def _judge(group: Group, chosen: list[families.Family], options: argparse.Namespace, command: str) -> int:
+    """Fly scenario families."""
+    policies = group.policies(options)
+    followers: list[Follower] = [*group.baselines(list(LAWS)), *policies]
+    _refuse_same_names([follower.name for follower in followers])
+    seeds = 3 if options.seeds is None else options.seeds
+    scores = judge_families(group.setup, followers, chosen, seeds, options.physics)
     if options.json:
-        options.json.write_text(to_json(cells))
+        options.json.write_text(json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
-        write_report(cells, options.out)
-        scores, shown = scores_of(cells)
-        write_judgement(options.out, setup, scores, shown, policies, command, versions())
-        print(f"report.html, figures and cells.json are in {options.out}")  # noqa: T201
-    return _check(setup, policies, cells, options.physics) if options.check else 0
+        write_judgement(options.out, group.setup, scores, chosen, policies, command, versions())
+        print(f"the report is {options.out / 'report.html'}")  # noqa: T201
+    return 0
+
+
+def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str) -> int:
+    """Fly every group's scenarios; the report of a plant other than the first one's has a directory of its own."""
+    loaded = [(group, group.baselines(list(BASELINES)), group.policies(options)) for group in groups]
+    for _, baselines, policies in loaded:
+        _refuse_same_names([*(follower.name for follower in baselines), *(policy.name for policy in policies)])
+    every: list[Cell] = []
+    code = 0
+    for number, (group, baselines, policies) in enumerate(loaded):
+        cells = run_cells(group.setup, [*baselines, *policies], group.scenarios, options.physics)
+        if number:
+            print(f"\n{group.setup.preset}: two Crazyflies, their own plant and scenarios")  # noqa: T201
+        print(table(cells))  # noqa: T201
+        every += cells
+        if options.out:
+            place = options.out / group.setup.preset if number else options.out
+            write_report(cells, place)
+            scores, shown = scores_of(cells)
+            write_judgement(place, group.setup, scores, shown, policies, command, versions())
+            print(f"report.html, figures and cells.json are in {place}")  # noqa: T201
+        if options.check:
+            code = max(code, _check(group.setup, policies, cells, options.physics))
+    if options.json:
+        options.json.write_text(to_json(every))
+    return code
+
+
+def _home_scenarios(options: argparse.Namespace, home: config.Config) -> Sequence[Scenario]:
+    """The standard scenarios of a Crazyflies' plant, the last one changed as the flags say."""
+    standard = standard_scenarios(home)
+    if not any(getattr(options, name) is not None for name in SCENARIO_FLAGS):
+        return standard if not (options.policies or options.followers) else standard[-1:]
+    reference = standard[-1]
+    if options.waveform or options.rolling is not None:
+        raise InputError("--waveform and --rolling are for the paper's plant; a rig's motion stands in its card")
+    common: dict[str, Any] = {"ball_start": reference.ball_start, "start_tilt": reference.start_tilt}
+    made = cross(
+        options.omega or [reference.omega],
+        options.amplitude or [reference.amplitude],
+        options.mass or [reference.mass],
+        believed_mass=options.believed_mass,
+        goal=tuple(options.goal or reference.goal),
+        seconds=reference.seconds if options.seconds is None else options.seconds,
+        mass_changes=tuple(map(_mass_change, options.mass_change or [])),
+        **common,
+    )
+    for scenario in made:
+        check_scenario(home, scenario)
+    return made
 
 
 def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
@@ -163,7 +247,7 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         raise InputError("--figures needs --out DIR, a directory to write to")
     cli.output_directory(options.out)
     listed = [Path(name) for name in options.figures if name.endswith(".npz")]
-    paths = [*options.policies, *listed] or [*shipped_policies(), *stand_policies()]
+    paths = [*options.policies, *listed] or [*by_home(shipped_policies())[0], *stand_policies()]
     policies = _load(paths, paper.plant_of, options)
     _refuse_same_names([*LAWS, *(policy.name for policy in policies)])
     figures = paper.draw_figures(names, policies, options.physics)
@@ -254,11 +338,13 @@ def _refuse_same_names(names: list[str]) -> None:
 
 def _check(setup: config.Config, policies: Sequence[Policy], cells: Sequence[Cell], physics: str) -> int:
     """Hold every policy against its card on the reference scenario, flown anew if the cells lack it."""
-    plain = dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
-    known = {cell.follower: cell for cell in cells if cell.scenario == REFERENCE} if plain == setup else {}
+    own = setup.autopilot.kind != "ideal"
+    plain = setup if own else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
+    reference = standard_scenarios(setup)[-1] if own else REFERENCE
+    known = {cell.follower: cell for cell in cells if cell.scenario == reference} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]
     if missing:
-        known |= {cell.follower: cell for cell in run_cells(plain, missing, [REFERENCE], physics)}
+        known |= {cell.follower: cell for cell in run_cells(plain, missing, [reference], physics)}
     failed = False
     for policy in policies:
         misses = check_bounds(policy, known[policy.name].metrics)
