@@ -274,7 +274,8 @@ class CoupledPairEnv(Env):
             return load
         # A leader that lifts too little can leave more than any follower trims: its world is drawn back towards 1.
         for _ in range(DRAWN_BACK):
-            milder = load._replace(thrust_scale=1.0 + 0.7 * (load.thrust_scale - 1.0))
+            scales: Array = load.thrust_scale
+            milder = load._replace(thrust_scale=1.0 + 0.7 * (scales - 1.0))
             load = jax.tree.map(functools.partial(jnp.where, self._trimmed(load) < 0), milder, load)
         return load
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -20,8 +19,8 @@ DISTANCE, AZIMUTH, ELEVATION = 2.3, 120.0, -12.0  # of the camera [m], [degrees]
 class Scene:
     """A plant and its goal, seen by a camera that stands still."""
 
-    def __init__(self, plant: Plant, goal: Sequence[float], size: tuple[int, int], look_at: Sequence[float]):
-        """`goal` of O [m], `size` = (height, width) in pixels, the camera looks at `look_at` [m]."""
+    def __init__(self, plant: Plant, goal: Array, size: tuple[int, int], look_at: Array):
+        """`goal` of O (3,) [m], `size` = (height, width) in pixels, the camera looks at `look_at` (3,) [m]."""
         spec = build_spec(dataclasses.replace(plant, stand="free"))  # a stand's pose is one of free flight
         ball = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [0.03, 0, 0], "rgba": GOAL_COLOUR}
         spec.worldbody.add_geom(name="goal", pos=list(map(float, goal)), contype=0, conaffinity=0, **ball)

@@ -77,10 +77,20 @@ class Link:
         from cflib.crazyflie import Crazyflie
 
         _start_drivers(cflib.crtp)
-        crazyflie, ready, failed = Crazyflie(), threading.Event(), []
+        crazyflie, ready = Crazyflie(), threading.Event()
+        failed: list[str] = []
+
+        def refused(_: str, why: str) -> None:
+            failed.append(why)
+            ready.set()
+
+        def lost(uri: str, why: str) -> None:
+            self._end(why)
+            refused(uri, why)
+
         crazyflie.fully_connected.add_callback(lambda uri: ready.set())
-        crazyflie.connection_failed.add_callback(lambda uri, why: (failed.append(why), ready.set()))
-        crazyflie.connection_lost.add_callback(lambda uri, why: (failed.append(why), self._end(why), ready.set()))
+        crazyflie.connection_failed.add_callback(refused)
+        crazyflie.connection_lost.add_callback(lost)
         crazyflie.console.receivedChar.add_callback(lambda text: self._note("console", drone=self.name, text=text))
         self._crazyflie = crazyflie
         started = time.monotonic()
@@ -216,6 +226,7 @@ class Link:
                     self._wake.wait()
                 if self._closing and not self._commands:
                     return
+                packet: Packet | None = None
                 if self._commands:
                     packet = self._commands.popleft()
                 else:

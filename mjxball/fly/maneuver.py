@@ -84,7 +84,8 @@ def blind_shares(seen: Glimpse, unheard: float, period: float, hardest: float = 
     known = [value if math.isfinite(value) else 0.0 for value in (seen.height, seen.climb, seen.lift)]
     lift = min(max(known[2], -3.0), 3.0)
     height = known[0] + known[1] * unheard + 0.5 * lift * unheard**2
-    climb, shares = known[1] + lift * unheard, []
+    climb = known[1] + lift * unheard
+    shares: list[float] = []
     while height > 0 and len(shares) * period < BLIND_LIMIT:
         wanted = min(max(3 * (-BLIND_SPEED - climb), -hardest), -0.15)
         shares.append(1 + wanted / GRAVITY)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import threading
@@ -85,7 +86,7 @@ def prepare(links: Sequence[Link], gains: Mapping[str, float], asked: Preflight)
         reset_estimator(link, asked)
         link.start_states()
 
-    together([lambda link=link: one(link) for link in links])
+    together([functools.partial(one, link) for link in links])
 
 
 def reset_estimator(link: Link, asked: Preflight) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -18,6 +18,7 @@ from mjxball.physics.step import make_cg_offset
 from mjxball.physics.stepper import make_stepper, on_the_host
 
 Array = Any
+METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 PICTURE = (360, 480)  # height, width of a rendered frame
 
 
@@ -50,7 +51,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     the object left d_term or that the world diverged, `truncated` that the episode's time is over: bootstrap there.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata = METADATA
 
     def __init__(
         self,
@@ -63,7 +64,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ValueError(f"render_mode must be None or rgb_array, not {render_mode!r}")
         self.config = worlds.settings(preset, config)
         self.render_mode = render_mode
-        self.metadata = {**type(self).metadata, "render_fps": round(1 / self.config.timing.control_period)}
+        self.metadata = {**METADATA, "render_fps": round(1 / self.config.timing.control_period)}
         with on_the_host():
             self._laws = compiled_laws(self.config)
         self._move = make_stepper(self.config, physics)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -17,6 +17,7 @@ from mjxball.env import CoupledPairEnv
 from mjxball.gym import worlds
 
 Array = Any
+METADATA: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
 
 
 class Program(NamedTuple):
@@ -64,7 +65,7 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
     last observation then being in `info["final_obs"]`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata = METADATA
 
     def __init__(
         self,
@@ -78,7 +79,7 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         mode = AutoresetMode(autoreset_mode)
         if mode == AutoresetMode.DISABLED:
             raise ValueError("autoreset_mode must be NextStep or SameStep")
-        self.metadata = {**type(self).metadata, "autoreset_mode": mode}
+        self.metadata = {**METADATA, "autoreset_mode": mode}
         self._same_step = mode == AutoresetMode.SAME_STEP
         if render_mode is not None:
             raise ValueError("the vector environment renders nothing; render one world with gymnasium.make")
@@ -124,7 +125,7 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
 
     def _ended(self, moved: Any, ended: np.ndarray) -> dict[str, Any]:
         """`info` of a step after which the worlds that `ended` (N,) have been started anew."""
-        info = _told(moved, ~ended)
+        info: dict[str, Any] = dict(_told(moved, ~ended))
         if ended.any():
             last = np.full(self.num_envs, None, object)
             for world in np.flatnonzero(ended):

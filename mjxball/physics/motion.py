@@ -51,7 +51,7 @@ def drawn(time: Array, load: Load) -> CgState:
     """A flight's own motion: its sine, or the places that it visits instead."""
     sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
     swinging = sine(time, *sines)
-    if load.cg_path is None:
+    if load.cg_path is None or load.cg_visits is None:
         return swinging
     xp = time.__array_namespace__()
     visiting = visits(time, *sines, load.cg_path)

@@ -97,9 +97,9 @@ class NetworkLaw:
         """The network's action in [-1, 1] (..., 3)."""
         xp = observation.__array_namespace__()
         weights, biases, mean, scale = self._parts
-        single = [xp.asarray(part, dtype=observation.dtype) for part in (mean, scale)]
-        layers = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
-        return mean_action(*layers, *single, self._recall.network_input(observation, memory))
+        mean, scale = (xp.asarray(part, dtype=observation.dtype) for part in (mean, scale))
+        weights, biases = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
+        return mean_action(weights, biases, mean, scale, self._recall.network_input(observation, memory))
 
     def command(self, scaled: Array, observation: Array) -> Array:
         """Command (..., 3) of the action `scaled` (..., 3)."""

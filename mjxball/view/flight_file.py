@@ -60,7 +60,7 @@ def save_flight(path: str | os.PathLike[str], flight: Flight) -> None:
     """Write `flight` to `path`, whole or not at all."""
     about = {"format": FORMAT, "title": flight.title, "plant": configs.to_dict(flight.plant)}
     stream = BytesIO()
-    arrays = {name: array.astype(np.float32) for name, array in flight.arrays.items() if name != "time"}
+    arrays: dict[str, Any] = {name: array.astype(np.float32) for name, array in flight.arrays.items() if name != "time"}
     np.savez_compressed(stream, about=np.array(json.dumps(about)), time=flight["time"], **arrays)
     write_whole(path, stream.getvalue())
 

@@ -30,11 +30,12 @@ def read_log(path: Path) -> Flight:
 
 
 def _flown(source: str, scenario: Scenario, physics: str) -> Flight:
-    from mjxball.control.followers import LAWS, make_baseline
+    from mjxball.control.followers import LAWS, Follower, make_baseline
     from mjxball.evaluate.cells import load_policy
     from mjxball.rollout import simulate
 
     setup, path = preset("paper"), Path(source)
+    follower: Follower
     if source in LAWS:
         follower = make_baseline(source, setup)
     elif path.is_dir():

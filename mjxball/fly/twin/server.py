@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import select
 import socket
 import threading
@@ -48,10 +49,7 @@ class Twin:
         self._pair, self._settings = pair, settings
         self._state = pair.start()
         self.drones = tuple(
-            TwinDrone(
-                settings.times, 2 * settings.seed + n, lambda name, value, n=n: pair.set_parameter(n, name, value)
-            )
-            for n in range(2)
+            TwinDrone(settings.times, 2 * settings.seed + n, functools.partial(pair.set_parameter, n)) for n in range(2)
         )
         self._sockets = [self._bound(port) for port in settings.ports]
         self._clients: list[tuple[str, int] | None] = [None, None]

@@ -76,7 +76,7 @@ def _mean_layers(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]
     return weights, [*policy.biases[:-1], policy.biases[-1][:ACTION_SIZE]]
 
 
-def _number(value: float) -> str:
+def _number(value: float | np.floating) -> str:
     """The shortest literal that is exactly this float."""
     return np.format_float_scientific(np.float32(value), unique=True, trim="0") + "f"
 

@@ -97,7 +97,7 @@ class Namespace:
     @staticmethod
     def zeros_like(value: Traced) -> Traced:
         """Zeros (N, size)."""
-        return value - value
+        return value.binary("Sub", value, value)
 
     @staticmethod
     def tanh(value: Traced) -> Traced:
