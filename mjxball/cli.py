@@ -13,7 +13,7 @@ from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
 
-EXTRAS = {"onnx": "onnx"}  # packages that another extra than `train` brings
+EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that another extra than `train` brings
 
 
 class Parser(argparse.ArgumentParser):

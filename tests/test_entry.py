@@ -13,16 +13,11 @@ from command_line import REPOSITORY, assert_one_line, environment, run
 
 from mjxball import __version__
 
-MODULES = ("mjxball.export", "mjxball.assembly", "mjxball.fly", "mjxball.view")
+MODULES = ("mjxball.export", "mjxball.assembly", "mjxball.fly", "mjxball.fly.twin", "mjxball.view")
 COMMANDS = {
     "train.py": [REPOSITORY / "train.py"],
     "eval.py": [REPOSITORY / "eval.py"],
-    **{
-        f"-m {name}": ["-m", name]
-        for name in MODULES
-        if list((REPOSITORY / "mjxball").glob(f"{name.split('.')[1]}.py"))
-        or (REPOSITORY / "mjxball" / name.split(".")[1] / "__main__.py").exists()
-    },
+    **{f"-m {name}": ["-m", name] for name in MODULES},
 }
 
 

@@ -31,7 +31,7 @@ def test_every_state_is_explained() -> None:
 
 def test_every_flag_is_named() -> None:
     for action in make_parser()._actions:
-        if action.option_strings and action.dest != "help":
+        if action.option_strings and action.dest not in ("help", "version"):
             assert action.option_strings[-1] in TEXT
 
 

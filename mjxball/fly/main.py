@@ -11,7 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjxball.cli import Parser, run_command
+from mjxball import cli
+from mjxball.cli import run_command
 from mjxball.errors import InputError
 from mjxball.fly import pair
 from mjxball.fly.command import LINEAR, OLDER, CommandMap
@@ -27,9 +28,10 @@ LOOP_RATE = 100.0  # [Hz] at least: the policy's period is a whole number of tic
 CURVES = {"linear": LINEAR, "older": OLDER}
 
 
-def make_parser() -> Parser:
-    """The flags; the first two lines of them are fixed (design section 9)."""
-    parser = Parser(prog="python -m mjxball.fly", description=__doc__)
+def make_parser() -> cli.Parser:
+    """The argument parser."""
+    about = "Fly a policy with two Crazyflies, or rehearse it with their software twin."
+    parser = cli.make_parser("python -m mjxball.fly", about)
     parser.add_argument("policy", type=Path, metavar="POLICY.npz", help="the follower")
     parser.add_argument("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
     parser.add_argument("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")

@@ -2,6 +2,9 @@
 
 import sys
 
+from mjxball.cli import quit_on_interrupt
 from mjxball.view.command import main
 
-sys.exit(main())
+if __name__ == "__main__":
+    quit_on_interrupt()  # there is nothing to save
+    sys.exit(main())

@@ -7,7 +7,7 @@ import tempfile
 import webbrowser
 from pathlib import Path
 
-from mjxball.cli import Parser, output_file, run_command
+from mjxball.cli import Parser, make_parser, output_file, run_command
 from mjxball.policy.file import write_whole
 from mjxball.scenario import Scenario
 from mjxball.view.flight_file import save_flight
@@ -19,10 +19,8 @@ REFERENCE = Scenario()
 
 def parser() -> Parser:
     """The argument parser of `python -m mjxball.view`."""
-    result = Parser(
-        prog="python -m mjxball.view",
-        description="Play a flight in the browser: one HTML page that needs neither a server nor a network.",
-    )
+    about = "Play a flight in the browser: one HTML page that needs neither a server nor a network."
+    result = make_parser("python -m mjxball.view", about)
     result.add_argument(
         "source", metavar="RUN_OR_LOG", help="recorded flight (.npz), or run directory, policy file or baseline to fly"
     )

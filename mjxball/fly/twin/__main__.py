@@ -5,11 +5,11 @@ It ends when its standard input closes, so that it never outlives whoever starte
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from pathlib import Path
 
+from mjxball.cli import make_parser
 from mjxball.fly.loop import urgent
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
@@ -18,7 +18,7 @@ from mjxball.policy import load_file
 
 def main() -> int:
     """Serve until standard input ends."""
-    parser = argparse.ArgumentParser(prog="python -m mjxball.fly.twin", description=__doc__)
+    parser = make_parser("python -m mjxball.fly.twin", __doc__ or "")
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
     parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
     options = parser.parse_args()
