@@ -63,9 +63,10 @@ def test_gymnasiums_checker_finds_nothing(name: str):
 
 @pytest.mark.parametrize("name", ["transport", "robust"])
 def test_it_flies_as_the_brax_environment(name: str, request: pytest.FixtureRequest):
-    """C MuJoCo in float64 against the training environment in float32, from the same drawn world, 50 steps.
+    """Float64 against the training environment in float32, from the same drawn world, 50 steps.
 
-    On closed-form physics, which compiles fastest; tests/test_env.py holds MJX against it.
+    C MuJoCo (`robust`: the closed form) against closed-form physics, which compiles fastest; tests/test_env.py holds
+    MJX against it.
     """
     config = preset(name)
     env = FollowerEnv(config=config)
@@ -128,6 +129,8 @@ def test_mistakes_are_named():
         FollowerEnv("nothing")
     with pytest.raises(InputError, match="unknown physics 'ode'"):
         FollowerEnv(physics="ode")
+    with pytest.raises(InputError, match="C MuJoCo has no inertia without mass"):
+        FollowerEnv("robust", physics="mujoco")
     with pytest.raises(ValueError, match="render_mode must be"):
         FollowerEnv(render_mode="human")
     vector = FollowerVectorEnv(2, physics="newton-euler")

@@ -1,4 +1,4 @@
-"""One world as a `gymnasium.Env`, on C MuJoCo unless told otherwise."""
+"""One world as a `gymnasium.Env`, on C MuJoCo where that knows what the worlds are made of."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
 from mjxball.env import CoupledPairEnv
+from mjxball.errors import InputError
 from mjxball.gym import worlds
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_cg_offset
@@ -44,11 +45,23 @@ def compiled_laws(config: Config) -> Laws:
     return Laws(pair, jax.jit(start), jax.jit(pair.command), jax.jit(pair.arrive))
 
 
+def engine_of(config: Config, physics: str | None) -> str:
+    """`physics`; by default C MuJoCo, or the closed form where worlds differ by inertia without mass.
+
+    Such inertia is what C MuJoCo lacks: raises InputError if it is asked for there.
+    """
+    massless = config.scenario.inertia_scale != (1.0, 1.0)
+    if massless and physics == "mujoco":
+        raise InputError("C MuJoCo has no inertia without mass, which scenario.inertia_scale draws; use newton-euler")
+    return physics or ("newton-euler" if massless else "mujoco")
+
+
 class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """The follower's task: observation (n,) float32, action (3,) in [-1, 1], both as in `mjxball.env`.
 
-    `physics` is mujoco, newton-euler or mjx, in float64; `config` replaces the preset's. `terminated` means that
-    the object left d_term or that the world diverged, `truncated` that the episode's time is over: bootstrap there.
+    `physics` is mujoco, newton-euler or mjx, in float64 (default: `engine_of`); `config` replaces the preset's.
+    `terminated` means that the object left d_term or that the world diverged, `truncated` that the episode's time
+    is over: bootstrap there.
     """
 
     metadata = METADATA
@@ -57,7 +70,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self,
         preset: str = "transport",
         config: Config | None = None,
-        physics: str = "mujoco",
+        physics: str | None = None,
         render_mode: str | None = None,
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -67,7 +80,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.metadata = {**METADATA, "render_fps": round(1 / self.config.timing.control_period)}
         with on_the_host():
             self._laws = compiled_laws(self.config)
-        self._move = make_stepper(self.config, physics)
+        self._move = make_stepper(self.config, engine_of(self.config, physics))
         self._cg_offset = make_cg_offset(self.config)
         self.observation_space, self.action_space = worlds.spaces(self._laws.pair)
         self._chain: Any = None
