@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import fcntl
 import os
 import shutil
 from collections.abc import Iterator
@@ -28,6 +30,34 @@ from mjxball.train.program import statistics
 # Derandomised: the same examples on every machine, so that a red build is never a matter of luck.
 hypothesis.settings.register_profile("mjxball", deadline=None, derandomize=True, database=None, max_examples=60)
 hypothesis.settings.load_profile("mjxball")
+
+QUEUE, ROOM = Path(__file__), Path(__file__).parent  # locked, never written: they are there on every machine
+
+
+@contextlib.contextmanager
+def locked(place: Path, kind: int) -> Iterator[None]:
+    """Hold a lock of `kind` on `place`, as all processes of the machine see it."""
+    handle = os.open(place, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, kind)
+        yield
+    finally:
+        os.close(handle)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """With workers side by side (`-n 2`), a test marked `alone` has the machine to itself.
+
+    Whoever waits for the room stands in the queue, so that a test that wants it alone is not passed for ever.
+    """
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return (yield)
+    kind = fcntl.LOCK_EX if item.get_closest_marker("alone") else fcntl.LOCK_SH
+    with contextlib.ExitStack() as stack:
+        with locked(QUEUE, fcntl.LOCK_EX):
+            stack.enter_context(locked(ROOM, kind))
+        return (yield)
 
 
 def with_settings(config: Config, **sections: dict[str, Any]) -> Config:

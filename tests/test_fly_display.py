@@ -21,6 +21,8 @@ from mjxball.fly.limits import Limits
 from mjxball.fly.packets import ZERO, DroneState
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 
+pytestmark = pytest.mark.alone  # keys and pictures by the clock
+
 LIMITS = Limits()
 
 

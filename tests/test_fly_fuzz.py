@@ -69,6 +69,7 @@ def opened(twin: Twin) -> Link:
     return link
 
 
+@pytest.mark.alone
 def test_cflib_still_connects_after_a_storm() -> None:
     random = np.random.default_rng(5)
     with Twin(StandIn()) as twin:
@@ -86,6 +87,7 @@ def test_cflib_still_connects_after_a_storm() -> None:
     assert twin.failure is None
 
 
+@pytest.mark.alone
 def test_the_runner_survives_a_hostile_twin() -> None:
     with Twin(StandIn()) as twin:
         link = opened(twin)
@@ -105,6 +107,7 @@ def test_the_runner_survives_a_hostile_twin() -> None:
     assert twin.failure is None
 
 
+@pytest.mark.alone
 def test_connecting_to_a_hostile_twin_ends_one_way_or_the_other() -> None:
     with Twin(StandIn()) as twin:
         twin.set_faults(0, DroneFaults(garbage=2.0))

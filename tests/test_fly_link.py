@@ -20,6 +20,7 @@ from mjxball.fly.twin.server import HOST, Twin
 from mjxball.fly.twin.standin import StandIn
 
 pytest.importorskip("cflib")
+pytestmark = pytest.mark.alone  # by the clock
 SHORT = Deadlines(connect=1.5, parameter=0.5, first_state=0.7, close=1.0)
 
 

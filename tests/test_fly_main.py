@@ -17,6 +17,7 @@ from mjxball.fly import journal
 from mjxball.fly.main import main
 
 pytest.importorskip("cflib")
+pytestmark = pytest.mark.alone  # by the clock
 URIS = ("--leader", "udp://127.0.0.1:19850", "--follower", "udp://127.0.0.1:19851")
 REFUSALS = [
     ([TRANSPORT], "--leader URI is needed"),

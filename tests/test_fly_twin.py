@@ -20,6 +20,7 @@ from mjxball.fly.twin.server import HOST, Twin
 from mjxball.fly.twin.standin import StandIn
 
 cflib = pytest.importorskip("cflib")
+pytestmark = pytest.mark.alone  # by the clock
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 5.0) -> bool:

@@ -22,6 +22,7 @@ from mjxball.fly.watchdog import FLYING, GOODBYE, IDLE, NOTHING, packed
 from mjxball.policy import load_file
 
 pytest.importorskip("cflib")
+pytestmark = pytest.mark.alone  # by the clock
 SEEN = Glimpse((45000, 46000), 0.5, 0.25, -1.0)  # numbers that float32 holds exactly
 
 
