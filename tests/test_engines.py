@@ -103,6 +103,8 @@ def test_added_inertia_is_that_of_drones_which_have_it(name: str, function: str)
     assert relative_difference(fast(*arguments, everywhere), expected) <= TOLERANCE
     with pytest.raises(NotImplementedError, match="without mass"):
         second(*arguments, everywhere)
+    for without, zero in zip(second(*arguments), second(*arguments, 0.0 * everywhere), strict=True):
+        np.testing.assert_array_equal(without, zero)  # worlds that vary in other ways carry a zero
 
 
 def test_closed_form_matches_the_hand_solution_of_design_section_4() -> None:
