@@ -23,7 +23,7 @@ FLOORS = (
     {"policy"},
     {"assembly"},
     {"physics", "scene"},
-    {"rewards", "sensing"},
+    {"rewards", "sensing", "wiring"},
     {"scenario", "nuisance"},
     {"rollout", "env"},
     {"train"},

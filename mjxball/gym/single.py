@@ -112,7 +112,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._load = load
         plant = self._move(self._plant, commands, _batch_of_one(load))
         with on_the_host():
-            arrived = PlantState(*(leaf[0].astype(np.float32) for leaf in plant))
+            arrived = plant.each(lambda leaf: leaf[0].astype(np.float32))
             self._state = self._laws.arrive(self._state, orders, arrived)
         if not self._state.metrics["diverged"]:
             self._plant = plant

@@ -57,7 +57,7 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
 
 
 def _refuse(added: Array | None) -> None:
-    if added is not None:
+    if added is not None and np.any(added):
         raise NotImplementedError("C MuJoCo knows bodies only, no inertia without mass")
 
 
