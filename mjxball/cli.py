@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
 
+PLANT_PARTS = ("plant", "autopilot", "scenario", "motion")  # what a plant file may set
 EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that another extra than `train` brings
 
 
@@ -89,14 +92,33 @@ def output_file(path: Path, suffix: str) -> Path:
 def add_config_flags(parser: argparse.ArgumentParser) -> None:
     """Add `--<path> VALUE` for every leaf of the configuration, with its help text."""
     group = parser.add_argument_group("configuration", "defaults are the preset's; tuples are comma-separated")
+    group.add_argument("--plant", type=Path, metavar="FILE", help="JSON of settings, as mjxball.rig.identify writes it")
     for path, _, item in configs.leaves(configs.Config()):
         about = item.metadata["about"].replace("%", "%%")
         group.add_argument(f"--{path}", metavar="VALUE", dest=f"config:{path}", default=None, help=about)
 
 
 def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> configs.Config:
-    """Return `config` with every `--<path> VALUE` that was given, validated."""
+    """Return `config` with the settings of `--plant FILE` and every `--<path> VALUE` that was given, validated."""
+    if getattr(options, "plant", None) is not None:
+        config = configs.apply_overrides(config, read_plant(options.plant))
     for name, text in vars(options).items():
         if name.startswith("config:") and text is not None:
             config = configs.override(config, name.removeprefix("config:"), text)
     return configs.validate(config)
+
+
+def read_plant(path: Path) -> dict[str, Any]:
+    """Settings {dotted path: value} of a plant file. Raises InputError if it is none; the settings are not checked."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"plant file {path} cannot be read: {error.strerror or error}") from None
+    except ValueError:
+        raise InputError(f"plant file {path} is not JSON") from None
+    if not isinstance(values, dict) or not values:
+        raise InputError(f'plant file {path} must be one JSON object such as {{"plant.rotor_lag": 0.06}}')
+    for name in values:
+        if name.partition(".")[0] not in PLANT_PARTS:
+            raise InputError(f"plant file {path} may set {', '.join(PLANT_PARTS)}, not {name}")
+    return values

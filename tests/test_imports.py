@@ -29,7 +29,7 @@ FLOORS = (
     {"train"},
     {"evaluate"},
     {"fly", "gym", "view"},
-    {"commands", "export"},
+    {"commands", "export", "rig"},
     {"entry"},
 )
 FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}

@@ -18,7 +18,7 @@ from mjxball.config._settings import (
     Scenario,
     Timing,
 )
-from mjxball.config._tree import config_hash, from_dict, leaves, override, replace, to_dict, to_json
+from mjxball.config._tree import apply_overrides, config_hash, from_dict, leaves, override, replace, to_dict, to_json
 from mjxball.config._validate import ball_reach, cg_reach, validate
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "Sac",
     "Scenario",
     "Timing",
+    "apply_overrides",
     "ball_reach",
     "cg_reach",
     "config_hash",

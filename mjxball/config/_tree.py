@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mjxball.config._settings import Config
@@ -43,6 +43,23 @@ def override(config: Config, path: str, text: str) -> Config:
         if known == path:
             return replace(config, path, _parse(path, text, value))
     raise InputError(f"--{path} is not a setting; run with --help for the list")
+
+
+def apply_overrides(config: Config, values: Mapping[str, Any]) -> Config:
+    """Return a copy of `config` with the leaf at every dotted path of `values` replaced; not validated.
+
+    Raises InputError for an unknown path.
+    """
+    known = {path: value for path, value, _ in leaves(config)}
+    for path, value in values.items():
+        if path not in known:
+            raise InputError(f"{path} is not a setting; run train.py --help for the list")
+        if isinstance(value, list):
+            value = tuple(value)  # noqa: PLW2901
+        if isinstance(known[path], float) and type(value) is int:
+            value = float(value)  # noqa: PLW2901
+        config = replace(config, path, value)
+    return config
 
 
 def _parse(path: str, text: str, example: Any) -> Any:

@@ -1,0 +1,57 @@
+"""What the rate loops of both drones have to turn: inertia and angular acceleration per unit of their output."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mjxball.config import Config
+from mjxball.control import crazyflie, mixer
+from mjxball.control.constants import plant_constants
+
+NAMES = ("roll", "pitch", "yaw")
+
+
+class Axis(NamedTuple):
+    """One body axis of the coupled pair, both drones' loops giving the same output."""
+
+    name: str
+    inertia: float  # about O, ball at O [kg m2]
+    gain: float  # angular acceleration per unit of the rate loops' output [deg/s2]
+    scale: float  # inertia that a drone turns over its own
+    trim: float  # output that holds the heaviest lasting moment: the ball at an end stop [1]
+    headroom: float  # output at which a motor of the hovering pair reaches full power [1]
+
+
+def inertia_about_o(config: Config) -> np.ndarray:
+    """Inertia (3,) of the assembly about O with the moving mass at O [kg m2]."""
+    constants = plant_constants(config.plant, config.attitude)
+    return np.diag(constants.drone_inertia) + config.plant.object_mass * constants.object_inertia_per_mass
+
+
+def hover(config: Config) -> tuple[float, float]:
+    """(motor command at hover, force of a motor per command there [N]), the mean of both drones."""
+    constants, curve = plant_constants(config.plant, config.attitude), config.autopilot.motor_curve
+    weight = (constants.drone_mass + constants.share * config.plant.object_mass) * config.plant.gravity
+    command = float(crazyflie.motor_command(curve, weight / 4).mean())
+    a, b = curve
+    return command, (2 * a * command / crazyflie.FULL + b) / crazyflie.FULL
+
+
+def axes(config: Config) -> tuple[Axis, ...]:
+    """Roll, pitch and yaw of the pair that `config` describes."""
+    plant = config.plant
+    command, slope = hover(config)
+    own = np.array([plant.leader_inertia, plant.follower_inertia]).sum(axis=0)
+    # A roll output moves each motor by half of it, a yaw output by all of it.
+    tilting = 2 * 4 * mixer.lever(plant.arm, plant.layout) / 2 * slope
+    torque = np.array([tilting, tilting, 2 * 4 * plant.yaw_per_thrust * slope])
+    inertia = inertia_about_o(config)
+    stop = plant.ball_stop or plant.object_size["xy".index(plant.cg_axis)] / 2
+    moment = plant.moving_fraction * plant.object_mass * plant.gravity * stop
+    loaded = np.array([plant.cg_axis == "y", plant.cg_axis == "x", False])
+    gain, trim = np.degrees(torque / inertia), loaded * moment / torque
+    spare = crazyflie.FULL - command
+    room = (2 * spare, 2 * spare, spare)
+    return tuple(map(Axis, NAMES, *(map(float, row) for row in (inertia, gain, inertia / own, trim, room))))

@@ -1,0 +1,100 @@
+"""Command line of `python -m mjxball.rig.gains`: attitude and rate gains for two Crazyflies on one stick."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mjxball import cli, config
+from mjxball.errors import InputError
+from mjxball.rig.design import ASKED, Design, design, judged, stock
+from mjxball.rig.loop import Gains, Margins
+
+PRESETS = ("flight", "stand")
+PICTURES = (".svg", ".png", ".pdf")
+
+
+def parser() -> cli.Parser:
+    """The flags."""
+    result = cli.make_parser("python -m mjxball.rig.gains", "Compute gains for the coupled pair, with their margins.")
+    result.add_argument("--preset", choices=PRESETS, default="flight", help="rig (default flight)")
+    result.add_argument("--plant", type=Path, metavar="FILE", help="plant file of mjxball.rig.identify, or by hand")
+    result.add_argument("--out", type=Path, metavar="GAINS.json", help="write what mjxball.fly --gains uploads")
+    result.add_argument("--picture", type=Path, metavar="FILE", help="draw steps, poles and margins (svg, png, pdf)")
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compute, print, write; return the exit code."""
+    options = parser().parse_args(arguments)
+    return cli.run_command(lambda: _gains(options))
+
+
+def _gains(options: argparse.Namespace) -> int:
+    settings = config.preset(options.preset)
+    if options.plant:
+        settings = config.validate(config.apply_overrides(settings, cli.read_plant(options.plant)))
+    if options.out:
+        cli.output_file(options.out, ".json")
+    if options.picture:
+        if options.picture.suffix not in PICTURES:
+            raise InputError(f"picture {options.picture} must end in {', '.join(PICTURES)}")
+        cli.output_file(options.picture, options.picture.suffix)
+    try:
+        designs = design(settings)
+    except ValueError as error:
+        raise InputError(f"{error}: a lighter or shorter stick, or faster motors, would help") from None
+    print(report(designs, settings.plant.rotor_lag))  # noqa: T201
+    if options.out:
+        options.out.write_text(parameter_file(designs))
+    if options.picture:
+        from mjxball.rig.picture import draw
+
+        draw(settings, designs, options.picture)
+    return 0
+
+
+def parameter_file(designs: Sequence[Design]) -> str:
+    """JSON of firmware parameters, as `mjxball.fly --gains` reads it."""
+    return json.dumps({name: value for one in designs for name, value in one.parameters.items()}, indent=1) + "\n"
+
+
+def report(designs: Sequence[Design], lag: float) -> str:
+    """A table: for each axis the designed gains and the delivered ones, with nominal and worst margins."""
+    head = ("axis", "inertia", "gains", "attitude kp ki kd", "rate kp ki kd", "phase", "gain", "delay", "worst")
+    rows = [head]
+    for one in designs:
+        rows.append(
+            _row(one, "kept" if one.gains == stock(one.axis) else "designed", one.gains, one.nominal, one.worst)
+        )
+        rows.append(_row(one, "delivered", stock(one.axis), *judged(stock(one.axis), one.axis, lag)))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    low, high = ASKED.lags
+    lines += [
+        f"margins at {1e3 * lag:.0f} ms motor lag and {1e3 * ASKED.delay:.0f} ms loop delay; worst: phase and gain "
+        f"over lag {1e3 * low:.0f} to {1e3 * high:.0f} ms, inertia x {ASKED.inertias[0]:g} to {ASKED.inertias[1]:g}, "
+        f"delay {1e3 * ASKED.worst_delay:.0f} ms"
+    ]
+    return "\n".join(lines)
+
+
+def _row(one: Design, whose: str, gains: Gains, nominal: Margins, worst: Margins) -> tuple[str, ...]:
+    numbers = (" ".join(f"{value:g}" for value in row) for row in gains)
+    inertia = f"{one.axis.scale:.1f} x"
+    if not nominal.phase:
+        return (one.axis.name, inertia, whose, *numbers, "unstable", "", "", "unstable")
+    gain = f"x {nominal.gain_up:.1f}, / {nominal.gain_down:.1f}"
+    left = f"{worst.phase:.0f} deg, x {worst.gain_up:.1f}, / {worst.gain_down:.1f}" if worst.phase else "unstable"
+    return (one.axis.name, inertia, whose, *numbers, f"{nominal.phase:.0f} deg", gain, _ms(nominal.delay), left)
+
+
+def _ms(seconds: float) -> str:
+    return f"{1e3 * seconds:.0f} ms"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
