@@ -26,6 +26,13 @@ DRONES = {
     "brushless": (0.0393, (0.0, 0.20)),
 }  # with a positioning deck where it is not part of the drone
 
+# Roll, roll rate, yaw, yaw rate of the pair, as `python -m mjxball.rig.gains` computes them; pitch is as delivered.
+GAINS = {
+    "2.1": ((3.25, 0.0, 0.0), (937.0, 454.0, 28.1), (1.61, 0.0, 0.0), (1160.0, 17.6, 0.0)),
+    "thrust-upgrade": ((2.41, 0.0, 0.0), (1330.0, 495.0, 26.5), (1.61, 0.0, 0.0), (1640.0, 24.2, 0.0)),
+    "brushless": ((2.41, 0.0, 0.0), (1350.0, 445.0, 27.0), (1.61, 0.0, 0.0), (1660.0, 24.2, 0.0)),
+}
+
 
 def rig(drone: str = "2.1") -> Plant:
     """Two drones 0.30 m apart on a carbon stick along body y, 10 g with its mounts, and a 7.5 g ball that it guides.
@@ -55,14 +62,15 @@ def rig(drone: str = "2.1") -> Plant:
 
 
 def autopilot(drone: str = "2.1") -> Autopilot:
-    """The firmware with gains for the coupled pair: the stick makes roll and yaw 50 times heavier."""
+    """The firmware with gains for the coupled pair: the stick makes roll 43 and yaw 25 times heavier."""
+    roll, roll_rate, yaw, yaw_rate = GAINS.get(drone, GAINS["2.1"])
     return Autopilot(
         kind="crazyflie",
         motor_curve=DRONES[drone][1],
-        roll=(3.25, 0.0, 0.0),
-        roll_rate=(937.0, 454.0, 28.1),
-        yaw=(1.61, 0.0, 0.0),
-        yaw_rate=(1160.0, 17.6, 0.0),
+        roll=roll,
+        roll_rate=roll_rate,
+        yaw=yaw,
+        yaw_rate=yaw_rate,
     )
 
 

@@ -26,6 +26,7 @@ class Asked:
     lags: tuple[float, float] = (0.03, 0.15)  # of the motors [s]
     inertias: tuple[float, float] = (0.6, 1.4)  # factors
     error: float = 5.0  # attitude error that may take half of the headroom [deg]
+    apart: float = 4.0  # the rate loop's bandwidth over the attitude loop's, at least
     derivative: float = 30.0  # largest kd of a rate loop, twelve times stock: noise of the gyro
     alone: float = 1.5  # an axis whose inertia is less than this times the drones' own keeps the delivered gains
     unloaded: float = 0.15  # share of the headroom that the integral of an axis without a load may take
@@ -84,7 +85,8 @@ def candidates(axis: Axis, lag: float, asked: Asked) -> list[tuple[float, float,
     stiffest = 0.5 * axis.headroom / asked.error
     rates, leads = np.geomspace(2.0, 60.0, 35) / axis.gain, np.linspace(0.0, lag, 6)
     grid = itertools.product(np.geomspace(0.8, 8.0, 24), rates, leads)
-    kept = [(a, r, d) for a, r, d in grid if a * r <= stiffest and d * r <= asked.derivative]
+    apart = ((a, r, d) for a, r, d in grid if asked.apart * a <= r * axis.gain)
+    kept = [(a, r, d) for a, r, d in apart if a * r <= stiffest and d * r <= asked.derivative]
     # Among the equally stiff the one with less lead, which is less noise.
     return sorted(((float(a), float(r), float(d)) for a, r, d in kept), key=lambda c: (-c[0] * c[1], c[2]))
 
@@ -103,7 +105,8 @@ def judged(gains: Gains, axis: Axis, lag: float, asked: Asked = ASKED) -> tuple[
 
 def rounded(gains: Gains) -> Gains:
     """To three significant digits, as they are written to the drones."""
-    return Gains(*(tuple(float(f"{value:.3g}") for value in row) for row in gains))
+    attitude, rate = ([float(f"{value:.3g}") for value in row] for row in gains)
+    return Gains((attitude[0], attitude[1], attitude[2]), (rate[0], rate[1], rate[2]))
 
 
 def stock(axis: Axis) -> Gains:
@@ -118,5 +121,6 @@ def gains_of(autopilot: Autopilot, axis: Axis) -> Gains:
 
 def apply(autopilot: Autopilot, designs: tuple[Design, ...]) -> Autopilot:
     """`autopilot` with the gains of `designs`."""
-    rows = {d.axis.name: d.gains.attitude for d in designs} | {f"{d.axis.name}_rate": d.gains.rate for d in designs}
-    return replace(autopilot, **rows)
+    roll, pitch, yaw = (one.gains for one in designs)
+    autopilot = replace(autopilot, roll=roll.attitude, pitch=pitch.attitude, yaw=yaw.attitude)
+    return replace(autopilot, roll_rate=roll.rate, pitch_rate=pitch.rate, yaw_rate=yaw.rate)

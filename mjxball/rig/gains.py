@@ -65,7 +65,7 @@ def parameter_file(designs: Sequence[Design]) -> str:
 def report(designs: Sequence[Design], lag: float) -> str:
     """A table: for each axis the designed gains and the delivered ones, with nominal and worst margins."""
     head = ("axis", "inertia", "gains", "attitude kp ki kd", "rate kp ki kd", "phase", "gain", "delay", "worst")
-    rows = [head]
+    rows: list[tuple[str, ...]] = [head]
     for one in designs:
         rows.append(
             _row(one, "kept" if one.gains == stock(one.axis) else "designed", one.gains, one.nominal, one.worst)

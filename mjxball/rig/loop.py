@@ -48,7 +48,9 @@ def closed_poles(gains: Gains, gain: float, lag: float, delay: float) -> Array:
     bottom = poly.polymul([0, 0, 0, 0, 1], [1, lag])
     pade = np.array([120, 60 * delay, 12 * delay**2, delay**3])
     top = poly.polymul(gain * number, pade * [1, -1, 1, -1])
-    whole = np.trim_zeros(poly.polyadd(top, poly.polymul(bottom, pade)))  # without the integrators that are not there
+    whole: Array = np.trim_zeros(
+        poly.polyadd(top, poly.polymul(bottom, pade))
+    )  # without the integrators that are not there
     return poly.polyroots(whole)
 
 

@@ -41,13 +41,13 @@ def _delivered(config: Config) -> Autopilot:
 
 
 def _along(axis: str, size: float) -> tuple[float, float, float]:
-    return tuple(size * (axis == name) for name in ("roll", "pitch", "yaw"))  # type: ignore[return-value]
+    return size * (axis == "roll"), size * (axis == "pitch"), size * (axis == "yaw")
 
 
 def _steps(place: Any, config: Config, autopilots: dict[str, Autopilot], worst: Design) -> None:
     yaw = worst.axis.name == "yaw"
-    kick = {"yaw": -STEP} if yaw else {"step": _along(worst.axis.name, STEP)}
-    trials = [Trial(lag=lag, delay=DELAY, **kick) for lag in LAGS]  # type: ignore[arg-type]
+    step = _along(worst.axis.name, 0.0 if yaw else STEP)
+    trials = [Trial(step, lag=lag, delay=DELAY, yaw=-STEP if yaw else 0.0) for lag in LAGS]
     _draw_turns(place, config, autopilots, trials, worst)
     place.axhline(0 if yaw else STEP, color="0.6", lw=0.8)
     place.set(title=f"{STEP:g} degree step, motor lag 30 to 150 ms (thin to thick)", ylim=(-12, 28))
