@@ -1,0 +1,180 @@
+"""Gains of the coupled pair: their margins against an independent count, the presets that use them, the command."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjxball.cli import read_plant
+from mjxball.config import Autopilot, apply_overrides, preset
+from mjxball.config._crazyflie import autopilot, rig
+from mjxball.errors import InputError
+from mjxball.fly.preflight import read_gains
+from mjxball.rig import gains as command
+from mjxball.rig.axis import axes
+from mjxball.rig.design import ASKED, design, gains_of, stock, worst_margins
+from mjxball.rig.loop import Gains, is_stable, margins
+from mjxball.rig.response import Trial, turn
+
+PAIR = preset("flight")
+ROLL, PITCH, YAW = axes(PAIR)
+INTERIM = dataclasses.replace(
+    PAIR.autopilot,
+    roll=(3.0, 0.3, 0.0),
+    roll_rate=(700.0, 350.0, 20.0),
+    yaw=(2.0, 0.2, 0.0),
+    yaw_rate=(2000.0, 300.0, 0.0),
+)
+
+
+@pytest.fixture(scope="module")
+def designs():
+    return design(PAIR)
+
+
+class TestAxes:
+    def test_a_unit_of_roll_turns_the_pair_as_in_the_cascade(self) -> None:
+        """Half a unit on each of eight motors, 46 / sqrt 2 mm from the axis."""
+        slope = (2 * 0.0915 * 46000 / 65535 + 0.0677) / 65535
+        torque = 8 * 0.5 * slope * 0.046 / math.sqrt(2)
+        assert math.radians(ROLL.gain) * ROLL.inertia == pytest.approx(torque, rel=1e-3)
+
+    def test_the_stick_makes_roll_and_yaw_heavy_and_leaves_pitch(self) -> None:
+        assert ROLL.scale == pytest.approx(2 * 0.029 * 0.15**2 / (2 * 1.66e-5) + 3, rel=0.1)
+        assert YAW.scale > 20
+        assert PITCH.scale == pytest.approx(1, abs=0.05)
+
+    def test_trim_holds_the_ball_at_its_stop(self) -> None:
+        assert ROLL.trim * math.radians(ROLL.gain) * ROLL.inertia == pytest.approx(0.0075 * 9.81 * 0.08)
+
+
+class TestMargins:
+    def test_closed_form(self) -> None:
+        """Rate P on gain / s (lag s + 1): crossover, phase and delay margin by hand; no gain makes it unstable."""
+        found = margins(Gains((0, 0, 0), (10.0, 0, 0)), 2.0, 0.05, 0.0)
+        # |20 / (w (0.05 j w + 1))| = 1 at w^2 = (sqrt(1 + 4 0.05^2 20^2) - 1) / (2 0.05^2)
+        crossover = math.sqrt((math.sqrt(1 + 4 * 0.0025 * 400) - 1) / 0.005)
+        phase = 90 - math.degrees(math.atan(0.05 * crossover))
+        assert found.crossover == pytest.approx(crossover, rel=0.01)
+        assert found.phase == pytest.approx(phase, abs=0.5)
+        assert found.delay == pytest.approx(math.radians(phase) / crossover, rel=0.02)
+        assert found.gain_up == math.inf
+
+    @pytest.mark.parametrize("which", ["roll", "yaw"])
+    def test_the_loop_is_lost_where_they_say(self, designs, which: str) -> None:
+        """Poles just inside and just outside each margin: Nyquist's count against the characteristic polynomial."""
+        one = next(one for one in designs if one.axis.name == which)
+        found, lag = one.nominal, PAIR.plant.rotor_lag
+        for factor in (found.gain_up, 1 / found.gain_down):
+            inside, outside = (one.axis.gain * factor**power for power in (0.95, 1.05))
+            assert is_stable(one.gains, inside, lag, ASKED.delay)
+            assert not is_stable(one.gains, outside, lag, ASKED.delay)
+        assert is_stable(one.gains, one.axis.gain, lag, ASKED.delay + 0.95 * found.delay)
+        assert not is_stable(one.gains, one.axis.gain, lag, ASKED.delay + 1.05 * found.delay)
+
+    def test_delivered_gains_have_none_left(self) -> None:
+        assert margins(stock(ROLL), ROLL.gain, 0.05, 0.01).phase < 3
+        assert worst_margins(stock(ROLL), ROLL).phase == 0
+        assert worst_margins(stock(YAW), YAW).phase == 0
+
+
+class TestDesign:
+    def test_margins_are_kept(self, designs) -> None:
+        for one in designs:
+            if one.axis.name == "pitch":
+                assert one.gains == stock(one.axis)
+                continue
+            assert one.nominal.phase >= ASKED.phase
+            assert min(one.nominal.gain_up, one.nominal.gain_down) >= ASKED.gain
+            assert one.worst.phase >= ASKED.worst_phase
+            assert min(one.worst.gain_up, one.worst.gain_down) >= ASKED.worst_gain
+
+    @pytest.mark.parametrize("drone", ["2.1", "thrust-upgrade", "brushless"])
+    def test_presets_fly_them(self, drone: str) -> None:
+        config = dataclasses.replace(PAIR, plant=rig(drone), autopilot=autopilot(drone))
+        for one in design(config):
+            assert gains_of(config.autopilot, one.axis) == one.gains, one.axis.name
+
+    def test_stand_flies_the_same(self) -> None:
+        stand = preset("stand").autopilot
+        assert (stand.roll, stand.roll_rate) == (PAIR.autopilot.roll, PAIR.autopilot.roll_rate)
+
+
+class TestResponse:
+    """The real cascade, 10 ms of delay, motor lags of 30 to 150 ms and inertias of 0.6 to 1.4."""
+
+    CORNERS = tuple((lag, inertia) for lag in (0.03, 0.05, 0.15) for inertia in (0.6, 1.0, 1.4))
+
+    def test_delivered_gains_diverge_and_these_do_not(self) -> None:
+        trials = [Trial((8, 0, 0), lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
+        stocked, designed = (
+            turn(PAIR, law, trials)[..., 0]
+            for law in (Autopilot(kind="crazyflie", motor_curve=PAIR.autopilot.motor_curve), PAIR.autopilot)
+        )
+        nominal = self.CORNERS.index((0.05, 1.0))
+        assert stocked[:, nominal].max() > 1.7 * 8  # and swings on: below
+        assert np.ptp(stocked[-500:, nominal]) > 8
+        assert np.abs(stocked[:, -3:]).max() > 60
+        assert designed.max() < 1.25 * 8
+        assert designed[:, nominal].max() < 1.02 * 8
+        assert np.abs(designed[-250:] - 8).max() < 0.8
+
+    def test_better_than_before_in_every_corner(self) -> None:
+        """Against the gains by hand that the presets had first: overshoot and the deflection by the ball's moment."""
+        moment = (0.5 * 0.0075 * 9.81 * 0.08, 0.0, 0.0)
+        steps = [Trial((8, 0, 0), lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
+        loads = [Trial(torque=moment, lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
+        before, now = (turn(PAIR, law, steps + loads)[..., 0] for law in (INTERIM, PAIR.autopilot))
+        count = len(self.CORNERS)
+        assert (now[:, :count].max(axis=0) <= before[:, :count].max(axis=0) + 0.01).all()
+        assert (now[:, count:].max(axis=0) < 0.75 * before[:, count:].max(axis=0)).all()
+
+
+class TestCommand:
+    def test_writes_what_the_runner_reads(self, tmp_path: Path, designs, capsys) -> None:
+        out, picture = tmp_path / "gains.json", tmp_path / "gains.svg"
+        assert command.main(["--out", str(out), "--picture", str(picture)]) == 0
+        read = read_gains(out)
+        assert read["pid_rate.roll_kp"] == designs[0].gains.rate[0]
+        assert len(read) == 18
+        assert b"<svg" in picture.read_bytes()
+        text = capsys.readouterr().out
+        assert "unstable" in text
+        assert f"{designs[0].nominal.phase:.0f} deg" in text
+
+    def test_another_plant_gets_other_gains(self, tmp_path: Path, capsys) -> None:
+        plant, out = tmp_path / "plant.json", tmp_path / "gains.json"
+        plant.write_text(json.dumps({"plant.rotor_lag": 0.08}))
+        assert command.main(["--plant", str(plant), "--out", str(out)]) == 0
+        slow = design(apply_overrides(PAIR, {"plant.rotor_lag": 0.08}))
+        assert read_gains(out)["pid_rate.roll_kp"] == slow[0].gains.rate[0]
+
+    @pytest.mark.parametrize(
+        ("text", "said"),
+        [
+            ("nothing", "is not JSON"),
+            ("[]", "one JSON object"),
+            ('{"sac.steps": 3}', "may set"),
+            ('{"plant.mass": 3}', "not a setting"),
+            ('{"plant.rotor_lag": "slow"}', "takes numbers"),
+            ('{"plant.rotor_lag": -1}', "greater than 0"),
+        ],
+    )
+    def test_plant_files_are_refused_in_a_sentence(self, tmp_path: Path, capsys, text: str, said: str) -> None:
+        plant = tmp_path / "plant.json"
+        plant.write_text(text)
+        assert command.main(["--plant", str(plant)]) == 2
+        assert said in capsys.readouterr().err
+
+    def test_missing_plant_file(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match="cannot be read"):
+            read_plant(tmp_path / "none.json")
+
+    def test_picture_of_another_kind(self, tmp_path: Path, capsys) -> None:
+        assert command.main(["--picture", str(tmp_path / "gains.txt")]) == 2
+        assert "must end in" in capsys.readouterr().err
