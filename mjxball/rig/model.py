@@ -1,0 +1,117 @@
+"""Roll and climb of the pair over short windows of a log: the cascade closed around a plant that is sought."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from mjxball.config import Config
+from mjxball.control import crazyflie, mixer
+from mjxball.control.constants import plant_constants
+from mjxball.rig.log import Log
+
+Array = np.ndarray
+
+
+class Sought(NamedTuple):
+    """What is identified; each (n,)."""
+
+    thrust: Array  # factor on the force of every motor
+    inertia: Array  # about the axis across the stick [kg m2]
+    lag: Array  # of the motors [s]
+    delay: Array  # from sending a setpoint to its part in what the state shows, without the motors' lag [s]
+
+
+class Start(NamedTuple):
+    """How a window begins, and the moment that nobody measured in it; each (n,)."""
+
+    roll: Array  # [rad]
+    rate: Array  # [rad/s]
+    climb: Array  # [m/s]
+    turning: Array  # constant angular acceleration by the ball and what else is not modelled [rad/s2]
+
+
+class Passed(NamedTuple):
+    """What the loops and motors of the log went through, on all of its ticks."""
+
+    loops: Array  # (K, 2, 13)
+    force: Array  # (K, 2, 4) [N]
+
+
+def replay(config: Config, log: Log, sought: Sought) -> Passed:
+    """Run both drones' cascades and motors through the log's own measurements; `sought` holds one plant, each (1,)."""
+    law = config.autopilot
+    both = np.stack([log.euler] * 2, axis=1), np.stack([log.rates] * 2, axis=1)
+    loops = crazyflie.start_loops(both[0][0], both[1][0])
+    scale, lag, late = sought.thrust[0], sought.lag[0], round(float(sought.delay[0]) / crazyflie.PERIOD)
+    force = scale * np.stack([crazyflie.motor_force(law.motor_curve, log.setpoints[0, :, 3])] * 4, axis=-1)
+    keep = math.exp(-crazyflie.PERIOD / lag)
+    kept_loops, kept_force = [], []
+    for tick in range(len(log.euler)):
+        kept_loops.append(loops)
+        kept_force.append(force)
+        sent = log.setpoints[max(tick - late, 0)]
+        loops, motors = crazyflie.cascade(law, loops, sent, both[0][tick], both[1][tick])
+        target = scale * crazyflie.motor_force(law.motor_curve, motors)
+        force = target + keep * (force - target)
+    return Passed(np.stack(kept_loops), np.stack(kept_force))
+
+
+def fly_windows(
+    config: Config, log: Log, passed: Passed, begins: Array, ticks: int, sought: Sought, start: Start
+) -> Array:
+    """Roll, roll rate, climb (ticks / every, n, 3) of n windows that begin at ticks `begins` (n,).
+
+    Pitch and yaw are the log's.
+    """
+    law, plant, h = config.autopilot, config.plant, crazyflie.PERIOD
+    mass, lever = pair_mass(config), np.array([plant.leader_mount[1], plant.follower_mount[1]])
+    keep = np.exp(-h / sought.lag)[:, None, None]
+    mean = (sought.lag[:, None, None] / h) * (1 - keep)
+    roll, rate, climb = start.roll, start.rate, start.climb
+    loops, force = _begin(log, passed, begins, roll, rate)
+    flown = []
+    for tick in range(ticks):
+        if tick % log.every == 0:
+            flown.append(np.stack([roll, rate, climb], axis=-1))
+        now = begins + tick
+        euler, rates = log.euler[now].copy(), log.rates[now].copy()
+        euler[:, 0], rates[:, 0] = roll, rate
+        sent = _delayed(log.setpoints, now, sought.delay / h)
+        loops, motors = crazyflie.cascade(law, loops, sent, *(np.stack([v, v], axis=1) for v in (euler, rates)))
+        target = sought.thrust[:, None, None] * crazyflie.motor_force(law.motor_curve, motors)
+        acting = target + mean * (force - target)
+        force = target + keep * (force - target)
+        wrench = mixer.wrench_from_rotors(acting, plant.arm, plant.yaw_per_thrust, plant.layout)
+        torque = (wrench[..., 1] + lever * wrench[..., 0]).sum(axis=1)
+        level = np.cos(roll) * np.cos(euler[:, 1])
+        climb = climb + h * (wrench[..., 0].sum(axis=1) * level / mass - plant.gravity)
+        rate = rate + h * (torque / sought.inertia + start.turning)
+        roll = roll + h * rate
+    return np.stack(flown)
+
+
+def pair_mass(config: Config) -> float:
+    """All that flies [kg]."""
+    constants = plant_constants(config.plant, config.attitude)
+    return float(constants.drone_mass.sum()) + config.plant.object_mass
+
+
+def _begin(log: Log, passed: Passed, begins: Array, roll: Array, rate: Array) -> tuple[Array, Array]:
+    """(loops, forces) of the windows' first ticks; what was last measured is where the window starts."""
+    euler, rates = log.euler[begins].copy(), log.rates[begins].copy()
+    euler[:, 0], rates[:, 0] = roll, rate
+    measured = np.concatenate([crazyflie.to_firmware(euler), crazyflie.to_firmware(rates)], axis=-1)
+    loops = passed.loops[begins].copy()
+    loops[..., 6:12] = measured[:, None]
+    return loops, passed.force[begins]
+
+
+def _delayed(setpoints: Array, now: Array, ticks: Array) -> Array:
+    """Setpoints (n, 2, 4) as they were `ticks` (n,) before `now` (n,), between two ticks the mean by share."""
+    when = np.maximum(now - ticks, 0.0)
+    low = np.floor(when).astype(int)
+    share = (when - low)[:, None, None]
+    return (1 - share) * setpoints[low] + share * setpoints[np.minimum(low + 1, len(setpoints) - 1)]
