@@ -10,6 +10,7 @@ import numpy as np
 from command_line import TRANSPORT
 
 from mjxball.fly import packets, pair
+from mjxball.fly.card import command_maps, gains_of
 from mjxball.fly.command import CommandMap
 from mjxball.fly.contract import FlightSettings
 from mjxball.fly.flight import Flight
@@ -18,11 +19,12 @@ from mjxball.fly.pilot import Pilot
 from mjxball.fly.supervisor import State
 from mjxball.fly.telemetry import Telemetry
 from mjxball.fly.twin import tables
+from mjxball.fly.twin.body import Pair
 from mjxball.fly.twin.drone import TwinDrone, drone_state
 from mjxball.fly.twin.firmware import FirmwareTimes
 from mjxball.fly.twin.protocol import header
 from mjxball.fly.twin.standin import StandIn, StandInPlant
-from mjxball.policy import Policy
+from mjxball.policy import Policy, PolicyFile
 
 MASS = 0.07
 STEP = 0.01
@@ -77,24 +79,35 @@ class Notes:
 class World:
     """A pair, its two drones, and a flight of them."""
 
-    def __init__(self, settings: FlightSettings | None = None, times: FirmwareTimes | None = None):
-        policy = Policy.load(TRANSPORT)
+    def __init__(
+        self,
+        settings: FlightSettings | None = None,
+        times: FirmwareTimes | None = None,
+        contents: PolicyFile | None = None,
+        physics: Pair | None = None,
+    ):
+        policy = Policy(contents, "given") if contents else Policy.load(TRANSPORT)
         self.rig = pair.Rig.of_card(policy.card)
-        self.plant = StandInPlant(mass=MASS, mounts=(self.rig.leader_mount, self.rig.follower_mount))
-        self.pair = StandIn(self.plant)
+        plant = StandInPlant(mass=MASS, mounts=(self.rig.leader_mount, self.rig.follower_mount))
+        self.pair: Pair = physics or StandIn(plant)
         self.state = self.pair.start()
         self.now = 0.0
-        self.drones = [TwinDrone(times or FirmwareTimes(), seed, lambda name, value: None) for seed in (1, 2)]
+        self.drones = [TwinDrone(times or FirmwareTimes(), seed, self._writer(seed - 1)) for seed in (1, 2)]
         self.links = [VirtualLink(drone, lambda: self.now) for drone in self.drones]
         self.notes = Notes()
-        constants = CommandMap(carried_mass=MASS / 2)
+        pilot = Pilot(policy)
+        for number in range(2):
+            for name, value in gains_of(pilot.config).items():
+                self.pair.set_parameter(number, name, value)
+        maps = command_maps(pilot.config) if contents else (CommandMap(carried_mass=MASS / 2),) * 2
         settings = settings or FlightSettings(seconds=2.0)
-        self.flight = Flight(
-            self.links, Pilot(policy, self.rig), (constants, constants), self.rig, settings, self.notes
-        )
+        self.flight = Flight(self.links, pilot, maps, self.rig, settings, self.notes)
         self.advance(0.05)
         self.flight.ready = True
         self.flight.begin(self.now)
+
+    def _writer(self, number: int) -> Callable[[str, float], None]:
+        return lambda name, value: self.pair.set_parameter(number, name, value)
 
     def advance(self, seconds: float) -> None:
         """Let the twin live on for `seconds`."""

@@ -10,9 +10,9 @@ from command_line import TRANSPORT
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mjxball.config import Config, from_dict, to_dict
 from mjxball.control import observation, rotations
 from mjxball.fly import pair
+from mjxball.fly.card import config_of
 from mjxball.fly.loop import Metronome
 from mjxball.fly.packets import DroneState, pack_state, unpack_state
 from mjxball.fly.pair import Rig
@@ -59,10 +59,9 @@ def with_integral(contents: PolicyFile) -> PolicyFile:
 
 def test_a_flight_of_the_pilot_is_a_flight_of_the_simulation() -> None:
     contents = with_integral(load_file(TRANSPORT))
-    today = to_dict(Config())  # a card may be older than some settings
-    config = from_dict({**today, "leader": {**today["leader"], **contents.card["config"]["leader"]}})
+    config = config_of(contents.card)
     assert config.leader.ki == (0.2, 0.1, 0.1)
-    pilot, follower = Pilot(Policy(contents, "a"), Rig.of_card(contents.card)), Policy(contents, "b")
+    pilot, follower = Pilot(Policy(contents, "a")), Policy(contents, "b")
     random, goal, integral = np.random.default_rng(2), np.array([0.3, -0.2, 0.5]), np.zeros(3)
     mount = np.array(contents.card["plant"]["follower_mount"])
     follower.reset()
@@ -103,7 +102,7 @@ def test_the_wire_costs_little_of_the_observation() -> None:
 
 def test_forgetting_starts_anew() -> None:
     contents = load_file(TRANSPORT)
-    pilot, rig = Pilot(Policy(contents, "a"), pilot_rig(contents)), pilot_rig(contents)
+    pilot, rig = Pilot(Policy(contents, "a")), pilot_rig(contents)
     state = pair.object_state(drones(rig, *np.full((4, 3), 0.1)), rig)
     first = pilot.step(state, np.ones(3))
     pilot.step(state, np.zeros(3))

@@ -28,7 +28,8 @@ FLOORS = (
     {"rollout", "env"},
     {"train"},
     {"evaluate"},
-    {"fly", "gym", "view"},
+    {"fly", "gym"},
+    {"view"},
     {"commands", "export", "rig"},
     {"entry"},
 )

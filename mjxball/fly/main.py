@@ -15,7 +15,8 @@ from mjxball import cli
 from mjxball.cli import run_command
 from mjxball.errors import InputError
 from mjxball.fly import pair
-from mjxball.fly.command import LINEAR, OLDER, CommandMap
+from mjxball.fly.card import ThrustChoice, command_maps, gains_of, goal_of
+from mjxball.fly.command import LINEAR, OLDER
 from mjxball.fly.contract import FlightSettings
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, read_gains
@@ -42,26 +43,16 @@ def make_parser() -> cli.Parser:
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
     parser.add_argument("--log", type=Path, metavar="FILE", help="write everything to this new file")
     parser.add_argument(
-        "--goal", type=float, nargs=3, default=(0.0, 0.0, 0.4), metavar=("X", "Y", "Z"), help="m (0 0 0.4)"
+        "--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help="m from the start (0 0 0.4; a stand: 0 0 0.08)"
     )
-    parser.add_argument("--gains", type=Path, metavar="FILE", help="JSON of firmware parameters to write and read back")
-    parser.add_argument("--thrust", choices=("calibrated", "paper"), default="calibrated", help="law from az to thrust")
-    parser.add_argument("--hover", type=float, default=46000.0, metavar="UNITS", help="paper law: thrust at hover")
-    parser.add_argument("--curve", choices=tuple(CURVES), default="linear", help="calibrated law: force of a motor")
     parser.add_argument(
-        "--mass", type=float, default=0.07, metavar="KG", help="calibrated law: of all that flies (0.07)"
+        "--gains", type=Path, metavar="FILE", help="JSON of firmware parameters to write and read back (the card's)"
     )
+    parser.add_argument("--thrust", choices=("calibrated", "paper"), help="law from az to thrust (the card's)")
+    parser.add_argument("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
+    parser.add_argument("--curve", choices=tuple(CURVES), help="calibrated law: force of a motor (the card's)")
+    parser.add_argument("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
     return parser
-
-
-def command_maps(options: argparse.Namespace, policy: Policy, rig: pair.Rig) -> tuple[CommandMap, CommandMap]:
-    """Command maps of leader and follower: each carries its share of the mass."""
-    gravity = float(policy.card["gravity"])
-    leader, follower = (
-        CommandMap(options.thrust, options.hover, 1000.0, share * options.mass, gravity, CURVES[options.curve])
-        for share in rig.weights
-    )
-    return leader, follower
 
 
 def check_options(options: argparse.Namespace) -> None:
@@ -80,9 +71,10 @@ def check_options(options: argparse.Namespace) -> None:
     if options.leader is not None and options.leader == options.follower:
         raise InputError("--leader and --follower are the same drone")
     for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0)):
-        if not low <= getattr(options, name) <= high:
-            raise InputError(f"--{name} must be {low:g} to {high:g}, not {getattr(options, name):g}")
-    if not all(math.isfinite(value) and abs(value) <= 5 for value in options.goal):
+        value = getattr(options, name)
+        if value is not None and not low <= value <= high:
+            raise InputError(f"--{name} must be {low:g} to {high:g}, not {value:g}")
+    if options.goal is not None and not all(math.isfinite(value) and abs(value) <= 5 for value in options.goal):
         raise InputError("--goal must be three numbers within 5 m")
     if options.log is not None and (options.log.exists() or not options.log.absolute().parent.is_dir()):
         raise InputError(f"log file {options.log} exists or its directory does not; choose another name")
@@ -95,11 +87,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def command() -> int:
         check_options(options)
         policy = Policy.load(options.policy)
-        gains = read_gains(options.gains) if options.gains else {}
+        pilot = Pilot(policy)
+        config = pilot.config
+        gains = read_gains(options.gains) if options.gains else gains_of(config)
         rig = pair.Rig.of_card(policy.card)
         period = policy.control_period / math.ceil(policy.control_period * LOOP_RATE - 1e-9)
-        settings = FlightSettings(options.seconds, tuple(options.goal), options.dry_run, period)
-        crew = Crew(Pilot(policy, rig), command_maps(options, policy, rig), rig, gains, Preflight())
+        settings = FlightSettings(options.seconds, tuple(options.goal or goal_of(config)), options.dry_run, period)
+        choice = ThrustChoice(options.thrust, options.hover, CURVES.get(options.curve), options.mass)
+        crew = Crew(pilot, command_maps(config, choice), rig, gains, Preflight())
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
             if options.rehearse:

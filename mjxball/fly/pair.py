@@ -17,8 +17,13 @@ class ObjectState(NamedTuple):
 
     position: np.ndarray  # (3,) of O in the world [m]
     velocity: np.ndarray  # (3,) [m/s]
-    matrix: np.ndarray  # (3, 3) attitude body -> world, as the follower measures it
+    quaternion: np.ndarray  # (4,) attitude body -> world (w, x, y, z), as the follower measures it
     rates: np.ndarray  # (3,) body rates [rad/s], likewise
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(3, 3) attitude body -> world."""
+        return rotations.matrix_from_quaternion(self.quaternion)
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ def object_state(states: Sequence[DroneState], rig: Rig) -> ObjectState:
     lead, follow = rig.weights
     position = lead * states[0].position + follow * states[1].position
     velocity = lead * states[0].velocity + follow * states[1].velocity
-    return ObjectState(position, velocity, rotations.matrix_from_quaternion(states[1].quaternion), states[1].rates)
+    return ObjectState(position, velocity, states[1].quaternion, states[1].rates)
 
 
 def yaw_of(state: DroneState) -> float:

@@ -1,4 +1,4 @@
-"""The two laws in flight: the leader's PID and the follower's policy, both those of `mjxball.control`."""
+"""The two laws in flight: the leader's PID and the follower's policy, both those of `mjxball.wiring` and `mjxball.control`."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.control import leader, observation
-from mjxball.fly.pair import ObjectState, Rig
+from mjxball.fly.card import config_of
+from mjxball.fly.pair import ObjectState
 from mjxball.policy import Policy
+from mjxball.wiring import Wiring
 
 
 class Commands(NamedTuple):
@@ -20,17 +21,12 @@ class Commands(NamedTuple):
 
 
 class Pilot:
-    """Leader and follower at the policy's own rate; its gains, limits and period stand in the policy's card."""
+    """Leader and follower at the policy's own rate, by the wiring, gains and limits in the policy's card."""
 
-    def __init__(self, policy: Policy, rig: Rig):
-        card = policy.card
-        self.policy, self.period = policy, policy.control_period
-        self._mount = np.array(rig.follower_mount)
-        gains = card.get("config", {}).get("leader", {})  # files from before it was recorded have no integral gain
-        self._kp, self._kd = (np.array(card[name], float) for name in ("leader_kp", "leader_kd"))
-        self._ki = np.array(gains.get("ki", (0.0, 0.0, 0.0)), float)
-        self._gravity = float(card["gravity"])
-        self._tilt_limit, self._vertical_limit = (float(limit) for limit in card["command_limits"])
+    def __init__(self, policy: Policy):
+        config = config_of(policy.card)
+        self.policy, self.config, self.period = policy, config, policy.control_period
+        self._wiring = Wiring(config)
         self.reset()
 
     def reset(self) -> None:
@@ -40,9 +36,7 @@ class Pilot:
 
     def step(self, state: ObjectState, goal: np.ndarray) -> Commands:
         """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
-        seen = observation.observe(state.position, state.matrix, state.velocity, state.rates, goal, self._mount)
-        error, rate = seen[observation.ERROR], seen[observation.ERROR_RATE]
-        wanted = leader.desired_acceleration(error, rate, self._integral, self._kp, self._kd, self._ki)
-        led = leader.command(wanted, 0.0, self._gravity, self._tilt_limit, self._vertical_limit)
-        self._integral = self._integral + self.period * error
+        seen = self._wiring.observe(state, goal)
+        led = self._wiring.leader_command(state, goal, self._integral)
+        self._integral = self._integral + self.period * self._wiring.leader_error(state, goal)[0]
         return Commands(led, np.asarray(self.policy(seen), float), seen)

@@ -1,0 +1,83 @@
+"""What a policy's card says about how it is to be flown: its configuration, gains, command maps and goal. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.fly.command import LINEAR, CommandMap, ForceCurve
+from mjxball.fly.pair import Rig
+
+GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
+STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
+UNKNOWN_MASS = 0.07  # of all that flies, where the card's plant is not a pair of Crazyflies [kg]
+
+
+def config_of(card: Mapping[str, Any]) -> Config:
+    """The configuration that a policy was trained with; what older files did not record has its default.
+
+    Raises InputError if the card's configuration is none.
+    """
+    recorded, data = card.get("config", {}), configs.to_dict(Config())
+    for section, default in data.items():
+        given = recorded.get(section, default)
+        data[section] = {**default, **given} if isinstance(default, dict) and isinstance(given, dict) else given
+    data["plant"] = {**data["plant"], **card["plant"]}
+    tilt, vertical = card["command_limits"]
+    data["leader"] |= {"kp": card["leader_kp"], "kd": card["leader_kd"], "tilt_limit": tilt, "vertical_limit": vertical}
+    data["timing"] |= {"control_period": card["control_period"]}
+    return configs.validate(configs.from_dict(data))
+
+
+def is_crazyflie(config: Config) -> bool:
+    """True if the policy was trained on a pair of Crazyflies."""
+    return config.autopilot.kind == "crazyflie"
+
+
+def gains_of(config: Config) -> dict[str, float]:
+    """Firmware parameters that make a drone's cascade the one that the policy was trained with; none for others."""
+    if not is_crazyflie(config):
+        return {}
+    gains = {}
+    for group, suffix in (("pid_attitude", ""), ("pid_rate", "_rate")):
+        for axis in ("roll", "pitch", "yaw"):
+            values = getattr(config.autopilot, f"{axis}{suffix}")
+            gains |= {f"{group}.{axis}_{gain}": value for gain, value in zip(("kp", "ki", "kd"), values, strict=True)}
+    return gains
+
+
+def goal_of(config: Config) -> tuple[float, float, float]:
+    """Where to fly if nobody says."""
+    return GOAL if config.plant.stand == "free" else STAND_GOAL
+
+
+@dataclass(frozen=True)
+class ThrustChoice:
+    """What the command line says about thrust; None: as the card has it."""
+
+    law: Literal["paper", "calibrated"] | None = None
+    hover: float | None = None  # [thrust units]
+    curve: ForceCurve | None = None
+    mass: float | None = None  # of all that flies [kg]
+
+
+def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple[CommandMap, CommandMap]:
+    """Command maps of leader and follower: each carries itself and its share of the object, as in simulation."""
+    plant, autopilot = config.plant, config.autopilot
+    known = is_crazyflie(config)
+    shares = Rig(plant.leader_mount, plant.follower_mount).weights
+    curve = choice.curve or (ForceCurve(*autopilot.motor_curve) if known else LINEAR)
+    hover = autopilot.hover_thrust if choice.hover is None else choice.hover
+    law = choice.law or (autopilot.thrust_law if known else "calibrated")
+    own = (plant.leader_mass, plant.follower_mass)
+    carried = [mass + share * plant.object_mass for mass, share in zip(own, shares, strict=True)]
+    if choice.mass is not None or not known:
+        whole = UNKNOWN_MASS if choice.mass is None else choice.mass
+        # Without a plant that can be trusted, all masses scale alike.
+        carried = [mass * whole / sum(carried) for mass in carried] if known else [share * whole for share in shares]
+    per_acceleration = autopilot.thrust_per_acceleration
+    leader, follower = (CommandMap(law, hover, per_acceleration, mass, plant.gravity, curve) for mass in carried)
+    return leader, follower

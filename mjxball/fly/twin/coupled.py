@@ -1,0 +1,263 @@
+"""The coupled Crazyflie model behind the twin: both firmwares' cascades, motors and batteries over C MuJoCo.
+
+MuJoCo steps the model of `mjxball.assembly` every millisecond, with legs and a floor added, so that the pair stands on
+the ground (a stand: on its rest, its lowest place) and takes off and lands by contact. The laws are those of
+`control.crazyflie`; what moves the ball is `physics.motion`, as in simulation.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from mjxball.assembly import ASSEMBLY, BALL_JOINT, FOLLOWER, LEADER, build_spec
+from mjxball.config import Autopilot, Config
+from mjxball.control import crazyflie, rotations
+from mjxball.fly.twin.body import PairState
+from mjxball.physics import motion
+from mjxball.physics.engine import Load
+
+STEP = 0.001  # [s] of MuJoCo and the motors; the cascade runs at every second one
+TICK = round(crazyflie.PERIOD / STEP)
+LEG = 0.03  # [m] from a drone's centre down to what it stands on
+REACH = 0.03  # [m] from a drone's centre sideways to each of its legs
+FOOT = 0.003  # [m] radius
+PARAMETERS = {
+    f"{group}.{axis}_{gain}": (f"{axis}{suffix}", number)
+    for group, suffix in (("pid_attitude", ""), ("pid_rate", "_rate"))
+    for axis in ("roll", "pitch", "yaw")
+    for number, gain in enumerate(("kp", "ki", "kd"))
+}
+
+
+@dataclass(frozen=True)
+class Battery:
+    """Voltage of a one-cell battery."""
+
+    full: float = 4.1  # without load [V]
+    sag: float = 0.35  # at full power [V]
+    drain: float = 0.0008  # at full power [V/s]
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a rehearsal meets that the laptop is not told. The CG moves from when the first motor turns."""
+
+    object_mass: float  # [kg]
+    cg_amplitude: float = 0.0  # of a prescribed sine [m]
+    cg_speed: float = 0.0  # [rad/s]
+    ball: float = 0.0  # where a rolling ball lies at the start, from O [m]
+    rotor_lag: float = 1.0  # factor on the motors' time constant
+    thrust: tuple[float, float] = (1.0, 1.0)  # factor on the motor forces of leader and follower
+    battery: Battery = Battery()
+
+    @classmethod
+    def of(cls, config: Config) -> Conditions:
+        """The middle of what the policy was trained for; a rolling ball lies half way to its farthest start."""
+        ranges = config.scenario
+        amplitude, speed = (sum(pair) / 2 for pair in (ranges.cg_amplitude, ranges.cg_speed))
+        return cls(sum(ranges.object_mass) / 2, amplitude, speed, ranges.ball_start / 2)
+
+
+def stock_gains(autopilot: Autopilot) -> Autopilot:
+    """`autopilot` with the gains that a firmware starts with: those of the flight are uploaded."""
+    stock = Autopilot()
+    return dataclasses.replace(autopilot, **{name: getattr(stock, name) for name, _ in PARAMETERS.values()})
+
+
+class CoupledPair:
+    """See `body.Pair`. One instance is one pair; `start` begins anew and keeps the gains."""
+
+    def __init__(self, config: Config, conditions: Conditions | None = None):
+        self.config, self.conditions = config, conditions or Conditions.of(config)
+        plant = dataclasses.replace(config.plant, object_mass=self.conditions.object_mass)
+        self.model = grounded_model(config, self.conditions.object_mass)
+        self.data = mujoco.MjData(self.model)
+        self._free = plant.stand == "free"
+        self._mounts = np.array([plant.leader_mount, plant.follower_mount])
+        self._slide = self.model.joint(BALL_JOINT).dofadr[0]
+        self._slide_position = self.model.joint(BALL_JOINT).qposadr[0]
+        self._body = self.model.body(ASSEMBLY).id
+        self._share = plant.moving_fraction
+        self._rolling = config.motion.kind == "rolling"
+        self._roll_force = motion.make_rolling_force(config)
+        self._prescribed = None if self._rolling else motion.make_prescribed(config)
+        values = (self.conditions.object_mass, 0.0, self.conditions.cg_amplitude, self.conditions.cg_speed, 0.0)
+        self._load = Load(*map(np.float64, values), np.zeros(0), np.zeros(0))
+        self._unit = np.zeros((1, self.model.nv))
+        self._unit[0, self._slide] = 1.0
+        lag = plant.rotor_lag * self.conditions.rotor_lag
+        self._keep = math.exp(-STEP / lag)
+        self._mean = lag / STEP * (1 - self._keep)
+        self._strength = np.array(self.conditions.thrust)[:, None]
+        self._autopilots = [stock_gains(config.autopilot)] * 2
+        self._alike = True
+        self.start()
+
+    def start(self) -> PairState:
+        """See `Pair.start`."""
+        mujoco.mj_resetData(self.model, self.data)
+        self._rotors, self._targets, self._motors = np.zeros((2, 4)), np.zeros((2, 4)), np.zeros((2, 4))
+        self._charge = np.full(2, self.conditions.battery.full)
+        self._steps, self._flown = 0, 0.0
+        self._left, self._moving = 0.0, False
+        self._place_ball()
+        mujoco.mj_forward(self.model, self.data)
+        self._loops = crazyflie.start_loops(*self._seen())
+        return self._state()
+
+    def set_parameter(self, drone: int, name: str, value: float) -> None:
+        """See `Pair.set_parameter`."""
+        if name not in PARAMETERS:
+            return
+        field, number = PARAMETERS[name]
+        gains = list(getattr(self._autopilots[drone], field))
+        gains[number] = value
+        self._autopilots[drone] = dataclasses.replace(self._autopilots[drone], **{field: tuple(gains)})
+        self._alike = self._autopilots[0] == self._autopilots[1]
+
+    def advance(self, setpoints: np.ndarray, dt: float) -> PairState:
+        """See `Pair.advance`; `dt` is made of whole milliseconds, what is left over is made good later."""
+        self._left += dt
+        self._moving = self._moving or bool((setpoints[:, 3] >= crazyflie.IDLE).any())
+        count = round(self._left / STEP)
+        self._left -= count * STEP
+        for _ in range(count):
+            self._step(setpoints)
+        battery = self.conditions.battery
+        self._charge = self._charge - battery.drain * dt * self._power()
+        return self._state()
+
+    def _step(self, setpoints: np.ndarray) -> None:
+        model, data = self.model, self.data
+        mujoco.mj_step1(model, data)
+        if self._steps % TICK == 0:
+            self._fly(setpoints)
+        acting = self._targets + self._mean * (self._rotors - self._targets)
+        self._rotors = self._targets + self._keep * (self._rotors - self._targets)
+        data.ctrl[:] = acting.ravel()
+        data.qfrc_applied[self._slide] = self._push_ball()
+        mujoco.mj_step2(model, data)
+        self._steps += 1
+        self._flown += STEP * self._moving
+        self._place_ball()
+
+    def _fly(self, setpoints: np.ndarray) -> None:
+        """Both cascades, once: what the motors are to give from now on."""
+        seen, law = self._seen(), self._autopilots
+        if self._alike:
+            self._loops, self._motors = crazyflie.cascade(law[0], self._loops, setpoints, *seen)
+        else:
+            rows = [
+                crazyflie.cascade(law[n], self._loops[n], setpoints[n], *(part[n] for part in seen)) for n in range(2)
+            ]
+            self._loops, self._motors = (np.stack(part) for part in zip(*rows, strict=True))
+        left = max(1.0 - law[0].sag * self._flown, 0.0)
+        self._targets = left * self._strength * crazyflie.motor_force(law[0].motor_curve, self._motors)
+
+    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
+        """Euler angles and body rates (2, 3) of both drones, which are the assembly's."""
+        euler = rotations.euler_from_matrix(self.data.xmat[self._body].reshape(3, 3))
+        return np.stack([euler] * 2), np.stack([self._rates()] * 2)
+
+    def _rates(self) -> np.ndarray:
+        velocity = self.data.qvel
+        return velocity[3:6].copy() if self._free else np.array([velocity[1 if self._heaves else 0], 0.0, 0.0])
+
+    @property
+    def _heaves(self) -> bool:
+        return self.config.plant.stand == "heave"
+
+    # The ball.
+
+    def _push_ball(self) -> float:
+        """Force on the ball along its slide [N]: friction and stops, or what its prescribed motion takes."""
+        model, data = self.model, self.data
+        if self._rolling:
+            offset, rate = data.qpos[self._slide_position], data.qvel[self._slide]
+            return float(self._roll_force(offset, rate, self._share * self._load.object_mass))
+        if not self._moving:
+            return 0.0
+        assert self._prescribed is not None
+        data.qfrc_applied[self._slide] = 0.0
+        mujoco.mj_fwdActuation(model, data)
+        free, response = np.zeros((1, model.nv)), np.zeros((1, model.nv))
+        mujoco.mj_solveM(model, data, free, (data.qfrc_actuator - data.qfrc_bias)[None])
+        mujoco.mj_solveM(model, data, response, self._unit)
+        wanted = self._prescribed(np.float64(self._flown), self._load).acceleration / self._share
+        return float((wanted - free[0, self._slide]) / response[0, self._slide])
+
+    def _place_ball(self) -> None:
+        """Put a prescribed ball where it is to be, so that no error adds up; a rolling one at its start."""
+        if self._rolling:
+            if self._steps == 0:
+                self.data.qpos[self._slide_position] = self.conditions.ball
+            return
+        assert self._prescribed is not None
+        cg = self._prescribed(np.float64(self._flown), self._load)
+        self.data.qpos[self._slide_position] = cg.offset / self._share
+        self.data.qvel[self._slide] = cg.rate / self._share if self._moving else 0.0
+
+    @property
+    def cg_offset(self) -> float:
+        """Where the CG is, from O along the stick [m]."""
+        return float(self._share * self.data.qpos[self._slide_position])
+
+    @property
+    def rotor_force(self) -> np.ndarray:
+        """(2, 4) of leader and follower [N]."""
+        return self._rotors.copy()
+
+    # What the firmware is shown.
+
+    def _power(self) -> np.ndarray:
+        return self._motors.mean(axis=1) / crazyflie.FULL
+
+    def _state(self) -> PairState:
+        position, quaternion, velocity, acceleration, turning = self._root()
+        rates, matrix = self._rates(), rotations.matrix_from_quaternion(quaternion)
+        swing = rotations.cross(rates, self._mounts)
+        whirl = rotations.cross(turning, self._mounts) + rotations.cross(rates, swing)
+        felt = (acceleration + np.array([0.0, 0.0, self.config.plant.gravity])) @ matrix + whirl
+        return PairState(
+            position=position + self._mounts @ matrix.T,
+            velocity=velocity + swing @ matrix.T,
+            quaternion=np.stack([quaternion] * 2),
+            rates=np.stack([rates] * 2),
+            specific_force=felt,
+            battery=self._charge - self.conditions.battery.sag * self._power(),
+        )
+
+    def _root(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """O's position, attitude, velocity, acceleration, and the angular acceleration in body axes."""
+        q, v, a = self.data.qpos, self.data.qvel, self.data.qacc
+        if self._free:
+            return q[:3].copy(), q[3:7].copy(), v[:3].copy(), a[:3].copy(), a[3:6].copy()
+        first = 1 if self._heaves else 0
+        rise = np.array([[part[0] if self._heaves else 0.0] for part in (q, v, a)]) * np.array([0.0, 0.0, 1.0])
+        half = q[first] / 2
+        quaternion = np.array([math.cos(half), math.sin(half), 0.0, 0.0])
+        return rise[0], quaternion, rise[1], rise[2], np.array([a[first], 0.0, 0.0])
+
+
+def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
+    """The assembly's model with contact: O is at height 0 while the drones' legs stand on the floor."""
+    plant = dataclasses.replace(config.plant, object_mass=object_mass)
+    spec = build_spec(plant, STEP)
+    disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    spec.option.disableflags &= ~int(disabled)
+    floor = spec.geom("floor")
+    lowest = min(plant.leader_mount[2], plant.follower_mount[2])
+    floor.pos = [0.0, 0.0, lowest - LEG - FOOT if plant.stand != "pivot" else -1.0]
+    floor.contype, floor.conaffinity = 1, 2
+    for name in (LEADER, FOLLOWER):
+        drone = spec.body(name)
+        places = [(x, y, -LEG) for x in (-REACH, REACH) for y in (-REACH, REACH)]
+        for place in (*places, (0.0, 0.0, LEG)):
+            leg = drone.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[FOOT, 0, 0], pos=place, mass=0.0)
+            leg.contype, leg.conaffinity, leg.solref = 2, 1, [0.008, 1.0]
+    return spec.compile()
