@@ -1,4 +1,4 @@
-"""What leader and follower see of the plant, and the leader's law on it: one wiring for training, judging and flight."""
+"""What leader and follower see of the plant, and the leader's law on it: one wiring for simulation and flight."""
 
 from __future__ import annotations
 

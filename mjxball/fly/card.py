@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from mjxball import config as configs
 from mjxball.config import Config
+from mjxball.control import firmware_gains
 from mjxball.fly.command import LINEAR, CommandMap, ForceCurve
 from mjxball.fly.pair import Rig
 
@@ -41,12 +42,7 @@ def gains_of(config: Config) -> dict[str, float]:
     """Firmware parameters that make a drone's cascade the one that the policy was trained with; none for others."""
     if not is_crazyflie(config):
         return {}
-    gains = {}
-    for group, suffix in (("pid_attitude", ""), ("pid_rate", "_rate")):
-        for axis in ("roll", "pitch", "yaw"):
-            values = getattr(config.autopilot, f"{axis}{suffix}")
-            gains |= {f"{group}.{axis}_{gain}": value for gain, value in zip(("kp", "ki", "kd"), values, strict=True)}
-    return gains
+    return firmware_gains.gains_of(config.autopilot)
 
 
 def goal_of(config: Config) -> tuple[float, float, float]:

@@ -6,6 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
+from mjxball.control import crazyflie
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, Setpoint, setpoint
 
 Array = Any
@@ -20,14 +23,11 @@ class ForceCurve:
 
     def force(self, thrust: float) -> float:
         """Force of the four motors of one drone [N] at `thrust` units."""
-        p = thrust / 65535
-        return 4 * (self.quadratic * p * p + self.linear * p)
+        return 4 * float(crazyflie.motor_force((self.quadratic, self.linear), thrust))
 
     def thrust(self, force: float) -> float:
         """Thrust units at which four motors give `force` [N]; not bounded above, 0 for none."""
-        a, b, wanted = self.quadratic, self.linear, max(force, 0.0) / 4
-        p = wanted / b if a == 0 else (math.sqrt(b * b + 4 * a * wanted) - b) / (2 * a)
-        return 65535 * p
+        return float(crazyflie.motor_command((self.quadratic, self.linear), np.float64(force / 4)))
 
 
 LINEAR = ForceCurve()

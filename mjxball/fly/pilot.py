@@ -1,4 +1,4 @@
-"""The two laws in flight: the leader's PID and the follower's policy, both those of `mjxball.wiring` and `mjxball.control`."""
+"""The two laws in flight: the leader's PID and the follower's policy, those of `wiring` and `control`."""
 
 from __future__ import annotations
 

@@ -15,23 +15,18 @@ import mujoco
 import numpy as np
 
 from mjxball.assembly import ASSEMBLY, BALL_JOINT, FOLLOWER, LEADER, build_spec
-from mjxball.config import Autopilot, Config
+from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
+from mjxball.control.firmware_gains import PARAMETERS, with_gains, with_stock_gains
 from mjxball.fly.twin.body import PairState
 from mjxball.physics import motion
-from mjxball.physics.engine import Load
+from mjxball.physics.engine import Load, PlantState
 
 STEP = 0.001  # [s] of MuJoCo and the motors; the cascade runs at every second one
 TICK = round(crazyflie.PERIOD / STEP)
 LEG = 0.03  # [m] from a drone's centre down to what it stands on
 REACH = 0.03  # [m] from a drone's centre sideways to each of its legs
 FOOT = 0.003  # [m] radius
-PARAMETERS = {
-    f"{group}.{axis}_{gain}": (f"{axis}{suffix}", number)
-    for group, suffix in (("pid_attitude", ""), ("pid_rate", "_rate"))
-    for axis in ("roll", "pitch", "yaw")
-    for number, gain in enumerate(("kp", "ki", "kd"))
-}
 
 
 @dataclass(frozen=True)
@@ -63,12 +58,6 @@ class Conditions:
         return cls(sum(ranges.object_mass) / 2, amplitude, speed, ranges.ball_start / 2)
 
 
-def stock_gains(autopilot: Autopilot) -> Autopilot:
-    """`autopilot` with the gains that a firmware starts with: those of the flight are uploaded."""
-    stock = Autopilot()
-    return dataclasses.replace(autopilot, **{name: getattr(stock, name) for name, _ in PARAMETERS.values()})
-
-
 class CoupledPair:
     """See `body.Pair`. One instance is one pair; `start` begins anew and keeps the gains."""
 
@@ -86,15 +75,17 @@ class CoupledPair:
         self._rolling = config.motion.kind == "rolling"
         self._roll_force = motion.make_rolling_force(config)
         self._prescribed = None if self._rolling else motion.make_prescribed(config)
-        values = (self.conditions.object_mass, 0.0, self.conditions.cg_amplitude, self.conditions.cg_speed, 0.0)
-        self._load = Load(*map(np.float64, values), np.zeros(0), np.zeros(0))
+        mass, amplitude, speed, zero = map(
+            np.float64, (self.conditions.object_mass, self.conditions.cg_amplitude, self.conditions.cg_speed, 0.0)
+        )
+        self._load = Load(mass, mass, amplitude, speed, zero, np.zeros(0), np.zeros(0))
         self._unit = np.zeros((1, self.model.nv))
         self._unit[0, self._slide] = 1.0
         lag = plant.rotor_lag * self.conditions.rotor_lag
         self._keep = math.exp(-STEP / lag)
         self._mean = lag / STEP * (1 - self._keep)
         self._strength = np.array(self.conditions.thrust)[:, None]
-        self._autopilots = [stock_gains(config.autopilot)] * 2
+        self._autopilots = [with_stock_gains(config.autopilot)] * 2
         self._alike = True
         self.start()
 
@@ -110,14 +101,27 @@ class CoupledPair:
         self._loops = crazyflie.start_loops(*self._seen())
         return self._state()
 
+    def place(self, state: PlantState) -> PairState:
+        """Put the pair, motors running, into a simulation's `state` (one world) and return it."""
+        data = self.data
+        if self._free:
+            data.qpos[:7], data.qvel[:6] = [*state.position, *state.quaternion], [*state.velocity, *state.rates]
+        else:
+            roll = float(rotations.roll_of_quaternion(state.quaternion))
+            data.qpos[:-1] = [state.position[2], roll][-len(data.qpos) + 1 :]
+            data.qvel[:-1] = [state.velocity[2], state.rates[0]][-len(data.qvel) + 1 :]
+        data.qpos[self._slide_position], data.qvel[self._slide] = state.ball_offset, state.ball_rate
+        self._rotors, self._loops = np.array(state.rotor_force), np.array(state.loops)
+        self._moving, self._flown, self._steps = True, float(state.time), 2 * TICK
+        self._place_ball()
+        mujoco.mj_forward(self.model, data)
+        return self._state()
+
     def set_parameter(self, drone: int, name: str, value: float) -> None:
         """See `Pair.set_parameter`."""
         if name not in PARAMETERS:
             return
-        field, number = PARAMETERS[name]
-        gains = list(getattr(self._autopilots[drone], field))
-        gains[number] = value
-        self._autopilots[drone] = dataclasses.replace(self._autopilots[drone], **{field: tuple(gains)})
+        self._autopilots[drone] = with_gains(self._autopilots[drone], {name: value})
         self._alike = self._autopilots[0] == self._autopilots[1]
 
     def advance(self, setpoints: np.ndarray, dt: float) -> PairState:

@@ -6,6 +6,8 @@ import struct
 import zlib
 from typing import NamedTuple
 
+from mjxball.control.firmware_gains import STOCK, gains_of
+
 # Type numbers of the two tables, each with its struct code (crazyflie.md).
 LOG_TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int8_t": (4, "b"), "int16_t": (5, "h")}
 LOG_TYPES |= {"int32_t": (6, "i"), "float": (7, "f"), "FP16": (8, "e")}
@@ -39,14 +41,7 @@ class Parameter(NamedTuple):
 
 
 def _gains() -> list[Parameter]:
-    attitude = {"roll": (6.0, 3.0, 0.0), "pitch": (6.0, 3.0, 0.0), "yaw": (6.0, 1.0, 0.35)}
-    rate = {"roll": (250.0, 500.0, 2.5), "pitch": (250.0, 500.0, 2.5), "yaw": (120.0, 16.7, 0.0)}
-    return [
-        Parameter(f"{group}.{axis}_{gain}", "float", value, persistent=True)
-        for group, table in (("pid_attitude", attitude), ("pid_rate", rate))
-        for axis, values in table.items()
-        for gain, value in zip(("kp", "ki", "kd"), values, strict=True)
-    ]
+    return [Parameter(name, "float", value, persistent=True) for name, value in gains_of(STOCK).items()]
 
 
 PARAMETERS = (

@@ -1,0 +1,124 @@
+"""Flights of both Crazyflie presets on the coupled model: the laws, gains and thrust of the card, in virtual time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from fly_policies import untrained
+from fly_virtual import World
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mjxball import config as configs
+from mjxball.control import crazyflie, rotations
+from mjxball.control.constants import plant_constants
+from mjxball.errors import InputError
+from mjxball.fly import card
+from mjxball.fly.command import OLDER, to_setpoint
+from mjxball.fly.contract import FlightSettings
+from mjxball.fly.packets import Setpoint
+from mjxball.fly.supervisor import State
+from mjxball.fly.twin.pairs import make_pair
+from mjxball.fly.twin.standin import StandIn
+from mjxball.policy import load_file
+from mjxball.policy.shipped import shipped_policy
+
+PRESETS = ("flight", "stand")
+vertical = st.floats(-4, 4)
+tilt = st.floats(-0.5, 0.5)
+
+
+def world_of(preset: str, seconds: float) -> World:
+    contents = untrained(preset)
+    config = card.config_of(contents.card)
+    settings = FlightSettings(seconds=seconds, goal=card.goal_of(config))
+    return World(settings, contents=contents, physics=make_pair(contents.card))
+
+
+def test_a_free_flight_rises_stays_and_lands() -> None:
+    world = world_of("flight", 5.0)
+    world.fly_until(State.FLY)
+    world.fly_for(3.0)
+    heights, tilts = [], []
+    while world.flight.supervisor.state is State.FLY:
+        world.tick()
+        heights.append(world.state.position[:, 2].mean())
+        tilts.append(np.abs(rotations.euler_from_matrix(rotations.matrix_from_quaternion(world.state.quaternion[0]))))
+    world.fly_until(State.DONE)
+    assert world.notes.transitions() == ["arm", "ramp", "fly", "land", "stop", "done"]
+    assert world.flight.supervisor.cause is None
+    assert 0.3 < min(heights) and max(heights) < 0.55  # copying leaves what the CG does, but holds
+    assert np.degrees(np.max(tilts)) < 8
+    world.advance(1.0)
+    assert np.abs(world.state.position[:, 2]).max() < 1e-3
+    assert world.running() == [False, False]
+
+
+def test_the_papers_stand_lifts_off_rolls_and_comes_down() -> None:
+    world = world_of("stand", 3.0)
+    world.fly_until(State.FLY)
+    world.fly_for(2.9)
+    there = world.state.position
+    assert (there[:, :1] == 0).all()
+    assert there[:, 2].mean() > 0.02  # the paper's gains and its thrust scale let height drift
+    world.fly_until(State.DONE, 40.0)
+    assert world.notes.transitions()[-2:] == ["stop", "done"]
+    assert world.flight.supervisor.cause is None
+    world.advance(1.0)
+    assert np.abs(world.state.position[:, 2]).max() < 1e-3
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_leader_flies_the_cards_law(preset: str) -> None:
+    config = card.config_of(untrained(preset).card)
+    assert config == configs.preset(preset)
+    world = world_of(preset, 2.0)
+    world.fly_until(State.FLY)
+    world.fly_for(1.0)
+    commands = world.flight._commands
+    own = preset == "stand"  # e_l of the leader's own place feels the roll, e_o does not
+    integrated = world.flight.pilot._integral[2] - world.flight.pilot.period * commands.observation[14]  # before it
+    lift = config.leader.kp[2] * commands.observation[14] + config.leader.kd[2] * commands.observation[17]
+    assert (abs(commands.leader[2] - lift - config.leader.ki[2] * integrated) > 1e-3) == own
+    # The network says nothing, so that the follower's command is the PD law on what it observes.
+    limit = config.leader.vertical_limit
+    assert commands.follower[2] == pytest.approx(np.clip(lift, -limit, limit), abs=1e-5)
+
+
+@given(st.sampled_from(PRESETS), tilt, tilt, vertical)
+def test_what_is_sent_is_what_was_simulated(preset: str, roll: float, pitch: float, lift: float) -> None:
+    config = configs.preset(preset)
+    constants = plant_constants(config.plant, config.attitude)
+    carried = constants.drone_mass + constants.share * config.plant.object_mass
+    command = np.array([[roll, pitch, lift]] * 2)
+    expected = crazyflie.setpoints(config.autopilot, command, carried, config.plant.gravity)
+    for row, known in zip(expected, card.command_maps(config), strict=True):
+        unhurried = dataclasses.replace(known, tilt_slew=1e9, thrust_slew=1e9)
+        sent = to_setpoint(command[0], 0.3, Setpoint(0.0, 0.0, 0.0, 40000), 0.01, unhurried).setpoint
+        np.testing.assert_allclose(sent[:3], row[:3], atol=1e-9)
+        assert abs(sent.thrust - row[3]) <= 1  # a cut of tilt comes before the thrust there as here; rounding
+
+
+def test_flags_overrule_the_card() -> None:
+    config = configs.preset("stand")
+    leader, _ = card.command_maps(config)
+    assert (leader.law, leader.hover, leader.curve) == ("paper", 46000.0, OLDER)
+    assert leader.carried_mass == pytest.approx(0.0755 / 2)
+    choice = card.ThrustChoice("calibrated", 45000.0, dataclasses.replace(OLDER, linear=0.07), 0.08)
+    leader, follower = card.command_maps(config, choice)
+    assert (leader.law, leader.hover, leader.curve.linear) == ("calibrated", 45000.0, 0.07)
+    assert leader.carried_mass + follower.carried_mass == pytest.approx(0.08)
+
+
+def test_policies_of_other_plants_keep_their_defaults() -> None:
+    contents = load_file(shipped_policy("transport"))
+    config = card.config_of(contents.card)
+    assert not card.is_crazyflie(config)
+    assert card.gains_of(config) == {}
+    assert card.command_maps(config)[0].carried_mass == pytest.approx(card.UNKNOWN_MASS / 2)
+    assert isinstance(make_pair(contents.card), StandIn)
+    broken = {**contents.card, "config": {**contents.card["config"], "autopilot": {"kind": "magic"}}}
+    with pytest.raises(InputError):
+        card.config_of(broken)
