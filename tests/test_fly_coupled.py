@@ -13,7 +13,8 @@ from mjxball.control import crazyflie, rotations
 from mjxball.control.constants import plant_constants
 from mjxball.control.firmware_gains import PARAMETERS, STOCK, gains_of, with_gains
 from mjxball.fly.twin.body import PairState
-from mjxball.fly.twin.coupled import Conditions, CoupledPair
+from mjxball.fly.twin.conditions import Conditions
+from mjxball.fly.twin.coupled import CoupledPair
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_control_step, start_state

@@ -240,7 +240,8 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture):
     ("arguments", "message"),
     [
         (["nobody"], "nobody is no flight"),
-        (["log.csv"], "flight logs are not read yet"),
+        (["log.csv"], "is no flight (.npz), flight log (.jsonl)"),
+        (["log.jsonl"], "does not begin with a header"),
         (["empty"], "has no policy.npz"),
         (["none.npz"], "none.npz does not exist"),
         (["copy", "--out", "page.txt"], "must end in .html"),
@@ -251,6 +252,7 @@ def test_refusals(arguments: list[str], message: str, tmp_path: Path, monkeypatc
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "log.csv").write_text("t,x\n")
+    (tmp_path / "log.jsonl").write_text('{"t": 0.0, "kind": "tick"}\n')
     before = listing(tmp_path)
     assert call(main, [arguments[0], *(arguments[1:] or ["--out", "page.html"])]) == 2
     errors = capsys.readouterr().err

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball import cli, config
+from mjxball.commands.flight_log import evaluate_log
 from mjxball.control.followers import BASELINES, LAWS, Baseline, Follower, make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate import families
@@ -86,6 +87,9 @@ def parser() -> cli.Parser:
     result.add_argument("--families", nargs="+", metavar="NAME", help="scenario families, or all; see --list")
     result.add_argument("--seeds", type=int, metavar="N", help="seeds of each level of a family (default 3)")
     result.add_argument("--figures", nargs="+", metavar="NAME", help=f"the paper's: {', '.join(paper.NAMES)}, or all")
+    result.add_argument(
+        "--flight", type=Path, metavar="LOG", help="draw a flight log, its commands simulated beside it"
+    )
     result.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
     result.add_argument("--list", action="store_true", help="list the scenario families and stop")
     return result
@@ -94,7 +98,8 @@ def parser() -> cli.Parser:
 def main(arguments: list[str] | None = None) -> int:
     """Evaluate; return the exit code."""
     options = parser().parse_args(arguments)
-    return cli.run_command(lambda: _evaluate(options, sys.argv[1:] if arguments is None else arguments))
+    given = sys.argv[1:] if arguments is None else arguments
+    return cli.run_command(lambda: _evaluate(options, given) if options.flight is None else _flight(options))
 
 
 def _families(options: argparse.Namespace) -> list[families.Family]:
@@ -235,6 +240,16 @@ def _home_scenarios(options: argparse.Namespace, home: config.Config) -> Sequenc
     for scenario in made:
         check_scenario(home, scenario)
     return made
+
+
+def _flight(options: argparse.Namespace) -> int:
+    """Draw a flight log; what was flown is the log's, so that no other flag but --out goes with it."""
+    given = [name for name in (*NOT_WITH_FIGURES, "policies", "figures") if getattr(options, name)]
+    if given:
+        raise InputError(f"--flight draws what was flown; drop {given[0].replace('_', '-')}")
+    if options.out is None:
+        raise InputError("--flight needs --out DIR, a directory to write to")
+    return evaluate_log(options.flight, options.out)
 
 
 def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:

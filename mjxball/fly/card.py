@@ -10,6 +10,7 @@ from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import firmware_gains
 from mjxball.fly.command import LINEAR, CommandMap, ForceCurve
+from mjxball.fly.maneuver import Times
 from mjxball.fly.pair import Rig
 
 GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
@@ -48,6 +49,11 @@ def gains_of(config: Config) -> dict[str, float]:
 def goal_of(config: Config) -> tuple[float, float, float]:
     """Where to fly if nobody says."""
     return GOAL if config.plant.stand == "free" else STAND_GOAL
+
+
+def times_of(config: Config) -> Times:
+    """How long the flight's states last: the paper's thrust law follows its goal down too weakly to wait for it."""
+    return Times(land_spare=0.0) if config.autopilot.thrust_law == "paper" else Times()
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import importlib.util
 import math
 import re
@@ -15,7 +16,7 @@ from mjxball import cli
 from mjxball.cli import run_command
 from mjxball.errors import InputError
 from mjxball.fly import pair
-from mjxball.fly.card import ThrustChoice, command_maps, gains_of, goal_of
+from mjxball.fly.card import ThrustChoice, command_maps, gains_of, goal_of, times_of
 from mjxball.fly.command import LINEAR, OLDER
 from mjxball.fly.contract import FlightSettings
 from mjxball.fly.pilot import Pilot
@@ -93,6 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rig = pair.Rig.of_card(policy.card)
         period = policy.control_period / math.ceil(policy.control_period * LOOP_RATE - 1e-9)
         settings = FlightSettings(options.seconds, tuple(options.goal or goal_of(config)), options.dry_run, period)
+        settings = dataclasses.replace(settings, times=times_of(config))
         choice = ThrustChoice(options.thrust, options.hover, CURVES.get(options.curve), options.mass)
         crew = Crew(pilot, command_maps(config, choice), rig, gains, Preflight())
         with contextlib.ExitStack() as stack:

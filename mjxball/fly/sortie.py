@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mjxball import __version__
+from mjxball import config as configs
 from mjxball.errors import InputError
 from mjxball.fly import packets, pair
 from mjxball.fly.command import CommandMap
@@ -49,6 +50,7 @@ def fly(
     """
     header = {"command": list(command), "version": __version__, "uris": list(uris), "settings": str(settings)}
     header |= {"policy": crew.pilot.policy.name, "config_hash": crew.pilot.policy.card["config_hash"]}
+    header |= {"config": configs.to_dict(crew.pilot.config), "gains": dict(crew.gains)}
     before = sys.getswitchinterval()
     with Journal(log, **header) as journal:
         links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]

@@ -22,7 +22,9 @@ def parser() -> Parser:
     about = "Play a flight in the browser: one HTML page that needs neither a server nor a network."
     result = make_parser("python -m mjxball.view", about)
     result.add_argument(
-        "source", metavar="RUN_OR_LOG", help="recorded flight (.npz), or run directory, policy file or baseline to fly"
+        "source",
+        metavar="RUN_OR_LOG",
+        help="recorded flight (.npz), flight log (.jsonl), or what to fly: a run directory, policy or baseline",
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
     result.add_argument("--save", type=Path, metavar="FILE.npz", help="write the flight itself too")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from mjxball.config import preset
+from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.scenario import Scenario
-from mjxball.view.flight_file import Flight, flight_of, is_flight, load_flight
+from mjxball.view.flight_file import Flight, check_flight, flight_of, is_flight, load_flight
 
 
 def flight_from(source: str, scenario: Scenario, physics: str) -> Flight:
@@ -25,8 +28,33 @@ def flight_from(source: str, scenario: Scenario, physics: str) -> Flight:
 
 
 def read_log(path: Path) -> Flight:
-    """The flight in a log of `mjxball.fly`: the place where its reader belongs."""
-    raise InputError(f"{path} is no flight (.npz), policy (.npz) or run directory; flight logs are not read yet")
+    """The flight in a log of `mjxball.fly`, from where its motors first turned.
+
+    The CG, the object's mass and the contact forces are not in a log: they are shown as 0 and as the plant's mass.
+    """
+    from mjxball.fly.recording import read_recording
+
+    if path.suffix != ".jsonl":
+        raise InputError(f"{path} is no flight (.npz), flight log (.jsonl), policy (.npz) or run directory")
+    recording = read_recording(path)
+    rows = len(recording.time)
+    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion))
+    arrays = {
+        "time": recording.time,
+        "position": recording.position,
+        "velocity": recording.velocity,
+        "euler": euler,
+        "quaternion": recording.quaternion,
+        "rotor_force": recording.rotor_force,
+        "leader_command": np.nan_to_num(recording.leader),
+        "follower_command": np.nan_to_num(recording.follower),
+        "cg_offset": np.zeros(rows),
+        "object_mass": np.full(rows, recording.config.plant.object_mass),
+        "contact_force": np.zeros((rows, 2, 3)),
+        "target": recording.goal,
+    }
+    title = f"{recording.policy}, flown (ball and contact forces were not measured)"
+    return check_flight(Flight(title, recording.config.plant, arrays), str(path))
 
 
 def _flown(source: str, scenario: Scenario, physics: str) -> Flight:

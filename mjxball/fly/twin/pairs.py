@@ -5,24 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.fly.card import config_of, is_crazyflie
-from mjxball.fly.pair import Rig
 from mjxball.fly.twin.body import Pair
 from mjxball.fly.twin.standin import StandIn, StandInPlant
 
 
 def make_pair(card: Mapping[str, Any] | None = None) -> Pair:
-    """Physics of the rig that a policy's `card` describes; whatever is heavy is imported here, not above.
+    """Physics of the rig that a policy's `card` describes; without one, the stand-in's own rig."""
+    return StandIn() if card is None else pair_of(config_of(card))
+
+
+def pair_of(config: Config) -> Pair:
+    """Physics of the rig of `config`; whatever is heavy is imported here, not above.
 
     Raises InputError if the coupled model is needed and MuJoCo is not installed.
     """
-    if card is None:
-        return StandIn()
-    config = config_of(card)
     if not is_crazyflie(config):
-        rig = Rig.of_card(card)
-        return StandIn(StandInPlant(mounts=(rig.leader_mount, rig.follower_mount)))
+        plant = config.plant
+        return StandIn(StandInPlant(mounts=(plant.leader_mount, plant.follower_mount)))
     try:
         from mjxball.fly.twin.coupled import CoupledPair
     except ModuleNotFoundError as error:
