@@ -1,6 +1,6 @@
 """Fault campaign: real runner processes, real cflib, a twin for each, one fault at a random moment in each flight.
 
-`python benchmarks/fly_faults.py [--trials 200] [--jobs 2] [--seed 0] [--json FILE] [--only KIND ...]`
+`python benchmarks/fly_faults.py [--policy FILE] [--trials 200] [--jobs 2] [--seed 0] [--json FILE] [--only KIND ...]`
 
 The twin's own truth judges: safe means that both drones' motors are off and stay off for two seconds, beyond the
 firmware's own watchdog. The physics are the twin's (`mjxball/fly/twin/pairs.py`); no radio is involved.
@@ -97,16 +97,16 @@ KINDS: dict[str, Strike] = {
 }
 
 
-def trial(job: tuple[int, str, int]) -> dict[str, Any]:
+def trial(job: tuple[int, str, int, Path]) -> dict[str, Any]:
     """Fly once with one fault of a kind; what became of it."""
-    number, kind, seed = job
+    number, kind, seed, policy = job
     random = np.random.default_rng([seed, number])
     which, moment = int(random.integers(2)), float(random.uniform(0, LATEST))
     row: dict[str, Any] = {"kind": kind, "drone": which, "moment": moment}
-    with tempfile.TemporaryDirectory() as place, urgent(), Twin(make_pair(load_file(POLICY).card)) as twin:
+    with tempfile.TemporaryDirectory() as place, urgent(), Twin(make_pair(load_file(policy).card)) as twin:
         log = Path(place) / "flight.jsonl"
         uris = ["--leader", twin.uris[0], "--follower", twin.uris[1]]
-        command = [sys.executable, "-m", "mjxball.fly", str(POLICY), *uris, "--seconds", str(FLOWN), "--log", str(log)]
+        command = [sys.executable, "-m", "mjxball.fly", str(policy), *uris, "--seconds", str(FLOWN), "--log", str(log)]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
         surroundings = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         with subprocess.Popen(command, env=surroundings, **quiet) as runner:
@@ -222,13 +222,14 @@ def first_abort(row: dict[str, Any]) -> str:
 def main() -> int:
     """Run the campaign; exit code 1 if any trial was not safe or any log not complete."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--policy", type=Path, default=POLICY, metavar="FILE", help="its card names the twin's physics")
     parser.add_argument("--trials", type=int, default=207, help="flights in all, spread evenly over the kinds")
     parser.add_argument("--jobs", type=int, default=2, help="flights at the same time")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS), metavar="KIND")
     options = parser.parse_args()
-    jobs = [(n, options.only[n % len(options.only)], options.seed) for n in range(options.trials)]
+    jobs = [(n, options.only[n % len(options.only)], options.seed, options.policy) for n in range(options.trials)]
     started, rows = time.monotonic(), []
     with multiprocessing.get_context("spawn").Pool(options.jobs, maxtasksperchild=20) as pool:
         for row in pool.imap_unordered(trial, jobs):
@@ -246,7 +247,8 @@ def main() -> int:
     refused = len(rows) - len(flown)
     print(f"{len(flown)} flown, {refused} refused on the ground, {len(bad)} not safe or without a whole log")
     if options.json:
-        whole = {"policy": POLICY.stem, "physics": "stand-in", "seconds": time.monotonic() - started}
+        physics = type(make_pair(load_file(options.policy).card)).__name__
+        whole = {"policy": options.policy.stem, "physics": physics, "seconds": time.monotonic() - started}
         options.json.write_text(
             json.dumps({**whole, "summary": lines, "trials": rows}, indent=1) + "\n", encoding="utf-8"
         )

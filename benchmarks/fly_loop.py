@@ -1,6 +1,6 @@
 """Jitter of the control loop in rehearsals through cflib, idle and under load, and microseconds per policy call.
 
-`python benchmarks/fly_loop.py [--seconds 20] [--hogs 0 2] [--json FILE]`
+`python benchmarks/fly_loop.py [--policy FILE] [--seconds 20] [--hogs 0 2] [--json FILE]`
 
 A hog is a process that computes without pause. Lateness is how long after its deadline a tick began.
 """
@@ -34,11 +34,11 @@ def hog(stop: Any) -> None:
         sum(range(10_000))
 
 
-def rehearse(seconds: float) -> dict[str, Any]:
+def rehearse(policy: Path, seconds: float) -> dict[str, Any]:
     """One rehearsal: what its log says of the loop."""
     with tempfile.TemporaryDirectory() as place:
         log = Path(place) / "flight.jsonl"
-        command = [sys.executable, "-m", "mjxball.fly", str(POLICY), "--rehearse", "--seconds", str(seconds)]
+        command = [sys.executable, "-m", "mjxball.fly", str(policy), "--rehearse", "--seconds", str(seconds)]
         surroundings = {**os.environ, "PYTHONPATH": str(ROOT)}
         more = {"env": surroundings, "capture_output": True, "timeout": seconds + 90, "check": False}
         done = subprocess.run([*command, "--log", str(log)], **more)  # noqa: PLW1510
@@ -60,9 +60,9 @@ def rehearse(seconds: float) -> dict[str, Any]:
     }
 
 
-def microseconds(calls: int = 3000) -> float:
+def microseconds(path: Path, calls: int = 3000) -> float:
     """Median time of one policy call [us]."""
-    policy, draw = Policy.load(POLICY), np.random.default_rng(0)
+    policy, draw = Policy.load(path), np.random.default_rng(0)
     policy.reset()
     times = []
     for seen in draw.normal(scale=0.3, size=(calls, OBSERVATION_SIZE)):
@@ -75,6 +75,7 @@ def microseconds(calls: int = 3000) -> float:
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--policy", type=Path, default=POLICY, metavar="FILE", help="its card names the twin's physics")
     parser.add_argument("--seconds", type=float, default=20.0, help="of flight in each rehearsal")
     parser.add_argument("--hogs", type=int, nargs="+", default=[0, os.cpu_count() or 1])
     parser.add_argument("--json", type=Path, metavar="FILE")
@@ -86,11 +87,11 @@ def main() -> None:
         for one in hogs:
             one.start()
         load = os.getloadavg()[0]
-        rows.append({"hogs": count, "load_before": load, **rehearse(options.seconds)})
+        rows.append({"hogs": count, "load_before": load, **rehearse(options.policy, options.seconds)})
         stop.set()
         for one in hogs:
             one.join(timeout=10)
-    call = microseconds()
+    call = microseconds(options.policy)
     heads = ("load", 7), ("ticks", 8), ("missed", 8), ("median", 9), ("p99", 9), ("p99.9", 9), ("largest", 9)
     print(" hogs" + "".join(f"{head:>{width}}" for head, width in heads) + "  ms late, code")
     for row in rows:

@@ -14,6 +14,7 @@ from mjxball.fly.card import command_maps, gains_of
 from mjxball.fly.command import CommandMap
 from mjxball.fly.contract import FlightSettings
 from mjxball.fly.flight import Flight
+from mjxball.fly.limits import NAMES
 from mjxball.fly.packets import Packet
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.supervisor import State
@@ -34,8 +35,9 @@ BLOCK = 1
 class VirtualLink:
     """In the place of `link.Link`: packets go straight to a twin's drone."""
 
-    def __init__(self, drone: TwinDrone, clock: Callable[[], float]):
+    def __init__(self, drone: TwinDrone, clock: Callable[[], float], name: str, notes: Any):
         self.drone, self._clock = drone, clock
+        self.name, self._notes = name, notes
         self.telemetry, self.lost = Telemetry(), None
         self.stuck = 0.0
         self.packets: list[tuple[float, Packet]] = []
@@ -60,6 +62,7 @@ class VirtualLink:
 
     def take(self, datagram: bytes, now: float) -> None:
         if datagram[:1] == bytes([header(5, 2)]) and len(datagram) == 5 + packets.STATE_SIZE:
+            self._notes.note("state", t=now, drone=self.name, raw=datagram[1:].hex())
             self.telemetry.take(packets.unpack_state(datagram[5:]), int.from_bytes(datagram[2:5], "little"), now)
 
 
@@ -85,6 +88,7 @@ class World:
         times: FirmwareTimes | None = None,
         contents: PolicyFile | None = None,
         physics: Pair | None = None,
+        notes: Any = None,
     ):
         policy = Policy(contents, "given") if contents else Policy.load(TRANSPORT)
         self.rig = pair.Rig.of_card(policy.card)
@@ -93,8 +97,9 @@ class World:
         self.state = self.pair.start()
         self.now = 0.0
         self.drones = [TwinDrone(times or FirmwareTimes(), seed, self._writer(seed - 1)) for seed in (1, 2)]
-        self.links = [VirtualLink(drone, lambda: self.now) for drone in self.drones]
-        self.notes = Notes()
+        self.notes: Any = notes or Notes()
+        named = zip(NAMES, self.drones, strict=True)
+        self.links = [VirtualLink(drone, lambda: self.now, name, self.notes) for name, drone in named]
         pilot = Pilot(policy)
         for number in range(2):
             for name, value in gains_of(pilot.config).items():

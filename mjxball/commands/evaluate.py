@@ -244,9 +244,10 @@ def _home_scenarios(options: argparse.Namespace, home: config.Config) -> Sequenc
 
 def _flight(options: argparse.Namespace) -> int:
     """Draw a flight log; what was flown is the log's, so that no other flag but --out goes with it."""
-    given = [name for name in (*NOT_WITH_FIGURES, "policies", "figures") if getattr(options, name)]
-    if given:
-        raise InputError(f"--flight draws what was flown; drop {given[0].replace('_', '-')}")
+    given = [name for name in ("figures", *NOT_WITH_FIGURES) if getattr(options, name) not in (None, False, [])]
+    if options.policies or given:
+        what = "the policies" if options.policies else f"--{given[0].replace('_', '-')}"
+        raise InputError(f"--flight draws what was flown; drop {what}")
     if options.out is None:
         raise InputError("--flight needs --out DIR, a directory to write to")
     return evaluate_log(options.flight, options.out)

@@ -19,6 +19,7 @@ def draw(cells: Sequence[Cell], stand: bool, leader_mount: Sequence[float], out:
 
     The first is the figure of every simulated flight; of a `stand` there is the one of the paper's experiment too.
     """
+    out.mkdir(parents=True, exist_ok=True)
     files = [out / "flight.png"]
     draw_flights(cells, files[0])
     if stand:
