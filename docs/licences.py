@@ -23,7 +23,8 @@ mjxball itself is Apache-2.0. Made by `python docs/licences.py` from the metadat
 pins; `tests/test_licences.py` compares the two.
 
 **cflib is under the GPL**, which is why it is an extra (`fly`) that nobody gets without asking; nothing imports it but
-what opens a radio. Whoever distributes mjxball together with cflib must heed the GPL.
+what opens a radio. Whoever distributes mjxball together with cflib must heed the GPL. docutils, which only builds these
+pages, is in the public domain or under BSD licences but for an Emacs mode, which is under the GPL and not installed.
 
 | package | licence | installed by |
 |---|---|---|

@@ -1,0 +1,49 @@
+"""The directive `settings`: every setting of one part of the configuration, from the dataclass itself."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from docutils import nodes
+from sphinx.util.docutils import SphinxDirective
+
+from mjxball.config import Config, leaves
+
+
+def shown(value: Any) -> str:
+    """A default as the command line takes it."""
+    if isinstance(value, tuple):
+        return ",".join(f"{part:g}" for part in value) or "(none)"
+    return f"{value:g}" if isinstance(value, float) else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def row(cells: list[nodes.Node]) -> nodes.row:
+    """One line of the table."""
+    return nodes.row("", *(nodes.entry("", nodes.paragraph("", "", cell)) for cell in cells))
+
+
+class Settings(SphinxDirective):
+    """`settings` with the part's name: a table of flag, default and meaning."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """Build the table."""
+        part = self.arguments[0]
+        rows = [
+            row([nodes.literal("", f"--{path}"), nodes.literal("", shown(value)), nodes.Text(item.metadata["about"])])
+            for path, value, item in leaves(Config())
+            if path.startswith(f"{part}.")
+        ]
+        if not rows:
+            raise self.error(f"the configuration has no part called {part!r}")
+        head = row([nodes.Text(text) for text in ("flag", "default", "meaning")])
+        group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (30, 20, 50)), cols=3)
+        group += [nodes.thead("", head), nodes.tbody("", *rows)]
+        return [nodes.table("", group, classes=["colwidths-auto"])]
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Register with Sphinx."""
+    app.add_directive("settings", Settings)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
