@@ -1,4 +1,4 @@
-"""The documentation's settings: `sphinx-build -W docs build/site`. Nothing in the built pages is fetched from elsewhere."""
+"""Settings of `sphinx-build -W docs build/site`. Nothing in the built pages is fetched from elsewhere."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ html_copy_source = False
 html_last_updated_fmt = None
 
 default_role = "code"
-suppress_warnings = ["toc.empty_glob"]  # pages that may come
 myst_enable_extensions = ["dollarmath", "fieldlist"]
 myst_heading_anchors = 4
 myst_dmath_double_inline = True

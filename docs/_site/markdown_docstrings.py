@@ -1,4 +1,4 @@
-"""Docstrings of this house for autodoc: prose with `code`, and fields whose shape and unit stand in a trailing comment."""
+"""Docstrings of this house for autodoc: prose with `code`, and fields whose shape and unit a comment states."""
 
 from __future__ import annotations
 
