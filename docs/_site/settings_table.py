@@ -17,9 +17,15 @@ def shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def row(cells: list[nodes.Node]) -> nodes.row:
-    """One line of the table."""
-    return nodes.row("", *(nodes.entry("", nodes.paragraph("", "", cell)) for cell in cells))
+def row(*cells: list[nodes.Node]) -> nodes.row:
+    """One line of the table; every part of a cell is a paragraph."""
+    return nodes.row("", *(nodes.entry("", *(nodes.paragraph("", "", part) for part in cell)) for cell in cells))
+
+
+def setting(path: str, value: Any, about: str) -> nodes.row:
+    """The line of one setting."""
+    default = nodes.inline("", f"default {shown(value)}", classes=["default"])
+    return row([nodes.literal("", f"--{path}"), default], [nodes.Text(about)])
 
 
 class Settings(SphinxDirective):
@@ -30,17 +36,14 @@ class Settings(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Build the table."""
         part = self.arguments[0]
-        rows = [
-            row([nodes.literal("", f"--{path}"), nodes.literal("", shown(value)), nodes.Text(item.metadata["about"])])
-            for path, value, item in leaves(Config())
-            if path.startswith(f"{part}.")
-        ]
+        found = [(path, value, item) for path, value, item in leaves(Config()) if path.startswith(f"{part}.")]
+        rows = [setting(path, value, item.metadata["about"]) for path, value, item in found]
         if not rows:
             raise self.error(f"the configuration has no part called {part!r}")
-        head = row([nodes.Text(text) for text in ("flag", "default", "meaning")])
-        group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (30, 20, 50)), cols=3)
+        head = row(*([nodes.Text(text)] for text in ("flag", "meaning")))
+        group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (40, 60)), cols=2)
         group += [nodes.thead("", head), nodes.tbody("", *rows)]
-        return [nodes.table("", group, classes=["colwidths-auto"])]
+        return [nodes.table("", group, classes=["colwidths-auto", "settings"])]
 
 
 def setup(app: Any) -> dict[str, bool]:
