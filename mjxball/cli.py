@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mjxball import __version__
 from mjxball import config as configs
@@ -100,16 +100,22 @@ def add_config_flags(parser: argparse.ArgumentParser) -> None:
 
 def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> configs.Config:
     """Return `config` with the settings of `--plant FILE` and every `--<path> VALUE` that was given, validated."""
-    if getattr(options, "plant", None) is not None:
-        config = configs.apply_overrides(config, read_plant(options.plant))
+    config = apply_plant(config, options.plant)
     for name, text in vars(options).items():
         if name.startswith("config:") and text is not None:
             config = configs.override(config, name.removeprefix("config:"), text)
     return configs.validate(config)
 
 
-def read_plant(path: Path) -> dict[str, Any]:
-    """Settings {dotted path: value} of a plant file. Raises InputError if it is none; the settings are not checked."""
+class PlantFile(NamedTuple):
+    """A plant file: what was measured of a rig."""
+
+    preset: str | None  # that the settings belong to
+    settings: dict[str, Any]  # by dotted path
+
+
+def read_plant(path: Path) -> PlantFile:
+    """The plant file `path`. Raises InputError if it is none; the settings' values are not checked."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -118,7 +124,17 @@ def read_plant(path: Path) -> dict[str, Any]:
         raise InputError(f"plant file {path} is not JSON") from None
     if not isinstance(values, dict) or not values:
         raise InputError(f'plant file {path} must be one JSON object such as {{"plant.rotor_lag": 0.06}}')
+    preset = values.pop("preset", None)
+    if preset is not None and preset not in configs.PRESETS:
+        raise InputError(f"plant file {path}: preset {preset!r} is none of {', '.join(configs.PRESETS)}")
     for name in values:
         if name.partition(".")[0] not in PLANT_PARTS:
             raise InputError(f"plant file {path} may set {', '.join(PLANT_PARTS)}, not {name}")
-    return values
+    return PlantFile(preset, values)
+
+
+def apply_plant(config: configs.Config, path: Path | None) -> configs.Config:
+    """`config` with the settings of the plant file `path`, if there is one, validated."""
+    if path is None:
+        return config
+    return configs.validate(configs.apply_overrides(config, read_plant(path).settings))

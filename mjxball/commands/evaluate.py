@@ -50,7 +50,7 @@ SCENARIO_FLAGS = (
     "rolling",
 )
 # What the paper's figures settle themselves.
-NOT_WITH_FIGURES = ("families", "seeds", "check", "followers", "json", "wn_pitch", *SCENARIO_FLAGS)
+NOT_WITH_FIGURES = ("families", "seeds", "check", "followers", "json", "wn_pitch", "plant", *SCENARIO_FLAGS)
 
 
 def parser() -> cli.Parser:
@@ -80,6 +80,7 @@ def parser() -> cli.Parser:
         metavar="T:DM",
         help="DM [kg] added to, or if negative dropped from, the object at T [s]",
     )
+    result.add_argument("--plant", type=Path, metavar="FILE", help="plant file of mjxball.rig.identify: rig and preset")
     result.add_argument("--physics", choices=ENGINES, default="mjx", help="physics engine (default mjx)")
     result.add_argument("--json", type=Path, metavar="FILE", help="write the cells as JSON")
     result.add_argument("--out", type=Path, metavar="DIR", help="write report.html, JSON and figures")
@@ -108,6 +109,7 @@ def _families(options: argparse.Namespace) -> list[families.Family]:
             raise InputError("--seeds belongs to --families")
         return []
     given = [name for name in SCENARIO_FLAGS if getattr(options, name) is not None]
+    given += ["plant"] if options.plant else []
     if given or options.check:
         flag = "check" if options.check else given[0].replace("_", "-")
         raise InputError(f"--families fly their own scenarios; drop --{flag}")
@@ -124,7 +126,7 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         return _figures(options, arguments)
     setup = _setup(options)
     chosen = _families(options)
-    scenarios = _scenarios(options)
+    scenarios = _scenarios(options, setup)
     for scenario in scenarios:
         check_scenario(setup, scenario)
     if options.out:
@@ -139,7 +141,7 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     paths = files if asked else shipped_policies()
     if options.check and not paths:
         raise InputError("--check needs a policy")
-    here, homes = (paths, []) if options.force else by_home(paths)
+    here, homes = (paths, []) if options.force or options.plant else by_home(paths)
     if chosen and homes:
         if asked:
             raise InputError(f"families fly the paper's plant, and {homes[0][1][0]} was made for two Crazyflies")
@@ -273,7 +275,8 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
 
 
 def _setup(options: argparse.Namespace) -> config.Config:
-    setup = config.preset("paper")
+    measured = cli.read_plant(options.plant).preset if options.plant else None
+    setup = cli.apply_plant(config.preset(measured or "paper"), options.plant)
     if options.wn_pitch is not None:
         roll, _, yaw = setup.attitude.natural_frequency
         setup = config.replace(setup, "attitude.natural_frequency", (roll, options.wn_pitch, yaw))
@@ -296,8 +299,10 @@ def _refuse_two_motions(options: argparse.Namespace) -> None:
         raise InputError(f"--{first} and --{second} exclude each other: the CG moves in one way")
 
 
-def _scenarios(options: argparse.Namespace) -> Sequence[Scenario]:
+def _scenarios(options: argparse.Namespace, setup: config.Config) -> Sequence[Scenario]:
     given = any(getattr(options, name) is not None for name in SCENARIO_FLAGS)
+    if options.plant and not given:
+        return standard_scenarios(setup)
     if not (given or options.policies or options.followers):
         return STANDARD
     return cross(

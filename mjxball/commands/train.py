@@ -132,7 +132,8 @@ def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:
 
 def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, dict[str, Any], Path]:
     """Configuration, origin and directory of a new run; everything that can be refused is refused here."""
-    name, seed = options.preset or "transport", options.seed or 0
+    measured = cli.read_plant(options.plant).preset if options.plant else None
+    name, seed = options.preset or measured or "transport", options.seed or 0
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
@@ -202,7 +203,7 @@ def _seed_of(path: Path) -> int:
 
 def _refuse_with_resume(options: argparse.Namespace) -> None:
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    own = ("out", "seed", "seeds", "sweep", "physics")
+    own = ("out", "seed", "seeds", "sweep", "physics", "plant")
     given += [f"--{name}" for name in own if getattr(options, name) is not None]
     given += [options.preset] if options.preset else []
     if given:

@@ -11,6 +11,7 @@ from mjxball.control import crazyflie, mixer
 from mjxball.control.constants import plant_constants
 
 NAMES = ("roll", "pitch", "yaw")
+DRONE = np.array([1.66e-5, 1.66e-5, 2.93e-5])  # inertia for which the delivered gains were found good [kg m2]
 
 
 class Axis(NamedTuple):
@@ -19,7 +20,7 @@ class Axis(NamedTuple):
     name: str
     inertia: float  # about O, ball at O [kg m2]
     gain: float  # angular acceleration per unit of the rate loops' output [deg/s2]
-    scale: float  # inertia that a drone turns over its own
+    scale: float  # inertia that each drone turns over `DRONE`
     trim: float  # output that holds the heaviest lasting moment: the ball at an end stop [1]
     headroom: float  # output at which a motor of the hovering pair reaches full power [1]
 
@@ -43,7 +44,6 @@ def axes(config: Config) -> tuple[Axis, ...]:
     """Roll, pitch and yaw of the pair that `config` describes."""
     plant = config.plant
     command, slope = hover(config)
-    own = np.array([plant.leader_inertia, plant.follower_inertia]).sum(axis=0)
     # A roll output moves each motor by half of it, a yaw output by all of it.
     tilting = 2 * 4 * mixer.lever(plant.arm, plant.layout) / 2 * slope
     torque = np.array([tilting, tilting, 2 * 4 * plant.yaw_per_thrust * slope])
@@ -54,4 +54,4 @@ def axes(config: Config) -> tuple[Axis, ...]:
     gain, trim = np.degrees(torque / inertia), loaded * moment / torque
     spare = crazyflie.FULL - command
     room = (2 * spare, 2 * spare, spare)
-    return tuple(map(Axis, NAMES, *(map(float, row) for row in (inertia, gain, inertia / own, trim, room))))
+    return tuple(map(Axis, NAMES, *(map(float, row) for row in (inertia, gain, inertia / (2 * DRONE), trim, room))))

@@ -23,7 +23,7 @@ ROUNDS, STEPS = 3, 4
 DIFFERENCE = np.array([0.01, 0.02, 0.05, 0.004])
 PRIOR = np.array([0.3, 0.7, 0.7, 0.02])
 LARGEST = np.array([0.2, 0.4, 0.4, 0.01])
-START_DIFFERENCE = np.array([0.005, 0.02, 0.02, 0.2])
+START_DIFFERENCE = np.array([0.005, 0.02, 0.02, 0.2, 0.4])
 SHORTEST_LAG, LONGEST_DELAY = 0.005, 0.06  # [s]
 
 
@@ -69,8 +69,8 @@ def _windows(log: Log) -> tuple[Array, int]:
 
 
 def _starts(log: Log, begins: Array) -> Array:
-    """(n, 4) first guesses of `Start`."""
-    return np.stack([log.euler[begins, 0], log.rates[begins, 0], log.climb[begins], 0 * begins], axis=1)
+    """(n, 5) first guesses of `Start`."""
+    return np.stack([log.euler[begins, 0], log.rates[begins, 0], log.climb[begins], 0 * begins, 0 * begins], axis=1)
 
 
 def _sought(common: Array) -> Sought:
@@ -85,18 +85,18 @@ def _step(
 
     All difference quotients of all windows are flown together. The windows' own unknowns are eliminated.
     """
-    count, width = len(begins), 9
+    count, width = len(begins), 10
     commons = np.broadcast_to(common, (width, 4)).copy()
     commons[1:5] += np.diag(DIFFERENCE)
-    owns = np.broadcast_to(own, (width, count, 4)).copy()
+    owns = np.broadcast_to(own, (width, count, 5)).copy()
     owns[5:] += np.diag(START_DIFFERENCE)[:, None, :]
-    sought, start = _sought(np.repeat(commons, count, axis=0)), Start(*owns.reshape(-1, 4).T)
+    sought, start = _sought(np.repeat(commons, count, axis=0)), Start(*owns.reshape(-1, 5).T)
     flown = fly_windows(config, log, passed, np.tile(begins, width), ticks, sought, start)
-    flown = flown.reshape(len(flown), width, count, 3).transpose(1, 2, 0, 3)  # (9, n, rows, 3)
+    flown = flown.reshape(len(flown), width, count, 3).transpose(1, 2, 0, 3)  # (10, n, rows, 3)
     when = begins[:, None] + np.arange(0, ticks, log.every)
     seen = np.stack([log.euler[when, 0], log.rates[when, 0], log.climb[when]], axis=-1)
     left = ((seen - flown[0]) / NOISE).reshape(count, -1)
-    slopes = ((flown[1:] - flown[0]) / NOISE).reshape(8, count, -1)
+    slopes = ((flown[1:] - flown[0]) / NOISE).reshape(9, count, -1)
     slopes /= np.concatenate([DIFFERENCE, START_DIFFERENCE])[:, None, None]
     normal, right = np.diag(1 / PRIOR**2), (nominal - common) / PRIOR**2
     eliminated = []

@@ -34,9 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _gains(options: argparse.Namespace) -> int:
-    settings = config.preset(options.preset)
-    if options.plant:
-        settings = config.validate(config.apply_overrides(settings, cli.read_plant(options.plant)))
+    settings = cli.apply_plant(config.preset(options.preset), options.plant)
     if options.out:
         cli.output_file(options.out, ".json")
     if options.picture:

@@ -57,7 +57,7 @@ def make_log(sent_at: np.ndarray, setpoints: np.ndarray, seen_at: Any, states: l
     grid = np.arange(max(t[0] for t in (sent_at, *times)), min(t[-1] for t in (sent_at, *times)), PERIOD)
     held = setpoints[np.searchsorted(sent_at, grid + 1e-9, side="right") - 1]
     rows = [_on_grid(grid, t, s) for t, s in zip(times, states, strict=True)]
-    climb, euler, rates = (sum(parts) / 2 for parts in zip(*rows, strict=True))
+    climb, euler, rates = (np.mean(parts, axis=0) for parts in zip(*rows, strict=True))
     every = max(1, round(float(np.median(np.diff(times[0]))) / PERIOD))
     return Log(held, climb, euler, rates, every)
 
@@ -89,5 +89,5 @@ def _of_journal(path: Path) -> Log:
         raise ValueError("it holds no guided flight of two drones")
     both = [(np.array(times), np.array(states)) for times, states in seen.values()]
     spans = [(t > sent_at[0] - LONGEST_GAP) & (t < sent_at[-1] + LONGEST_GAP) for t, _ in both]
-    times, states = ([pair[i][span] for pair, span in zip(both, spans, strict=True)] for i in (0, 1))
-    return make_log(np.array(sent_at), np.array(sent, float), times, states)
+    guided = [(t[span], s[span]) for (t, s), span in zip(both, spans, strict=True)]
+    return make_log(np.array(sent_at), np.array(sent, float), [t for t, _ in guided], [s for _, s in guided])

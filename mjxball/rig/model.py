@@ -30,7 +30,8 @@ class Start(NamedTuple):
     roll: Array  # [rad]
     rate: Array  # [rad/s]
     climb: Array  # [m/s]
-    turning: Array  # constant angular acceleration by the ball and what else is not modelled [rad/s2]
+    turning: Array  # angular acceleration by the ball and what else is not modelled, at the start [rad/s2]
+    growing: Array  # its change with time [rad/s3]
 
 
 class Passed(NamedTuple):
@@ -88,7 +89,7 @@ def fly_windows(
         torque = (wrench[..., 1] + lever * wrench[..., 0]).sum(axis=1)
         level = np.cos(roll) * np.cos(euler[:, 1])
         climb = climb + h * (wrench[..., 0].sum(axis=1) * level / mass - plant.gravity)
-        rate = rate + h * (torque / sought.inertia + start.turning)
+        rate = rate + h * (torque / sought.inertia + start.turning + start.growing * (tick * h))
         roll = roll + h * rate
     return np.stack(flown)
 

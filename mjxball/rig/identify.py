@@ -1,0 +1,147 @@
+"""Command line of `python -m mjxball.rig.identify`: a plant file from logs of a flight or of a bench."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball import cli, config
+from mjxball.errors import InputError
+from mjxball.fly.preflight import read_gains
+from mjxball.rig.axis import hover, inertia_about_o
+from mjxball.rig.fit import Found, identify
+from mjxball.rig.log import read_log
+from mjxball.rig.model import pair_mass
+
+LEAST_INERTIA = 1e-6  # of a drone about its own centre [kg m2]
+DELAY_EITHER_WAY = 0.01  # [s] by which training varies the delay that was found
+
+
+def parser() -> cli.Parser:
+    """The flags."""
+    about = "Estimate hover thrust, thrust gain, motor lag, inertia across the stick and delay from logs."
+    result = cli.make_parser("python -m mjxball.rig.identify", about)
+    result.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="of mjxball.fly --log, or .npz; see docs")
+    result.add_argument("--preset", choices=("flight", "stand"), default="flight", help="rig (default flight)")
+    result.add_argument("--plant", type=Path, metavar="FILE", help="masses and places as measured, to start from")
+    result.add_argument("--gains", type=Path, metavar="FILE", help="what the drones flew with, if not the preset's")
+    result.add_argument("--out", type=Path, metavar="PLANT.json", help="write a plant file for train, eval, rig.gains")
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Identify, print, write; return the exit code."""
+    options = parser().parse_args(arguments)
+    return cli.run_command(lambda: _identify(options))
+
+
+def _identify(options: argparse.Namespace) -> int:
+    if options.out:
+        cli.output_file(options.out, ".json")
+    known = cli.read_plant(options.plant).settings if options.plant else {}
+    settings = cli.apply_plant(config.preset(options.preset), options.plant)
+    if options.gains:
+        settings = with_gains(settings, read_gains(options.gains))
+    if settings.plant.cg_axis != "y":
+        raise InputError("identification is of the inertia about x; the stick must lie along y")
+    found = [identify(settings, read_log(path)) for path in options.logs]
+    for path, one in zip(options.logs, found, strict=True):
+        print(f"{path.name}: {one.windows} s of flight\n{report(settings, one)}")  # noqa: T201
+    mean = average(found)
+    if len(found) > 1:
+        print(f"all {len(found)} logs\n{report(settings, mean)}")  # noqa: T201
+    values = {**known, **plant_settings(settings, mean)}
+    if options.out:
+        options.out.write_text(json.dumps({"preset": options.preset, **values}, indent=1) + "\n")
+    config.validate(config.apply_overrides(settings, values))  # the file is kept: what is wrong is the rig
+    return 0
+
+
+def with_gains(settings: config.Config, gains: Mapping[str, float]) -> config.Config:
+    """`settings` whose autopilot has the firmware parameters `gains`; others than its loops' are ignored."""
+    law = settings.autopilot
+    for group, suffix in (("pid_attitude", ""), ("pid_rate", "_rate")):
+        for axis in ("roll", "pitch", "yaw"):
+            before = getattr(law, axis + suffix)
+            terms = zip(("kp", "ki", "kd"), before, strict=True)
+            row = tuple(gains.get(f"{group}.{axis}_{term}", value) for term, value in terms)
+            law = config.replace(law, axis + suffix, row)
+    return dataclasses.replace(settings, autopilot=law)
+
+
+def average(found: Sequence[Found]) -> Found:
+    """One result from several logs, each weighted by its own precision."""
+    values = np.array([[one.thrust, one.inertia, one.lag, one.delay] for one in found])
+    spreads = np.array([one.spread for one in found])
+    weights = 1 / spreads**2
+    thrust, inertia, lag, delay = map(float, (weights * values).sum(axis=0) / weights.sum(axis=0))
+    s = np.sqrt(1 / weights.sum(axis=0))
+    spread = (float(s[0]), float(s[1]), float(s[2]), float(s[3]))
+    misfit = float(np.sqrt(np.mean([one.misfit**2 for one in found])))
+    return Found(thrust, inertia, lag, delay, spread, misfit, sum(one.windows for one in found))
+
+
+def plant_settings(settings: config.Config, found: Found) -> dict[str, Any]:
+    """Settings by path that make `settings` the plant that was found.
+
+    Inertia beyond what masses and places explain is given to the drones, half to each, about roll and yaw.
+    """
+    plant, (a, b) = settings.plant, settings.autopilot.motor_curve
+    curve = (found.thrust * a, found.thrust * b)
+    stronger = config.apply_overrides(settings, {"autopilot.motor_curve": curve})
+    more = 0.5 * (found.inertia - float(inertia_about_o(settings)[0]))
+
+    def own(before: tuple[float, float, float]) -> tuple[float, float, float]:
+        return max(before[0] + more, LEAST_INERTIA), before[1], max(before[2] + more, LEAST_INERTIA)
+
+    return {
+        "plant.rotor_lag": _rounded(found.lag),
+        "plant.rotor_force_max": _rounded(sum(curve)),
+        "plant.leader_inertia": [_rounded(value) for value in own(plant.leader_inertia)],
+        "plant.follower_inertia": [_rounded(value) for value in own(plant.follower_inertia)],
+        "autopilot.motor_curve": [_rounded(value) for value in curve],
+        "autopilot.hover_thrust": round(hover(stronger)[0]),
+        "scenario.delay": [
+            _rounded(max(found.delay - DELAY_EITHER_WAY, 0.0)),
+            _rounded(found.delay + DELAY_EITHER_WAY),
+        ],
+    }
+
+
+def report(settings: config.Config, found: Found) -> str:
+    """What was found with one standard deviation by the fit's own account, a line each."""
+    a, b = settings.autopilot.motor_curve
+    stronger = config.apply_overrides(settings, {"autopilot.motor_curve": (found.thrust * a, found.thrust * b)})
+    command, slope = hover(stronger)
+    gain = 8 * slope * 1000 / pair_mass(settings)
+    thrust, inertia, lag, delay = found.spread
+    computed = float(inertia_about_o(settings)[0])
+    lines = [
+        f"  hover thrust  {command:.0f} units, force {found.thrust:.3f} +- {thrust:.3f} of the motor curve",
+        f"  thrust gain   {gain:.3f} m/s2 per 1000 units",
+        f"  motor lag     {1e3 * found.lag:.1f} +- {1e3 * found.lag * lag:.1f} ms",
+        f"  inertia       {1e3 * found.inertia:.4f} +- {1e3 * found.inertia * inertia:.4f} g m2 across the stick, "
+        f"{found.inertia / computed:.2f} of what masses and places give",
+        f"  delay         {1e3 * found.delay:.1f} +- {1e3 * delay:.1f} ms",
+        f"  misfit        {found.misfit:.2f} of the noise that was assumed",
+    ]
+    if max(thrust, inertia, lag) > 0.1:
+        lines.append("  too little moves in this log: fly steps of roll and of height")
+    if found.inertia < 0.95 * computed:
+        lines.append("  less inertia than masses and places give: weigh and measure the rig again")
+    return "\n".join(lines)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.5g}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,230 @@
+"""Identification from simulated logs whose truth is known, and what becomes of the plant file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjxball import cli
+from mjxball.commands import evaluate, train
+from mjxball.config import Config, preset, validate
+from mjxball.control import crazyflie, rotations
+from mjxball.control.constants import plant_constants
+from mjxball.errors import InputError
+from mjxball.fly import packets
+from mjxball.fly.journal import Journal
+from mjxball.physics.engine import Load
+from mjxball.physics.step import start_state
+from mjxball.physics.stepper import make_stepper
+from mjxball.rig import identify as command
+from mjxball.rig.axis import inertia_about_o
+from mjxball.rig.fit import Found, identify
+from mjxball.rig.log import make_log, read_log
+
+PAIR = preset("flight")
+PERIOD = PAIR.timing.control_period
+COMPUTED = float(inertia_about_o(PAIR)[0])
+
+
+class Rig:
+    """A rig that is not as it was thought: the truth of a log."""
+
+    def __init__(self, thrust: float, added: float, lag: float, late: int):
+        self.thrust, self.added, self.lag, self.late = thrust, added, lag, late
+
+
+RIGS = {"weak and slow": Rig(0.9, 4e-4, 1.4, 2), "strong and quick": Rig(1.1, 2e-4, 0.7, 1)}
+
+
+def record(config: Config, rig: Rig, seconds: float, noise: float = 1.0) -> dict[str, np.ndarray]:
+    """A flight with random steps of all commands, a moving ball, and the noise of a small drone's sensors."""
+    random, one, mass = np.random.default_rng(5), np.ones(1), config.plant.object_mass
+    sine = (0.02 * one, 0.6 * one, 0 * one, np.zeros((1, 0)), np.zeros((1, 0)))
+    load = Load(
+        mass * one,
+        mass * one,
+        *sine,
+        rotor_lag_scale=rig.lag * one,
+        thrust_scale=rig.thrust * np.ones((1, 2)),
+        added_inertia=np.array([[rig.added, 0, 0]]),
+    )
+    step, zero = make_stepper(config, "newton-euler"), np.zeros((1, 3))
+    state = start_state(config, zero, zero, zero, mass * one, np.zeros(1))
+    constants = plant_constants(config.plant, config.attitude)
+    commands: list[np.ndarray] = []
+    log: dict[str, list[np.ndarray]] = {"setpoints": [], "states": []}
+    for number in range(round(seconds / PERIOD)):
+        if number % 40 == 0:
+            steps = random.uniform(-1, 1, (2, 3)) * np.array([0.09, 0.05, 1.0])
+            steps[1, :2] = steps[0, :2]
+        place, speed = state.position[0], state.velocity[0]
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))[0]
+        held = steps + np.array([0.1 * speed[1], -0.1 * speed[0], (1 - rig.thrust) * 9.81 - 1.5 * speed[2] - place[2]])
+        commands.append(held)
+        sent = crazyflie.setpoints(config.autopilot, held, constants.drone_mass + constants.share * mass, 9.81)
+        log["setpoints"].append(sent)
+        rows = []
+        for _ in range(2):
+            jitter = noise * random.normal(size=(4, 3)) * np.array([[0.003], [0.02], [0.005], [0.02]])
+            seen = rotations.quaternion_from_euler(euler + jitter[2])
+            rows.append(np.concatenate([place + jitter[0], speed + jitter[1], seen, state.rates[0] + jitter[3]]))
+        log["states"].append(np.stack(rows))
+        state = step(state, commands[max(0, number - rig.late)][None], load)
+    time = np.arange(len(commands)) * PERIOD
+    return {"time": time, **{name: np.stack(rows) for name, rows in log.items()}}
+
+
+@pytest.fixture(scope="module")
+def logs() -> dict[str, dict[str, np.ndarray]]:
+    return {name: record(PAIR, rig, 20.0) for name, rig in RIGS.items()}
+
+
+@pytest.fixture(scope="module")
+def found(logs) -> dict[str, Found]:
+    return {
+        name: identify(
+            PAIR, make_log(log["time"], log["setpoints"], log["time"], [log["states"][:, 0], log["states"][:, 1]])
+        )
+        for name, log in logs.items()
+    }
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_truth_is_found(found, name: str) -> None:
+    """The errors that docs/crazyflie.md states: 20 s of noisy flight."""
+    truth, one = RIGS[name], found[name]
+    assert one.thrust == pytest.approx(truth.thrust, rel=0.005)
+    assert one.inertia == pytest.approx(COMPUTED + truth.added, rel=0.04)
+    assert one.lag == pytest.approx(0.05 * truth.lag, rel=0.12)
+    assert one.delay == pytest.approx(PERIOD * truth.late, abs=0.005)
+    assert one.misfit < 1
+
+
+def test_journal_and_arrays_tell_the_same(tmp_path: Path, logs) -> None:
+    """A flight's own log: packed states, setpoints as they were sent, other states of the runner left out."""
+    log = {name: rows[:300] for name, rows in logs["weak and slow"].items()}
+    path = tmp_path / "flight.jsonl"
+    with Journal(path) as journal:
+        journal.note("tick", -1.0, state="ramp", sent=[[0, 0, 0, 0]] * 2)
+        for t, sent, states in zip(log["time"], log["setpoints"], log["states"], strict=True):
+            for drone, row in zip(("leader", "follower"), states, strict=True):
+                state = packets.DroneState(row[:3], row[3:6], row[6:10], row[10:], packets.FLYING, 3.9)
+                journal.note("state", float(t), drone=drone, raw=packets.pack_state(state).hex())
+            journal.note("tick", float(t), state="fly", sent=sent)
+    np.savez(tmp_path / "flight.npz", **log)
+    packed, plain = read_log(path), read_log(tmp_path / "flight.npz")
+    assert packed.every == plain.every == 5
+    np.testing.assert_array_equal(packed.setpoints, plain.setpoints)
+    np.testing.assert_allclose(packed.climb, plain.climb, atol=6e-4)  # whole mm/s
+    np.testing.assert_allclose(packed.rates, plain.rates, atol=6e-4)
+    np.testing.assert_allclose(packed.euler, plain.euler, atol=3e-3)  # three components of 9 bits
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"states": np.zeros((9, 2, 12))}, "shapes"),
+        ({"time": np.zeros(9)}, "times do not increase"),
+        ({"setpoints": np.full((9, 2, 4), np.nan)}, "not finite"),
+    ],
+)
+def test_damaged_logs_are_refused(tmp_path: Path, change: dict[str, np.ndarray], said: str) -> None:
+    states = np.zeros((9, 2, 13))
+    states[..., 6] = 1
+    np.savez(
+        tmp_path / "a.npz", **{"time": np.arange(9) * 0.01, "setpoints": np.zeros((9, 2, 4)), "states": states} | change
+    )
+    with pytest.raises(InputError, match=said):
+        read_log(tmp_path / "a.npz")
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.jsonl").write_text("nothing\n")
+    with pytest.raises(InputError, match="no guided flight"):
+        read_log(tmp_path / "a.jsonl")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_log(tmp_path / "none.npz")
+
+
+def test_too_short_a_flight_is_refused(logs) -> None:
+    log = {name: rows[:300] for name, rows in logs["weak and slow"].items()}
+    short = make_log(log["time"], log["setpoints"], log["time"], [log["states"][:, 0], log["states"][:, 1]])
+    with pytest.raises(InputError, match="5 s or more"):
+        identify(PAIR, short)
+
+
+SOME = Found(0.95, COMPUTED + 4e-4, 0.06, 0.02, (0.001, 0.01, 0.02, 0.001), 0.8, 19)
+
+
+class TestPlantFile:
+    def write(self, place: Path, found: Found = SOME) -> Path:
+        path = place / "plant.json"
+        path.write_text(json.dumps({"preset": "flight", **command.plant_settings(PAIR, found)}))
+        return path
+
+    def test_it_is_the_plant_that_was_found(self, tmp_path: Path) -> None:
+        rig = cli.apply_plant(PAIR, self.write(tmp_path))
+        assert inertia_about_o(rig)[0] == pytest.approx(SOME.inertia, rel=1e-4)
+        assert rig.plant.rotor_lag == SOME.lag
+        force = crazyflie.motor_force(rig.autopilot.motor_curve, np.array(rig.autopilot.hover_thrust))
+        assert 8 * force == pytest.approx(0.0755 * 9.81, rel=1e-4)
+        assert rig.scenario.delay == pytest.approx((0.01, 0.03))
+
+    def test_less_inertia_than_there_can_be(self, tmp_path: Path) -> None:
+        """Masses at their places are a floor; the report says what to do."""
+        light = SOME._replace(inertia=0.8 * COMPUTED)
+        validate(cli.apply_plant(PAIR, self.write(tmp_path, light)))
+        assert "weigh and measure" in command.report(PAIR, light)
+
+    def test_train_takes_it_with_its_preset(self, tmp_path: Path) -> None:
+        options = train.parser().parse_args(["--plant", str(self.write(tmp_path)), "--out", str(tmp_path / "run")])
+        settings, _, _ = train._new_run(options, "")
+        assert settings.preset == "flight"
+        assert settings.plant.rotor_lag == SOME.lag
+
+    def test_flags_overrule_it(self, tmp_path: Path) -> None:
+        path, out = self.write(tmp_path), str(tmp_path / "run")
+        options = train.parser().parse_args(["--plant", str(path), "--out", out, "--plant.rotor_lag", "0.07"])
+        assert train._new_run(options, "")[0].plant.rotor_lag == 0.07
+
+    def test_eval_takes_it(self, tmp_path: Path) -> None:
+        options = evaluate.parser().parse_args(["--followers", "copy", "--plant", str(self.write(tmp_path))])
+        setup = evaluate._setup(options)
+        assert setup.preset == "flight"
+        assert setup.plant.rotor_lag == SOME.lag
+        assert {scenario.mass for scenario in evaluate._scenarios(options, setup)} == {PAIR.plant.object_mass}
+
+    def test_figures_do_not(self, tmp_path: Path, capsys) -> None:
+        assert evaluate.main(["--figures", "all", "--plant", str(self.write(tmp_path))]) == 2
+        assert "drop --plant" in capsys.readouterr().err
+
+
+class TestCommand:
+    def test_from_log_to_plant_file(self, tmp_path: Path, monkeypatch, capsys, logs) -> None:
+        monkeypatch.setattr(command, "identify", lambda settings, log: SOME)
+        log, out = tmp_path / "bench.npz", tmp_path / "plant.json"
+        np.savez(log, **logs["weak and slow"])
+        assert command.main([str(log), str(log), "--out", str(out)]) == 0
+        assert cli.read_plant(out).preset == "flight"
+        text = capsys.readouterr().out
+        assert "motor lag     60.0" in text
+        assert "all 2 logs" in text
+
+    def test_a_rig_too_weak_to_fly_is_told(self, tmp_path: Path, monkeypatch, capsys, logs) -> None:
+        monkeypatch.setattr(command, "identify", lambda settings, log: SOME._replace(thrust=0.75))
+        log = tmp_path / "bench.npz"
+        np.savez(log, **logs["weak and slow"])
+        assert command.main([str(log)]) == 2
+        assert "hovering takes" in capsys.readouterr().err
+
+    def test_gains_that_were_flown(self) -> None:
+        changed = command.with_gains(PAIR, {"pid_rate.roll_kp": 500.0, "pid_attitude.yaw_ki": 0.5, "kalman.x": 1.0})
+        assert changed.autopilot.roll_rate == (500.0, *PAIR.autopilot.roll_rate[1:])
+        assert changed.autopilot.yaw == (PAIR.autopilot.yaw[0], 0.5, PAIR.autopilot.yaw[2])
+
+    def test_precise_logs_count_more(self) -> None:
+        vague = SOME._replace(lag=0.09, spread=(0.001, 0.01, 0.2, 0.001))
+        assert command.average([SOME, vague]).lag == pytest.approx(0.06 + 0.03 / 101)
