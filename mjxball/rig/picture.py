@@ -32,7 +32,7 @@ def draw(config: Config, designs: Sequence[Design], path: Path) -> None:
     _bode(places[1, 1], config, gains, worst)
     ratio = f"{worst.axis.name}: {worst.axis.scale:.0f} times the inertia of the drones alone"
     figure.suptitle(f"Attitude loop of the coupled pair, {ratio}")
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=80)
     plt.close(figure)
 
 
