@@ -31,7 +31,7 @@ CURVES = {"linear": LINEAR, "older": OLDER}
 
 
 def make_parser() -> cli.Parser:
-    """The argument parser."""
+    """The flags; what None stands for is the policy card's."""
     about = "Fly a policy with two Crazyflies, or rehearse it with their software twin."
     parser = cli.make_parser("python -m mjxball.fly", about)
     parser.add_argument("policy", type=Path, metavar="POLICY.npz", help="the follower")

@@ -9,7 +9,7 @@ import json
 import sys
 from pathlib import Path
 
-from mjxball.cli import make_parser
+from mjxball.cli import make_parser, run_command
 from mjxball.fly.loop import urgent
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
@@ -17,11 +17,16 @@ from mjxball.policy import load_file
 
 
 def main() -> int:
-    """Serve until standard input ends."""
+    """Command line of the twin; returns the exit code."""
     parser = make_parser("python -m mjxball.fly.twin", __doc__ or "")
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
     parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
     options = parser.parse_args()
+    return run_command(lambda: serve(options))
+
+
+def serve(options: argparse.Namespace) -> int:
+    """Run the twin that `options` ask for until standard input ends."""
     card = load_file(options.policy).card if options.policy else None
     with urgent(), Twin(make_pair(card), TwinSettings(ports=tuple(options.ports))) as twin:
         print(json.dumps({"uris": twin.uris}), flush=True)  # noqa: T201
