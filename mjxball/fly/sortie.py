@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from mjxball import __version__
 from mjxball import config as configs
@@ -48,7 +49,12 @@ def fly(
 
     Prints the checks and how it ended. `command` goes into the log's header.
     """
-    header = {"command": list(command), "version": __version__, "uris": list(uris), "settings": str(settings)}
+    header: dict[str, Any] = {
+        "command": list(command),
+        "version": __version__,
+        "uris": list(uris),
+        "settings": str(settings),
+    }
     header |= {"policy": crew.pilot.policy.name, "config_hash": crew.pilot.policy.card["config_hash"]}
     header |= {"config": configs.to_dict(crew.pilot.config), "gains": dict(crew.gains)}
     before = sys.getswitchinterval()
