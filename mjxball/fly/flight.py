@@ -144,7 +144,9 @@ class Flight:
             ]
         except (PacketError, ValueError, FloatingPointError) as error:
             return None, [Fault(Event.BAD_STATE, str(error))]
-        if self._saturated.update(any(one.saturated for one in mapped), now):
+        # A dry run never lifts: the laws ask for more and more.
+        saturated = any(one.saturated for one in mapped) and not self.settings.dry_run
+        if self._saturated.update(saturated, now):
             return mapped, [Fault(Event.SATURATED, f"for {self.settings.limits.saturation_time:g} s")]
         return mapped, []
 
