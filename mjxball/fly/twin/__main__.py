@@ -5,6 +5,7 @@ It ends when its standard input closes, so that it never outlives whoever starte
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
