@@ -17,7 +17,6 @@ from mjxball.fly import journal
 from mjxball.fly.main import main
 
 pytest.importorskip("cflib")
-pytestmark = pytest.mark.alone  # by the clock
 URIS = ("--leader", "udp://127.0.0.1:19850", "--follower", "udp://127.0.0.1:19851")
 REFUSALS = [
     ([TRANSPORT], "--leader URI is needed"),
@@ -143,6 +142,7 @@ def flown(flight: Ended) -> Ended:
 NORMAL = ["arm", "ramp", "fly", "land", "stop", "done"]
 
 
+@pytest.mark.alone
 def test_a_rehearsal(flights: dict[str, Ended]) -> None:
     flight = flown(flights["rehearsed"])
     assert (flight.code, flight.states()) == (0, NORMAL)
@@ -155,6 +155,7 @@ def test_a_rehearsal(flights: dict[str, Ended]) -> None:
     assert max(errors) < 0.1  # the pair has gone where it was sent
 
 
+@pytest.mark.alone
 def test_the_log_holds_everything(flights: dict[str, Ended]) -> None:
     flight = flown(flights["rehearsed"])
     kinds = {record["kind"] for record in flight.records}
@@ -166,6 +167,7 @@ def test_the_log_holds_everything(flights: dict[str, Ended]) -> None:
     assert all(len(bytes.fromhex(record["raw"])) == 30 for record in flight.records if record["kind"] == "state")
 
 
+@pytest.mark.alone
 def test_a_dry_run(flights: dict[str, Ended]) -> None:
     flight = flown(flights["dry"])
     assert (flight.code, flight.states()) == (0, NORMAL)
@@ -174,6 +176,7 @@ def test_a_dry_run(flights: dict[str, Ended]) -> None:
     assert max(tick["observation"][2] for tick in flight.ticks("fly")[1:]) < 0.01  # nothing has lifted
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("name", list(SIGNALS))
 def test_signals_land(flights: dict[str, Ended], name: str) -> None:
     flight = flown(flights[name])
