@@ -14,6 +14,7 @@ from command_line import TRANSPORT, assert_one_line, call, listing, load_arrays,
 
 from mjxball.commands.evaluate import main
 from mjxball.control.followers import BASELINES
+from mjxball.evaluate.homes import by_home
 from mjxball.policy.shipped import shipped_policies
 
 FAST = ["--physics", "newton-euler"]
@@ -47,8 +48,10 @@ def one(cells: list[dict[str, Any]], **wanted: Any) -> dict[str, Any]:
 
 
 def test_no_arguments_judge_every_shipped_policy_and_baseline(standard: list[dict[str, Any]]) -> None:
-    names = {*BASELINES, *(path.stem for path in shipped_policies())}
-    assert "transport" in names
+    here, homes = by_home(shipped_policies())
+    names = {*BASELINES, *(path.stem for path in here)}
+    assert {"transport", "robust", "paper"} <= names
+    assert {config.preset for config, _ in homes} == {"flight", "stand"}
     scenarios = {(0.31, 0.0), *((omega, 0.05) for omega in SPEEDS)}
     assert {(cell["follower"], cell["omega"], cell["amplitude"]) for cell in standard} == {
         (name, *scenario) for name in names for scenario in scenarios
@@ -114,6 +117,23 @@ def test_out_holds_the_cells_and_a_figure_for_each_scenario(tmp_path: Path) -> N
     figures = list(out.glob("*.png"))
     assert len(figures) == 2
     assert all(figure.read_bytes().startswith(b"\x89PNG") for figure in figures)
+
+
+@pytest.mark.parametrize("name", ["flight", "stand"])
+def test_a_policy_for_crazyflies_flies_its_own_plant(name: str, tmp_path: Path) -> None:
+    path = next(path for path in shipped_policies() if path.stem == name)
+    out = tmp_path / "cells.json"
+    assert call(main, [path, *FAST, "--seconds", 3, "--json", out]) == 0
+    cells = cells_of(out)
+    assert [cell["follower"] for cell in cells] == ["copy", name]
+    assert {cell["mass"] for cell in cells} == {0.0175}
+    assert all(cell["max_tilt"] < 0.3 and not cell["failed"] for cell in cells)
+
+
+def test_families_refuse_a_policy_for_crazyflies(capsys: pytest.CaptureFixture[str]) -> None:
+    path = next(path for path in shipped_policies() if path.stem == "flight")
+    assert call(main, [path, "--families", "gusts"]) == 2
+    assert "two Crazyflies" in capsys.readouterr().err
 
 
 # --- check ----------------------------------------------------------------------------------------------------------

@@ -206,7 +206,8 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
         if number:
             print(f"\n{group.setup.preset}: two Crazyflies, their own plant and scenarios")  # noqa: T201
         print(table(cells))  # noqa: T201
-        every += cells
+        if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
+            every += cells
         if options.out:
             place = options.out / group.setup.preset if number else options.out
             write_report(cells, place)
