@@ -31,7 +31,7 @@ def derivative(engine: Engine, mass: np.ndarray, sines: tuple, state: PlantState
 
 
 def advance(state: PlantState, rate: PlantState, h: float) -> PlantState:
-    return PlantState(*(value + h * change for value, change in zip(state, rate, strict=True)))
+    return state.each(lambda value, change: value + h * change, rate)
 
 
 def momenta(plant: Plant, mass: np.ndarray, cg: CgState, state: PlantState) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +93,7 @@ def test_free_fall_conserves_momentum(plant: Plant, make_engine: object) -> None
         k2 = derivative(engine, mass, sines, advance(state, k1, STEP / 2))
         k3 = derivative(engine, mass, sines, advance(state, k2, STEP / 2))
         k4 = derivative(engine, mass, sines, advance(state, k3, STEP))
-        mean = PlantState(*((a + 2 * b + 2 * c + d) / 6 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)))
+        mean = k1.each(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, k2, k3, k4)
         state = advance(state, mean, STEP)
     later_linear, later_angular = momenta(plant, mass, sine(state.time, *sines), state)
     fallen = np.zeros((WORLDS, 3))

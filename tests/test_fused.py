@@ -51,7 +51,7 @@ def test_fused_step_equals_the_plain_one(name: str) -> None:
     arguments = batch(config)
     plain = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude))
     expected, found = jax.jit(plain)(*arguments), jax.jit(fused.make_fused_step(config))(*arguments)
-    for a, b in zip(found, expected, strict=True):
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         # float32 rounding of four steps; rates reach 10 rad/s
         np.testing.assert_allclose(a, b, atol=2e-5)
 
@@ -61,7 +61,7 @@ def test_fused_step_works_for_one_world_under_vmap() -> None:
     arguments = batch(config)
     step = fused.make_fused_step(config)
     one_by_one, together = jax.jit(jax.vmap(step))(*arguments), jax.jit(step)(*arguments)
-    for a, b in zip(one_by_one, together, strict=True):
+    for a, b in zip(jax.tree.leaves(one_by_one), jax.tree.leaves(together), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-6)  # the compiler may order sums differently
 
 
@@ -71,7 +71,8 @@ def test_kernel_equals_the_fused_step() -> None:
     arguments = fused.split_state(state), split(commands, 2), fused.split_load(load)
     kernel = make_kernel_step(config, block=4, interpret=True)
     expected = jax.jit(fused.make_split_step(config))(*arguments)
-    for a, b in zip(fused.join_state(kernel(*arguments)), fused.join_state(expected), strict=True):
+    joined = (jax.tree.leaves(fused.join_state(state)) for state in (kernel(*arguments), expected))
+    for a, b in zip(*joined, strict=True):
         np.testing.assert_allclose(a, b, atol=2e-5)
 
 

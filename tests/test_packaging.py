@@ -107,5 +107,7 @@ def test_a_source_tree_finds_the_policies_beside_it() -> None:
 
 
 def test_an_unknown_policy_is_refused_with_the_names_of_those_there_are() -> None:
-    with pytest.raises(ValueError, match="no shipped policy is called 'nobody'; there are paper, robust, transport"):
+    with pytest.raises(
+        ValueError, match="no shipped policy is called 'nobody'; there are flight, paper, robust, stand, transport"
+    ):
         shipped_policy("nobody")

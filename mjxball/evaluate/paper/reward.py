@@ -51,7 +51,8 @@ def draw(policies: Sequence[Policy]) -> Figure:
     curves = [(policy.name, read_curve(policy)) for policy in policies]
     drawn = [curve for _, curve in curves if curve]
     without = [name for name, curve in curves if not curve]
-    several = [f"{called(p.name)} ({p.card['seeds']})" for p in policies if _is_several(p.card.get("seeds"))]
+    together = [p for p, (_, curve) in zip(policies, curves, strict=True) if curve and _is_several(p.card.get("seeds"))]
+    several = [f"{called(p.name)} ({p.card['seeds']})" for p in together]
     shows = f"{SHOWS} Grey is the median of all that were trained together: {listed(several)}." if several else SHOWS
     agrees, differs = judged(drawn)
     if without:

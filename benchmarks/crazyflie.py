@@ -1,0 +1,141 @@
+"""The Crazyflie pair: does the ball stay on the stick of the stand, and does the pair fly whatever the rig?
+
+`python benchmarks/crazyflie.py [--stand POLICY.npz] [--flight POLICY.npz] [--starts N] [--rigs N] [--json FILE]`
+
+- stand: flights of 60 s from random ball offsets, rolls and heights, undisturbed. The ball is kept if it never touches
+  an end stop; shares over all starts, beside a follower that copies.
+- flight: rigs drawn as the preset's training draws them (thrust of both and of each, motor lag, inertia, object mass,
+  CG motion, noise, delay, gusts), of which those count whose weaker drone keeps 30 % of its thrust in hover. 20 s each;
+  a crash is |e_o| beyond d_term or a world that diverges. RMSE and tilt after 5 s, beside copying in the same worlds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjxball.cache import enable_compilation_cache
+from mjxball.config import Config, ball_reach, preset
+from mjxball.control import rotations
+from mjxball.control.constants import plant_constants
+from mjxball.control.followers import make_baseline
+from mjxball.env import CoupledPairEnv
+from mjxball.evaluate.cells import load_policy
+from mjxball.policy.policy import NetworkLaw
+from mjxball.policy.shipped import shipped_policy
+from mjxball.rollout import simulate_batch
+from mjxball.scenario import Scenario
+
+MARGIN, SECONDS, SETTLED = 0.3, 20.0, 5.0
+
+
+def stand(path: Path, starts: int) -> list[dict[str, Any]]:
+    """Shares of flights that keep the ball, of copy and of the policy."""
+    config, random = preset("stand"), np.random.default_rng(0)
+    scenarios = [
+        Scenario(
+            amplitude=0.0,
+            mass=config.plant.object_mass,
+            goal=(0.0, 0.0, 0.0),
+            seconds=60.0,
+            ball_start=random.uniform(-1, 1) * config.scenario.ball_start,
+            start_tilt=(random.uniform(-1, 1) * config.scenario.start_tilt, 0.0),
+            start_position=(0.0, 0.0, random.uniform(-1, 1) * config.scenario.start_position),
+        )
+        for _ in range(starts)
+    ]
+    rows = []
+    for follower in (make_baseline("copy", config), load_policy(path, config)):
+        flown = simulate_batch(config, [(follower, scenarios)], "newton-euler")
+        ball = np.abs(flown.cg_offset) / config.plant.moving_fraction
+        late = flown.time > 10
+        rows.append(
+            {
+                "follower": follower.name,
+                "starts": starts,
+                "kept": float((ball.max(axis=0) < ball_reach(config.plant) - 1e-3).mean()),
+                "ball rms": float(np.median(np.sqrt((ball[late] ** 2).mean(axis=0)))),
+                "roll rms": float(np.median(np.sqrt((flown.euler[late, :, 0] ** 2).mean(axis=0)))),
+                "height rms": float(np.median(np.sqrt((flown.error[late, :, 2] ** 2).mean(axis=0)))),
+                "diverged": int(flown.diverged.sum()),
+            }
+        )
+    return rows
+
+
+def margins(config: Config, load: Any) -> np.ndarray:
+    """Share of its thrust (n,) that the weaker drone of each world keeps in hover."""
+    constants = plant_constants(config.plant, config.attitude)
+    carried = constants.drone_mass + constants.share * np.asarray(load.object_mass)[:, None]
+    most = 4 * config.plant.rotor_force_max * np.asarray(load.thrust_scale)
+    return (1 - carried * config.plant.gravity / most).min(axis=1)
+
+
+def flight(path: Path, rigs: int) -> list[dict[str, Any]]:
+    """Crashes, RMSE and tilt over random rigs, of copy and of the policy in the same worlds."""
+    config = preset("flight")
+    env, law = CoupledPairEnv(config, "newton-euler"), NetworkLaw(load_policy(path, config))
+    starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(7), 3 * rigs))
+    fit = np.flatnonzero(margins(config, starts.pipeline_state.load) >= MARGIN)[:rigs]
+    starts = jax.tree.map(lambda leaf: leaf[fit], starts)
+
+    def fly(acting: bool) -> Any:
+        def step(state: Any, _: Any) -> Any:
+            scaled = law.scaled(state.pipeline_state.memory, state.obs[:, :18])
+            state = jax.vmap(env.step)(state, scaled if acting else jnp.zeros_like(scaled))
+            plant = state.pipeline_state.plant
+            euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
+            tilt = jnp.sqrt((euler[:, :2] ** 2).sum(axis=-1))
+            return state, (state.metrics["error"], tilt, state.metrics["diverged"])
+
+        return jax.lax.scan(step, starts, None, length=round(SECONDS / env.dt))[1]
+
+    rows = []
+    for name, acting in (("copy", False), (law.name, True)):
+        error, tilt, diverged = map(np.asarray, jax.jit(fly, static_argnums=0)(acting))
+        crashed = (error > config.scenario.termination_distance).any(axis=0) | (diverged > 0).any(axis=0)
+        late = round(SETTLED / env.dt)
+        rmse = np.sqrt((error[late:, ~crashed] ** 2).mean(axis=0))
+        rows.append(
+            {
+                "follower": name,
+                "rigs": len(fit),
+                "crashes": int(crashed.sum()),
+                "rmse": float(np.median(rmse)),
+                "rmse, worst of 99 %": float(np.percentile(rmse, 99)),
+                "tilt rms": float(np.median(np.sqrt((tilt[late:, ~crashed] ** 2).mean(axis=0)))),
+                "largest tilt": float(np.median(tilt[:, ~crashed].max(axis=0))),
+            }
+        )
+    return rows
+
+
+def main() -> None:
+    """Fly, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--stand", type=Path, default=shipped_policy("stand"), metavar="POLICY.npz")
+    parser.add_argument("--flight", type=Path, default=shipped_policy("flight"), metavar="POLICY.npz")
+    parser.add_argument("--starts", type=int, default=100)
+    parser.add_argument("--rigs", type=int, default=1000)
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    options = parser.parse_args()
+    enable_compilation_cache()
+    found = {"stand": stand(options.stand, options.starts), "flight": flight(options.flight, options.rigs)}
+    for part, rows in found.items():
+        for row in rows:
+            shown = (
+                f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()
+            )
+            print(f"{part}: " + ", ".join(shown))
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
