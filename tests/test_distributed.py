@@ -125,6 +125,38 @@ def test_devices_are_arranged_by_members_first(members, devices, together, expec
     assert grid(members, devices, split=together) == expected
 
 
+TRACE = """
+import sys, jax
+from mjxball.config import preset
+jax.distributed.initialize(sys.argv[1], 2, int(sys.argv[2]))
+from mjxball.env import CoupledPairEnv
+env = CoupledPairEnv(preset("transport"), "mjx")
+state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+jax.jit(env.step).lower(state, jax.ShapeDtypeStruct((3,), "float32"))
+print("traced by", jax.process_index())
+"""
+
+
+def test_every_process_can_trace_mjx() -> None:
+    """MJX's own choice of a device is the first of all processes, whose arrays no other process may use."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1:{free.getsockname()[1]}"
+    children = [
+        subprocess.Popen(
+            [sys.executable, "-c", TRACE, place, str(process)],
+            cwd=REPOSITORY,
+            env={**os.environ, "JAX_PLATFORMS": "cpu"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        for process in range(2)
+    ]
+    for process, output in enumerate(finish(children)):
+        assert f"traced by {process}" in output, output
+
+
 @pytest.mark.parametrize(
     ("meeting", "word"),
     [
