@@ -130,6 +130,18 @@ def test_a_policy_for_crazyflies_flies_its_own_plant(name: str, tmp_path: Path) 
     assert all(cell["max_tilt"] < 0.3 and not cell["failed"] for cell in cells)
 
 
+def test_baselines_beside_a_policy_for_crazyflies_fly_its_plant(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = next(path for path in shipped_policies() if path.stem == "flight")
+    out = tmp_path / "cells.json"
+    assert call(main, [path, "--followers", "copy", *FAST, "--seconds", 3, "--json", out]) == 0
+    assert [(cell["follower"], cell["mass"]) for cell in cells_of(out)] == [("copy", 0.0175), ("flight", 0.0175)]
+    capsys.readouterr()
+    assert call(main, [path, "--followers", "adaptive"]) == 2
+    assert "this plant is another" in capsys.readouterr().err
+
+
 def test_families_refuse_a_policy_for_crazyflies(capsys: pytest.CaptureFixture[str]) -> None:
     path = next(path for path in shipped_policies() if path.stem == "flight")
     assert call(main, [path, "--families", "gusts"]) == 2

@@ -10,6 +10,7 @@ import pytest
 
 from mjxball import cli
 from mjxball.commands import evaluate, train
+from mjxball.commands.scenarios import scenarios_of, setup_of
 from mjxball.config import Config, preset, validate
 from mjxball.control import crazyflie, rotations
 from mjxball.control.constants import plant_constants
@@ -192,10 +193,10 @@ class TestPlantFile:
 
     def test_eval_takes_it(self, tmp_path: Path) -> None:
         options = evaluate.parser().parse_args(["--followers", "copy", "--plant", str(self.write(tmp_path))])
-        setup = evaluate._setup(options)
+        setup = setup_of(options)
         assert setup.preset == "flight"
         assert setup.plant.rotor_lag == SOME.lag
-        assert {scenario.mass for scenario in evaluate._scenarios(options, setup)} == {PAIR.plant.object_mass}
+        assert {scenario.mass for scenario in scenarios_of(options, setup)} == {PAIR.plant.object_mass}
 
     def test_figures_do_not(self, tmp_path: Path, capsys) -> None:
         assert evaluate.main(["--figures", "all", "--plant", str(self.write(tmp_path))]) == 2

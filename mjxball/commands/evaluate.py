@@ -9,19 +9,17 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from mjxball import cli, config
 from mjxball.commands.flight_log import evaluate_log
+from mjxball.commands.scenarios import SCENARIO_FLAGS, home_scenarios, scenarios_of, setup_of
 from mjxball.control.followers import BASELINES, LAWS, Baseline, Follower, make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate import families
 from mjxball.evaluate.cells import (
     REFERENCE,
-    STANDARD,
     Cell,
     check_bounds,
-    cross,
     load_policy,
     run_cells,
     standard_scenarios,
@@ -31,24 +29,12 @@ from mjxball.evaluate.judging import judge_families, scores_of, write_judgement
 from mjxball.evaluate.paper import command as paper
 from mjxball.evaluate.report import to_json, write_report
 from mjxball.evaluate.table import table
-from mjxball.evaluate.waveform import read_waveform
 from mjxball.physics.stepper import ENGINES
 from mjxball.policy import Policy, PolicyFileError
 from mjxball.policy.shipped import shipped_policies, stand_policies
-from mjxball.scenario import Scenario, check_scenario
+from mjxball.scenario import Scenario
 from mjxball.train.provenance import versions
 
-SCENARIO_FLAGS = (
-    "omega",
-    "amplitude",
-    "mass",
-    "believed_mass",
-    "goal",
-    "seconds",
-    "waveform",
-    "mass_change",
-    "rolling",
-)
 # What the paper's figures settle themselves.
 NOT_WITH_FIGURES = ("families", "seeds", "check", "followers", "json", "wn_pitch", "plant", *SCENARIO_FLAGS)
 
@@ -124,11 +110,9 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         return 0
     if options.figures is not None:
         return _figures(options, arguments)
-    setup = _setup(options)
+    setup = setup_of(options)
     chosen = _families(options)
-    scenarios = _scenarios(options, setup)
-    for scenario in scenarios:
-        check_scenario(setup, scenario)
+    scenarios = scenarios_of(options, setup)
     if options.out:
         cli.output_directory(options.out)
     if options.json:
@@ -146,9 +130,9 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         if asked:
             raise InputError(f"families fly the paper's plant, and {homes[0][1][0]} was made for two Crazyflies")
         homes = []
-    # Only what was made for Crazyflies: then nothing flies on the paper's plant.
-    groups = [] if homes and not here and not named else [Group(setup, scenarios, named, here, asked)]
-    groups += [Group(home, _home_scenarios(options, home), named or ["copy"], there, True) for home, there in homes]
+    # Only policies for Crazyflies: then the baselines beside them fly their plant, and nothing the paper's.
+    groups = [] if homes and not here else [Group(setup, scenarios, named, here, asked)]
+    groups += [Group(home, home_scenarios(options, home), named or ["copy"], there, True) for home, there in homes]
     command = shlex.join(["python", "eval.py", *arguments])
     if chosen:
         return _judge(groups[0], chosen, options, command)
@@ -221,30 +205,6 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
     return code
 
 
-def _home_scenarios(options: argparse.Namespace, home: config.Config) -> Sequence[Scenario]:
-    """The standard scenarios of a Crazyflies' plant, the last one changed as the flags say."""
-    standard = standard_scenarios(home)
-    if not any(getattr(options, name) is not None for name in SCENARIO_FLAGS):
-        return standard if not (options.policies or options.followers) else standard[-1:]
-    reference = standard[-1]
-    if options.waveform or options.rolling is not None:
-        raise InputError("--waveform and --rolling are for the paper's plant; a rig's motion stands in its card")
-    common: dict[str, Any] = {"ball_start": reference.ball_start, "start_tilt": reference.start_tilt}
-    made = cross(
-        options.omega or [reference.omega],
-        options.amplitude or [reference.amplitude],
-        options.mass or [reference.mass],
-        believed_mass=options.believed_mass,
-        goal=tuple(options.goal or reference.goal),
-        seconds=reference.seconds if options.seconds is None else options.seconds,
-        mass_changes=tuple(map(_mass_change, options.mass_change or [])),
-        **common,
-    )
-    for scenario in made:
-        check_scenario(home, scenario)
-    return made
-
-
 def _flight(options: argparse.Namespace) -> int:
     """Draw a flight log; what was flown is the log's, so that no other flag but --out goes with it."""
     given = [name for name in ("figures", *NOT_WITH_FIGURES) if getattr(options, name) not in (None, False, [])]
@@ -273,57 +233,6 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     paper.write_figures(options.out, figures, policies, shlex.join(["python", "eval.py", *arguments]), versions())
     print(f"the figures are in {options.out / paper.PAGE}")  # noqa: T201
     return 0
-
-
-def _setup(options: argparse.Namespace) -> config.Config:
-    measured = cli.read_plant(options.plant).preset if options.plant else None
-    setup = cli.apply_plant(config.preset(measured or "paper"), options.plant)
-    if options.wn_pitch is not None:
-        roll, _, yaw = setup.attitude.natural_frequency
-        setup = config.replace(setup, "attitude.natural_frequency", (roll, options.wn_pitch, yaw))
-    _refuse_two_motions(options)
-    if options.waveform:
-        times, offsets = read_waveform(options.waveform)
-        setup = dataclasses.replace(setup, motion=config.Motion(kind="waveform", times=times, offsets=offsets))
-    if options.rolling is not None:
-        setup = dataclasses.replace(setup, motion=config.Motion(kind="rolling"))
-    return config.validate(setup)
-
-
-def _refuse_two_motions(options: argparse.Namespace) -> None:
-    """The CG moves in one way: as a waveform, as a rolling ball, or as a sine of some speed and amplitude."""
-    ways = {"waveform": "waveform", "rolling": "rolling", "omega": "sine", "amplitude": "sine"}
-    given = {name: way for name, way in ways.items() if getattr(options, name) is not None}
-    if len(set(given.values())) > 1:
-        first, *others = given
-        second = next(name for name in others if given[name] != given[first])
-        raise InputError(f"--{first} and --{second} exclude each other: the CG moves in one way")
-
-
-def _scenarios(options: argparse.Namespace, setup: config.Config) -> Sequence[Scenario]:
-    given = any(getattr(options, name) is not None for name in SCENARIO_FLAGS)
-    if options.plant and not given:
-        return standard_scenarios(setup)
-    if not (given or options.policies or options.followers):
-        return STANDARD
-    return cross(
-        options.omega or [REFERENCE.omega],
-        options.amplitude or [REFERENCE.amplitude],
-        options.mass or [REFERENCE.mass],
-        believed_mass=options.believed_mass,
-        goal=tuple(options.goal or REFERENCE.goal),
-        seconds=REFERENCE.seconds if options.seconds is None else options.seconds,
-        mass_changes=tuple(map(_mass_change, options.mass_change or [])),
-        ball_start=options.rolling or 0.0,
-    )
-
-
-def _mass_change(text: str) -> tuple[float, float]:
-    try:
-        time, mass = map(float, text.split(":"))
-    except ValueError:
-        raise InputError(f"--mass-change takes TIME:KG, for example 10:0.2, not {text!r}") from None
-    return time, mass
 
 
 def _load(

@@ -84,6 +84,21 @@ PAIR = Config(
 )
 
 
+SAC = Sac(
+    steps=3_072_000,
+    worlds=512,
+    batch=512,
+    updates=16,
+    replay=512_000,
+    policy_layers=(128, 128),
+    critic_layers=(128, 128),
+    privileged=True,
+    return_steps=15,
+    learning_rate=2e-3,
+    learning_rate_end=0.02,
+)
+
+
 def stand() -> Config:
     """The paper's experiment: roll and height free, pitch locked, a rolling ball, the paper's gains and thrust law."""
     return replace(
@@ -120,20 +135,7 @@ def stand() -> Config:
         ),
         reward=Reward(error_scale=0.05, velocity=2.0, tilt=5.0, rates=0.2, ball=10.0, termination=200.0),
         bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.05),
-        sac=Sac(
-            steps=3_072_000,
-            worlds=512,
-            batch=512,
-            updates=16,
-            replay=512_000,
-            policy_layers=(128, 128),
-            critic_layers=(128, 128),
-            privileged=True,
-            discount=0.99,
-            return_steps=15,
-            learning_rate=2e-3,
-            learning_rate_end=0.02,
-        ),
+        sac=replace(SAC, discount=0.99),
     )
 
 
@@ -163,18 +165,5 @@ def flight() -> Config:
         ),
         reward=Reward(error_scale=0.02, velocity=8.0),
         bounds=Bounds(x_peak=0.05, settling_time=5.0, rmse=0.25),
-        sac=Sac(
-            steps=3_072_000,
-            worlds=512,
-            batch=512,
-            updates=16,
-            replay=512_000,
-            policy_layers=(128, 128),
-            critic_layers=(128, 128),
-            privileged=True,
-            discount=0.985,
-            return_steps=15,
-            learning_rate=2e-3,
-            learning_rate_end=0.02,
-        ),
+        sac=replace(SAC, discount=0.985),
     )

@@ -98,5 +98,5 @@ def _bode(place: Any, config: Config, gains: dict[str, Gains], worst: Design) ->
         place.plot(angle, 20 * np.log10(np.abs(value)), color=COLOURS[name], label=name)
     place.plot([-180], [0], "k+", ms=12, mew=2)
     place.set(xlim=(-280, -80), ylim=(-40, 40), xlabel="phase [degrees]", ylabel="loop gain [dB]")
-    place.set_title("Loop gain against phase; the cross is the point of instability")
+    place.set_title("Loop gain against phase; cross: instability")
     place.legend(loc="upper left")

@@ -1,0 +1,101 @@
+"""What `eval.py` flies: the plant and the scenarios that its flags ask for."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from mjxball import cli, config
+from mjxball.errors import InputError
+from mjxball.evaluate.cells import REFERENCE, STANDARD, cross, standard_scenarios
+from mjxball.evaluate.waveform import read_waveform
+from mjxball.scenario import Scenario, check_scenario
+
+SCENARIO_FLAGS = (
+    "omega",
+    "amplitude",
+    "mass",
+    "believed_mass",
+    "goal",
+    "seconds",
+    "waveform",
+    "mass_change",
+    "rolling",
+)
+
+
+def setup_of(options: argparse.Namespace) -> config.Config:
+    """The paper's plant and laws, or those of `--plant`, with the motion of the CG that is asked for."""
+    measured = cli.read_plant(options.plant).preset if options.plant else None
+    setup = cli.apply_plant(config.preset(measured or "paper"), options.plant)
+    if options.wn_pitch is not None:
+        roll, _, yaw = setup.attitude.natural_frequency
+        setup = config.replace(setup, "attitude.natural_frequency", (roll, options.wn_pitch, yaw))
+    _refuse_two_motions(options)
+    if options.waveform:
+        times, offsets = read_waveform(options.waveform)
+        setup = dataclasses.replace(setup, motion=config.Motion(kind="waveform", times=times, offsets=offsets))
+    if options.rolling is not None:
+        setup = dataclasses.replace(setup, motion=config.Motion(kind="rolling"))
+    return config.validate(setup)
+
+
+def _refuse_two_motions(options: argparse.Namespace) -> None:
+    """The CG moves in one way: as a waveform, as a rolling ball, or as a sine of some speed and amplitude."""
+    ways = {"waveform": "waveform", "rolling": "rolling", "omega": "sine", "amplitude": "sine"}
+    given = {name: way for name, way in ways.items() if getattr(options, name) is not None}
+    if len(set(given.values())) > 1:
+        first, *others = given
+        second = next(name for name in others if given[name] != given[first])
+        raise InputError(f"--{first} and --{second} exclude each other: the CG moves in one way")
+
+
+def scenarios_of(options: argparse.Namespace, setup: config.Config) -> Sequence[Scenario]:
+    """On the paper's plant, or on that of `--plant`."""
+    given = _given(options)
+    if options.plant and not given:
+        return standard_scenarios(setup)
+    if not (given or options.policies or options.followers):
+        return STANDARD
+    return _asked(options, setup, REFERENCE, ball_start=options.rolling or 0.0)
+
+
+def home_scenarios(options: argparse.Namespace, home: config.Config) -> Sequence[Scenario]:
+    """The standard scenarios of a Crazyflies' plant, or the last one changed as the flags say."""
+    standard = standard_scenarios(home)
+    if not _given(options):
+        return standard[-1:] if options.policies or options.followers else standard
+    if options.waveform or options.rolling is not None:
+        raise InputError("--waveform and --rolling are for the paper's plant; a rig's motion stands in its card")
+    return _asked(options, home, standard[-1], ball_start=standard[-1].ball_start)
+
+
+def _given(options: argparse.Namespace) -> bool:
+    return any(getattr(options, name) is not None for name in SCENARIO_FLAGS)
+
+
+def _asked(options: argparse.Namespace, setup: config.Config, reference: Scenario, **common: Any) -> Sequence[Scenario]:
+    """The cross product of the flags' lists; what no flag says is the reference's."""
+    made = cross(
+        options.omega or [reference.omega],
+        options.amplitude or [reference.amplitude],
+        options.mass or [reference.mass],
+        believed_mass=options.believed_mass,
+        goal=tuple(options.goal or reference.goal),
+        seconds=reference.seconds if options.seconds is None else options.seconds,
+        mass_changes=tuple(map(_mass_change, options.mass_change or [])),
+        **common,
+    )
+    for scenario in made:
+        check_scenario(setup, scenario)
+    return made
+
+
+def _mass_change(text: str) -> tuple[float, float]:
+    try:
+        time, mass = map(float, text.split(":"))
+    except ValueError:
+        raise InputError(f"--mass-change takes TIME:KG, for example 10:0.2, not {text!r}") from None
+    return time, mass
