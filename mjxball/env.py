@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball.config import Config, ball_reach
-from mjxball.control import observation, rotations
+from mjxball.control import crazyflie, observation, rotations
 from mjxball.control.constants import plant_constants, trim_reach
 from mjxball.control.recall import recall_of
 from mjxball.nuisance import Nuisances
@@ -221,7 +221,7 @@ class CoupledPairEnv(Env):
         moved = world._replace(
             plant=plant,
             nuisance=nuisance,
-            integral=world.integral + timing.control_period * self._wiring.leader_error(world.plant, world.goal)[0],
+            integral=self._wiring.integrated(world.integral, world.plant, world.goal, timing.control_period),
             memory=self._recall.next(world.memory, seen, action),
             action=action,
             steps=steps,
@@ -301,11 +301,17 @@ class CoupledPairEnv(Env):
         if self._varies:
             lag: Array = world.load.rotor_lag_scale
             parts += [lag[None], world.load.thrust_scale, world.load.added_inertia]
+        if world.plant.loops is not None:
+            kept = crazyflie.unpack(world.plant.loops).rate_integral
+            parts += [(kept / jnp.asarray(self.config.autopilot.rate_limits)).ravel()]
+        if self.config.motion.kind == "rolling":
+            parts += [world.plant.ball_rate[None]]
         return jnp.concatenate(parts)
 
     def _count_secrets(self) -> int:
         clean = observation.OBSERVATION_SIZE - 3 + 5 if self._nuisances.present else 0
-        return SECRETS + clean + (6 if self._varies else 0)
+        firmware, rolls = self.config.autopilot.kind == "crazyflie", self.config.motion.kind == "rolling"
+        return SECRETS + clean + 6 * self._varies + 6 * firmware + rolls
 
     def _follower_command(self, action: Array, seen: Array) -> Array:
         follower, law = self.config.follower, self.config.leader
@@ -329,6 +335,9 @@ class CoupledPairEnv(Env):
             euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
             weights = self.config.reward
             reward = task_reward(weights, error, plant.velocity, euler, plant.rates, action, last)
+            if weights.opposition:
+                idle = 1 if self.config.plant.cg_axis == "y" else 0
+                reward = reward - weights.opposition * (followed - led)[idle] ** 2
             if weights.ball:
                 reward = reward - weights.ball * (plant.ball_offset / self._ball_reach) ** 2
         return reward - jnp.where(ended, self.config.reward.termination, 0.0)

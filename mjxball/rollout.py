@@ -175,7 +175,7 @@ def fly(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str) -
         flown = (state.position, goal, euler, state.rotor_force, led, followed, diverged)
         yield Tick(number * period, *flown, state, seen, cg_offset(state, load))
         if number < count:
-            integral = integral + period * wiring.leader_error(state, goal)[0]
+            integral = wiring.integrated(integral, state, goal, period)
             acting = load if senses.pushes is None else load._replace(push=senses.pushes[number])
             moved = step(state, np.stack([led, followed], axis=1), acting)
             diverged = diverged | has_diverged(moved)

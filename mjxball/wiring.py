@@ -54,6 +54,12 @@ class Wiring:
             return goal - state.position, -state.velocity
         return self._own_error(state, goal)
 
+    def integrated(self, integral: Array, state: Body, goal: Array, period: float) -> Array:
+        """`integral` (..., 3) [m s] one `period` [s] on, in which its error was that at `state`."""
+        xp = goal.__array_namespace__()
+        band = xp.asarray(self._law.integral_band, dtype=goal.dtype)
+        return integral + period * xp.clip(self.leader_error(state, goal)[0], -band, band)
+
     def leader_command(self, state: Body, goal: Array, integral: Array) -> Array:
         """The leader's command (..., 3) at `state`; `integral` (..., 3) of its error so far [m s]."""
         xp, law = goal.__array_namespace__(), self._law

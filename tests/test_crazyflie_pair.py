@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -55,7 +57,7 @@ def still_load(worlds: int = 1) -> Load:
     return Load(mass, mass, zero, zero, zero, np.zeros((worlds, 0)), np.zeros((worlds, 0)))
 
 
-def flown(config: Config, command: tuple[float, float, float], seconds: float) -> PlantState:
+def flown(config: Config, command: Sequence[Any], seconds: float) -> PlantState:
     """The state after both drones were sent `command` from a hover at rest."""
     step, load = make_stepper(config, "newton-euler"), still_load()
     zero = np.zeros((1, 3))
@@ -80,7 +82,19 @@ class TestPair:
         state = flown(PAIR, (0.0, np.radians(8), 0.0), 1.5)
         assert euler_of(state)[1] == pytest.approx(8, abs=1)
         assert state.position[0, 0] > 0.3
-        assert abs(state.position[0, 1]) < 1e-6
+        assert abs(state.position[0, 1]) < 1e-3  # the two drones' outputs differ and are truncated to whole units
+
+    def test_integrals_of_two_drones_fight(self) -> None:
+        """Told pitches 3 degrees apart, two that integrate turn their motors ever further apart; one alone does not."""
+        apart = [[0.0, np.radians(1.5), 0.0], [0.0, np.radians(-1.5), 0.0]]
+
+        def spread(share: float, seconds: float) -> float:
+            autopilot = dataclasses.replace(PAIR.autopilot, follower_integrals=share)
+            return float(np.ptp(flown(dataclasses.replace(PAIR, autopilot=autopilot), apart, seconds).rotor_force))
+
+        assert spread(1.0, 10.0) > 1.2 * spread(1.0, 3.0) > 0.05  # of 0.09 N in hover
+        assert spread(0.0, 10.0) == pytest.approx(spread(0.0, 3.0), rel=0.1)
+        assert spread(0.0, 10.0) < 0.02
 
     def test_calibrated_thrust_climbs_as_asked(self) -> None:
         state = flown(PAIR, (0.0, 0.0, 1.0), 1.0)

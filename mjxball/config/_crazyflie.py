@@ -76,16 +76,25 @@ def autopilot(drone: str = "2.1") -> Autopilot:
 
 PAIR = Config(
     plant=rig(),
-    autopilot=autopilot(),
+    # Only the leader's firmware integrates: told different angles, two that do wind up against each other until motors
+    # are full and the pair sinks.
+    autopilot=replace(autopilot(), follower_integrals=0.0),
     timing=Timing(control_period=0.01, physics_steps=5, episode_steps=1500),
     # Stiff in height and with an integral term, so that the leader finds the thrust for its share of the weight: what
     # the two lift apart acts over half the stick, and beyond 4 % of hover no drone's rotors hold that about roll.
-    leader=Leader(kp=(1.0, 1.0, 4.0), kd=(1.6, 1.6, 3.5), ki=(0.1, 0.1, 2.0), tilt_limit=0.26, vertical_limit=3.0),
+    leader=Leader(
+        kp=(1.0, 1.0, 4.0),
+        kd=(1.6, 1.6, 3.5),
+        ki=(0.1, 0.1, 2.0),
+        integral_band=(0.05, 0.05, 1e3),
+        tilt_limit=0.26,
+        vertical_limit=3.0,
+    ),
 )
 
 
 SAC = Sac(
-    steps=3_072_000,
+    steps=2_560_000,
     worlds=512,
     batch=512,
     updates=16,
@@ -133,9 +142,11 @@ def stand() -> Config:
             inertia_scale=(0.6, 1.4),
             termination_distance=1.0,
         ),
-        reward=Reward(error_scale=0.05, velocity=2.0, tilt=5.0, rates=0.2, ball=10.0, termination=200.0),
+        reward=Reward(
+            error_scale=0.05, velocity=2.0, tilt=5.0, rates=0.2, ball=10.0, opposition=20.0, termination=200.0
+        ),
         bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.05),
-        sac=replace(SAC, discount=0.99),
+        sac=replace(SAC, discount=0.99, reward_scale=0.1),
     )
 
 
@@ -163,7 +174,8 @@ def flight() -> Config:
             cg_visits=0.3,
             termination_distance=1.5,
         ),
-        reward=Reward(error_scale=0.02, velocity=8.0),
+        # The leader's integral hides what the follower commands where no load turns the pair, until motors are full.
+        reward=Reward(error_scale=0.02, velocity=8.0, opposition=20.0),
         bounds=Bounds(x_peak=0.05, settling_time=5.0, rmse=0.25),
         sac=replace(SAC, discount=0.985),
     )

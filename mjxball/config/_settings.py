@@ -108,6 +108,9 @@ class Autopilot:
     yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0)
     attitude_limits: Vector3 = setting((20.0, 20.0, 360.0), "limits of the attitude integrals [deg s]", above=0)
     rate_limits: Vector3 = setting((33.3, 33.3, 166.7), "limits of the rate integrals [deg]", above=0)
+    follower_integrals: float = setting(
+        1.0, "factor on the follower's ki: two drones that integrate on one body work against each other", low=0, high=1
+    )
     motor_curve: Range = setting(
         (0.0915, 0.0677), "force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]", low=0
     )
@@ -126,6 +129,11 @@ class Leader:
     kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0)
     kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0)
     ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0)
+    integral_band: Vector3 = setting(
+        (1e3, 1e3, 1e3),
+        "largest error per axis that is integrated [m]: none winds up on the way to a far goal",
+        above=0,
+    )
     tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", above=0, high=1.2)
     vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", above=0)
     error: Literal["object", "own"] = setting(
@@ -222,6 +230,9 @@ class Reward:
     effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0)
     smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0)
     ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0)
+    opposition: float = setting(
+        0.0, "weight of the squared difference of both drones' tilt commands about the axis that no load turns", low=0
+    )
     termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0)
 
 

@@ -85,11 +85,13 @@ def setpoints(autopilot: Autopilot, command: Array, carried_mass: Array, gravity
     return xp.stack([xp.rad2deg(roll), -xp.rad2deg(pitch), xp.zeros_like(roll), thrust], axis=-1)
 
 
-def cascade(autopilot: Autopilot, loops: Array, setpoint: Array, euler: Array, rates: Array) -> tuple[Array, Array]:
+def cascade(
+    autopilot: Autopilot, loops: Array, setpoint: Array, euler: Array, rates: Array, integrals: Array | None = None
+) -> tuple[Array, Array]:
     """(loops (..., 13), motor commands (..., 4)) one tick of 2 ms on.
 
-    `setpoint` (..., 4) as from `setpoints`, `euler` (..., 3) [rad] and body `rates` (..., 3) [rad/s] as they are.
-    Without thrust the motors stop and the loops are reset.
+    `setpoint` (..., 4) as from `setpoints`, `euler` (..., 3) [rad] and body `rates` (..., 3) [rad/s] as they are;
+    `integrals` (..., 1), if given, a factor on every ki. Without thrust the motors stop and the loops are reset.
     """
     xp = euler.__array_namespace__()
     old, attitude, turning = unpack(loops), to_firmware(euler), to_firmware(rates)
@@ -102,8 +104,9 @@ def cascade(autopilot: Autopilot, loops: Array, setpoint: Array, euler: Array, r
     error = xp.concat([errors[..., :2], _wrapped(errors[..., 2:])], axis=-1)
     moved = attitude - old.attitude
     moved = xp.concat([moved[..., :2], _wrapped(moved[..., 2:])], axis=-1)
-    held, asked = _pid(outer, autopilot.attitude_limits, old.attitude_integral, error, moved)
-    kept, output = _pid(inner, autopilot.rate_limits, old.rate_integral, asked - turning, turning - old.rates)
+    held, asked = _pid(outer, autopilot.attitude_limits, old.attitude_integral, error, moved, integrals)
+    rated = asked - turning, turning - old.rates
+    kept, output = _pid(inner, autopilot.rate_limits, old.rate_integral, *rated, integrals)
     output = xp.trunc(xp.clip(output, -LARGEST, LARGEST))
     thrust = setpoint[..., 3]
     on = (thrust >= IDLE)[..., None]
@@ -111,6 +114,11 @@ def cascade(autopilot: Autopilot, loops: Array, setpoint: Array, euler: Array, r
     reset = start_loops(euler, rates)
     after = xp.concat([held, kept, attitude, turning, yaw], axis=-1)
     return xp.where(on, after, reset), xp.where(on, motors, xp.zeros_like(motors))
+
+
+def integral_shares(xp: Any, autopilot: Autopilot, dtype: Any) -> Array:
+    """Factors (2, 1) on ki of leader and follower."""
+    return xp.asarray([[1.0], [autopilot.follower_integrals]], dtype=dtype)
 
 
 def mix(thrust: Array, output: Array) -> Array:
@@ -135,12 +143,18 @@ def mix(thrust: Array, output: Array) -> Array:
 
 
 def _pid(
-    gains: tuple[Any, Any, Any], limits: tuple[float, float, float], integral: Array, error: Array, moved: Array
+    gains: tuple[Any, Any, Any],
+    limits: tuple[float, float, float],
+    integral: Array,
+    error: Array,
+    moved: Array,
+    share: Array | None,
 ) -> tuple[Array, Array]:
     """(integral, output) (..., 3) of three PIDs whose derivative is that of the measurement, which `moved` [deg]."""
     xp = error.__array_namespace__()
     kp, ki, kd = (xp.asarray(column, dtype=error.dtype) for column in zip(*gains, strict=True))
     bound = xp.asarray(limits, dtype=error.dtype)
+    ki = ki if share is None else ki * share
     integral = xp.clip(integral + PERIOD * error, -bound, bound)
     return integral, kp * error + ki * integral - kd / PERIOD * moved
 

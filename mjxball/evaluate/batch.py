@@ -123,7 +123,7 @@ class Batch:
         diverged = carry.diverged | rollout.has_diverged(moved)
         return Carry(
             plant=plant.each(functools.partial(rollout.keep, diverged), moved),
-            integral=carry.integral + period * self._wiring.leader_error(plant, goal)[0],
+            integral=self._wiring.integrated(carry.integral, plant, goal, period),
             follower=follower,
             senses=memory,
             diverged=diverged,

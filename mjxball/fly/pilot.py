@@ -38,5 +38,5 @@ class Pilot:
         """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
         seen = self._wiring.observe(state, goal)
         led = self._wiring.leader_command(state, goal, self._integral)
-        self._integral = self._integral + self.period * self._wiring.leader_error(state, goal)[0]
+        self._integral = self._wiring.integrated(self._integral, state, goal, self.period)
         return Commands(led, np.asarray(self.policy(seen), float), seen)

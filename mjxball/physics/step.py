@@ -142,8 +142,9 @@ def make_autopilot(config: Config) -> Autopilot:
         own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
         sent = crazyflie.setpoints(law, commands, own + share * load.believed_mass[..., None], gravity)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-        both = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
-        loops, motors = crazyflie.cascade(law, state.loops, sent, *both)
+        euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
+        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype)
+        loops, motors = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals)
         left = xp.maximum(1.0 - law.sag * state.time, xp.zeros_like(state.time))[..., None, None]
         return loops, left * crazyflie.motor_force(law.motor_curve, motors)
 
