@@ -92,6 +92,7 @@ class CoupledPairEnv(Env):
         self._object = constants.object_inertia_per_mass
         self._secrets = self._count_secrets() if config.sac.privileged else 0
         self._cg = make_cg_offset(config)
+        self._commanded = np.array(observation.commanded(config.follower.load_axis_only, config.plant.cg_axis))
 
     @property
     def observation_size(self) -> int:
@@ -193,7 +194,7 @@ class CoupledPairEnv(Env):
         """What the physics is given for one control period at the network's `action` (3,)."""
         world: World = state.pipeline_state
         sound = jnp.all(jnp.isfinite(action))
-        action = jnp.where(sound, action, jnp.zeros_like(action))
+        action = jnp.where(sound, action, jnp.zeros_like(action)) * self._commanded
         seen = state.obs[: observation.OBSERVATION_SIZE]
         led = self._wiring.leader_command(world.plant, world.goal, world.integral)
         followed = self._follower_command(action, seen)

@@ -155,7 +155,8 @@ def flight() -> Config:
     return replace(
         PAIR,
         preset="flight",
-        follower=Follower(tilt_limit=0.2, vertical_limit=3.0, filters=(0.05, 0.2, 1.0)),
+        # The leader's integral hides what the follower commands where no load turns the pair, until motors are full.
+        follower=Follower(load_axis_only=True, tilt_limit=0.2, vertical_limit=3.0, filters=(0.05, 0.2, 1.0)),
         scenario=Scenario(
             goal_reach=0.5,
             start_velocity=0.1,
@@ -174,8 +175,7 @@ def flight() -> Config:
             cg_visits=0.3,
             termination_distance=1.5,
         ),
-        # The leader's integral hides what the follower commands where no load turns the pair, until motors are full.
-        reward=Reward(error_scale=0.02, velocity=8.0, opposition=20.0),
+        reward=Reward(error_scale=0.02, velocity=8.0),
         bounds=Bounds(x_peak=0.05, settling_time=5.0, rmse=0.25),
         sac=replace(SAC, discount=0.985),
     )

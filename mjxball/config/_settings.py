@@ -150,6 +150,10 @@ class Follower:
     )
     tilt_limit: float = setting(0.2, "reach of the network's roll and pitch action [rad]", above=0, high=1.2)
     vertical_limit: float = setting(2.0, "reach of the network's vertical action [m/s2]", above=0)
+    load_axis_only: bool = setting(
+        False,
+        "of roll and pitch the network commands the one that the load turns; the other follows the PD law or is 0",
+    )
     error: Literal["object", "leader"] = setting(
         "object", "what the slots of the object's error carry: e_o, or the leader's e_l"
     )

@@ -61,6 +61,11 @@ def copy_command(
     return leader.command(acceleration, 0.0, gravity, tilt_limit, vertical_limit)
 
 
+def commanded(load_axis_only: bool, cg_axis: str) -> tuple[float, float, float]:
+    """1 for each action that a network commands, else 0: of roll and pitch perhaps only the one that the load turns."""
+    return (1.0, 1.0, 1.0) if not load_axis_only else (float(cg_axis == "y"), float(cg_axis == "x"), 1.0)
+
+
 def scale_action(scaled: Array, tilt_limit: float, vertical_limit: float) -> Array:
     """Network action in [-1, 1] (..., 3) -> (roll, pitch [rad], vertical acceleration [m/s2])."""
     xp = scaled.__array_namespace__()

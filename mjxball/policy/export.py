@@ -9,7 +9,7 @@ import numpy as np
 
 from mjxball import __version__
 from mjxball.config import Config, config_hash, to_dict
-from mjxball.control.observation import ACTION, OBSERVATION
+from mjxball.control.observation import ACTION, OBSERVATION, commanded
 from mjxball.control.recall import recall_of
 from mjxball.policy.file import FORMAT_VERSION, PolicyFile
 
@@ -50,9 +50,13 @@ def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any]
         **(origin or {}),
     }
     weights = [np.asarray(layers[name]["kernel"], np.float32) for name in names]
+    biases = [np.asarray(layers[name]["bias"], np.float32) for name in names]
+    # What the network does not command is 0, the mean of nothing; behind the means stand the deviations.
+    keep = np.append(commanded(follower.load_axis_only, config.plant.cg_axis), np.ones(len(ACTION))).astype(np.float32)
+    weights[-1], biases[-1] = weights[-1] * keep, biases[-1] * keep
     return PolicyFile(
         weights=(weights[0][:size], *weights[1:]),
-        biases=tuple(np.asarray(layers[name]["bias"], np.float32) for name in names),
+        biases=tuple(biases),
         observation_mean=np.asarray(learner.normaliser.mean, np.float32)[:size],
         observation_scale=(mask / deviation).astype(np.float32),
         action_scale=np.array([reach[0], reach[0], reach[1]], np.float32),
