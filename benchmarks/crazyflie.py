@@ -3,10 +3,11 @@
 `python benchmarks/crazyflie.py [--stand POLICY.npz] [--flight POLICY.npz] [--starts N] [--rigs N] [--json FILE]`
 
 - stand: flights of 60 s from random ball offsets, rolls and heights, undisturbed. The ball is kept if it never touches
-  an end stop; shares over all starts, beside a follower that copies.
+  an end stop; shares over all starts, of copy, adaptive, LQG and the policy.
 - flight: rigs drawn as the preset's training draws them (thrust of both and of each, motor lag, inertia, object mass,
   CG motion, noise, delay, gusts), of which those count whose weaker drone keeps 30 % of its thrust in hover. 20 s each;
-  a crash is |e_o| beyond d_term or a world that diverges. RMSE and tilt after 5 s, beside copying in the same worlds.
+  a crash is |e_o| beyond d_term or a world that diverges. RMSE and tilt after 5 s, of the same
+  followers in the same worlds. All see the same noise and delay; classical ones are told the nominal plant.
 """
 
 from __future__ import annotations
@@ -24,19 +25,21 @@ from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config, ball_reach, preset
 from mjxball.control import rotations
 from mjxball.control.constants import plant_constants
-from mjxball.control.followers import make_baseline
+from mjxball.control.followers import Follower, make_baseline
+from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.env import CoupledPairEnv
 from mjxball.evaluate.cells import load_policy
-from mjxball.policy.policy import NetworkLaw
+from mjxball.policy.policy import NetworkLaw, Policy
 from mjxball.policy.shipped import shipped_policy
-from mjxball.rollout import simulate_batch
+from mjxball.rollout import make_brief, simulate_batch
 from mjxball.scenario import Scenario
 
 MARGIN, SECONDS, SETTLED = 0.3, 20.0, 5.0
+CLASSICAL = ("copy", "adaptive", "lqg")
 
 
 def stand(path: Path, starts: int) -> list[dict[str, Any]]:
-    """Shares of flights that keep the ball, of copy and of the policy."""
+    """Shares of flights that keep the ball, of the classical followers and of the policy."""
     config, random = preset("stand"), np.random.default_rng(0)
     scenarios = [
         Scenario(
@@ -51,7 +54,7 @@ def stand(path: Path, starts: int) -> list[dict[str, Any]]:
         for _ in range(starts)
     ]
     rows = []
-    for follower in (make_baseline("copy", config), load_policy(path, config)):
+    for follower in (*(make_baseline(name, config) for name in CLASSICAL), load_policy(path, config)):
         flown = simulate_batch(config, [(follower, scenarios)], "newton-euler")
         ball = np.abs(flown.cg_offset) / config.plant.moving_fraction
         late = flown.time > 10
@@ -77,38 +80,60 @@ def margins(config: Config, load: Any) -> np.ndarray:
     return (1 - carried * config.plant.gravity / most).min(axis=1)
 
 
-def flight(path: Path, rigs: int) -> list[dict[str, Any]]:
-    """Crashes, RMSE and tilt over random rigs, of copy and of the policy in the same worlds."""
-    config = preset("flight")
-    env, law = CoupledPairEnv(config, "newton-euler"), NetworkLaw(load_policy(path, config))
-    starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(7), 3 * rigs))
+def fit_rigs(config: Config, env: CoupledPairEnv, rigs: int, seed: int = 7) -> Any:
+    """States of `rigs` random worlds at their start whose weaker drone keeps `MARGIN` of its thrust."""
+    starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(seed), 3 * rigs))
     fit = np.flatnonzero(margins(config, starts.pipeline_state.load) >= MARGIN)[:rigs]
-    starts = jax.tree.map(lambda leaf: leaf[fit], starts)
+    return jax.tree.map(lambda leaf: leaf[fit], starts)
 
-    def fly(acting: bool) -> Any:
-        def step(state: Any, _: Any) -> Any:
-            scaled = law.scaled(state.pipeline_state.memory, state.obs[:, :18])
-            state = jax.vmap(env.step)(state, scaled if acting else jnp.zeros_like(scaled))
-            plant = state.pipeline_state.plant
-            euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
-            tilt = jnp.sqrt((euler[:, :2] ** 2).sum(axis=-1))
-            return state, (state.metrics["error"], tilt, state.metrics["diverged"])
 
-        return jax.lax.scan(step, starts, None, length=round(SECONDS / env.dt))[1]
+def fly_rigs(env: CoupledPairEnv, starts: Any, follower: Follower) -> tuple[np.ndarray, ...]:
+    """e_o (T, n, 3) [m], tilt [rad] and divergence (T, n) of `follower` in the worlds that begin as `starts`."""
+    brief = jax.vmap(make_brief(env.config))
+    policy = isinstance(follower, Policy)
+    law = NetworkLaw(follower) if policy else follower.law
 
+    def step(carried: Any, _: Any) -> Any:
+        state, memory = carried
+        world, seen = state.pipeline_state, state.obs[:, :OBSERVATION_SIZE]
+        if policy:
+            state = jax.vmap(env.step)(state, law.scaled(world.memory, seen))
+        else:
+            memory, command = law.step(memory, seen, brief(world.plant, world.load))
+            state = jax.vmap(env.step_told)(state, command)
+        plant = state.pipeline_state.plant
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
+        tilt = jnp.sqrt((euler[:, :2] ** 2).sum(axis=-1))
+        return (state, memory), (world.goal - plant.position, tilt, state.metrics["diverged"])
+
+    def fly() -> Any:
+        memory = () if policy else law.start(starts.obs[:, :OBSERVATION_SIZE])
+        return jax.lax.scan(step, (starts, memory), None, length=round(SECONDS / env.dt))[1]
+
+    return tuple(map(np.asarray, jax.jit(fly)()))
+
+
+def flight(path: Path, rigs: int) -> list[dict[str, Any]]:
+    """Crashes, RMSE and tilt over random rigs, of every follower in the same worlds."""
+    config = preset("flight")
+    env = CoupledPairEnv(config, "newton-euler")
+    starts = fit_rigs(config, env, rigs)
     rows = []
-    for name, acting in (("copy", False), (law.name, True)):
-        error, tilt, diverged = map(np.asarray, jax.jit(fly, static_argnums=0)(acting))
+    for follower in (*(make_baseline(name, config) for name in CLASSICAL), load_policy(path, config)):
+        errors, tilt, diverged = fly_rigs(env, starts, follower)
+        error = np.linalg.norm(errors, axis=-1)
         crashed = (error > config.scenario.termination_distance).any(axis=0) | (diverged > 0).any(axis=0)
         late = round(SETTLED / env.dt)
         rmse = np.sqrt((error[late:, ~crashed] ** 2).mean(axis=0))
         rows.append(
             {
-                "follower": name,
-                "rigs": len(fit),
+                "follower": follower.name,
+                "rigs": len(crashed),
                 "crashes": int(crashed.sum()),
                 "rmse": float(np.median(rmse)),
                 "rmse, worst of 99 %": float(np.percentile(rmse, 99)),
+                "rmse along the stick": float(np.median(np.sqrt((errors[late:, ~crashed, 1] ** 2).mean(axis=0)))),
+                "rmse of height": float(np.median(np.sqrt((errors[late:, ~crashed, 2] ** 2).mean(axis=0)))),
                 "tilt rms": float(np.median(np.sqrt((tilt[late:, ~crashed] ** 2).mean(axis=0)))),
                 "largest tilt": float(np.median(tilt[:, ~crashed].max(axis=0))),
             }

@@ -186,7 +186,14 @@ class CoupledPairEnv(Env):
 
     def step(self, state: State, action: Array) -> State:
         """Apply the network's `action` (3,) in [-1, 1] for one control period."""
-        orders, load = self.command(state, action)
+        return self._obeyed(state, *self.command(state, action))
+
+    def step_told(self, state: State, followed: Array) -> State:
+        """`step` of a follower that is no network: its command `followed` (3,) is flown as it is."""
+        orders, load = self.command(state, jnp.zeros(observation.ACTION_SIZE))
+        return self._obeyed(state, orders._replace(followed=followed), load)
+
+    def _obeyed(self, state: State, orders: Orders, load: Load) -> State:
         plant = self._control_step(state.pipeline_state.plant, jnp.stack([orders.led, orders.followed]), load)
         return self.arrive(state, orders, plant)
 

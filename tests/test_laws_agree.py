@@ -40,9 +40,9 @@ BRIEF = Brief(random.uniform(0.1, 0.3, WORLDS), 0.01 * normal(), 0.01 * normal()
 FLIGHT = 0.1 * normal(4, 18)  # four observations in a row
 
 
-def flown(name: str) -> Callable[..., Any]:
-    """The commands (WORLDS, 4, 3) of a classical follower that is shown `FLIGHT`."""
-    law = make_law(name, preset("paper"))
+def flown(name: str, plant: str = "paper") -> Callable[..., Any]:
+    """The commands (WORLDS, 4, 3) of a classical follower of the preset `plant` that is shown `FLIGHT`."""
+    law = make_law(name, preset(plant))
 
     def commands(flight: Any, *brief: Any) -> Any:
         memory, given = law.start(flight[..., 0, :]), []
@@ -116,9 +116,21 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
         (ACTION, 3 * SEEN),
     ),
     **{f"baseline {name}": (flown(name), (FLIGHT, *BRIEF)) for name in FOLLOWERS},
+    **{
+        f"baseline {name} {plant}": (flown(name, plant), (FLIGHT, *BRIEF))
+        for name, plant in (("adaptive", "flight"), ("oracle", "flight"), ("lqg", "flight"), ("lqg", "stand"))
+    },
 }
 # Computed once in NumPy float64, from the config, not from arrays.
-NOT_LAWS = {"attitude.design_gains", "mixer.lever", "mixer.torque_reach", "crazyflie.unpack", "crazyflie.cascade"}
+NOT_LAWS = {
+    "attitude.design_gains",
+    "mixer.lever",
+    "mixer.torque_reach",
+    "crazyflie.unpack",
+    "crazyflie.cascade",
+    "crazyflie.integral_shares",
+    "observation.commanded",
+}
 each_law = pytest.mark.parametrize("name", LAWS)
 
 

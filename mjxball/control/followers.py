@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from mjxball.config import Config
-from mjxball.control.baselines import Adaptive, Copy, Lqg, Memoryless, Oracle, Random, Stay
+from mjxball.control.baselines import Adaptive, Copy, Lqg, Memoryless, Oracle, PairLqg, Random, Stay
 from mjxball.control.baselines.law import Brief, Law
 from mjxball.errors import InputError
 
@@ -61,7 +61,7 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "adaptive-mass": lambda config: Adaptive(config, adapts_mass=True),
     "oracle": Oracle,
     "memoryless": Memoryless,
-    "lqg": Lqg,
+    "lqg": lambda config: PairLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
 }
 
 

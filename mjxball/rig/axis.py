@@ -9,6 +9,7 @@ import numpy as np
 from mjxball.config import Config
 from mjxball.control import crazyflie, mixer
 from mjxball.control.constants import plant_constants
+from mjxball.control.hover import hover
 
 NAMES = ("roll", "pitch", "yaw")
 DRONE = np.array([1.66e-5, 1.66e-5, 2.93e-5])  # inertia for which the delivered gains were found good [kg m2]
@@ -29,15 +30,6 @@ def inertia_about_o(config: Config) -> np.ndarray:
     """Inertia (3,) of the assembly about O with the moving mass at O [kg m2]."""
     constants = plant_constants(config.plant, config.attitude)
     return np.diag(constants.drone_inertia) + config.plant.object_mass * constants.object_inertia_per_mass
-
-
-def hover(config: Config) -> tuple[float, float]:
-    """(motor command at hover, force of a motor per command there [N]), the mean of both drones."""
-    constants, curve = plant_constants(config.plant, config.attitude), config.autopilot.motor_curve
-    weight = (constants.drone_mass + constants.share * config.plant.object_mass) * config.plant.gravity
-    command = float(crazyflie.motor_command(curve, weight / 4).mean())
-    a, b = curve
-    return command, (2 * a * command / crazyflie.FULL + b) / crazyflie.FULL
 
 
 def axes(config: Config) -> tuple[Axis, ...]:

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from mjxball import cli, config
+from mjxball.control.hover import hover
 from mjxball.errors import InputError
 from mjxball.fly.preflight import read_gains
-from mjxball.rig.axis import hover, inertia_about_o
+from mjxball.rig.axis import inertia_about_o
 from mjxball.rig.fit import Found, identify
 from mjxball.rig.log import read_log
 from mjxball.rig.model import pair_mass

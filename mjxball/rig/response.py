@@ -9,7 +9,8 @@ import numpy as np
 
 from mjxball.config import Autopilot, Config
 from mjxball.control import crazyflie, mixer, rotations
-from mjxball.rig.axis import hover, inertia_about_o
+from mjxball.control.hover import hover
+from mjxball.rig.axis import inertia_about_o
 
 UPSET = 90.0  # attitude beyond which a case counts as diverged and is frozen [deg]
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mjxball.config import Config
-from mjxball.control.baselines.gains import copied_law, pitch_gains
+from mjxball.control.baselines.gains import CopiedPid, load_axis
 from mjxball.control.baselines.law import Brief
 from mjxball.control.leader import clip_command
-from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
+from mjxball.control.observation import ERROR, ERROR_RATE
 
 Array = Any
 BANDWIDTH = 6.0  # w_b [rad/s]; the loop limit-cycles from 16
 RATIO = 0.5  # r
 MOMENT_LIMIT, RATE_LIMIT = 0.15, 0.3  # [kg m], [kg m/s]
+PAIR_BANDWIDTH = 4.0  # of two Crazyflies; in the middle of 2 to 9 tried on random rigs; at 9 more crash [rad/s]
+PAIR_RATE = 4.0  # what their load may change in a second over the largest that one tilt limit holds [1/s]
 MASS_GAIN, MASS_SLOPE, MASS_LIMIT = 0.5, 0.35, 0.5  # Gamma, [1/s], [kg]
 CORRECTION_LIMIT = 0.5  # [rad] of pitch, with mass adaptation
 
@@ -21,8 +23,9 @@ CORRECTION_LIMIT = 0.5  # [rad] of pitch, with mass adaptation
 class Memory(NamedTuple):
     """What the adaptive follower carries from step to step."""
 
-    wanted: Array  # (...) last pitch command of the copied law [rad]
-    moment: Array  # (...) estimate of m_o c [kg m]
+    integral: Any  # (..., 3) see `CopiedPid`
+    wanted: Array  # (...) last command of the copied law about the load's axis [rad]
+    moment: Array  # (...) estimate of the load's moment about that axis over gravity, m_o c for pitch [kg m]
     rate: Array  # (...) estimate of its rate [kg m/s]
     extra_mass: Array  # (...) estimate of the object's mass beyond what is believed [kg]
     error: Array  # (...) height error of an ideal PD response [m]
@@ -36,49 +39,60 @@ class Adaptive:
     theta_d is the copied pitch command, lam = Kp / Kd of a drone's pitch loop, K = 2 Kd, G1 = K w_b / g^2,
     G2 = G1 w_b r / 2; theta_f = theta_d - (g + az) d / Kp. With `adapts_mass` the object's mass is estimated from
     the height against an ideal PD response, and its weight and the torque of carrying it alone are compensated.
+    With the CG along y the same of roll. A leader that integrates is copied with its integral, so that both lift alike;
+    what a Crazyflie's motors lift besides when they work apart is taken off.
     """
 
     needs_truth = False
 
     def __init__(self, config: Config, adapts_mass: bool = False):
         self.name = "adaptive-mass" if adapts_mass else "adaptive"
-        self._law = copied_law(config)
+        self._pid = CopiedPid(config)
+        self._limits = config.leader.tilt_limit, config.leader.vertical_limit
         self._height = (config.leader.kp[2], config.leader.kd[2])
-        self._gains = pitch_gains(config, self.name)
+        self._gains = gains = load_axis(config, self.name)
         self._adapts_mass = adapts_mass
+        self._bandwidth, self._reach = BANDWIDTH, (MOMENT_LIMIT, RATE_LIMIT)
+        if config.autopilot.kind == "crazyflie":
+            trimmed = gains.kp * config.leader.tilt_limit / gains.gravity
+            self._bandwidth, self._reach = PAIR_BANDWIDTH, (trimmed, PAIR_RATE * trimmed)
 
     def start(self, observation: Array) -> Memory:
         """See `Law.start`."""
         zero = observation.__array_namespace__().zeros_like(observation[..., 0])
-        return Memory(
-            zero, zero, zero, zero, observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2], zero
-        )
+        error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]
+        return Memory(self._pid.start(observation), zero, zero, zero, zero, error, error_rate, zero)
 
     def step(self, memory: Memory, observation: Array, brief: Brief) -> tuple[Memory, Array]:
         """See `Law.step`."""
         xp = observation.__array_namespace__()
         gains = self._gains
-        roll, wanted, vertical = (copy_command(observation, *self._law)[..., k] for k in range(3))
-        theta, rate = observation[..., 4], observation[..., 10]
+        integral, copied = self._pid.step(memory.integral, observation)
+        wanted, vertical = copied[..., gains.axis], copied[..., 2]
+        theta, rate = observation[..., 3 + gains.axis], observation[..., 9 + gains.axis]
         wanted_rate = memory.started * (wanted - memory.wanted) / gains.period
         s = (rate - wanted_rate) + gains.kp / gains.kd * (theta - wanted)
         lift = gains.gravity + vertical
-        first = 2.0 * gains.kd * BANDWIDTH / gains.gravity**2
-        second = first * BANDWIDTH * RATIO / 2.0
+        first = 2.0 * gains.kd * self._bandwidth / gains.gravity**2
+        second = first * self._bandwidth * RATIO / 2.0
         moment = memory.moment + gains.period * (memory.rate + first * lift * s)
-        moment = xp.clip(moment, -MOMENT_LIMIT, MOMENT_LIMIT)
-        moment_rate = xp.clip(memory.rate + gains.period * second * lift * s, -RATE_LIMIT, RATE_LIMIT)
+        moment = xp.clip(moment, -self._reach[0], self._reach[0])
+        moment_rate = xp.clip(memory.rate + gains.period * second * lift * s, -self._reach[1], self._reach[1])
         correction = -lift * moment / gains.kp
-        moved = memory._replace(wanted=wanted, moment=moment, rate=moment_rate, started=xp.ones_like(memory.started))
+        moved = memory._replace(
+            integral=integral, wanted=wanted, moment=moment, rate=moment_rate, started=xp.ones_like(memory.started)
+        )
         if self._adapts_mass:
             moved, more, push = self._mass(moved, observation, brief)
             vertical = vertical + push
             correction = xp.clip(correction + more, -CORRECTION_LIMIT, CORRECTION_LIMIT)
-        command = xp.stack([roll, wanted + correction, vertical], axis=-1)
-        return moved, clip_command(command, *self._law[3:])
+        tilts = [copied[..., 0], copied[..., 1]]
+        tilts[gains.axis] = wanted + correction
+        vertical = gains.unlifted(vertical, correction)
+        return moved, clip_command(xp.stack([*tilts, vertical], axis=-1), *self._limits)
 
     def _mass(self, memory: Memory, observation: Array, brief: Brief) -> tuple[Memory, Array, Array]:
-        """(memory, pitch [rad], vertical acceleration [m/s2]) that carry the estimated extra mass."""
+        """(memory, tilt [rad], vertical acceleration [m/s2]) that carry the estimated extra mass."""
         xp = observation.__array_namespace__()
         gains = self._gains
         carried = gains.drone_mass[1] + gains.share[1] * brief.believed_mass
@@ -93,4 +107,4 @@ class Adaptive:
             error=memory.error + gains.period * memory.error_rate,
             error_rate=memory.error_rate + gains.period * ideal,
         )
-        return moved, -gains.half_length * mass * gains.gravity / gains.kp, mass * gains.gravity / carried
+        return moved, -gains.sign * gains.half_length * mass * gains.gravity / gains.kp, mass * gains.gravity / carried

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control.baselines.gains import PitchGains, copied_law, pitch_gains
+from mjxball.control.baselines.gains import LoadAxis, copied_law, pitch_gains
 from mjxball.control.baselines.law import Brief
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 
@@ -137,7 +137,7 @@ class Lqg(Takeover):
         return Memory(estimate, torque, xp.ones_like(memory.started)), command
 
 
-def feedback(plant: PitchGains) -> Gains:
+def feedback(plant: LoadAxis) -> Gains:
     """LQR of both tilt axes, each with its closed attitude loop, and of the height."""
 
     def tilt(frequency: float, sign: float) -> tuple[float, ...]:
@@ -171,7 +171,7 @@ def lqr(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> tuple[flo
     return tuple(map(float, np.linalg.solve(r, b.T @ cost)[0]))
 
 
-def kalman(plant: PitchGains) -> Filter:
+def kalman(plant: LoadAxis) -> Filter:
     """The filter's matrices; its gain is the fixed point of the discrete Riccati recursion."""
     a = np.zeros((5, 5))
     a[0, 1] = a[2, 3] = 1.0
