@@ -23,6 +23,7 @@ from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.rehearse import Rehearsal
 from mjxball.fly.sortie import Crew, fly
+from mjxball.fly.spectator import Spectator
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
@@ -43,6 +44,14 @@ def make_parser() -> cli.Parser:
     parser.add_argument("--dry-run", action="store_true", help="connect, log, and send zeros only")
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
     parser.add_argument("--log", type=Path, metavar="FILE", help="write everything to this new file")
+    parser.add_argument(
+        "--view",
+        type=int,
+        nargs="?",
+        const=0,
+        metavar="PORT",
+        help="a live page of the log, for a browser on this machine (a free port)",
+    )
     parser.add_argument(
         "--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help="m from the start (0 0 0.4; a stand: 0 0 0.08)"
     )
@@ -79,6 +88,8 @@ def check_options(options: argparse.Namespace) -> None:
         raise InputError("--goal must be three numbers within 5 m")
     if options.log is not None and (options.log.exists() or not options.log.absolute().parent.is_dir()):
         raise InputError(f"log file {options.log} exists or its directory does not; choose another name")
+    if options.view is not None and (options.log is None or not 0 <= options.view <= 65535):
+        raise InputError("--view takes a port of 1 to 65535, or none, and shows what is logged: it needs --log FILE")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -102,6 +113,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if options.rehearse:
                 ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
                 uris = stack.enter_context(Rehearsal(options.policy, ports)).uris
+            if options.view is not None:
+                print(stack.enter_context(Spectator(options.log, options.view)).line, flush=True)  # noqa: T201
             return fly(uris, crew, settings, options.log, list(sys.argv if arguments is None else arguments))
 
     return run_command(command)

@@ -8,6 +8,7 @@ import webbrowser
 from pathlib import Path
 
 from mjxball.cli import Parser, make_parser, output_file, run_command
+from mjxball.errors import InputError
 from mjxball.policy.file import write_whole
 from mjxball.scenario import Scenario
 from mjxball.view.flight_file import save_flight
@@ -19,7 +20,7 @@ REFERENCE = Scenario()
 
 def parser() -> Parser:
     """The argument parser of `python -m mjxball.view`."""
-    about = "Play a flight in the browser: one HTML page that needs neither a server nor a network."
+    about = "Play a flight in the browser: one HTML page that needs neither a server nor a network; or watch one live."
     result = make_parser("python -m mjxball.view", about)
     result.add_argument(
         "source",
@@ -28,6 +29,12 @@ def parser() -> Parser:
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
     result.add_argument("--save", type=Path, metavar="FILE.npz", help="write the flight itself too")
+    live = result.add_argument_group("while it is flown")
+    live.add_argument(
+        "--live", action="store_true", help="follow a flight log that is being written, on a page of this machine alone"
+    )
+    live.add_argument("--port", type=int, default=None, metavar="PORT", help="of that page (a free one)")
+    live.add_argument("--attached", action="store_true", help=argparse.SUPPRESS)  # end when standard input does
     flown = result.add_argument_group("scenario of what is flown on the spot")
     flown.add_argument("--omega", type=float, default=REFERENCE.omega, help="CG speed [rad/s] (default %(default)s)")
     flown.add_argument("--amplitude", type=float, default=REFERENCE.amplitude, help="of the CG [m] (%(default)s)")
@@ -45,6 +52,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
+    if options.live:
+        return _follow(options)
+    if options.port is not None:
+        raise InputError("--port is the port of --live; any other page needs no server")
     for path, suffix in ((options.out, ".html"), (options.save, ".npz")):
         if path:
             output_file(path, suffix)
@@ -65,3 +76,16 @@ def _view(options: argparse.Namespace) -> int:
     if not options.out:
         webbrowser.open(page.as_uri())
     return 0
+
+
+def _follow(options: argparse.Namespace) -> int:
+    from mjxball.view.live import follow
+
+    if options.out or options.save:
+        raise InputError("--live writes no file; play the log with --out or --save once the flight has ended")
+    path, port = Path(options.source), options.port or 0
+    if not 0 <= port <= 65535:
+        raise InputError(f"--port must be 1 to 65535, not {port}")
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"directory {path.absolute().parent} of the log does not exist")
+    return follow(path, port, options.attached)

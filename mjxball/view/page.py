@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.config import Plant
 from mjxball.view.flight_file import Flight
 
 PARTS = Path(__file__).parent / "parts"
@@ -18,13 +19,22 @@ SCRIPTS = ("space.js", "scene.js", "plots.js", "player.js")
 
 def flight_page(flight: Flight) -> str:
     """The page's text; the flight is inside, as float32."""
-    script = "\n".join((PARTS / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    return _page(flight.title, _contents(flight), "recorded.js")
+
+
+def live_page(title: str, token: str) -> str:
+    """The page that asks its server for a flight while it is flown (`view/live.py`); `token` names the server."""
+    return _page(title, {"token": token}, "live.js")
+
+
+def _page(title: str, data: Any, start: str) -> str:
+    script = "\n".join((PARTS / name).read_text(encoding="utf-8") for name in (*SCRIPTS, start))
     return (
         (PARTS / "page.html")
         .read_text(encoding="utf-8")
-        .replace("{{title}}", html.escape(flight.title))
+        .replace("{{title}}", html.escape(title))
         .replace("{{style}}", (PARTS / "style.css").read_text(encoding="utf-8"))
-        .replace("{{data}}", _json(_contents(flight)))
+        .replace("{{data}}", _json(data))
         .replace("{{script}}", script)
     )
 
@@ -32,24 +42,28 @@ def flight_page(flight: Flight) -> str:
 def _contents(flight: Flight) -> dict[str, Any]:
     thrust = flight["rotor_force"].sum(axis=-1)
     shown = {**flight.arrays, "thrust": thrust, "error": flight["target"] - flight["position"]}
-    plant = flight.plant
     return {
         "title": flight.title,
         "rows": len(flight["time"]),
-        "arrays": {name: _packed(array) for name, array in shown.items() if name != "rotor_force"},
-        "plant": {
-            "size": plant.object_size,
-            "arm": plant.arm,
-            "mounts": [plant.leader_mount, plant.follower_mount],
-            "axis": "xy".index(plant.cg_axis),
-            "share": plant.moving_fraction,
-            "ball": plant.ball_radius,
-            "gravity": plant.gravity,
-        },
+        "arrays": {name: packed(array) for name, array in shown.items() if name != "rotor_force"},
+        "plant": plant_of(flight.plant),
     }
 
 
-def _packed(array: np.ndarray) -> str:
+def plant_of(plant: Plant) -> dict[str, Any]:
+    """What the scene draws of `plant`."""
+    return {
+        "size": plant.object_size,
+        "arm": plant.arm,
+        "mounts": [plant.leader_mount, plant.follower_mount],
+        "axis": "xy".index(plant.cg_axis),
+        "share": plant.moving_fraction,
+        "ball": plant.ball_radius,
+        "gravity": plant.gravity,
+    }
+
+
+def packed(array: np.ndarray) -> str:
     """Row after row as little-endian float32 in base64."""
     return base64.b64encode(np.ascontiguousarray(array, "<f4").tobytes()).decode("ascii")
 

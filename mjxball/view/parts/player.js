@@ -4,12 +4,28 @@ class Flight {
     this.rows = rows;
     this.plant = plant;
     this.arrays = {};
-    for (const [name, text] of Object.entries(arrays)) {
-      const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-      this.arrays[name] = new Float32Array(bytes.buffer);
-    }
+    for (const [name, text] of Object.entries(arrays)) this.arrays[name] = Flight.unpacked(text);
     this.time = this.arrays.time;
   }
+
+  static unpacked(text) {
+    return new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
+  }
+
+  // Rows that came later, packed alike.
+  grow({ rows, arrays }) {
+    for (const [name, text] of Object.entries(arrays)) {
+      const before = this.arrays[name], added = Flight.unpacked(text), all = new Float32Array(before.length + added.length);
+      all.set(before);
+      all.set(added, before.length);
+      this.arrays[name] = all;
+    }
+    this.rows += rows;
+    this.time = this.arrays.time;
+  }
+
+  // A flight that is being flown knows no CG, object mass or contact force.
+  has(name) { return name in this.arrays; }
 
   // Row `row` of the array `name`, flat.
   at(name, row) {
@@ -54,6 +70,9 @@ class Flight {
   }
 }
 
+// The array that each part of the scene is drawn from.
+const NEEDED = { thrust: 'thrust', contact: 'contact_force', weight: 'object_mass', path: 'position' };
+
 class Player {
   constructor(flight) {
     Object.assign(this, { flight, playing: false, now: flight.time[0] });
@@ -74,7 +93,14 @@ class Player {
   }
 
   makePlots() {
-    const { flight } = this, parent = document.getElementById('plots'), degrees = 180 / Math.PI;
+    const parent = document.getElementById('plots');
+    return this.recipes().map(({ title, unit, series }) =>
+      new Plot(parent, title, unit, this.flight.time, series, (time) => this.seek(time)));
+  }
+
+  // What is plotted of the arrays that the flight has.
+  recipes() {
+    const { flight } = this, degrees = 180 / Math.PI;
     const line = (name, colour, values, dash) => ({ name, colour, values, dash });
     const axes = ['#c92a2a', '#2b8a3e', '#1864ab'];
     const drones = [['leader', COLOURS.leader], ['follower', COLOURS.follower]];
@@ -82,17 +108,20 @@ class Player {
       line(name, colour, flight.column(`${name}_command`, index, factor), k ? [] : [5, 3]));
     const push = (drone) => Float32Array.from({ length: flight.rows }, (_, row) =>
       length(flight.at('contact_force', row).slice(3 * drone, 3 * drone + 3)));
-    const make = (title, unit, series) => new Plot(parent, title, unit, flight.time, series, (time) => this.seek(time));
-    return [
-      make('Error to the goal', 'm', ['x', 'y', 'z'].map((name, k) => line(name, axes[k], flight.column('error', k)))),
-      make('CG from the centre', 'cm', [line('offset', COLOURS.cg, flight.column('cg_offset', 0, 100))]),
-      make('Attitude', '°', ['roll', 'pitch', 'yaw'].map((name, k) => line(name, axes[k], flight.column('euler', k, degrees)))),
-      make('Commanded pitch', '°', command(1, degrees)),
-      make('Commanded roll', '°', command(0, degrees)),
-      make('Commanded vertical acceleration', 'm/s²', command(2, 1)),
-      make('Thrust', 'N', drones.map(([name, colour], k) => line(name, colour, flight.column('thrust', k)))),
-      make('Contact force on the object', 'N', drones.map(([name, colour], k) => line(name, colour, push(k)))),
-    ];
+    const of = (name) => drones.map(([drone, colour], k) => line(drone, colour, flight.column(name, k)));
+    const found = [];
+    const plot = (needed, title, unit, series) => { if (flight.has(needed)) found.push({ title, unit, series: series() }); };
+    plot('error', 'Error to the goal', 'm', () => ['x', 'y', 'z'].map((name, k) => line(name, axes[k], flight.column('error', k))));
+    plot('cg_offset', 'CG from the centre', 'cm', () => [line('offset', COLOURS.cg, flight.column('cg_offset', 0, 100))]);
+    plot('euler', 'Attitude', '°', () => ['roll', 'pitch', 'yaw'].map((name, k) => line(name, axes[k], flight.column('euler', k, degrees))));
+    plot('leader_command', 'Commanded pitch', '°', () => command(1, degrees));
+    plot('leader_command', 'Commanded roll', '°', () => command(0, degrees));
+    plot('leader_command', 'Commanded vertical acceleration', 'm/s²', () => command(2, 1));
+    plot('thrust', 'Thrust', 'N', () => of('thrust'));
+    plot('contact_force', 'Contact force on the object', 'N', () => drones.map(([name, colour], k) => line(name, colour, push(k))));
+    plot('battery', 'Battery', 'V', () => of('battery'));
+    plot('late', 'Lateness of the loop', 'ms', () => [line('late', COLOURS.weight, flight.column('late', 0, 1000))]);
+    return found;
   }
 
   makeToggles() {
@@ -100,6 +129,7 @@ class Player {
     const scaleOf = (kind) => `${short(0.1 / reach[kind])} N per 10 cm`;
     const labels = { thrust: `thrust, ${scaleOf('thrust')}`, contact: `contact forces, ${scaleOf('contact')}`, weight: 'object’s weight at the CG', path: 'path' };
     for (const [kind, text] of Object.entries(labels)) {
+      if (!this.flight.has(NEEDED[kind])) continue;
       const label = document.createElement('label');
       label.innerHTML = `<input type="checkbox" checked><i class="swatch" style="background:${COLOURS[kind]}"></i>${text}`;
       label.firstChild.id = `show-${kind}`;
@@ -171,16 +201,14 @@ class Player {
 
   draw() {
     const { flight, row } = this, euler = flight.at('euler', row);
-    const tilt = Math.hypot(euler[0], euler[1]) * 180 / Math.PI, cg = 100 * flight.at('cg_offset', row)[0];
+    const tilt = Math.hypot(euler[0], euler[1]) * 180 / Math.PI;
     const tell = (name, text) => { document.getElementById(`now-${name}`).textContent = text; };
     tell('time', `${flight.time[row].toFixed(2)} s`);
     tell('error', `${length(flight.at('error', row)).toFixed(3)} m`);
     tell('tilt', `${tilt.toFixed(1)}°`);
-    tell('cg', `${cg.toFixed(1).replace('-', '−')} cm`);
+    if (flight.has('cg_offset')) tell('cg', `${(100 * flight.at('cg_offset', row)[0]).toFixed(1).replace('-', '−')} cm`);
     this.span();
     this.scene.draw(row);
     this.plots.forEach((plot) => plot.draw(row));
   }
 }
-
-const player = new Player(new Flight(JSON.parse(document.getElementById('flight').textContent)));

@@ -39,6 +39,12 @@ class Plot {
     this.canvas.addEventListener('pointermove', move);
   }
 
+  // The same lines, longer.
+  grow(time, series) {
+    Object.assign(this, { time, series, size: '' });
+    this.range();
+  }
+
   range() {
     let low = Infinity, high = -Infinity;
     for (const { values } of this.series) for (const v of values) { low = Math.min(low, v); high = Math.max(high, v); }

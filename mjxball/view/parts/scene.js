@@ -15,13 +15,23 @@ class Scene {
     this.canvas = canvas;
     this.context = canvas.getContext('2d');
     this.flight = flight;
-    this.shown = { thrust: true, contact: true, weight: true, path: true };
-    const box = flight.bounds(), middle = times(0.5, add(box.low, box.high));
-    this.camera = new Camera(middle, 0.95 * length(sub(box.high, box.low)) + 0.85);
-    this.floor = Math.min(box.low[2] - 0.25, -0.25);
-    this.middle = middle;
-    // Arrows: this long [m] for the largest of its kind.
-    this.reach = { thrust: 0.3 / flight.largest('thrust'), contact: 0.4 / flight.largestContact() };
+    this.shown = { thrust: true, contact: flight.has('contact_force'), weight: flight.has('object_mass'), path: true };
+    this.camera = new Camera([0, 0, 0], 1);
+    this.fit();
+    // Arrows: this long [m] for the largest of its kind; of a flight that goes on, for the largest that there can be.
+    this.reach = {
+      thrust: 0.3 / (flight.plant.thrust || flight.largest('thrust')),
+      contact: flight.has('contact_force') ? 0.4 / flight.largestContact() : 0,
+    };
+  }
+
+  // Put the camera where all of the flight is seen, but leave how somebody has turned and zoomed.
+  fit() {
+    const { low, high } = this.flight.bounds(), { camera } = this, zoomed = camera.distance / camera.home.distance;
+    this.middle = times(0.5, add(low, high));
+    this.floor = Math.min(low[2] - 0.25, -0.25);
+    Object.assign(camera.home, { target: this.middle, distance: 0.95 * length(sub(high, low)) + 0.85 });
+    Object.assign(camera, { target: this.middle, distance: zoomed * camera.home.distance });
   }
 
   draw(row) {
@@ -46,7 +56,7 @@ class Scene {
     this.pair(row);
     this.paint();
     this.arrows(row);
-    this.centreOfGravity(row);
+    if (this.flight.has('cg_offset')) this.centreOfGravity(row);
     this.paint();
   }
 
@@ -185,12 +195,13 @@ class Scene {
 
   arrows(row) {
     const { flight } = this, place = flight.at('position', row), turn = flight.at('quaternion', row);
-    const thrust = flight.at('thrust', row), force = flight.at('contact_force', row);
+    const thrust = flight.at('thrust', row), force = this.shown.contact ? flight.at('contact_force', row) : [];
     flight.plant.mounts.forEach((mount, drone) => {
       const from = add(place, rotate(turn, mount));
       if (this.shown.thrust) this.arrow(from, rotate(turn, [0, 0, this.reach.thrust * thrust[drone]]), COLOURS.thrust);
+      if (!this.shown.contact) return;
       const push = times(this.reach.contact, force.slice(3 * drone, 3 * drone + 3));
-      if (this.shown.contact) this.arrow(from, rotate(turn, push), COLOURS.contact);
+      this.arrow(from, rotate(turn, push), COLOURS.contact);
     });
     if (!this.shown.weight) return;
     const weight = flight.plant.gravity * flight.at('object_mass', row)[0];

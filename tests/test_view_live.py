@@ -1,0 +1,300 @@
+"""The live view: a log that grows under an open page, one that is not there yet, one that is none; who may ask."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment
+from fly_policies import untrained
+from fly_virtual import World
+
+from mjxball import config as configs
+from mjxball.errors import InputError
+from mjxball.fly import card
+from mjxball.fly.contract import FlightSettings
+from mjxball.fly.journal import Journal
+from mjxball.fly.main import main as fly
+from mjxball.fly.recording import read_recording
+from mjxball.fly.spectator import Spectator
+from mjxball.fly.supervisor import State
+from mjxball.fly.twin.pairs import make_pair
+from mjxball.view.command import main
+from mjxball.view.feed import COLUMNS, STEP, Feed, columns
+from mjxball.view.live import Board, Server
+
+LIMIT = 20.0  # [s] that anything may take here on a busy machine
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
+    """The lines of a log of 2 s of free flight in virtual time, as the runner writes it."""
+    path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
+    config = card.config_of(contents.card)
+    header = {"policy": "nobody", "config": configs.to_dict(config), "gains": card.gains_of(config)}
+    with Journal(path, **header) as notes:
+        settings = FlightSettings(seconds=2.0, goal=(0.1, 0.0, 0.4))
+        world = World(settings, contents=contents, physics=make_pair(contents.card), notes=notes)
+        world.fly_until(State.DONE)
+        notes.note("end", code=0)
+    return path.read_bytes().splitlines(keepends=True)
+
+
+def read_all(path: Path) -> Feed:
+    with contextlib.closing(Feed(path)) as feed:
+        while feed.update():
+            pass
+    return feed
+
+
+def test_rows_are_the_recording(lines: list[bytes], tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(b"".join(lines))
+    feed, recording = read_all(path), read_recording(path)
+    shown = {name: values.reshape(len(feed.rows), -1) for name, values in columns(feed.rows).items()}
+    time = shown["time"][:, 0]
+    assert (feed.ended, feed.text, feed.mood) == (True, "the flight has ended, exit code 0: time up", "busy")
+    np.testing.assert_allclose(np.diff(time), STEP, atol=2e-3)
+    # A recording counts from where the motors turned, the view from the first tick.
+    first = [json.loads(line)["t"] for line in lines if b'"tick"' in line]
+    turned = first[-1] - first[0] - recording.time[-1]
+    rows = np.searchsorted(recording.time + turned, time[time > turned + 0.005] - 2e-3)
+    for name, wanted in (
+        ("position", recording.position),
+        ("quaternion", recording.quaternion),
+        ("target", recording.goal),
+        ("thrust", recording.rotor_force.sum(axis=-1)),
+        ("follower_command", np.nan_to_num(recording.follower)),
+    ):
+        np.testing.assert_allclose(shown[name][time > turned + 0.005], wanted[rows], atol=1e-6)  # float32
+
+
+def test_a_log_in_pieces_gives_the_same_rows(lines: list[bytes], tmp_path: Path) -> None:
+    """However a line is torn, it counts once it is whole; damaged ones in between do not count at all."""
+    whole, pieces = tmp_path / "whole.jsonl", tmp_path / "pieces.jsonl"
+    whole.write_bytes(b"".join(lines))
+    feed = Feed(pieces)
+    assert not feed.update()
+    assert feed.text == "waiting for pieces.jsonl"
+    damaged = [b"{torn\n", b"[]\n", b'{"t": 1, "kind": "tick"}\n', b'{"t": 1, "kind": "state", "drone": 7}\n', b"\n"]
+    text = b"".join([lines[0], *damaged, *lines[1:]])
+    with pieces.open("ab", buffering=0) as stream:
+        for start in range(0, len(text), 1777):
+            stream.write(text[start : start + 1777])
+            feed.update()
+            assert feed.mood == ("good" if feed.text in ("fly", "land: time up") else "busy")
+    assert feed.rows == read_all(whole).rows
+    assert feed.ended
+
+
+@pytest.mark.parametrize(
+    ("contents", "message"),
+    [
+        (b'{"t": 0.0, "kind": "tick"}\n', "does not begin with a header"),
+        (b'{"t": 0.0, "kind": "header", "config": {}}\n', "does not begin with a header"),
+        (b"PK\x03\x04\n\x00", "does not begin with a header"),
+        (b"x" * (3 << 20), "a line of more than 1 MiB"),
+    ],
+)
+def test_what_is_no_log_is_refused(contents: bytes, message: str, tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "log.jsonl").write_bytes(contents)
+    assert call(main, ["--live", tmp_path / "log.jsonl"]) == 2
+    errors = capsys.readouterr().err
+    assert_one_line(errors)
+    assert message in errors
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--live", "."], "is no file"),
+        (["--live", "nowhere/log.jsonl"], "does not exist"),
+        (["--live", "log.jsonl", "--port", "70000"], "--port must be"),
+        (["--live", "log.jsonl", "--out", "page.html"], "--live writes no file"),
+        (["log.jsonl", "--port", "8000"], "--port is the port of --live"),
+        (["--live", "log.jsonl", "--port", "TAKEN"], "cannot be had"),
+    ],
+)
+def test_refusals(arguments: list[str], message: str, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert call(main, [port if argument == "TAKEN" else argument for argument in arguments]) == 2
+    errors = capsys.readouterr().err
+    assert_one_line(errors)
+    assert message in errors
+
+
+@pytest.mark.parametrize("more", [["--view"], ["--view", "70000", "--log", "new.jsonl"]])
+def test_flying_with_a_view_needs_a_log_and_a_port(more: list[str], capsys: Any) -> None:
+    pytest.importorskip("cflib")
+    assert call(fly, [TRANSPORT, "--rehearse", *more]) == 2
+    assert "it needs --log FILE" in capsys.readouterr().err
+
+
+@pytest.fixture
+def server(lines: list[bytes], tmp_path: Path) -> Iterator[Server]:
+    """Serves a log that has ended."""
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(b"".join(lines))
+    board = Board(Feed(path))
+    while board.update():
+        pass
+    result = Server(0, board)
+    threading.Thread(target=result.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
+    yield result
+    result.shutdown()
+    result.server_close()
+
+
+def asked(server: Server, path: str, method: str = "GET", host: str | None = None) -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=LIMIT)
+    connection.request(method, path, headers={"Host": host} if host else {})
+    answer = connection.getresponse()
+    return answer.status, answer.read()
+
+
+def test_this_machine_alone_is_served(server: Server) -> None:
+    assert server.socket.getsockname()[0] == "127.0.0.1"
+    with socket.socket() as other:  # another of this machine's addresses: nobody listens
+        other.settimeout(LIMIT)
+        assert other.connect_ex(("127.0.0.2", server.server_port)) != 0
+    assert asked(server, "/")[0] == 200
+    for host in ("evil.example", f"evil.example:{server.server_port}", "127.0.0.1"):
+        assert asked(server, "/", host=host)[0] == 403
+
+
+def test_nothing_but_the_page_and_its_rows_is_served(server: Server) -> None:
+    rows = f"/rows?token={server.board.token}&after="
+    for path, code in (
+        ("/log.jsonl", 404),
+        ("/../../etc/passwd", 404),
+        ("/rows", 409),
+        ("/rows?token=guessed&after=0", 409),
+        (rows, 400),
+        (rows + "-1", 400),
+        (rows + "1e3", 400),
+        (rows + "9" * 30, 400),
+    ):
+        assert asked(server, path)[0] == code, path
+    assert asked(server, "/", "POST")[0] == 501
+    code, body = asked(server, rows + "3")
+    answer = json.loads(body)
+    assert (code, answer["ended"], answer["rows"]) == (200, True, answer["total"] - 3)
+    assert set(answer["arrays"]) == set(COLUMNS)
+    assert json.loads(asked(server, rows + "999999")[1])["rows"] == 0
+
+
+def started(path: Path) -> tuple[subprocess.Popen, str]:
+    """The command, and its page's address."""
+    command = [sys.executable, "-m", "mjxball.view", "--live", str(path)]
+    surroundings, pipe = {**environment(), "PYTHONPATH": str(REPOSITORY)}, subprocess.PIPE
+    process = subprocess.Popen(command, env=surroundings, text=True, stdout=pipe, stderr=pipe)
+    line = process.stdout.readline()
+    found = re.fullmatch(r"the live view is at (http://127\.0\.0\.1:\d+/), and waits for (.*)\n", line)
+    assert found, line + process.stderr.read()
+    assert found[2] == str(path)
+    return process, found[1]
+
+
+def test_a_page_follows_a_log(lines: list[bytes], browser: Any, tmp_path: Path) -> None:
+    """From before there is a log to its end; whoever looks back is left alone; Ctrl-C ends the command."""
+    path, errors, hosts = tmp_path / "log.jsonl", [], set()
+    process, address = started(path)
+    tab = browser.new_page(viewport={"width": 1280, "height": 800})
+    tab.set_default_timeout(1000 * LIMIT)
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("request", lambda request: hosts.add(re.sub(r"(?<=\w/).*", "", request.url)))
+
+    def shows(status: str) -> None:
+        tab.wait_for_function("text => document.getElementById('status').textContent.includes(text)", arg=status)
+
+    def newest(written: list[bytes]) -> float:
+        """What `player.now` should be."""
+        ticks = [json.loads(line)["t"] for line in written if b'"kind": "tick"' in line]
+        return ticks[-1] - ticks[0]
+
+    try:
+        tab.goto(address)
+        shows("waiting for log.jsonl")
+        with path.open("ab", buffering=0) as stream:
+            stream.write(lines[0])
+            shows("connecting and checking")
+            half = len(lines) // 2
+            stream.write(b"".join(lines[1:half]) + lines[half][:40])
+            tab.wait_for_function("time => player && player.now > time", arg=newest(lines[:half]) - 1.5 * STEP)
+            assert float(tab.inner_text("#now-time").split()[0]) <= newest(lines[:half]) + 0.005
+            shows("fly")
+            shows("nothing new for")
+            tab.evaluate("player.seek(0.5)")
+            stream.write(lines[half][40:] + b"".join(lines[half + 1 :]))
+        shows("the flight has ended, exit code 0: time up")
+        assert tab.inner_text("#now-time") == "0.48 s"
+        tab.click("#newest")
+        assert tab.evaluate("player.now") == pytest.approx(newest(lines), abs=1.5 * STEP)
+        assert {"Battery [V]", "Lateness of the loop [ms]"} <= set(tab.locator(".plot h2").all_inner_texts())
+        assert tab.locator("#now-cg").count() == 0  # nobody measures it
+        assert process.stdout.readline() == "the flight has ended, exit code 0: time up; Ctrl-C ends the view\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(LIMIT) == 0
+        assert process.stderr.read() == ""
+        assert errors == []
+        assert hosts <= {address, "data:,"}
+    finally:
+        tab.close()
+        process.kill()
+        process.communicate()
+
+
+def test_a_log_that_turns_out_to_be_none(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    process, _ = started(path)
+    path.write_text("nothing\n")
+    _, errors = process.communicate(timeout=LIMIT)
+    assert process.returncode == 2
+    assert_one_line(errors)
+    assert "does not begin with a header" in errors
+
+
+def test_a_flight_starts_and_ends_its_view(lines: list[bytes], tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    with Spectator(path) as spectator:
+        address = re.fullmatch(r"the live view is at (http://127\.0\.0\.1:(\d+)/), and waits for .*", spectator.line)
+        path.write_bytes(b"".join(lines))
+        with urllib.request.urlopen(address[1], timeout=LIMIT) as page:
+            assert page.status == 200
+        with pytest.raises(InputError, match="the port of --view"):
+            Spectator(path, int(address[2]))
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", int(address[2])), LIMIT)
+
+
+def test_a_feed_outlives_what_is_not_finite(lines: list[bytes], tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    ticks = [json.loads(line) for line in lines if b'"kind": "tick"' in line]
+    bad = {**ticks[-1], "t": ticks[-1]["t"] + 1, "goal": [float("nan")] * 3}
+    path.write_bytes(b"".join(lines[:-1]) + json.dumps(bad).encode() + b"\n")
+    before = len(read_all(path).rows)
+    path.write_bytes(b"".join(lines[:-1]))
+    assert len(read_all(path).rows) == before > 10
+
+
+def test_a_fault_is_told(lines: list[bytes], tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    fault = {"t": 1.0, "kind": "transition", "before": "fly", "after": "descend", "events": ["FENCE: leader left"]}
+    path.write_bytes(lines[0] + json.dumps(fault).encode() + b"\n")
+    feed = read_all(path)
+    assert (feed.text, feed.mood, feed.ended) == ("descend: fence: leader left", "bad", False)
