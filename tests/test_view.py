@@ -222,6 +222,18 @@ def test_it_plays_to_the_end_and_stops(browser: Any, page: Path):
     tab.close()
 
 
+def test_what_nobody_measured_is_not_shown(flight: Flight, browser: Any, tmp_path: Path):
+    """A flight log has no contact forces: neither they nor the weight, which has their scale, can be drawn."""
+    arrays = {**flight.arrays, "contact_force": np.zeros_like(flight["contact_force"])}
+    path = tmp_path / "log.html"
+    path.write_text(flight_page(dataclasses.replace(flight, arrays=arrays)), encoding="utf-8")
+    tab = opened(browser, path, 1000)
+    assert not tab.is_visible("#now-cg")
+    assert [box.get_attribute("id") for box in tab.locator("#shown input").all()] == ["show-thrust", "show-path"]
+    assert not any(title.startswith(("CG", "Contact")) for title in tab.locator(".plot h2").all_inner_texts())
+    tab.close()
+
+
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture):
     page, record = tmp_path / "page.html", tmp_path / "flight.npz"
     given = ["copy", "--seconds", 1, "--omega", 2, "--out", page, "--save", record]

@@ -14,6 +14,7 @@ from mjxball.config import Plant
 from mjxball.view.flight_file import Flight
 
 PARTS = Path(__file__).parent / "parts"
+UNMEASURED = ("cg_offset", "object_mass", "contact_force")  # in a flight log
 SCRIPTS = ("space.js", "scene.js", "plots.js", "player.js")
 
 
@@ -42,6 +43,8 @@ def _page(title: str, data: Any, start: str) -> str:
 def _contents(flight: Flight) -> dict[str, Any]:
     thrust = flight["rotor_force"].sum(axis=-1)
     shown = {**flight.arrays, "thrust": thrust, "error": flight["target"] - flight["position"]}
+    if not flight["contact_force"].any():  # whatever is carried pushes: these zeros stand for what nobody measured
+        shown = {name: array for name, array in shown.items() if name not in UNMEASURED}
     return {
         "title": flight.title,
         "rows": len(flight["time"]),

@@ -30,7 +30,8 @@ def flight_from(source: str, scenario: Scenario, physics: str) -> Flight:
 def read_log(path: Path) -> Flight:
     """The flight in a log of `mjxball.fly`, from where its motors first turned.
 
-    The CG, the object's mass and the contact forces are not in a log: they are shown as 0 and as the plant's mass.
+    The CG, the object's mass and the contact forces are not in a log: they are 0 and the plant's mass here, and no page
+    shows them.
     """
     from mjxball.fly.recording import read_recording
 

@@ -21,7 +21,7 @@ class Live {
     this.newest.textContent = 'now';
     this.newest.onclick = () => { if (player) { if (player.playing) player.toggle(); player.seek(Infinity); } };
     document.querySelector('.transport').append(this.newest);
-    document.getElementById('now-cg').parentElement.remove();
+    document.getElementById('now-cg').parentElement.hidden = true;
     document.getElementById('width').value = '20';
     this.ask();
   }

@@ -85,6 +85,7 @@ class Player {
     this.seeker.max = flight.rows - 1;
     this.plots = this.makePlots();
     this.makeToggles();
+    document.getElementById('now-cg').parentElement.hidden = !flight.has('cg_offset');
     this.play.onclick = () => this.toggle();
     this.seeker.oninput = () => this.seek(flight.time[+this.seeker.value]);
     this.listen();
