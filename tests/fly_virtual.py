@@ -101,8 +101,8 @@ class World:
         named = zip(NAMES, self.drones, strict=True)
         self.links = [VirtualLink(drone, lambda: self.now, name, self.notes) for name, drone in named]
         pilot = Pilot(policy)
-        for number in range(2):
-            for name, value in gains_of(pilot.config).items():
+        for number, gains in enumerate(gains_of(pilot.config)):
+            for name, value in gains.items():
                 self.pair.set_parameter(number, name, value)
         maps = command_maps(pilot.config) if contents else (CommandMap(carried_mass=MASS / 2),) * 2
         settings = settings or FlightSettings(seconds=2.0)

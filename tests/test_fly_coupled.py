@@ -11,7 +11,7 @@ from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
 from mjxball.control.constants import plant_constants
-from mjxball.control.firmware_gains import PARAMETERS, STOCK, gains_of, with_gains
+from mjxball.control.firmware_gains import PARAMETERS, STOCK, gains_of, pair_gains, with_gains
 from mjxball.fly.twin.body import PairState
 from mjxball.fly.twin.conditions import Conditions
 from mjxball.fly.twin.coupled import CoupledPair
@@ -26,8 +26,8 @@ PERIOD = 0.005  # the twin's
 def pair_of(config: Config, conditions: Conditions | None = None) -> CoupledPair:
     """A pair whose gains are those of the card."""
     pair = CoupledPair(config, conditions)
-    for drone in range(2):
-        for name, value in gains_of(config.autopilot).items():
+    for drone, gains in enumerate(pair_gains(config.autopilot)):
+        for name, value in gains.items():
             pair.set_parameter(drone, name, value)
     return pair
 
@@ -126,9 +126,12 @@ def test_uploaded_gains_matter() -> None:
 
 def test_each_drone_has_gains_of_its_own() -> None:
     config = configs.preset("flight")
-    one, other = pair_of(config), pair_of(config)
+    alike = configs.replace(config, "autopilot.follower_integrals", 1.0)
+    one, other = pair_of(alike), pair_of(alike)
+    assert one._alike
     other._alike = False  # the way that is taken once gains differ
     np.testing.assert_allclose(run(one, (4, 2, 5, 47000), 0.5).position, run(other, (4, 2, 5, 47000), 0.5).position)
+    assert not pair_of(config)._alike
     one.set_parameter(0, "pid_rate.roll_kp", 100.0)
     assert [law.roll_rate[0] for law in one._autopilots] == [100.0, config.autopilot.roll_rate[0]]
     one.set_parameter(0, "kalman.resetEstimation", 1.0)  # ignored

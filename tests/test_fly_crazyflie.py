@@ -117,7 +117,7 @@ def test_policies_of_other_plants_keep_their_defaults() -> None:
     contents = load_file(shipped_policy("transport"))
     config = card.config_of(contents.card)
     assert not card.is_crazyflie(config)
-    assert card.gains_of(config) == {}
+    assert card.gains_of(config) == ({}, {})
     assert card.command_maps(config)[0].carried_mass == pytest.approx(card.UNKNOWN_MASS / 2)
     assert isinstance(make_pair(contents.card), StandIn)
     broken = {**contents.card, "config": {**contents.card["config"], "autopilot": {"kind": "magic"}}}

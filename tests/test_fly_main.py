@@ -47,7 +47,19 @@ def test_refusals(arguments: list[object], reason: str, capsys: pytest.CaptureFi
     assert_one_line(errors)
 
 
-@pytest.mark.parametrize("text", ["[1]", "{", '{"a": 1}', '{"a.b": "x"}', '{"a.b": true}', '{"a.b": NaN}'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[1]",
+        "{",
+        '{"leader": {}}',
+        '{"leader": {}, "follower": 1}',
+        '{"a": 1}',
+        '{"a.b": "x"}',
+        '{"a.b": true}',
+        '{"a.b": NaN}',
+    ],
+)
 def test_gain_files_that_are_none(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "gains.json"
     path.write_text(text)
@@ -99,7 +111,8 @@ def started(name: str, place: Path) -> subprocess.Popen:
 def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Ended]:
     """Four flights, two at a time, each with a twin of its own: rehearsed with gains, dry, interrupted, terminated."""
     place = tmp_path_factory.mktemp("flights")
-    (place / "gains.json").write_text(json.dumps({"pid_attitude.roll_kp": 4.5, "pid_rate.roll_kd": 3.0}))
+    gains = {"pid_attitude.roll_kp": 4.5, "pid_rate.roll_kd": 3.0}
+    (place / "gains.json").write_text(json.dumps({"leader": gains, "follower": {**gains, "pid_rate.roll_ki": 0.0}}))
     ended = {}
     for names in (("rehearsed", "interrupted"), ("dry", "terminated")):
         running = {name: started(name, place) for name in names}
@@ -151,6 +164,7 @@ def test_a_rehearsal(flights: dict[str, Ended]) -> None:
     for drone in ("leader", "follower"):
         assert written[drone, "pid_attitude.roll_kp"] == 4.5
         assert written[drone, "pid_rate.roll_kd"] == 3.0
+    assert [drone for drone, name in written if name == "pid_rate.roll_ki"] == ["follower"]
     errors = [abs(value) for value in flight.ticks("fly")[-1]["observation"][12:15]]
     assert max(errors) < 0.1  # the pair has gone where it was sent
 

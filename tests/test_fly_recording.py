@@ -15,6 +15,7 @@ from fly_virtual import World
 from mjxball import config as configs
 from mjxball.commands import evaluate
 from mjxball.control import rotations
+from mjxball.control.firmware_gains import to_json
 from mjxball.errors import InputError
 from mjxball.fly import card
 from mjxball.fly.contract import FlightSettings
@@ -34,7 +35,11 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log of 4 s of free flight in virtual time, as the runner writes it."""
     path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
     config = card.config_of(contents.card)
-    header = {"policy": "nobody", "config": configs.to_dict(config), "gains": card.gains_of(config)}
+    header = {
+        "policy": "nobody",
+        "config": configs.to_dict(config),
+        "gains": to_json(card.gains_of(config)),
+    }
     with Journal(path, **header) as notes:
         settings = FlightSettings(seconds=4.0, goal=(0.1, 0.0, 0.4))
         world = World(settings, contents=contents, physics=make_pair(contents.card), notes=notes)

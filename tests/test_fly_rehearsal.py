@@ -47,9 +47,11 @@ def test_the_cards_gains_are_uploaded(flown: Path) -> None:
     written = {
         (record["drone"], record["name"]): record["value"] for record in read(flown) if record["kind"] == "parameter"
     }
-    for drone in ("leader", "follower"):
-        for name, value in card.gains_of(config).items():
+    for drone, gains in zip(("leader", "follower"), card.gains_of(config), strict=True):
+        for name, value in gains.items():
             assert written[drone, name] == pytest.approx(value, rel=1e-6)  # a float on the wire
+    assert written["leader", "pid_rate.roll_ki"] > 0
+    assert written["follower", "pid_rate.roll_ki"] == 0
 
 
 def test_it_flies_and_its_commands_simulated_do_the_same(flown: Path) -> None:

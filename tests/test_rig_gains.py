@@ -139,9 +139,11 @@ class TestCommand:
     def test_writes_what_the_runner_reads(self, tmp_path: Path, designs, capsys) -> None:
         out, picture = tmp_path / "gains.json", tmp_path / "gains.svg"
         assert command.main(["--out", str(out), "--picture", str(picture)]) == 0
-        read = read_gains(out)
-        assert read["pid_rate.roll_kp"] == designs[0].gains.rate[0]
-        assert len(read) == 18
+        leader, follower = read_gains(out)
+        assert leader["pid_rate.roll_kp"] == follower["pid_rate.roll_kp"] == designs[0].gains.rate[0]
+        assert leader["pid_rate.roll_ki"] == designs[0].gains.rate[1] > 0
+        assert {value for name, value in follower.items() if name.endswith("_ki")} == {0.0}
+        assert len(leader) == len(follower) == 18
         assert b"<svg" in picture.read_bytes()
         text = capsys.readouterr().out
         assert "unstable" in text
@@ -152,7 +154,7 @@ class TestCommand:
         plant.write_text(json.dumps({"plant.rotor_lag": 0.08}))
         assert command.main(["--plant", str(plant), "--out", str(out)]) == 0
         slow = design(apply_overrides(PAIR, {"plant.rotor_lag": 0.08}))
-        assert read_gains(out)["pid_rate.roll_kp"] == slow[0].gains.rate[0]
+        assert read_gains(out)[0]["pid_rate.roll_kp"] == slow[0].gains.rate[0]
 
     @pytest.mark.parametrize(
         ("text", "said"),

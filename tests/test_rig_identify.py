@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -17,12 +18,14 @@ from mjxball.control.constants import plant_constants
 from mjxball.errors import InputError
 from mjxball.fly import packets
 from mjxball.fly.journal import Journal
+from mjxball.fly.preflight import read_gains
 from mjxball.physics.engine import Load
 from mjxball.physics.step import start_state
 from mjxball.physics.stepper import make_stepper
 from mjxball.rig import identify as command
 from mjxball.rig.axis import inertia_about_o
 from mjxball.rig.fit import Found, identify
+from mjxball.rig.gains import parameter_file
 from mjxball.rig.log import make_log, read_log
 
 PAIR = preset("flight")
@@ -222,9 +225,24 @@ class TestCommand:
         assert "hovering takes" in capsys.readouterr().err
 
     def test_gains_that_were_flown(self) -> None:
-        changed = command.with_gains(PAIR, {"pid_rate.roll_kp": 500.0, "pid_attitude.yaw_ki": 0.5, "kalman.x": 1.0})
+        leader = {"pid_rate.roll_kp": 500.0, "pid_attitude.yaw_ki": 0.5, "kalman.x": 1.0}
+        changed = command.with_gains(PAIR, (leader, {"pid_rate.roll_kp": 500.0}))
         assert changed.autopilot.roll_rate == (500.0, *PAIR.autopilot.roll_rate[1:])
         assert changed.autopilot.yaw == (PAIR.autopilot.yaw[0], 0.5, PAIR.autopilot.yaw[2])
+        assert changed.autopilot.follower_integrals == 0.0
+
+    @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+    def test_a_gain_file_says_how_much_the_follower_integrates(self, tmp_path: Path, share: float) -> None:
+        law = dataclasses.replace(PAIR.autopilot, follower_integrals=share)
+        (tmp_path / "gains.json").write_text(parameter_file(law))
+        assert command.with_gains(PAIR, read_gains(tmp_path / "gains.json")).autopilot == law
+
+    @pytest.mark.parametrize(
+        "follower", [{"pid_rate.roll_kp": 500.0}, {"pid_rate.pitch_ki": 500.0}, {"pid_rate.yaw_ki": 1e9}]
+    )
+    def test_a_follower_with_other_gains_is_refused(self, follower: dict[str, float]) -> None:
+        with pytest.raises(InputError, match="identification takes a follower whose"):
+            command.with_gains(PAIR, ({}, follower))
 
     def test_precise_logs_count_more(self) -> None:
         vague = SOME._replace(lag=0.09, spread=(0.001, 0.01, 0.2, 0.001))

@@ -23,6 +23,7 @@ from fly_policies import untrained
 from fly_virtual import World
 
 from mjxball import config as configs
+from mjxball.control.firmware_gains import to_json
 from mjxball.errors import InputError
 from mjxball.fly import card
 from mjxball.fly.contract import FlightSettings
@@ -44,7 +45,11 @@ def lines(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     """The lines of a log of 2 s of free flight in virtual time, as the runner writes it."""
     path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
     config = card.config_of(contents.card)
-    header = {"policy": "nobody", "config": configs.to_dict(config), "gains": card.gains_of(config)}
+    header = {
+        "policy": "nobody",
+        "config": configs.to_dict(config),
+        "gains": to_json(card.gains_of(config)),
+    }
     with Journal(path, **header) as notes:
         settings = FlightSettings(seconds=2.0, goal=(0.1, 0.0, 0.4))
         world = World(settings, contents=contents, physics=make_pair(contents.card), notes=notes)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import firmware_gains
+from mjxball.control.firmware_gains import PairGains
 from mjxball.fly.command import LINEAR, CommandMap, ForceCurve
 from mjxball.fly.maneuver import Times
 from mjxball.fly.pair import Rig
@@ -39,11 +40,11 @@ def is_crazyflie(config: Config) -> bool:
     return config.autopilot.kind == "crazyflie"
 
 
-def gains_of(config: Config) -> dict[str, float]:
-    """Firmware parameters that make a drone's cascade the one that the policy was trained with; none for others."""
+def gains_of(config: Config) -> PairGains:
+    """Firmware parameters that make both cascades those that the policy was trained with; none for others."""
     if not is_crazyflie(config):
-        return {}
-    return firmware_gains.gains_of(config.autopilot)
+        return {}, {}
+    return firmware_gains.pair_gains(config.autopilot)
 
 
 def goal_of(config: Config) -> tuple[float, float, float]:

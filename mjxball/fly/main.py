@@ -56,7 +56,10 @@ def make_parser() -> cli.Parser:
         "--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help="m from the start (0 0 0.4; a stand: 0 0 0.08)"
     )
     parser.add_argument(
-        "--gains", type=Path, metavar="FILE", help="JSON of firmware parameters to write and read back (the card's)"
+        "--gains",
+        type=Path,
+        metavar="FILE",
+        help="JSON of firmware parameters to upload, for both drones or each (the card's)",
     )
     parser.add_argument("--thrust", choices=("calibrated", "paper"), help="law from az to thrust (the card's)")
     parser.add_argument("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")

@@ -7,13 +7,14 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from mjxball.control.firmware_gains import Gains, PairGains, read_pair_gains
 from mjxball.errors import InputError
 from mjxball.fly import limits, packets, pair
 from mjxball.fly.limits import Limits
@@ -42,20 +43,21 @@ class Check(NamedTuple):
     found: str
 
 
-def read_gains(path: Path) -> dict[str, float]:
-    """Parameters {"group.name": value} from a JSON file. Raises InputError."""
+def read_gains(path: Path) -> PairGains:
+    """Parameters of leader and follower from a JSON file, see `firmware_gains.read_pair_gains`. Raises InputError."""
     try:
-        gains = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"gain file {path} cannot be read: {error.strerror or error}") from None
     except ValueError:
         raise InputError(f"gain file {path} is not JSON") from None
-    sound = isinstance(gains, dict) and all(
-        name.count(".") == 1 and type(value) in (int, float) and math.isfinite(value) for name, value in gains.items()
-    )
-    if not sound:
-        raise InputError(f"gain file {path} must be one JSON object of parameter names with finite numbers")
-    return {name: float(value) for name, value in gains.items()}
+    try:
+        return read_pair_gains(data)
+    except ValueError:
+        raise InputError(
+            f"gain file {path} must be one JSON object of parameter names with finite numbers, or two of them, named "
+            "leader and follower"
+        ) from None
 
 
 def together(actions: Sequence[Callable[[], None]]) -> None:
@@ -77,16 +79,16 @@ def together(actions: Sequence[Callable[[], None]]) -> None:
         raise errors[0]
 
 
-def prepare(links: Sequence[Link], gains: Mapping[str, float], asked: Preflight) -> None:
-    """Open both links, write the gains, reset the estimators, start the states. Raises LinkError."""
+def prepare(links: Sequence[Link], gains: PairGains, asked: Preflight) -> None:
+    """Open both links, write each drone's gains, reset the estimators, start the states. Raises LinkError."""
 
-    def one(link: Link) -> None:
+    def one(link: Link, own: Gains) -> None:
         link.open()
-        link.write_parameters(gains)
+        link.write_parameters(own)
         reset_estimator(link, asked)
         link.start_states()
 
-    together([functools.partial(one, link) for link in links])
+    together([functools.partial(one, *each) for each in zip(links, gains, strict=True)])
 
 
 def reset_estimator(link: Link, asked: Preflight) -> None:

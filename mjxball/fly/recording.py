@@ -12,6 +12,7 @@ import numpy as np
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import crazyflie
+from mjxball.control.firmware_gains import PairGains, read_pair_gains
 from mjxball.errors import InputError
 from mjxball.fly import packets
 from mjxball.fly.card import command_maps
@@ -33,7 +34,7 @@ class Recording:
 
     policy: str
     config: Config
-    gains: dict[str, float]  # that were uploaded
+    gains: PairGains  # that were uploaded
     time: np.ndarray  # (T,) from 0 [s]
     phase: tuple[str, ...]  # (T,) the supervisor's state
     sent: np.ndarray  # (T, 2, 4) leader, follower: roll, pitch [deg], yaw rate [deg/s], thrust, wire's signs
@@ -96,14 +97,13 @@ def _recording(path: Path, header: Mapping[str, Any], config: Config, rows: Sequ
         raise InputError(f"flight log {path}: its ticks do not follow each other")
     seen = [row["seen"] for row in rows]
     position, velocity, quaternion, rates = (np.array(part, float) for part in zip(*seen, strict=True))
-    gains = {str(name): float(value) for name, value in header["gains"].items()}
     force = np.array(
         [[m.curve.force(s[3]) / 4 for m, s in zip(command_maps(config), row, strict=True)] for row in sent]
     )
     return Recording(
         policy=str(header["policy"])[:80],
         config=config,
-        gains=gains,
+        gains=read_pair_gains(header["gains"]),
         time=time,
         phase=tuple(str(row["state"]) for row in rows),
         sent=sent,
@@ -127,8 +127,8 @@ def fly_again(recording: Recording) -> Recording:
     are those of a rehearsal (`twin.coupled.Conditions.of`).
     """
     pair = pair_of(recording.config)
-    for drone in range(2):
-        for name, value in recording.gains.items():
+    for drone, gains in enumerate(recording.gains):
+        for name, value in gains.items():
             pair.set_parameter(drone, name, value)
     rig = Rig(recording.config.plant.leader_mount, recording.config.plant.follower_mount)
     state, seen, forces, offsets = pair.start(), [], [], []

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mjxball import __version__
 from mjxball import config as configs
+from mjxball.control.firmware_gains import PairGains, to_json
 from mjxball.errors import InputError
 from mjxball.fly import packets, pair
 from mjxball.fly.command import CommandMap
@@ -38,7 +39,7 @@ class Crew:
     pilot: Pilot
     maps: tuple[CommandMap, CommandMap]
     rig: pair.Rig
-    gains: Mapping[str, float]
+    gains: PairGains
     preflight: Preflight
 
 
@@ -56,7 +57,7 @@ def fly(
         "settings": str(settings),
     }
     header |= {"policy": crew.pilot.policy.name, "config_hash": crew.pilot.policy.card["config_hash"]}
-    header |= {"config": configs.to_dict(crew.pilot.config), "gains": dict(crew.gains)}
+    header |= {"config": configs.to_dict(crew.pilot.config), "gains": to_json(crew.gains)}
     before = sys.getswitchinterval()
     with Journal(log, **header) as journal:
         links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]

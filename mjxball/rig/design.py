@@ -43,13 +43,6 @@ class Design(NamedTuple):
     nominal: Margins
     worst: Margins  # each the smallest of the corners
 
-    @property
-    def parameters(self) -> dict[str, float]:
-        """The firmware's parameters of this axis by name."""
-        groups = (("pid_attitude", self.axis.name, self.gains.attitude), ("pid_rate", self.axis.name, self.gains.rate))
-        terms = ("kp", "ki", "kd")
-        return {f"{g}.{n}_{t}": v for g, n, row in groups for t, v in zip(terms, row, strict=True)}
-
 
 def design(config: Config, asked: Asked = ASKED) -> tuple[Design, ...]:
     """Gains for roll, pitch and yaw of the pair in `config`. Raises ValueError if nothing keeps the margins."""

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mjxball import cli, config
+from mjxball.control.firmware_gains import pair_gains, to_json
 from mjxball.errors import InputError
-from mjxball.rig.design import ASKED, Design, design, judged, stock
+from mjxball.rig.design import ASKED, Design, apply, design, judged, stock
 from mjxball.rig.loop import Gains, Margins
 
 PRESETS = ("flight", "stand")
@@ -47,7 +48,7 @@ def _gains(options: argparse.Namespace) -> int:
         raise InputError(f"{error}: a lighter or shorter stick, or faster motors, would help") from None
     print(report(designs, settings.plant.rotor_lag))  # noqa: T201
     if options.out:
-        options.out.write_text(parameter_file(designs))
+        options.out.write_text(parameter_file(apply(settings.autopilot, designs)))
     if options.picture:
         from mjxball.rig.picture import draw
 
@@ -55,9 +56,9 @@ def _gains(options: argparse.Namespace) -> int:
     return 0
 
 
-def parameter_file(designs: Sequence[Design]) -> str:
-    """JSON of firmware parameters, as `mjxball.fly --gains` reads it."""
-    return json.dumps({name: value for one in designs for name, value in one.parameters.items()}, indent=1) + "\n"
+def parameter_file(autopilot: config.Autopilot) -> str:
+    """JSON of both drones' firmware parameters, as `mjxball.fly --gains` reads it."""
+    return json.dumps(to_json(pair_gains(autopilot)), indent=1) + "\n"
 
 
 def report(designs: Sequence[Design], lag: float) -> str:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjxball import cli, config
+from mjxball.control import firmware_gains
+from mjxball.control.firmware_gains import PARAMETERS, PairGains, pair_gains
 from mjxball.control.hover import hover
 from mjxball.errors import InputError
 from mjxball.fly.preflight import read_gains
@@ -65,15 +68,23 @@ def _identify(options: argparse.Namespace) -> int:
     return 0
 
 
-def with_gains(settings: config.Config, gains: Mapping[str, float]) -> config.Config:
-    """`settings` whose autopilot has the firmware parameters `gains`; others than its loops' are ignored."""
+def with_gains(settings: config.Config, gains: PairGains) -> config.Config:
+    """`settings` whose autopilot has both drones' firmware parameters `gains`; others than its loops' are ignored.
+
+    Raises InputError if the follower's differ from the leader's by more than one factor on all ki.
+    """
     law = settings.autopilot
-    for group, suffix in (("pid_attitude", ""), ("pid_rate", "_rate")):
-        for axis in ("roll", "pitch", "yaw"):
-            before = getattr(law, axis + suffix)
-            terms = zip(("kp", "ki", "kd"), before, strict=True)
-            row = tuple(gains.get(f"{group}.{axis}_{term}", value) for term, value in terms)
-            law = config.replace(law, axis + suffix, row)
+    leader, follower = (
+        {**before, **{name: value for name, value in own.items() if name in PARAMETERS}}
+        for before, own in zip(pair_gains(law), gains, strict=True)
+    )
+    largest = max((name for name in leader if name.endswith("_ki")), key=lambda name: leader[name])
+    share = follower[largest] / leader[largest] if leader[largest] else 1.0
+    if not 0 <= share <= 1:
+        raise InputError("identification takes a follower whose ki are not above the leader's")
+    law = dataclasses.replace(firmware_gains.with_gains(law, leader), follower_integrals=share)
+    if not all(math.isclose(value, follower[name], rel_tol=1e-3) for name, value in pair_gains(law)[1].items()):
+        raise InputError("identification takes a follower whose gains are the leader's, all ki by one factor less")
     return dataclasses.replace(settings, autopilot=law)
 
 

@@ -49,12 +49,13 @@ def replay(config: Config, log: Log, sought: Sought) -> Passed:
     scale, lag, late = sought.thrust[0], sought.lag[0], round(float(sought.delay[0]) / crazyflie.PERIOD)
     force = scale * np.stack([crazyflie.motor_force(law.motor_curve, log.setpoints[0, :, 3])] * 4, axis=-1)
     keep = math.exp(-crazyflie.PERIOD / lag)
+    shares = crazyflie.integral_shares(np, law, float)
     kept_loops, kept_force = [], []
     for tick in range(len(log.euler)):
         kept_loops.append(loops)
         kept_force.append(force)
         sent = log.setpoints[max(tick - late, 0)]
-        loops, motors = crazyflie.cascade(law, loops, sent, both[0][tick], both[1][tick])
+        loops, motors = crazyflie.cascade(law, loops, sent, both[0][tick], both[1][tick], shares)
         target = scale * crazyflie.motor_force(law.motor_curve, motors)
         force = target + keep * (force - target)
     return Passed(np.stack(kept_loops), np.stack(kept_force))
@@ -70,6 +71,7 @@ def fly_windows(
     law, plant, h = config.autopilot, config.plant, crazyflie.PERIOD
     mass, lever = pair_mass(config), np.array([plant.leader_mount[1], plant.follower_mount[1]])
     keep = np.exp(-h / sought.lag)[:, None, None]
+    shares = crazyflie.integral_shares(np, law, float)
     mean = (sought.lag[:, None, None] / h) * (1 - keep)
     roll, rate, climb = start.roll, start.rate, start.climb
     loops, force = _begin(log, passed, begins, roll, rate)
@@ -81,7 +83,8 @@ def fly_windows(
         euler, rates = log.euler[now].copy(), log.rates[now].copy()
         euler[:, 0], rates[:, 0] = roll, rate
         sent = _delayed(log.setpoints, now, sought.delay / h)
-        loops, motors = crazyflie.cascade(law, loops, sent, *(np.stack([v, v], axis=1) for v in (euler, rates)))
+        seen = [np.stack([v, v], axis=1) for v in (euler, rates)]
+        loops, motors = crazyflie.cascade(law, loops, sent, seen[0], seen[1], shares)
         target = sought.thrust[:, None, None] * crazyflie.motor_force(law.motor_curve, motors)
         acting = target + mean * (force - target)
         force = target + keep * (force - target)
