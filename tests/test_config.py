@@ -268,3 +268,17 @@ class TestValidate:
     def test_config_is_frozen(self):
         with pytest.raises(dataclasses.FrozenInstanceError):
             Config().plant.arm = 0.2
+
+
+def test_a_record_of_an_older_version_gets_the_defaults() -> None:
+    recorded = configs.to_dict(configs.preset("flight"))
+    del recorded["autopilot"]["follower_integrals"], recorded["scenario"]
+    found = configs.from_record(recorded)
+    assert (found.autopilot.follower_integrals, found.scenario) == (1.0, configs.Scenario())
+    assert found.plant == configs.preset("flight").plant
+
+
+@pytest.mark.parametrize("changed", [{"nothing": 1}, {"autopilot": 3}, {"plant": {"x": 1}}])
+def test_a_record_that_does_not_fit_is_refused(changed: dict) -> None:
+    with pytest.raises(InputError, match="configuration"):
+        configs.from_record({**configs.to_dict(configs.preset("flight")), **changed})

@@ -13,17 +13,16 @@ import pytest
 from command_line import TRANSPORT, assert_one_line, call, listing, load_arrays, write_arrays
 from conftest import opened
 
-from mjxball import config as configs
 from mjxball.commands.evaluate import main
 from mjxball.config import preset
 from mjxball.control.followers import make_baseline
 from mjxball.errors import InputError
 from mjxball.evaluate.cells import REFERENCE, Cell, run_cells
-from mjxball.evaluate.paper import adaptive, reward, variations
+from mjxball.evaluate.paper import adaptive, experiment, reward, variations
 from mjxball.evaluate.paper.command import NAMES
 from mjxball.evaluate.paper.figure import listed
-from mjxball.evaluate.paper.stand import stand_config
 from mjxball.policy import Policy
+from mjxball.policy.shipped import shipped_policy
 
 CONFIG = preset("paper")
 FAST = ["--physics", "newton-euler"]
@@ -164,12 +163,10 @@ def test_unsound_training_curve_is_refused(curve: Any) -> None:
 # --- the command line -----------------------------------------------------------------------------------------------
 
 
-def standing(path: Path, stand: str = "heave", **plant: Any) -> Path:
-    """A policy file whose card says that it was made for a stand."""
-    arrays, card = load_arrays()
-    setup = configs.to_dict(stand_config(stand))
-    card |= {"seeds": 4, "plant": {**setup["plant"], **plant}, "config": {**card["config"], "leader": setup["leader"]}}
-    return write_arrays(path, arrays, card)
+def standing(path: Path, **plant: Any) -> Path:
+    """The shipped follower for the stand under another name."""
+    arrays, card = load_arrays(shipped_policy("stand"))
+    return write_arrays(path, arrays, {**card, "seeds": 4, "plant": {**card["plant"], **plant}})
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +176,9 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     arrays, card = load_arrays()
     write_arrays(here / "curved.npz", arrays, {**card, "curve": CURVE})
     flags = [here / "curved.npz", "--figures", "all", standing(here / "rocked.npz"), "--out", here / "out"]
-    assert call(main, [*FAST, *flags]) == 0
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(experiment, "SCENARIO", dataclasses.replace(experiment.SCENARIO, seconds=22.0))
+        assert call(main, [*FAST, *flags]) == 0
     return here / "out"
 
 
@@ -227,9 +226,9 @@ def test_captions_name_who_is_drawn(drawn: Path) -> None:
     assert "curved" in caption(page, "reward")
     assert "rocked" not in caption(page, "reward")
     assert "rocked" not in caption(page, "speeds")
-    assert "roll and height free, rocked" in caption(page, "stand")
-    assert "pivot at O, rocked" not in caption(page, "stand")
-    assert "not two Crazyflies" in caption(page, "stand")
+    assert "the paper&#x27;s gains, rocked" in caption(page, "stand")
+    assert "better settings, rocked" in caption(page, "stand")
+    assert "the paper&#x27;s gains, curved" not in caption(page, "stand")
 
 
 @pytest.mark.parametrize("width", [1280, 390], ids=["desktop", "phone"])

@@ -31,7 +31,7 @@ from mjxball.evaluate.report import to_json, write_report
 from mjxball.evaluate.table import table
 from mjxball.physics.stepper import ENGINES
 from mjxball.policy import Policy, PolicyFileError
-from mjxball.policy.shipped import shipped_policies, stand_policies
+from mjxball.policy.shipped import shipped_policies
 from mjxball.scenario import Scenario
 from mjxball.train.provenance import versions
 
@@ -226,7 +226,7 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         raise InputError("--figures needs --out DIR, a directory to write to")
     cli.output_directory(options.out)
     listed = [Path(name) for name in options.figures if name.endswith(".npz")]
-    paths = [*options.policies, *listed] or [*by_home(shipped_policies())[0], *stand_policies()]
+    paths = [*options.policies, *listed] or paper.fitting(shipped_policies())
     policies = _load(paths, paper.plant_of, options)
     _refuse_same_names([*LAWS, *(policy.name for policy in policies)])
     figures = paper.draw_figures(names, policies, options.physics)

@@ -18,7 +18,17 @@ from mjxball.config._settings import (
     Scenario,
     Timing,
 )
-from mjxball.config._tree import apply_overrides, config_hash, from_dict, leaves, override, replace, to_dict, to_json
+from mjxball.config._tree import (
+    apply_overrides,
+    config_hash,
+    from_dict,
+    from_record,
+    leaves,
+    override,
+    replace,
+    to_dict,
+    to_json,
+)
 from mjxball.config._validate import ball_reach, cg_reach, validate
 
 __all__ = [
@@ -40,6 +50,7 @@ __all__ = [
     "cg_reach",
     "config_hash",
     "from_dict",
+    "from_record",
     "leaves",
     "override",
     "preset",

@@ -176,6 +176,6 @@ def flight() -> Config:
             termination_distance=1.5,
         ),
         reward=Reward(error_scale=0.02, velocity=8.0),
-        bounds=Bounds(x_peak=0.05, settling_time=5.0, rmse=0.25),
+        bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.2),
         sac=replace(SAC, discount=0.985),
     )

@@ -105,6 +105,22 @@ def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
     return kind(**values)
 
 
+def from_record(data: Any) -> Any:
+    """The configuration that a policy's card or a log holds; what an older version did not know yet has its default.
+
+    Defaults of new settings are what earlier versions did. Raises InputError on any other mismatch or without a plant.
+    """
+    if isinstance(data, dict) and "plant" not in data:
+        raise InputError("configuration does not fit this version: missing plant")
+    return from_dict(_completed(data, to_dict(Config())))
+
+
+def _completed(data: Any, default: Any) -> Any:
+    if not isinstance(data, dict) or not isinstance(default, dict):
+        return data
+    return {**data, **{name: _completed(data.get(name, value), value) for name, value in default.items()}}
+
+
 def _is_float_tuple(hint: Any, value: list[Any]) -> bool:
     plain = all(isinstance(number, (int, float)) and not isinstance(number, bool) for number in value)
     return plain and typing.get_args(hint)[:1] == (float,)

@@ -15,7 +15,7 @@ def own_home(path: Path) -> Config | None:
     autopilot = settings.get("autopilot") if isinstance(settings, dict) else None
     if not isinstance(autopilot, dict) or autopilot.get("kind") != "crazyflie":
         return None
-    return configs.validate(configs.from_dict(settings))
+    return configs.validate(configs.from_record(settings))
 
 
 def by_home(paths: list[Path]) -> tuple[list[Path], list[tuple[Config, list[Path]]]]:

@@ -24,10 +24,7 @@ def config_of(card: Mapping[str, Any]) -> Config:
 
     Raises InputError if the card's configuration is none.
     """
-    recorded, data = card.get("config", {}), configs.to_dict(Config())
-    for section, default in data.items():
-        given = recorded.get(section, default)
-        data[section] = {**default, **given} if isinstance(default, dict) and isinstance(given, dict) else given
+    data = configs.to_dict(configs.from_record({"plant": {}, **card.get("config", {})}))
     data["plant"] = {**data["plant"], **card["plant"]}
     tilt, vertical = card["command_limits"]
     data["leader"] |= {"kp": card["leader_kp"], "kd": card["leader_kd"], "tilt_limit": tilt, "vertical_limit": vertical}

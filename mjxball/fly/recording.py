@@ -66,7 +66,7 @@ def _arrange(path: Path, records: Sequence[Mapping[str, Any]]) -> Recording:
     if not records or records[0]["kind"] != "header" or "config" not in records[0]:
         raise InputError(f"{path} is not a flight log of this version: it does not begin with a header and its config")
     header = records[0]
-    config = configs.validate(configs.from_dict(header["config"]))
+    config = configs.validate(configs.from_record(header["config"]))
     rig = Rig(config.plant.leader_mount, config.plant.follower_mount)
     rows: list[dict[str, Any]] = []
     newest: list[DroneState | None] = [None, None]

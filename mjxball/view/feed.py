@@ -108,7 +108,7 @@ class Feed:
 
     def _begin(self, header: Mapping[str, Any]) -> None:
         try:
-            self._config = configs.validate(configs.from_dict(header["config"]))
+            self._config = configs.validate(configs.from_record(header["config"]))
             self._maps = command_maps(self._config)
         except (InputError, KeyError, TypeError, ValueError, AttributeError):
             raise InputError(

@@ -12,9 +12,10 @@ from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.evaluate import page
+from mjxball.evaluate.homes import own_home
 from mjxball.evaluate.paper import adaptive, experiment, reward, variations
 from mjxball.evaluate.paper.figure import LETTERS, Figure
-from mjxball.evaluate.paper.stand import STANDS, stand_config
+from mjxball.evaluate.paper.stand import stand_config
 from mjxball.plotting import pyplot
 from mjxball.policy import Policy
 
@@ -38,15 +39,23 @@ def find(names: Sequence[str]) -> list[str]:
 
 
 def plant_of(path: Path) -> Config:
-    """The configuration that a policy file must fit: a stand's if it was made for one, else the paper's."""
-    stand = Policy.load(path).card["plant"].get("stand")
-    return stand_config(stand) if stand in tuple(STANDS) else configs.preset("paper")
+    """The configuration that a policy file must fit: the stand's if it was made for one, else the paper's."""
+    return stand_config() if _stands(Policy.load(path)) else configs.preset("paper")
+
+
+def fitting(paths: Sequence[Path]) -> list[Path]:
+    """Those of `paths` that the figures can fly: made for the paper's plant or for the stand."""
+    return [path for path in paths if own_home(path) is None or _stands(Policy.load(path))]
+
+
+def _stands(policy: Policy) -> bool:
+    return policy.card["plant"].get("stand", "free") != "free"
 
 
 def draw_figures(names: Sequence[str], policies: Sequence[Policy], physics: str) -> list[Figure]:
     """Fly and draw, saying on stderr how far it is; raise InputError before any flight if a figure lacks a policy."""
     setup = configs.preset("paper")
-    standing = [policy for policy in policies if policy.card["plant"].get("stand") in tuple(STANDS)]
+    standing = [policy for policy in policies if _stands(policy)]
     free = [policy for policy in policies if policy not in standing]
     needy = [name for name in names if name in FREE]
     if needy and not free:
