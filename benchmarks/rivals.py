@@ -4,9 +4,9 @@
 
 The 70 feasible cells of `benchmarks/cells.py`, mass known, phase 0, undisturbed and with noise at level 1 and 40 ms of
 delay. Of each follower: in how many cells it is strictly better than `adaptive` in peak, overshoot, settling and RMSE;
-medians and largest over the cells of the rms change of its roll and pitch commands from step to step and of the share of
-time that its rotors are at a limit; and in how many cells neither is above LQG's. Who fails or never settles counts as
-infinitely bad.
+medians and largest over the cells of the rms change of its roll and pitch commands from step to step and of the share
+of time that its rotors are at a limit; and in how many cells neither is above LQG's. Who fails or never settles counts
+as infinitely bad.
 """
 
 from __future__ import annotations
