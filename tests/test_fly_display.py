@@ -69,7 +69,7 @@ SCRIPT = """
 import sys, time
 from mjxball.fly.keys import listening
 heard = []
-with listening(lambda: heard.append("land"), lambda: heard.append("kill")):
+with listening(*(lambda word=word: heard.append(word) for word in ("land", "interrupt", "kill"))):
     print("ready", flush=True)
     end = time.monotonic() + 20
     while len(heard) < 3 and time.monotonic() < end:
@@ -94,7 +94,7 @@ def test_signals_land_without_a_terminal(signals: tuple[signal.Signals, ...]) ->
         for number in signals:
             child.send_signal(number)
             time.sleep(0.1)
-        assert child.stdout.readline() == "heard land land land\n"
+        assert child.stdout.readline() == "heard interrupt land land\n"
 
 
 def test_keys_in_a_terminal(tmp_path: Path) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 
 import numpy as np
 import pytest
 from fly_virtual import World, thrusts
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mjxball.fly import packets, sortie
 from mjxball.fly.contract import FlightSettings
 from mjxball.fly.maneuver import Glimpse, Times
-from mjxball.fly.supervisor import AIRBORNE, Event, State
+from mjxball.fly.supervisor import AIRBORNE, Event, Fault, State, Supervisor
 from mjxball.fly.twin.firmware import FirmwareTimes
 
 NORMAL = ["arm", "ramp", "fly", "land", "stop", "done"]
@@ -149,10 +152,83 @@ def test_a_bug_in_the_runner_stops_both(monkeypatch: pytest.MonkeyPatch) -> None
     def broken(*_: object) -> bool:
         raise RuntimeError("a bug")
 
+    beats: list[bool] = []
+
+    class Listening:
+        def beat(self, flying: bool, seen: Glimpse) -> bool:
+            beats.append(flying)
+            return True
+
+    world.flight.guard = Listening()
     monkeypatch.setattr(world.flight, "tick", broken)
     sortie.run(world.flight)
+    assert len(beats) > 20  # the watchdog is told throughout, or it would end us and send thrust again
+    assert not any(beats)
     world.advance(0.05)
     assert world.running() == [False, False]
     assert world.flight.supervisor.state is State.DONE
     assert world.flight.supervisor.cause is not None
     assert any("RuntimeError: a bug" in record.get("text", "") for record in world.notes.records)
+
+
+def test_asking_twice_to_land_is_no_kill_but_ctrl_c_twice_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The landing key repeats while it is held, and a closed terminal sends SIGHUP more than once."""
+    for names, kills in ((("land", "land"), False), (("interrupt", "interrupt"), True), (("land", "interrupt"), True)):
+        world = World()
+        world.fly_until(State.FLY)
+
+        @contextlib.contextmanager
+        def pressed(*given, names=names):
+            by_name = dict(zip(("land", "interrupt", "kill"), given, strict=True))
+            for name in names:
+                by_name[name]()
+            yield
+
+        monkeypatch.setattr(sortie, "listening", pressed)
+        monkeypatch.setattr(world.flight, "tick", lambda *_: False)
+        sortie.run(world.flight)
+        assert (world.flight.interrupts > 1) is kills
+
+
+@pytest.mark.parametrize("state", [State.ARM, State.RAMP])
+def test_a_state_that_takes_too_long_is_a_fault(state: State) -> None:
+    after = Supervisor(state, 0.0).after([Fault(Event.TIMEOUT)], 1.0)
+    assert after.cause is not None
+    assert Supervisor(State.FLY, 0.0).after([Fault(Event.TIMEOUT)], 1.0).cause is None
+
+
+def test_a_kill_in_a_dry_run_locks_no_drone() -> None:
+    world = World(FlightSettings(dry_run=True))
+    world.fly_until(State.FLY)
+    world.flight.kill = True
+    world.fly_until(State.DONE)
+    assert packets.EMERGENCY_STOP not in [packet for link in world.links for _, packet in link.packets]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    raw=st.lists(st.tuples(*[st.binary(min_size=packets.STATE_SIZE, max_size=packets.STATE_SIZE)] * 2), max_size=30),
+    paused=st.floats(0.0, 0.3),
+)
+def test_whatever_the_drones_report_no_command_leaves_its_bounds(raw: list[tuple[bytes, bytes]], paused: float) -> None:
+    """A hostile pair that speaks the protocol well: states of any bytes in the middle of a flight."""
+    world = World()
+    world.fly_until(State.FLY)
+    world.fly_for(paused)
+    before = [len(link.packets) for link in world.links]
+    for pair_of_states in raw:
+        world.now += 0.01
+        for link, data in zip(world.links, pair_of_states, strict=True):
+            with contextlib.suppress(packets.PacketError):  # the link drops such a packet
+                link.telemetry.take(packets.unpack_state(data), round(1000 * world.now), world.now)
+        if not world.flight.tick(world.now):
+            break
+    for link, count in zip(world.links, before, strict=True):
+        sent = [
+            packet for _, packet in link.packets[count:] if packet.port == packets.setpoint_packet(packets.ZERO).port
+        ]
+        assert sent or not raw
+        for packet in sent:
+            roll, pitch, yaw_rate, thrust = packets.unpack_setpoint(packet.data)
+            assert max(map(abs, (roll, pitch, yaw_rate))) <= 15
+            assert thrust <= 60000

@@ -258,7 +258,7 @@ class Flight:
         for link, value in zip(self.links, wanted, strict=True):
             if state is State.STOP:
                 link.command(packets.STOP)
-            elif state is State.KILL:
+            elif state is State.KILL and not self.settings.dry_run:
                 link.command(packets.EMERGENCY_STOP)
             elif state is State.DONE and not self.settings.dry_run:
                 link.command(packets.DISARM)

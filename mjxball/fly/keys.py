@@ -16,15 +16,15 @@ LAND_KEYS = b"lLq\n"
 
 
 @contextlib.contextmanager
-def listening(land: Callable[[], None], kill: Callable[[], None]) -> Iterator[None]:
-    """Call `land` on Ctrl-C, SIGTERM, a closed terminal and the landing keys, `kill` on the kill keys.
+def listening(land: Callable[[], None], interrupt: Callable[[], None], kill: Callable[[], None]) -> Iterator[None]:
+    """Call `interrupt` on Ctrl-C, `land` on SIGTERM, a closed terminal and the landing keys, `kill` on the kill keys.
 
-    Pressing Ctrl-C twice calls `land` twice; what that means is the caller's. Keys work in a terminal only.
+    What Ctrl-C pressed twice means is the caller's. Keys work in a terminal only.
     """
     done = threading.Event()
 
     def caught(number: int, frame: FrameType | None) -> None:
-        land()
+        (interrupt if number == signal.SIGINT else land)()
 
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {number: signal.signal(number, caught) for number in numbers}
@@ -58,7 +58,8 @@ def _raw_terminal() -> Iterator[int | None]:
     try:
         yield number
     finally:
-        termios.tcsetattr(number, termios.TCSADRAIN, before)
+        with contextlib.suppress(OSError, termios.error):  # the terminal may have been closed
+            termios.tcsetattr(number, termios.TCSADRAIN, before)
 
 
 def _read(terminal: int, done: threading.Event, land: Callable[[], None], kill: Callable[[], None]) -> None:

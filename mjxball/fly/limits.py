@@ -10,6 +10,7 @@ import numpy as np
 
 from mjxball.fly import packets
 from mjxball.fly.packets import DroneState
+from mjxball.fly.pair import Rig
 from mjxball.fly.supervisor import Event, Fault
 
 NAMES = ("leader", "follower")
@@ -31,6 +32,12 @@ class Limits:
     saturation_time: float = 1.0  # of thrust at a bound [s]
     missed_deadlines: int = 10  # within a second
     longest_gap: float = 0.1  # between two ticks [s]
+
+
+def within_fence(goal: Sequence[float], rig: Rig, limits: Limits) -> bool:
+    """True if both drones are within the fence when O is at `goal`, from where it stood at the start [m]."""
+    places = np.asarray(goal, float) + np.array([rig.leader_mount, rig.follower_mount])
+    return bool((places >= limits.fence_low).all() and (places <= limits.fence_high).all())
 
 
 def age_faults(ages: list[float], limits: Limits) -> list[Fault]:

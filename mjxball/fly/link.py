@@ -199,6 +199,8 @@ class Link:
         """Queue `packet` before any setpoint; an older setpoint that still waits is dropped."""
         with self._wake:
             self._setpoint = None
+            if packet == packets.EMERGENCY_STOP:
+                self._commands.clear()  # nothing may be before it, or in its place
             if len(self._commands) < 20:
                 self._commands.append(packet)
             self._waiting_since = self._waiting_since or time.monotonic()

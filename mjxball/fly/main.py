@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import importlib.util
 import math
 import re
@@ -15,19 +14,24 @@ from pathlib import Path
 from mjxball import cli
 from mjxball.cli import run_command
 from mjxball.errors import InputError
-from mjxball.fly import pair
+from mjxball.fly import limits, pair
 from mjxball.fly.card import ThrustChoice, command_maps, gains_of, goal_of, times_of
 from mjxball.fly.command import LINEAR, OLDER
 from mjxball.fly.contract import FlightSettings
+from mjxball.fly.limits import Limits
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.rehearse import Rehearsal
 from mjxball.fly.sortie import Crew, fly
 from mjxball.fly.spectator import Spectator
+from mjxball.fly.twin.faults import STRIKES, read_strike
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
 LOOP_RATE = 100.0  # [Hz] at least: the policy's period is a whole number of ticks
+# Numbers with least and most: of the battery, and of the rehearsal's link.
+LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
+WORSE = {"loss": "share of lost datagrams", "delay": "seconds that each is late", "jitter": "seconds more, at random"}
 CURVES = {"linear": LINEAR, "older": OLDER}
 
 
@@ -41,6 +45,12 @@ def make_parser() -> cli.Parser:
     parser.add_argument(
         "--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given"
     )
+    for name, _, high in LINK[1:]:
+        parser.add_argument(f"--{name}", type=float, metavar="X", help=f"--rehearse: {WORSE[name]}, up to {high:g}")
+    parser.add_argument(
+        "--fault", action="append", default=[], metavar="KIND:DRONE@S", help=f"--rehearse: {', '.join(STRIKES)}"
+    )
+    parser.add_argument("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
     parser.add_argument("--dry-run", action="store_true", help="connect, log, and send zeros only")
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
     parser.add_argument("--log", type=Path, metavar="FILE", help="write everything to this new file")
@@ -59,7 +69,7 @@ def make_parser() -> cli.Parser:
         "--gains",
         type=Path,
         metavar="FILE",
-        help="JSON of firmware parameters to upload, for both drones or each (the card's)",
+        help="JSON of firmware parameters to upload, for both drones or each, over the card's",
     )
     parser.add_argument("--thrust", choices=("calibrated", "paper"), help="law from az to thrust (the card's)")
     parser.add_argument("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
@@ -83,16 +93,31 @@ def check_options(options: argparse.Namespace) -> None:
             raise InputError(f"--{flag} {uri}: the twin of --rehearse answers at udp://127.0.0.1:PORT only")
     if options.leader is not None and options.leader == options.follower:
         raise InputError("--leader and --follower are the same drone")
-    for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0)):
+    for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0), *LINK):
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
             raise InputError(f"--{name} must be {low:g} to {high:g}, not {value:g}")
-    if options.goal is not None and not all(math.isfinite(value) and abs(value) <= 5 for value in options.goal):
-        raise InputError("--goal must be three numbers within 5 m")
+    if options.goal is not None and not all(math.isfinite(value) for value in options.goal):
+        raise InputError("--goal must be three finite numbers")
     if options.log is not None and (options.log.exists() or not options.log.absolute().parent.is_dir()):
         raise InputError(f"log file {options.log} exists or its directory does not; choose another name")
     if options.view is not None and (options.log is None or not 0 <= options.view <= 65535):
         raise InputError("--view takes a port of 1 to 65535, or none, and shows what is logged: it needs --log FILE")
+
+
+def check_twin_options(options: argparse.Namespace) -> None:
+    """Raise InputError for what no rehearsal can be asked for."""
+    asked = [name for name in (*WORSE, "fault") if getattr(options, name)]
+    if asked and not options.rehearse:
+        raise InputError(f"--{asked[0]} is for --rehearse only")
+    for fault in options.fault:
+        read_strike(fault)
+
+
+def twin_options(options: argparse.Namespace) -> list[str]:
+    """What the twin is told of the link and of faults."""
+    worse = [f"--{name}={getattr(options, name)}" for name in WORSE if getattr(options, name) is not None]
+    return [*worse, *(f"--fault={fault}" for fault in options.fault)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -101,21 +126,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def command() -> int:
         check_options(options)
+        check_twin_options(options)
         policy = Policy.load(options.policy)
         pilot = Pilot(policy)
         config = pilot.config
-        gains = read_gains(options.gains) if options.gains else gains_of(config)
+        gains = gains_of(config)
+        if options.gains:
+            leader, follower = ({**own, **new} for own, new in zip(gains, read_gains(options.gains), strict=True))
+            gains = leader, follower
         rig = pair.Rig.of_card(policy.card)
         period = policy.control_period / math.ceil(policy.control_period * LOOP_RATE - 1e-9)
-        settings = FlightSettings(options.seconds, tuple(options.goal or goal_of(config)), options.dry_run, period)
-        settings = dataclasses.replace(settings, times=times_of(config))
+        bounds = Limits() if options.battery is None else Limits(battery=options.battery)
+        goal = tuple(options.goal or goal_of(config))
+        if not limits.within_fence(goal, rig, bounds):
+            raise InputError(f"--goal {' '.join(f'{value:g}' for value in goal)} puts a drone beyond the fence")
+        settings = FlightSettings(options.seconds, goal, options.dry_run, period, bounds, times_of(config))
         choice = ThrustChoice(options.thrust, options.hover, CURVES.get(options.curve), options.mass)
         crew = Crew(pilot, command_maps(config, choice), rig, gains, Preflight())
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
             if options.rehearse:
                 ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
-                uris = stack.enter_context(Rehearsal(options.policy, ports)).uris
+                uris = stack.enter_context(Rehearsal(options.policy, ports, twin_options(options))).uris
             if options.view is not None:
                 print(stack.enter_context(Spectator(options.log, options.view)).line, flush=True)  # noqa: T201
             return fly(uris, crew, settings, options.log, list(sys.argv if arguments is None else arguments))

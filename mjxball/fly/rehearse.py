@@ -11,13 +11,15 @@ from pathlib import Path
 
 from mjxball.errors import InputError
 
+START_LIMIT = 30.0  # [s]
+
 
 class Rehearsal:
     """A running twin. A context manager; `uris` are leader and follower."""
 
-    def __init__(self, policy: Path, ports: Sequence[int] = (0, 0), start_limit: float = 30.0):
-        """Start the twin of the rig that `policy` was made for. Raises InputError if it does not start."""
-        arguments = ["--ports", *map(str, ports), "--policy", str(policy)]
+    def __init__(self, policy: Path, ports: Sequence[int] = (0, 0), more: Sequence[str] = ()):
+        """Start the twin of the rig that `policy` was made for, with `more` options; InputError if it does not."""
+        arguments = ["--ports", *map(str, ports), "--policy", str(policy), *more]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "mjxball.fly.twin", *arguments],
             stdin=subprocess.PIPE,
@@ -26,7 +28,7 @@ class Rehearsal:
             text=True,
         )
         assert self._process.stdout is not None
-        readable, _, _ = select.select([self._process.stdout], [], [], start_limit)
+        readable, _, _ = select.select([self._process.stdout], [], [], START_LIMIT)
         line = self._process.stdout.readline() if readable else ""
         if not line:
             self.close()

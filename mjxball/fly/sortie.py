@@ -26,8 +26,8 @@ from mjxball.fly.link import Link
 from mjxball.fly.loop import Metronome, Timing, urgent
 from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, check, prepare
-from mjxball.fly.supervisor import FAULTS, Event, Fault, State, Supervisor
-from mjxball.fly.watchdog import Watchdog
+from mjxball.fly.supervisor import Event, Fault, State, Supervisor
+from mjxball.fly.watchdog import NOTHING, Watchdog
 
 SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
 
@@ -89,12 +89,15 @@ def run(flight: Flight) -> Timing:
     metronome = Metronome(flight.settings.period)
 
     def land() -> None:
+        flight.interrupts = max(flight.interrupts, 1)
+
+    def interrupt() -> None:
         flight.interrupts += 1
 
     def kill() -> None:
         flight.kill = True
 
-    with listening(land, kill), Display(lambda: flight.view, flight.settings.limits):
+    with listening(land, interrupt, kill), Display(lambda: flight.view, flight.settings.limits):
         metronome.start()
         flight.begin(time.monotonic())
         going = True
@@ -112,6 +115,8 @@ def run(flight: Flight) -> Timing:
 def _emergency(flight: Flight) -> bool:
     """A tick failed: stop both drones without the flight's help. Returns false: it is over."""
     for _ in range(50):
+        if flight.guard is not None:
+            flight.guard.beat(False, NOTHING)  # it has nothing to take over any more
         for link in flight.links:
             link.command(packets.EMERGENCY_STOP)
             link.send(packets.setpoint_packet(packets.ZERO))
@@ -131,7 +136,7 @@ def _checked(links: Sequence[Link], crew: Crew, settings: FlightSettings, journa
 def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     supervisor = flight.supervisor
     cause = supervisor.cause
-    code = 1 if cause is not None and cause.event in FAULTS else 0
+    code = 0 if cause is None else 1
     sent = [getattr(link, "overwritten", 0) for link in flight.links]
     journal.note("end", code=code, cause=str(cause) if cause else "", timing=timing, overwritten=sent)
     if cause is not None:

@@ -115,6 +115,7 @@ def _table() -> dict[tuple[State, Event], State]:
 
 TRANSITIONS = {pair: state for pair, state in _table().items() if pair[0] is not state}
 # Of several events at once the one that leads furthest counts; the flight's exit code is 1 after any of these.
+SHORT = (S.ARM, S.RAMP)  # states whose time limit is only reached if something is wrong
 FAULTS = frozenset(E) - {E.READY, E.ARMED, E.HOVERING, E.TIME_UP, E.INTERRUPT, E.TOUCHED_DOWN, E.TIMEOUT}
 
 
@@ -138,7 +139,8 @@ class Supervisor:
         best, why = max(asked or led, key=lambda pair: pair[0].severity, default=(self.state, None))
         if why is None:
             return self
-        first = self.cause or (why if why.event in FAULTS else None)
+        unplanned = why.event in FAULTS or (self.state in SHORT and why.event is Event.TIMEOUT)
+        first = self.cause or (why if unplanned else None)
         return Supervisor(best, now, first)
 
 

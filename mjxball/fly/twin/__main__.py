@@ -8,10 +8,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import threading
+import time
 from pathlib import Path
 
 from mjxball.cli import make_parser, run_command
 from mjxball.fly.loop import urgent
+from mjxball.fly.twin.faults import LinkFaults, Strike, read_strike
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
 from mjxball.policy import load_file
@@ -22,6 +25,9 @@ def main() -> int:
     parser = make_parser("python -m mjxball.fly.twin", __doc__ or "")
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
     parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
+    for name in ("loss", "delay", "jitter"):
+        parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links")
+    parser.add_argument("--fault", type=read_strike, action="append", default=[], metavar="KIND:DRONE@S")
     options = parser.parse_args()
     return run_command(lambda: serve(options))
 
@@ -30,6 +36,10 @@ def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` ask for until standard input ends."""
     card = load_file(options.policy).card if options.policy else None
     with urgent(), Twin(make_pair(card), TwinSettings(ports=tuple(options.ports))) as twin:
+        for drone in range(2):
+            twin.set_link(drone, LinkFaults(options.loss, options.delay, options.jitter))
+        for one in options.fault:
+            threading.Thread(target=strike, args=(twin, one), daemon=True).start()
         print(json.dumps({"uris": twin.uris}), flush=True)  # noqa: T201
         try:
             while sys.stdin.readline():
@@ -37,6 +47,14 @@ def serve(options: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             pass
     return 0
+
+
+def strike(twin: Twin, one: Strike) -> None:
+    """Wait for the first motor to turn, then until the fault is due."""
+    while max(twin.truth.thrust) == 0:
+        time.sleep(0.01)
+    time.sleep(one.after)
+    twin.strike(one)
 
 
 if __name__ == "__main__":

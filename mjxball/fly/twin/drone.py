@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mjxball.control import rotations
+from mjxball.control.firmware_gains import STOCK, gains_of
 from mjxball.fly import packets
 from mjxball.fly.packets import DroneState, Setpoint
 from mjxball.fly.twin import faults, tables
@@ -72,6 +73,8 @@ class TwinDrone:
         """Power off and on: log blocks and parameters are forgotten."""
         self.firmware.reboot()
         self.peer = Peer(self.firmware, self._written)
+        for name, value in gains_of(STOCK).items():
+            self._on_parameter(name, value)
 
     def _read(self, state: DroneState, force_z: float, now: float) -> dict[str, float]:
         """Every log variable."""

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+
+from mjxball.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,39 @@ class DroneFaults:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # added to the reported position [m]
     battery: float = 0.0  # added to the reported voltage [V]
     garbage: float = 0.0  # datagrams of random bytes sent for each step
+
+
+# What `--fault KIND:DRONE@S` can be: faults of the link, of a drone, or what the twin does to it.
+STRIKES: dict[str, LinkFaults | DroneFaults | str] = {
+    "silent": LinkFaults(silent_up=True, silent_down=True),
+    "silent-up": LinkFaults(silent_up=True),
+    "silent-down": LinkFaults(silent_down=True),
+    "frozen": DroneFaults(frozen=True),
+    "clock": DroneFaults(clock_stopped=True),
+    "jump": DroneFaults(offset=(0.0, 0.0, 0.4)),
+    "battery": DroneFaults(battery=-1.2),
+    "garbage": DroneFaults(garbage=3.0),
+    "crash": "crash",
+    "power": "kill",
+    "port": "close_port",
+    "reboot": "reboot",
+}
+
+
+class Strike(NamedTuple):
+    """A fault that comes during a rehearsal."""
+
+    what: LinkFaults | DroneFaults | str
+    drone: int  # 0 leader, 1 follower
+    after: float  # the first motor has turned [s]
+
+
+def read_strike(text: str) -> Strike:
+    """The fault of `KIND:DRONE@S`, such as `frozen:follower@3`. Raises InputError."""
+    match = re.fullmatch(r"([\w-]+):(leader|follower)@(\d{1,4}(?:\.\d+)?)", text)
+    if match is None or match[1] not in STRIKES:
+        raise InputError(f"--fault {text} is no KIND:DRONE@S such as frozen:follower@3; kinds: {', '.join(STRIKES)}")
+    return Strike(STRIKES[match[1]], ("leader", "follower").index(match[2]), float(match[3]))
 
 
 class Channel:

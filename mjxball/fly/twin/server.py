@@ -13,7 +13,7 @@ import numpy as np
 
 from mjxball.fly.twin.body import Pair, PairState
 from mjxball.fly.twin.drone import TwinDrone, drone_state
-from mjxball.fly.twin.faults import DroneFaults, LinkFaults
+from mjxball.fly.twin.faults import DroneFaults, LinkFaults, Strike
 from mjxball.fly.twin.firmware import FirmwareTimes
 
 HOST = "127.0.0.1"
@@ -86,6 +86,15 @@ class Twin:
     def set_faults(self, drone: int, faults: DroneFaults) -> None:
         """Replace the `DroneFaults` of a drone."""
         self.drones[drone].faults = faults
+
+    def strike(self, one: Strike) -> None:
+        """Have a fault come to pass now."""
+        if isinstance(one.what, LinkFaults):
+            self.set_link(one.drone, one.what)
+        elif isinstance(one.what, DroneFaults):
+            self.set_faults(one.drone, one.what)
+        else:
+            getattr(self, one.what)(one.drone)
 
     def crash(self, drone: int) -> None:
         """The firmware of a drone finds that it has crashed: its motors stop."""
