@@ -92,7 +92,10 @@ def output_file(path: Path, suffix: str) -> Path:
 def add_config_flags(parser: argparse.ArgumentParser) -> None:
     """Add `--<path> VALUE` for every leaf of the configuration, with its help text."""
     group = parser.add_argument_group("configuration", "defaults are the preset's; tuples are comma-separated")
-    group.add_argument("--plant", type=Path, metavar="FILE", help="JSON of settings, as mjxball.rig.identify writes it")
+    rigs = ", ".join(configs.RIGS)
+    group.add_argument(
+        "--plant", type=Path, metavar="FILE", help=f"JSON of settings, as mjxball.rig.identify writes it, or {rigs}"
+    )
     for path, _, item in configs.leaves(configs.Config()):
         about = item.metadata["about"].replace("%", "%%")
         group.add_argument(f"--{path}", metavar="VALUE", dest=f"config:{path}", default=None, help=about)
@@ -115,11 +118,17 @@ class PlantFile(NamedTuple):
 
 
 def read_plant(path: Path) -> PlantFile:
-    """The plant file `path`. Raises InputError if it is none; the settings' values are not checked."""
+    """The plant file `path`, or the one of that name in `configs.RIGS`. Raises InputError if it is neither.
+
+    The settings' values are not checked.
+    """
+    if str(path) in configs.RIGS and not path.exists():
+        return PlantFile("flight", configs.RIGS[str(path)])
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"plant file {path} cannot be read: {error.strerror or error}") from None
+        known = f"; by name there are {', '.join(configs.RIGS)}" if isinstance(error, FileNotFoundError) else ""
+        raise InputError(f"plant file {path} cannot be read: {error.strerror or error}{known}") from None
     except ValueError:
         raise InputError(f"plant file {path} is not JSON") from None
     if not isinstance(values, dict) or not values:

@@ -12,8 +12,10 @@ from mjxball.control.baselines.gains import pitch_gains
 from mjxball.control.followers import LAWS, make_baseline, make_law
 from mjxball.errors import InputError
 from mjxball.evaluate.cells import REFERENCE, Cell, cross, run_cells
+from mjxball.evaluate.metrics import measure
 from mjxball.rollout import simulate
 from mjxball.scenario import Scenario
+from mjxball.sensing import Disturbance
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 # From an independent float64 simulation, RK4 at 1 kHz, attitude loop at 500 Hz:
@@ -67,19 +69,31 @@ def test_mass_adaptation_finds_an_unknown_mass() -> None:
     assert abs(sags["adaptive-mass"]) < 0.02
 
 
-def test_feedback_is_the_riccati_solution_of_scipy() -> None:
+def test_only_the_slow_filter_bears_late_commands() -> None:
+    config = preset("paper")
+    late = Scenario(seconds=30.0, disturbance=Disturbance(noise=1.0, delay=0.04))
+    followers = [make_baseline(name, config) for name in ("lqg", "lqg-slow")]
+    flown = [measure(simulate(config, follower, late, "newton-euler"), 3.0) for follower in followers]
+    assert flown[0].x_peak > 0.05
+    assert flown[1].x_peak < 0.02
+    assert flown[1].settling_time == pytest.approx(2.5, abs=0.3)
+
+
+@pytest.mark.parametrize("law", [lqg.Lqg, lqg.SlowLqg])
+def test_feedback_is_the_riccati_solution_of_scipy(law: type[lqg.Lqg]) -> None:
     plant = pitch_gains(preset("paper"), "lqg")
     wn, zeta, g = 10.0, 0.9, 9.81
     a = np.array([[0, 1, 0, 0], [0, 0, g, 0], [0, 0, 0, 1], [0, 0, -wn * wn, -2 * zeta * wn]])
     b = np.array([[0.0], [0], [0], [wn * wn]])
-    q, r = np.diag([16.0, 1.0, 0.0, 0.0]), np.array([[0.15**-2]])
+    q, r = np.diag([law.tuning.position**-2, law.tuning.velocity**-2, 0.0, 0.0]), np.array([[0.15**-2]])
     expected = np.linalg.solve(r, b.T @ solve_continuous_are(a, b, q, r))[0]
-    np.testing.assert_allclose(lqg.feedback(plant).pitch, expected, rtol=1e-8)
+    np.testing.assert_allclose(lqg.feedback(plant, law.tuning).pitch, expected, rtol=1e-8)
 
 
-def test_filter_is_the_steady_kalman_filter_of_scipy() -> None:
+@pytest.mark.parametrize("walk", [9.0, 0.003])
+def test_filter_is_the_steady_kalman_filter_of_scipy(walk: float) -> None:
     plant = pitch_gains(preset("paper"), "lqg")
-    found = lqg.kalman(plant)
+    found = lqg.kalman(plant, walk)
     a = np.zeros((6, 6))
     a[0, 1] = a[2, 3] = 1
     a[1, 2] = a[1, 4] = 1 / plant.inertia
@@ -88,7 +102,7 @@ def test_filter_is_the_steady_kalman_filter_of_scipy() -> None:
     np.testing.assert_allclose(found.transition, whole[:5, :5], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found.drive, whole[:5, 5], rtol=1e-9, atol=1e-12)
     noise, seen = np.zeros((5, 5)), np.eye(2, 5)
-    noise[3, 3] = 9 * plant.period
+    noise[3, 3] = walk * plant.period
     measurement = np.diag([2e-3**2, 2e-2**2])
     predicted = solve_discrete_are(found.transition.T, seen.T, noise, measurement)
     gain = predicted @ seen.T @ np.linalg.inv(seen @ predicted @ seen.T + measurement)
@@ -130,7 +144,9 @@ def test_oracle_refuses_to_fly_without_being_told() -> None:
 def test_every_baseline_commands_within_its_limits(cells) -> None:
     for (name, _), cell in cells.items():
         largest = np.abs(cell.flight.follower_command).max(axis=0)
-        assert (largest <= np.array([0.6, 1.0 if name in ("lqg", "memoryless") else 0.6, 6.0]) + 1e-12).all(), name
+        assert (
+            largest <= np.array([0.6, 1.0 if name in ("lqg", "lqg-slow", "memoryless") else 0.6, 6.0]) + 1e-12
+        ).all(), name
 
 
 def test_reference_scenario_is_the_first_cell(cells) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mjxball.cli import apply_plant
 from mjxball.config import Autopilot, Config, preset, replace, validate
 from mjxball.config._crazyflie import DRONES, autopilot, rig
 from mjxball.control import crazyflie, mixer
@@ -224,6 +226,12 @@ class TestRefused:
     @pytest.mark.parametrize("drone", ["2.1", "thrust-upgrade", "brushless"])
     def test_variants_hover(self, drone: str) -> None:
         validate(self.with_drone(drone))
+
+    @pytest.mark.parametrize("drone", ["thrust-upgrade", "brushless"])
+    def test_variants_are_plant_files_by_name(self, drone: str) -> None:
+        # Only the leader's firmware integrates in any preset.
+        expected = replace(self.with_drone(drone), "autopilot.follower_integrals", 0.0)
+        assert apply_plant(preset("flight"), Path(f"crazyflie-{drone}")) == expected
 
     def test_the_plain_drone_on_the_newest_firmware_does_not(self) -> None:
         with pytest.raises(InputError, match="leaves 20%, where 30% are needed"):

@@ -3,7 +3,7 @@
 Importing it needs the standard library only.
 """
 
-from mjxball.config._presets import PRESETS, preset
+from mjxball.config._presets import PRESETS, RIGS, preset
 from mjxball.config._settings import (
     Attitude,
     Autopilot,
@@ -33,6 +33,7 @@ from mjxball.config._validate import ball_reach, cg_reach, validate
 
 __all__ = [
     "PRESETS",
+    "RIGS",
     "Attitude",
     "Autopilot",
     "Bounds",

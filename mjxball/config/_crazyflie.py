@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 from mjxball.config._settings import (
     Autopilot,
@@ -72,6 +73,17 @@ def autopilot(drone: str = "2.1") -> Autopilot:
         yaw=yaw,
         yaw_rate=yaw_rate,
     )
+
+
+def rig_settings(drone: str) -> dict[str, Any]:
+    """What a plant file of the pair of `DRONES` says: every setting of plant and autopilot that a 2.1 has otherwise."""
+    parts: dict[str, list[Any]] = {"plant": [rig(drone), rig()], "autopilot": [autopilot(drone), autopilot()]}
+    return {
+        f"{part}.{item.name}": getattr(mine, item.name)
+        for part, (mine, usual) in parts.items()
+        for item in fields(mine)
+        if getattr(mine, item.name) != getattr(usual, item.name)
+    }
 
 
 PAIR = Config(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from mjxball.config import Config
-from mjxball.control.baselines import Adaptive, Copy, Lqg, Memoryless, Oracle, PairLqg, Random, Stay
+from mjxball.control.baselines import Adaptive, Copy, Lqg, Memoryless, Oracle, PairLqg, Random, SlowLqg, Stay
 from mjxball.control.baselines.law import Brief, Law
 from mjxball.errors import InputError
 
@@ -62,6 +62,7 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "oracle": Oracle,
     "memoryless": Memoryless,
     "lqg": lambda config: PairLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
+    "lqg-slow": SlowLqg,
 }
 
 
@@ -77,5 +78,5 @@ def make_baseline(name: str, config: Config) -> Baseline:
     return Baseline(make_law(name, config), config)
 
 
-# What is flown when nobody names followers; `adaptive-mass` is a variant, flown by name and by the judge.
-BASELINES = tuple(name for name in LAWS if name != "adaptive-mass")
+# What is flown when nobody names followers; the others are variants, flown by name and by the judge.
+BASELINES = tuple(name for name in LAWS if name not in ("adaptive-mass", "lqg-slow"))

@@ -20,6 +20,7 @@ COLOURS = {
     "adaptive-mass": "#edae49",
     "oracle": "#222222",
     "lqg": "#2e933c",
+    "lqg-slow": "#9bc53d",
     "memoryless": "#8d6a4f",
     "stay": "#b9a7c7",
     "random": "#d9c9b0",

@@ -6,8 +6,8 @@ adaptive controller that the paper compares with is not public.
 
 from mjxball.control.baselines.adaptive import Adaptive
 from mjxball.control.baselines.floors import Copy, Random, Stay
-from mjxball.control.baselines.lqg import Lqg, Memoryless
+from mjxball.control.baselines.lqg import Lqg, Memoryless, SlowLqg
 from mjxball.control.baselines.oracle import Oracle
 from mjxball.control.baselines.pair_lqg import PairLqg
 
-__all__ = ["Adaptive", "Copy", "Lqg", "Memoryless", "Oracle", "PairLqg", "Random", "Stay"]
+__all__ = ["Adaptive", "Copy", "Lqg", "Memoryless", "Oracle", "PairLqg", "Random", "SlowLqg", "Stay"]
