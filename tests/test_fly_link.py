@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -120,6 +121,18 @@ def test_a_parameter_that_is_never_confirmed_has_a_deadline(twin: Twin, link: Li
     twin.set_link(0, LinkFaults(silent_down=True))
     with pytest.raises(LinkError, match="did not confirm"):
         link.write_parameters({"pid_rate.roll_kp": 100.0})
+
+
+def test_a_library_that_hangs_in_a_request_has_a_deadline(link: Link, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As cflib's sends do, which share a lock with a ping that a dead link never answers."""
+    link._deadlines = dataclasses.replace(link._deadlines, request=0.2)
+    for where, name in ((link._crazyflie.log, "add_config"), (link._crazyflie.param, "set_value")):
+        monkeypatch.setattr(where, name, lambda *_: threading.Event().wait())
+    for request in (lambda: link.stream(("kalman.varPX",), 50, print), lambda: link.write_parameters({"a.b": 1.0})):
+        began = time.monotonic()
+        with pytest.raises(LinkError, match="takes no packet"):
+            request()
+        assert time.monotonic() - began < 2
 
 
 def test_nobody_there() -> None:

@@ -1,4 +1,4 @@
-"""A rehearsal of the free flight over the real protocol: runner, cflib, twin, coupled model, log."""
+"""Rehearsals of the shipped policies over the real protocol: runner, cflib, twin, coupled model, log."""
 
 from __future__ import annotations
 
@@ -9,22 +9,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import REPOSITORY, environment
-from fly_policies import untrained
 
 from mjxball.fly import card
 from mjxball.fly.journal import read
 from mjxball.fly.recording import fly_again, read_recording
-from mjxball.policy import save_file
+from mjxball.policy import load_file
+from mjxball.policy.shipped import shipped_policy
 
 pytest.importorskip("cflib")
 
 
+HEIGHTS = {"flight": (0.3, 0.6), "stand": (0.04, 0.15)}  # least and most of the highest place [m]
+
+
+@pytest.fixture(scope="module", params=sorted(HEIGHTS))
+def name(request: pytest.FixtureRequest) -> str:
+    """A shipped policy for Crazyflies."""
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def flown(name: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Log of 3 s of flight with nothing but the policy's file."""
     place = tmp_path_factory.mktemp("rehearsal")
-    save_file(place / "nobody.npz", untrained("flight"))
-    command = [sys.executable, "-m", "mjxball.fly", "nobody.npz", "--rehearse", "--seconds", "3", "--log", "log.jsonl"]
+    policy = str(shipped_policy(name))
+    command = [sys.executable, "-m", "mjxball.fly", policy, "--rehearse", "--seconds", "3", "--log", "log.jsonl"]
     done = subprocess.run(
         command,
         cwd=place,
@@ -42,22 +51,23 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place / "log.jsonl"
 
 
-def test_the_cards_gains_are_uploaded(flown: Path) -> None:
-    config = card.config_of(untrained("flight").card)
+def test_the_cards_gains_are_uploaded(name: str, flown: Path) -> None:
+    config = card.config_of(load_file(shipped_policy(name)).card)
     written = {
         (record["drone"], record["name"]): record["value"] for record in read(flown) if record["kind"] == "parameter"
     }
     for drone, gains in zip(("leader", "follower"), card.gains_of(config), strict=True):
-        for name, value in gains.items():
-            assert written[drone, name] == pytest.approx(value, rel=1e-6)  # a float on the wire
+        for parameter, value in gains.items():
+            assert written[drone, parameter] == pytest.approx(value, rel=1e-6)  # a float on the wire
     assert written["leader", "pid_rate.roll_ki"] > 0
     assert written["follower", "pid_rate.roll_ki"] == 0
 
 
-def test_it_flies_and_its_commands_simulated_do_the_same(flown: Path) -> None:
+def test_it_flies_and_its_commands_simulated_do_the_same(name: str, flown: Path) -> None:
     recording = read_recording(flown)
     heights = recording.position[np.array(recording.phase) == "fly", 2]
-    assert 0.3 < heights.max() < 0.6
+    least, most = HEIGHTS[name]
+    assert least < heights.max() < most
     assert abs(recording.position[-1, 2]) < 0.01
     # Open loop: setpoints that took effect up to 10 ms later than they were noted, for 6 s.
     assert np.abs(fly_again(recording).position - recording.position).max() < 0.05

@@ -6,11 +6,11 @@ cflib is imported when a link is opened, so that all else here works without it.
 from __future__ import annotations
 
 import collections
+import functools
 import logging
-import struct
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,7 @@ class Deadlines:
 
     connect: float = 15.0  # tables and parameters over a radio take several seconds
     parameter: float = 1.0  # each write with its read back
+    request: float = 2.0  # a packet of ours, before the flight
     first_state: float = 2.0
     close: float = 2.0
 
@@ -120,18 +121,10 @@ class Link:
 
     def start_states(self) -> None:
         """Have the state sent at 100 Hz, and wait for the first one. Raises LinkError."""
-        from cflib.crazyflie.log import LogConfig
-
-        block = LogConfig("state", 10)
-        for name, kind in packets.STATE_VARIABLES:
-            block.add_variable(name, kind)
-        try:
-            self._crazyflie.log.add_config(block)
-        except KeyError as error:
-            raise LinkError(f"the firmware of the {self.name} lacks a log variable: {error.args[0]}") from None
+        block = self._log_block("state", packets.STATE_VARIABLES, 10)
         self._block = block.id
         self._crazyflie.add_header_callback(self._receive, LOG_PORT, LOG_DATA)
-        block.start()
+        self._ask(block.start)
         deadline = time.monotonic() + self._deadlines.first_state
         while self.telemetry.newest is None:
             if time.monotonic() > deadline:
@@ -152,11 +145,9 @@ class Link:
             group, _, variable = name.partition(".")
             param = self._crazyflie.param
             param.add_update_callback(group, variable, updated)
-            try:
-                param.set_value(name, value)
-                param.request_param_update(name)  # what the write echoes is not what the firmware holds
-            except (KeyError, AttributeError, struct.error) as error:
-                raise LinkError(f"parameter {name} of the {self.name} cannot be written: {error.args[0]}") from None
+            refused = self._ask(functools.partial(_write, param, name, value))
+            if refused is not None:
+                raise LinkError(f"parameter {name} of the {self.name} cannot be written: {refused}")
             in_time = heard.wait(self._deadlines.parameter)
             param.remove_update_callback(group, variable, updated)
             if not in_time:
@@ -167,23 +158,43 @@ class Link:
 
     def stream(self, variables: tuple[str, ...], period_ms: int, take: Callable[[dict[str, float]], None]) -> Any:
         """Have `take` called with further log variables; returns what `stop_stream` ends. Raises LinkError."""
-        from cflib.crazyflie.log import LogConfig
-
-        block = LogConfig("extra", period_ms)
-        for name in variables:
-            block.add_variable(name, "float")
-        try:
-            self._crazyflie.log.add_config(block)
-        except KeyError as error:
-            raise LinkError(f"the firmware of the {self.name} lacks a log variable: {error.args[0]}") from None
+        block = self._log_block("extra", [(name, "float") for name in variables], period_ms)
         block.data_received_cb.add_callback(lambda stamp, data, config: take(data))
-        block.start()
+        self._ask(block.start)
         return block
 
     def stop_stream(self, block: Any) -> None:
-        """End a `stream`."""
-        block.stop()
-        block.delete()
+        """End a `stream`. Raises LinkError."""
+        self._ask(block.stop)
+        self._ask(block.delete)
+
+    def _log_block(self, title: str, variables: Iterable[tuple[str, str]], period_ms: int) -> Any:
+        from cflib.crazyflie.log import LogConfig
+
+        block = LogConfig(title, period_ms)
+        for name, kind in variables:
+            block.add_variable(name, kind)
+        missing = self._ask(lambda: self._crazyflie.log.add_config(block))
+        if missing is not None:
+            raise LinkError(f"the firmware of the {self.name} lacks a log variable: {missing}")
+        return block
+
+    def _ask(self, request: Callable[[], Any]) -> Any:
+        """Make a `request` of cflib, whose sends wait without limit for a link that is dying; its refusal, if any.
+
+        Raises LinkError if that takes too long.
+        """
+        refused: list[Any] = []
+
+        def ask() -> None:
+            try:
+                request()
+            except Exception as error:  # cflib raises many kinds, Exception itself among them
+                refused.append(error.args[0] if error.args else type(error).__name__)
+
+        if not bounded(ask, self._deadlines.request):
+            raise LinkError(f"the link to the {self.name} takes no packet within {self._deadlines.request:g} s")
+        return refused[0] if refused else None
 
     # In flight; these never block.
 
@@ -279,3 +290,8 @@ def _start_drivers(crtp: Any) -> None:
         if not logger.handlers:
             logger.addHandler(logging.NullHandler())
             logger.propagate = False
+
+
+def _write(param: Any, name: str, value: float) -> None:
+    param.set_value(name, value)
+    param.request_param_update(name)  # what the write echoes is not what the firmware holds
