@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -95,6 +97,20 @@ class Ended(NamedTuple):
 
     def ticks(self, state: str) -> list[dict]:
         return [record for record in self.records if record["kind"] == "tick" and record["state"] == state]
+
+
+def test_a_flight_with_no_name_for_its_log_gets_one(tmp_path: Path) -> None:
+    """Refused here, since nobody answers; a rehearsal leaves no file behind that was not asked for."""
+    with contextlib.ExitStack() as stack:
+        silent = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(2)]
+        for one in silent:
+            one.bind(("127.0.0.1", 0))
+        ports = [one.getsockname()[1] for one in silent]
+    uris = ["--leader", f"udp://127.0.0.1:{ports[0]}", "--follower", f"udp://127.0.0.1:{ports[1]}"]
+    done = run(["-m", "mjxball.fly", TRANSPORT, *uris], tmp_path)
+    logs = list(tmp_path.iterdir())
+    assert (done.returncode, done.stdout) == (2, f"log: {logs[0].name}\n"), done.stderr
+    assert next(journal.read(logs[0]))["kind"] == "header"
 
 
 KINDS = {

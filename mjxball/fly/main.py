@@ -8,6 +8,7 @@ import importlib.util
 import math
 import re
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -53,7 +54,12 @@ def make_parser() -> cli.Parser:
     parser.add_argument("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
     parser.add_argument("--dry-run", action="store_true", help="connect, log, and send zeros only")
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
-    parser.add_argument("--log", type=Path, metavar="FILE", help="write everything to this new file")
+    parser.add_argument(
+        "--log",
+        type=Path,
+        metavar="FILE",
+        help="write everything to this new file (flight-DATE.jsonl; none for --rehearse)",
+    )
     parser.add_argument(
         "--view",
         type=int,
@@ -101,7 +107,7 @@ def check_options(options: argparse.Namespace) -> None:
         raise InputError("--goal must be three finite numbers")
     if options.log is not None and (options.log.exists() or not options.log.absolute().parent.is_dir()):
         raise InputError(f"log file {options.log} exists or its directory does not; choose another name")
-    if options.view is not None and (options.log is None or not 0 <= options.view <= 65535):
+    if options.view is not None and ((options.rehearse and options.log is None) or not 0 <= options.view <= 65535):
         raise InputError("--view takes a port of 1 to 65535, or none, and shows what is logged: it needs --log FILE")
 
 
@@ -127,6 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def command() -> int:
         check_options(options)
         check_twin_options(options)
+        log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
         policy = Policy.load(options.policy)
         pilot = Pilot(policy)
         config = pilot.config
@@ -148,8 +155,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if options.rehearse:
                 ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
                 uris = stack.enter_context(Rehearsal(options.policy, ports, twin_options(options))).uris
-            if options.view is not None:
-                print(stack.enter_context(Spectator(options.log, options.view)).line, flush=True)  # noqa: T201
-            return fly(uris, crew, settings, options.log, list(sys.argv if arguments is None else arguments))
+            if options.view is not None and log is not None:
+                print(stack.enter_context(Spectator(log, options.view)).line, flush=True)  # noqa: T201
+            if log and not options.log:
+                print(f"log: {log}", flush=True)  # noqa: T201
+            return fly(uris, crew, settings, log, list(sys.argv if arguments is None else arguments))
 
     return run_command(command)
