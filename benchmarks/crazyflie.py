@@ -8,6 +8,8 @@
   CG motion, noise, delay, gusts), of which those count whose weaker drone keeps 30 % of its thrust in hover. 20 s each;
   a crash is |e_o| beyond d_term or a world that diverges. RMSE and tilt after 5 s, of the same
   followers in the same worlds. All see the same noise and delay; classical ones are told the nominal plant.
+- route: up 0.4 m, along a square of 0.5 m whose sides take 15 s each, and down again, the ball swinging 30 mm
+  at five speeds, noise at level 1, 20 ms of delay, nominal rig: how far O is from each corner when its 15 s are over.
 """
 
 from __future__ import annotations
@@ -33,8 +35,10 @@ from mjxball.policy.policy import NetworkLaw, Policy
 from mjxball.policy.shipped import shipped_policy
 from mjxball.rollout import make_brief, simulate_batch
 from mjxball.scenario import Scenario
+from mjxball.sensing import Disturbance
 
 MARGIN, SECONDS, SETTLED = 0.3, 20.0, 5.0
+LEG = 15.0  # [s]
 CLASSICAL = ("copy", "adaptive", "lqg")
 
 
@@ -141,6 +145,42 @@ def flight(path: Path, rigs: int) -> list[dict[str, Any]]:
     return rows
 
 
+def route(path: Path) -> list[dict[str, Any]]:
+    """Distance from each waypoint at the end of its leg, RMSE and tilt on the way, over CG speeds."""
+    config = preset("flight")
+    places = [(0.0, 0.0, 0.4), (0.5, 0.0, 0.4), (0.5, 0.5, 0.4), (0.0, 0.5, 0.4), (0.0, 0.0, 0.4), (0.0, 0.0, 0.0)]
+    later = tuple((LEG * (k + 1), place) for k, place in enumerate(places[1:]))
+    scenarios = [
+        Scenario(
+            omega=omega,
+            amplitude=0.03 * config.plant.moving_fraction,
+            mass=config.plant.object_mass,
+            goal=places[0],
+            waypoints=later,
+            seconds=LEG * len(places),
+            disturbance=Disturbance(noise=1.0, delay=0.02, seed=number),
+        )
+        for number, omega in enumerate((0.3, 0.5, 0.7, 0.85, 1.0))
+    ]
+    rows = []
+    for follower in (*(make_baseline(name, config) for name in CLASSICAL), load_policy(path, config)):
+        flown = simulate_batch(config, [(follower, scenarios)], "newton-euler")
+        ends = [round(LEG * (k + 1) / config.timing.control_period) - 1 for k in range(len(places))]
+        missed = np.linalg.norm(flown.position[ends] - np.array(places)[:, None], axis=-1)  # (waypoints, flights)
+        tilt = np.sqrt((flown.euler[..., :2] ** 2).sum(axis=-1))
+        rows.append(
+            {
+                "follower": follower.name,
+                "flights": len(scenarios),
+                "diverged": int(flown.diverged.sum()),
+                "beside a corner, median": float(np.median(missed)),
+                "beside a corner, worst": float(missed.max()),
+                "tilt rms": float(np.median(np.sqrt((tilt**2).mean(axis=0)))),
+            }
+        )
+    return rows
+
+
 def main() -> None:
     """Fly, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -152,6 +192,7 @@ def main() -> None:
     options = parser.parse_args()
     enable_compilation_cache()
     found = {"stand": stand(options.stand, options.starts), "flight": flight(options.flight, options.rigs)}
+    found["route"] = route(options.flight)
     for part, rows in found.items():
         for row in rows:
             shown = (

@@ -16,7 +16,11 @@ from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import hover_rotor_force, make_autopilot, make_control_step, start_state
 from mjxball.physics.stepper import make_stepper
+from mjxball.policy import Policy
+from mjxball.policy.shipped import shipped_policy
 from mjxball.rig.response import Trial, rise_and_overshoot, turn_alone
+from mjxball.rollout import simulate
+from mjxball.scenario import Scenario
 
 PAIR = preset("flight")
 # Published inertias run from 0.94e-5 to 1.68e-5 kg m2; ours is near the upper end.
@@ -147,3 +151,13 @@ class TestPair:
             # An ulp before a truncation moves a motor by a unit: 3e-6 N, 1e-5 of hover; through the body less.
             scale = np.abs(ours).max() or 1.0
             assert np.abs(np.asarray(theirs) - ours).max() < 2e-5 * scale, name
+
+
+def test_the_flight_policy_goes_where_waypoints_lead() -> None:
+    corners = ((0.4, 0.0, 0.4), (0.4, 0.4, 0.4))
+    path = ((12.0, corners[1]), (24.0, (0.0, 0.0, 0.0)))
+    scenario = Scenario(omega=0.7, amplitude=0.013, mass=0.0175, goal=corners[0], waypoints=path, seconds=36.0)
+    flown = simulate(PAIR, Policy.load(shipped_policy("flight")), scenario, "newton-euler")
+    for number, place in enumerate((*corners, (0.0, 0.0, 0.0))):
+        end = flown.position[round(12 * (number + 1) / PAIR.timing.control_period) - 1]
+        assert np.linalg.norm(end - place) < 0.03
