@@ -12,10 +12,11 @@ distribution is printed as well. Wanted, of medians over the phases; who fails i
 - settling: 2 %, at most LQG's plus 10 % or 0.1 s
 - rmse: at most LQG's plus 10 % or 5 mm
 
-LQG is always told the plant. Delay makes it limit-cycle, so that settling and rmse are held against its undisturbed
-flights everywhere. Cells in which one drone's pitch torque, 2 (5.5 - T / 4) L, does not hold the object's weight at the
-CG's largest offset with 15 % left are infeasible, for every follower. Where the mass is unknown that of the follower
-must also hold what it lifts alone (`trim_reach`): those cells are counted apart as well.
+LQG (`--told lqg`, or `lqg-slow` with the better filter) is always told the plant. Delay makes `lqg` limit-cycle, so
+that settling and rmse are held against undisturbed flights everywhere. Cells in which one drone's pitch torque,
+2 (5.5 - T / 4) L, does not hold the object's weight at the CG's largest offset with 15 % left are infeasible, for every
+follower. Where the mass is unknown that of the follower must also hold what it lifts alone (`trim_reach`): those cells
+are counted apart as well.
 """
 
 from __future__ import annotations
@@ -124,9 +125,11 @@ def distribution(summaries: list[dict[str, Any]]) -> None:
             print(f"{where}: least - median - most of {len(rows)} policies, of {rows[0]['cells']} cells: {shown}")
 
 
-def judge(config: Config, policies: list[Follower], robust: list[Follower], cells: list[Any], seeds: int) -> Any:
+def judge(
+    config: Config, policies: list[Follower], robust: list[Follower], told: str, cells: list[Any], seeds: int
+) -> Any:
     """(summaries, what is missed) of all policies where the mass is known, of the robust ones where it is not."""
-    calm, summaries, missed = fly(make_baseline("lqg", config), cells, {}, False, seeds), [], []
+    calm, summaries, missed = fly(make_baseline(told, config), cells, {}, False, seeds), [], []
     for known, disturbed in ((True, False), (True, True), (False, False), (False, True)):
         rival = "adaptive" if known else "adaptive-mass"
         common = {} if known else {"believed_mass": BELIEVED}
@@ -135,9 +138,9 @@ def judge(config: Config, policies: list[Follower], robust: list[Follower], cell
         for policy in dict.fromkeys([*policies, *robust]) if known else robust:
             rows = []
             mine = fly(policy, cells, common, disturbed, seeds)
-            for cell, own, theirs, told in zip(cells, mine, other, calm, strict=True):
-                bar = wanted(theirs, told)
-                peaks = {"policy": own["peak"], rival: theirs["peak"], "lqg, undisturbed": told["peak"]}
+            for cell, own, theirs, best in zip(cells, mine, other, calm, strict=True):
+                bar = wanted(theirs, best)
+                peaks = {"policy": own["peak"], rival: theirs["peak"], f"{told}, undisturbed": best["peak"]}
                 rows.append({"cell": cell, **own, "bar": bar, "peaks": peaks, "wins": wins_of(own, bar)})
             summaries.append(show(where, policy.name, rows))
             if not known:
@@ -160,6 +163,7 @@ def main() -> None:
     parser.add_argument("policies", type=Path, nargs="*")
     parser.add_argument("--robust", type=Path, nargs="+", help="policies for unknown masses (default: the same)")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--told", choices=("lqg", "lqg-slow"), default="lqg", help="LQG of settling and rmse")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
     config = preset("paper")
@@ -169,7 +173,7 @@ def main() -> None:
     print(f"{len(cells)} of {len(every)} cells are feasible, not at any speed: {lost}")
     policies = [load_policy(path, config) for path in options.policies]
     robust = [load_policy(path, config) for path in options.robust] if options.robust else policies
-    summaries, missed = judge(config, policies, robust, cells, options.seeds)
+    summaries, missed = judge(config, policies, robust, options.told, cells, options.seeds)
     distribution(summaries)
     if len(policies) + len(robust) <= 4:
         print("\n".join(missed))

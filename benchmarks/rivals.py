@@ -28,7 +28,8 @@ from mjxball.policy.shipped import shipped_policy
 from mjxball.scenario import Scenario
 from mjxball.sensing import Disturbance
 
-CLASSICAL = ("lqg", "adaptive", "copy")
+CLASSICAL = ("lqg", "lqg-slow", "adaptive", "copy")
+TOLD = CLASSICAL[:2]
 SHIPPED = ("transport", "robust", "paper")
 COMMANDS = ("smoothness", "saturation")
 ROUNDED = 1e-6  # float32: what two followers' numbers may differ by and be called equal
@@ -47,15 +48,19 @@ def fly(follower: Follower, cells: list[Any], disturbed: bool) -> list[dict[str,
 
 def summary(name: str, mine: list[Any], rivals: dict[str, list[Any]]) -> dict[str, Any]:
     """One row of the table."""
-    pairs = list(zip(mine, rivals["adaptive"], rivals["lqg"], strict=True))
-    row: dict[str, Any] = {"follower": name, "cells": len(pairs)}
+    row: dict[str, Any] = {"follower": name, "cells": len(mine)}
     for key in WANTED:
-        row[f"beats adaptive in {key}"] = sum(own[key] < other[key] - ROUNDED for own, other, _ in pairs)
+        beaten = (own[key] < other[key] - ROUNDED for own, other in zip(mine, rivals["adaptive"], strict=True))
+        row[f"beats adaptive in {key}"] = sum(beaten)
+    row["peak, median"] = statistics.median(own["peak"] for own in mine)
+    row["failed"] = sum(math.isinf(own["rmse"]) for own in mine)
     row["settling, median"] = statistics.median(own["settling"] for own in mine)
     for key in COMMANDS:
         row[f"{key}, median"] = statistics.median(own[key] for own in mine)
         row[f"{key}, largest"] = max(own[key] for own in mine)
-        row[f"no more {key} than lqg"] = sum(own[key] <= told[key] + ROUNDED for own, _, told in pairs)
+        for rival in TOLD:
+            less = (own[key] <= told[key] + ROUNDED for own, told in zip(mine, rivals[rival], strict=True))
+            row[f"no more {key} than {rival}"] = sum(less)
     return row
 
 
