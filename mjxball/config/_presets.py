@@ -79,8 +79,8 @@ def _transport_large() -> Config:
             rotor_lag_scale=(0.7, 1.4),
         ),
         bounds=Bounds(x_peak=0.015, settling_time=2.8, rmse=0.345),
-        # Speed is dear so that the goal is not overshot.
-        reward=Reward(error_scale=0.02, velocity=6.0),
+        # Speed is dear so that the goal is not overshot, and changes of the command, or noise comes through to the rotors.
+        reward=Reward(error_scale=0.02, velocity=6.0, smoothness=1.5),
         sac=Sac(
             steps=2_048_000,
             worlds=512,
@@ -91,7 +91,7 @@ def _transport_large() -> Config:
             critic_layers=(128, 128),
             privileged=True,
             discount=0.97,
-            return_steps=10,
+            return_steps=5,
             learning_rate=3e-3,
             learning_rate_end=0.02,
         ),
