@@ -29,6 +29,8 @@ from mjxball.evaluate.cells import load_policy
 from mjxball.physics.stepper import TRAINING_ENGINES
 
 BASE = "transport-large"
+# What the preset was when the rows were trained; its smoothness and return steps were chosen after them.
+THEN = {"reward.smoothness": 0.02, "sac.return_steps": 10}
 ROWS: dict[str, dict[str, Any]] = {
     "base": {},
     "no-memory": {"follower.filters": ()},
@@ -64,9 +66,9 @@ ROWS: dict[str, dict[str, Any]] = {
 
 
 def settings_of(row: str, steps: int) -> Config:
-    """`BASE` with `steps` and the change of `row`."""
+    """`BASE` as it was THEN, with `steps` and the change of `row`."""
     config = configs.replace(preset(BASE), "sac.steps", steps)
-    for name, value in ROWS[row].items():
+    for name, value in {**THEN, **ROWS[row]}.items():
         config = configs.replace(config, name, value)
     return configs.validate(config)
 

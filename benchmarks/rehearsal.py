@@ -4,14 +4,16 @@
 
 The runner flies `policies/flight.npz` and `policies/stand.npz` with cflib against the twin, in real time. The pure
 simulation (`mjxball.rollout.simulate`, closed form, no protocol, no estimator, no contact) begins where each flight
-came under both laws: its place, velocity, roll, CG phase or place of the ball, the same goal. Compared are figures
-from 5 s on, from the flight's own log and, for the ball, the twin's truth. Medians over the flights.
+came under both laws: its place, velocity, roll, CG phase or place of the ball, the same goal. It is flown twice, the
+follower reading exact numbers, and numbers in the steps in which a drone's state comes over the wire. Compared are
+figures from 5 s on; attitude and ball are the twin's truth, positions the flight's log. Medians over the flights.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import statistics
 import subprocess
@@ -37,11 +39,25 @@ from mjxball.scenario import Scenario
 ROOT = Path(__file__).parents[1]
 NAMES = ("flight", "stand")
 SETTLED = 5.0  # [s] under both laws, from which on figures count
-BALL_EVERY = 0.02  # [s]
+TRUTH_EVERY = 0.02  # [s]
+# Steps of the 18 observed numbers: millimetres, a compressed quaternion's, half a millimetre for O, which is between two.
+STEPS = np.array([*[1e-3] * 3, *[2 / (511 * math.sqrt(2))] * 3, *[1e-3] * 6, *[5e-4] * 6])
+
+
+class Coarse:
+    """A follower that reads its policy's observation in `STEPS`."""
+
+    def __init__(self, policy: Policy):
+        self._policy, self.name = policy, policy.name
+        self.reset = policy.reset
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """See `Follower.__call__`."""
+        return self._policy(STEPS * np.round(observation / STEPS))
 
 
 def rehearse(path: Path, seconds: float) -> tuple[Recording, np.ndarray]:
-    """A flight's recording and, of the twin, (time since the motors turned [s], CG offset [m]) as rows."""
+    """A flight's recording and, of the twin, (time since the motors turned [s], CG offset [m], tilts [rad]) as rows."""
     config = config_of(Policy.load(path).card)
     pair = CoupledPair(config)
     with tempfile.TemporaryDirectory() as place, Twin(pair) as twin:
@@ -53,20 +69,21 @@ def rehearse(path: Path, seconds: float) -> tuple[Recording, np.ndarray]:
         )
         rows = []
         while running.poll() is None:
-            rows.append((pair._flown, pair.cg_offset))
-            time.sleep(BALL_EVERY)
+            turned = rotations.euler_from_matrix(rotations.matrix_from_quaternion(twin.truth.state.quaternion[1]))
+            rows.append((pair._flown, pair.cg_offset, *turned))
+            time.sleep(TRUTH_EVERY)
         if running.returncode != 0:
             raise SystemExit(f"the rehearsal of {path.stem} ended with {running.returncode}: {running.stdout.read()}")
         return read_recording(log), np.array(rows)
 
 
-def simulated(recording: Recording, offsets: np.ndarray, policy: Policy, seconds: float) -> Any:
+def simulated(recording: Recording, truth: np.ndarray, follower: Any, seconds: float) -> Any:
     """The pure simulation from where `recording` came under both laws."""
     config = recording.config
     begin = recording.phase.index("fly")
     conditions, moved = Conditions.of(config), float(recording.time[begin])
     euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion[begin]))
-    ball = float(np.interp(moved, *offsets.T)) / config.plant.moving_fraction
+    ball = float(np.interp(moved, *truth[:, :2].T)) / config.plant.moving_fraction
     stands = config.plant.stand != "free"
     place, climb = recording.position[begin], recording.velocity[begin]
     upright = np.array([0.0, 0.0, 1.0]) if stands else np.ones(3)
@@ -82,7 +99,7 @@ def simulated(recording: Recording, offsets: np.ndarray, policy: Policy, seconds
         start_tilt=(float(euler[0]), 0.0 if stands else float(euler[1])),
         seconds=seconds,
     )
-    return simulate(config, policy, scenario, "newton-euler")
+    return simulate(config, follower, scenario, "newton-euler")
 
 
 def figures(config: Config, error: np.ndarray, euler: np.ndarray, offset: np.ndarray) -> dict[str, float]:
@@ -104,21 +121,21 @@ def figures(config: Config, error: np.ndarray, euler: np.ndarray, offset: np.nda
     }
 
 
-def compare(path: Path, seconds: float) -> dict[str, tuple[float, float]]:
-    """Figure -> (rehearsed, simulated) of one flight."""
+def compare(path: Path, seconds: float) -> dict[str, tuple[float, ...]]:
+    """Figure -> (rehearsed, simulated, simulated with coarse readings) of one flight."""
     policy = Policy.load(path)
-    recording, offsets = rehearse(path, seconds)
-    pure = simulated(recording, offsets, policy, seconds)
+    recording, truth = rehearse(path, seconds)
     begin = recording.time[recording.phase.index("fly")]
-    flying = np.array(recording.phase) == "fly"
-    late = flying & (recording.time >= begin + SETTLED)
-    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion[late]))
+    late = (np.array(recording.phase) == "fly") & (recording.time >= begin + SETTLED)
+    moments = recording.time[late]
+    euler = np.stack([np.interp(moments, truth[:, 0], truth[:, 2 + axis]) for axis in range(3)], axis=-1)
     errors = recording.goal[late] - recording.position[late]
-    offset = np.interp(recording.time[late], *offsets.T)
-    flown = figures(recording.config, errors, euler, offset)
-    settled = pure.time >= SETTLED
-    alone = figures(recording.config, pure.error[settled], pure.euler[settled], pure.cg_offset[settled])
-    return {name: (flown[name], alone[name]) for name in flown}
+    sides = [figures(recording.config, errors, euler, np.interp(moments, *truth[:, :2].T))]
+    for follower in (policy, Coarse(policy)):
+        pure = simulated(recording, truth, follower, seconds)
+        settled = pure.time >= SETTLED
+        sides.append(figures(recording.config, pure.error[settled], pure.euler[settled], pure.cg_offset[settled]))
+    return {name: tuple(side[name] for side in sides) for name in sides[0]}
 
 
 def main() -> None:
@@ -132,9 +149,10 @@ def main() -> None:
     for name in NAMES:
         flights = [compare(shipped_policy(name), options.seconds) for _ in range(options.flights)]
         for figure in flights[0]:
-            flown, alone = (statistics.median(one[figure][side] for one in flights) for side in (0, 1))
-            found.append({"policy": name, "figure": figure, "rehearsed": flown, "simulated": alone})
-            print(f"{name:7s} {figure:16s} rehearsed {flown:7.2f}  simulated {alone:7.2f}  ratio {flown / alone:.2f}")
+            flown, alone, coarse = (statistics.median(one[figure][side] for one in flights) for side in range(3))
+            row = {"rehearsed": flown, "simulated": alone, "simulated, coarse readings": coarse}
+            found.append({"policy": name, "figure": figure, **row})
+            print(f"{name:7s} {figure:16s}" + "".join(f"  {key} {value:7.2f}" for key, value in row.items()))
     if options.json:
         options.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
 
