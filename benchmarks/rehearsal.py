@@ -40,7 +40,7 @@ ROOT = Path(__file__).parents[1]
 NAMES = ("flight", "stand")
 SETTLED = 5.0  # [s] under both laws, from which on figures count
 TRUTH_EVERY = 0.02  # [s]
-# Steps of the 18 observed numbers: millimetres, a compressed quaternion's, half a millimetre for O, which is between two.
+# Steps of the 18 observed numbers: millimetres, a compressed quaternion's, and half a millimetre for the place of O.
 STEPS = np.array([*[1e-3] * 3, *[2 / (511 * math.sqrt(2))] * 3, *[1e-3] * 6, *[5e-4] * 6])
 
 
