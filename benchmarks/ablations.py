@@ -61,6 +61,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "no-smoothness": {"reward.smoothness": 0.0},
     "discount-0.985": {"sac.discount": 0.985},
     "discount-0.95": {"sac.discount": 0.95},
+    "curriculum": {"sac.curriculum": 0.5},
     "learning-rate-1e-3": {"sac.learning_rate": 1e-3},
 }
 

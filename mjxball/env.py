@@ -129,13 +129,16 @@ class CoupledPairEnv(Env):
         """Control period [s]."""
         return self.config.timing.control_period
 
-    def reset(self, rng: Array) -> State:
-        """A fresh world at rest or nearly so, drawn from `config.scenario`."""
+    def reset(self, rng: Array, reach: Array | float = 1.0) -> State:
+        """A fresh world at rest or nearly so, drawn from `config.scenario`.
+
+        `reach` () in [0, 1]: the lower share of the ranges of the CG's amplitude and speed, which is drawn from.
+        """
         scenario = self.config.scenario
         # One draw for everything: a reset runs beside every training step, and each draw is kernels to launch.
         drawn = iter(jnp.split(jax.random.uniform(rng, (DRAWS,)), DRAWS))
 
-        def between(low: float, high: float) -> Array:
+        def between(low: float, high: Array | float) -> Array:
             return low + (high - low) * next(drawn)[0]
 
         def symmetric(reach: float, size: int = 3) -> Array:
@@ -147,8 +150,8 @@ class CoupledPairEnv(Env):
         load = Load(
             object_mass=mass,
             believed_mass=believed,
-            cg_amplitude=between(*scenario.cg_amplitude),
-            cg_speed=between(*scenario.cg_speed),
+            cg_amplitude=between(*shortened(scenario.cg_amplitude, reach)),
+            cg_speed=between(*shortened(scenario.cg_speed, reach)),
             cg_phase=between(0.0, 2 * jnp.pi),
             mass_change=between(*scenario.mass_change)[None],
             mass_change_time=between(*scenario.mass_change_time)[None],
@@ -359,3 +362,9 @@ class CoupledPairEnv(Env):
 def _make_step(config: Config, physics: str) -> ControlStep:
     make = make_engine if physics == "mjx" else newton_euler.make_engine
     return make_control_step(config, make(config.plant, config.attitude), jax_repeat)
+
+
+def shortened(ends: tuple[float, float], share: Array | float) -> tuple[float, Array | float]:
+    """The lower `share` () of the range between `ends`."""
+    low, high = ends
+    return low, high if isinstance(share, float) and share == 1.0 else low + share * (high - low)

@@ -79,7 +79,7 @@ def _transport_large() -> Config:
             rotor_lag_scale=(0.7, 1.4),
         ),
         bounds=Bounds(x_peak=0.015, settling_time=2.8, rmse=0.345),
-        # Speed is dear so that the goal is not overshot, and changes of the command, or noise comes through to the rotors.
+        # Speed is dear so that the goal is not overshot, changes of the command so that noise ends before the rotors.
         reward=Reward(error_scale=0.02, velocity=6.0, smoothness=1.5),
         sac=Sac(
             steps=2_048_000,

@@ -262,6 +262,12 @@ class Sac:
     alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
     return_steps: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
+    curriculum: float = setting(
+        0.0,
+        "share of training over which the CG's amplitude and speed grow to the scenario's, 0: all from the start",
+        low=0,
+        high=1,
+    )
     policy_delay: int = setting(1, "critic updates for each update of policy and temperature", low=1, high=1000)
     gradient_clip: float = setting(0.0, "largest global norm of a gradient, 0: not clipped", low=0)
     target_rate: float = setting(0.02, "tau of the slow copies that give the targets", above=0, high=1)

@@ -111,13 +111,13 @@ class Program:
         self._shards = shards or Shards()
         self._worlds = config.sac.worlds // self._shards.parts
         self._update = sac.make_update(self.networks, config.sac, self.sizes[1], self._shards.mean)
-        self._reset, self._step = jax.vmap(self.env.reset), jax.vmap(self.env.step)
+        self._step = jax.vmap(self.env.step)
 
     def create(self, key: Array) -> TrainState:
         """A fresh training state; the worlds' episodes are staggered so that they do not end together."""
         learner_key, world_key, stagger_key, key = jax.random.split(key, 4)
         limits = self.config.sac
-        worlds = self.fresh_worlds(world_key)
+        worlds = self.fresh_worlds(world_key, self._reach(jnp.zeros(()), jnp.ones((), bool)))
         spread = jax.random.randint(self._shards.own(stagger_key), (self._worlds,), 0, self.config.timing.episode_steps)
         worlds = worlds.replace(pipeline_state=worlds.pipeline_state._replace(steps=spread))
         return TrainState(
@@ -128,9 +128,18 @@ class Program:
             steps=jnp.zeros((), jnp.int32),
         )
 
-    def fresh_worlds(self, key: Array) -> Any:
-        """All worlds, newly reset."""
-        return self._reset(jax.random.split(self._shards.own(key), self._worlds))
+    def fresh_worlds(self, key: Array, reach: Array | float = 1.0) -> Any:
+        """All worlds, newly reset; `reach` as in `CoupledPairEnv.reset`."""
+        keys = jax.random.split(self._shards.own(key), self._worlds)
+        return jax.vmap(lambda one: self.env.reset(one, reach))(keys)
+
+    def _reach(self, steps: Array, record: Array) -> Array | float:
+        """How much of the CG's motion is drawn after so many `steps`; in evaluation all of it."""
+        limits = self.config.sac
+        if limits.curriculum == 0:
+            return 1.0
+        grown = jnp.clip(steps / (limits.curriculum * limits.steps), 0.0, 1.0)
+        return jnp.where(record, grown, 1.0)
 
     def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
         """Step all worlds `mode.steps` times, with `mode.updates` gradient updates after each."""
@@ -179,7 +188,7 @@ class Program:
         after = self._step(worlds, action)
         terminated = after.done * (1 - after.info["truncation"])
         transitions = replay.Transitions(worlds.obs, action, after.reward, 1 - terminated, after.obs, after.done)
-        fresh = self.fresh_worlds(reset_key)
+        fresh = self.fresh_worlds(reset_key, self._reach(state.steps, mode.record))
 
         def reset_if_done(new: Array, old: Array) -> Array:
             done = after.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
