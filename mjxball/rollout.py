@@ -113,7 +113,7 @@ def simulate(
 ) -> Trajectory:
     """Fly `follower` through `scenario` on `plant` (or on a whole `Config`: gains, limits and rates too).
 
-    `physics` is mjx, newton-euler or mujoco. Raises InputError for an unsound scenario.
+    `physics` is mjx, newton-euler or mujoco. Raises InputError for an unsound scenario or a policy of another rate.
     """
     config = plant if isinstance(plant, Config) else dataclasses.replace(preset("paper"), plant=plant)
     return simulate_batch(config, [(follower, [scenario or Scenario()])], physics).world(0)
@@ -140,6 +140,9 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     parts = [slice(end - len(part), end) for end, (_, part) in zip(ends, flights, strict=True)]
     followers = [follower for follower, _ in flights]
     for follower in followers:
+        wanted = getattr(follower, "control_period", config.timing.control_period)
+        if abs(wanted - config.timing.control_period) > 1e-9:
+            raise InputError(f"{follower.name} acts every {wanted:g} s, not every {config.timing.control_period:g} s")
         follower.reset()
 
     def act(seen: np.ndarray, brief: Brief) -> np.ndarray:

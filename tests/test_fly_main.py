@@ -114,7 +114,7 @@ def test_a_flight_with_no_name_for_its_log_gets_one(tmp_path: Path) -> None:
 
 
 KINDS = {
-    "rehearsed": ["--seconds", "2", "--gains", "gains.json"],
+    "rehearsed": ["--seconds", "2", "--gains", "gains.json", "--loss", "0.1", "--delay", "0.01", "--jitter", "0.005"],
     "dry": ["--seconds", "1", "--dry-run"],
     "interrupted": ["--seconds", "60"],
     "terminated": ["--seconds", "60", "--thrust", "paper", "--hover", "47000"],
@@ -187,6 +187,10 @@ def test_a_rehearsal(flights: dict[str, Ended]) -> None:
         assert written[drone, "pid_attitude.roll_kp"] == 4.5
         assert written[drone, "pid_rate.roll_kd"] == 3.0
     assert [drone for drone, name in written if name == "pid_rate.roll_ki"] == ["follower"]
+    ticks = flight.ticks("fly")
+    first, last = ticks[0]["t"], ticks[-1]["t"]
+    came = sum(record["kind"] == "state" and first < record["t"] < last for record in flight.records)
+    assert 0.8 < came / (2 * len(ticks)) < 0.97  # a tenth was lost
     errors = [abs(value) for value in flight.ticks("fly")[-1]["observation"][12:15]]
     assert max(errors) < 0.1  # the pair has gone where it was sent
 

@@ -15,7 +15,6 @@ from conftest import opened
 
 from mjxball.config import Plant
 from mjxball.errors import InputError
-from mjxball.scenario import Scenario
 from mjxball.view.command import main
 from mjxball.view.flight_file import SHAPES, Flight, load_flight, save_flight
 from mjxball.view.page import flight_page
@@ -28,7 +27,7 @@ COLOURS = {"thrust": "#0c8599", "contact": "#c2255c", "goal": "#2f9e44", "cg": "
 @pytest.fixture(scope="module")
 def flight() -> Flight:
     """The shipped policy on the reference scenario, its first seconds."""
-    return flight_from(str(TRANSPORT), Scenario(seconds=SECONDS), "newton-euler")
+    return flight_from(str(TRANSPORT), {"seconds": SECONDS}, "newton-euler")
 
 
 @pytest.fixture(scope="module")
@@ -53,9 +52,19 @@ def test_what_is_flown_is_the_reference(flight: Flight):
     assert flight.title == "transport: CG ±5 cm at 0.31 rad/s, 0.2 kg"
 
 
+@pytest.mark.parametrize(
+    ("name", "title"), [("flight", "flight: CG ±3.4 cm at 0.31 rad/s"), ("stand", "stand: ball from 5 cm")]
+)
+def test_a_policy_for_crazyflies_flies_its_own_plant(name: str, title: str):
+    shown = flight_from(str(TRANSPORT.with_name(f"{name}.npz")), {"seconds": 1.0}, "newton-euler")
+    assert shown.title == f"{title}, 0.0175 kg"
+    assert shown.plant.layout == "x"
+    assert len(shown["time"]) == 101
+
+
 def test_a_flight_file_gives_the_flight_back(flight: Flight, tmp_path: Path):
     save_flight(tmp_path / "flight.npz", flight)
-    again = flight_from(str(tmp_path / "flight.npz"), Scenario(), "newton-euler")
+    again = flight_from(str(tmp_path / "flight.npz"), {}, "newton-euler")
     assert (again.title, again.plant) == (flight.title, flight.plant)
     np.testing.assert_array_equal(again["time"], flight["time"])
     for name in SHAPES:
@@ -65,10 +74,10 @@ def test_a_flight_file_gives_the_flight_back(flight: Flight, tmp_path: Path):
 def test_a_run_directory_and_a_baseline_are_flown(flight: Flight, tmp_path: Path):
     (tmp_path / "mine").mkdir()
     shutil.copy(TRANSPORT, tmp_path / "mine" / "policy.npz")
-    run = flight_from(str(tmp_path / "mine"), Scenario(seconds=SECONDS), "newton-euler")
+    run = flight_from(str(tmp_path / "mine"), {"seconds": SECONDS}, "newton-euler")
     assert run.title.startswith("mine: ")
     np.testing.assert_array_equal(run["position"], flight["position"])
-    copy = flight_from("copy", Scenario(seconds=1.0), "newton-euler")
+    copy = flight_from("copy", {"seconds": 1.0}, "newton-euler")
     np.testing.assert_array_equal(copy["leader_command"], copy["follower_command"])
 
 
@@ -240,7 +249,7 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert call(main, given) == 0
     assert capsys.readouterr().out == f"the flight is {record}\nthe page is {page}\n"
     assert load_flight(record).title == "copy: CG ±5 cm at 2 rad/s, 0.2 kg"
-    shown = flight_from("copy", Scenario(omega=2, seconds=1), "newton-euler")
+    shown = flight_from("copy", {"omega": 2, "seconds": 1}, "newton-euler")
     assert page.read_text(encoding="utf-8") == flight_page(shown)
     before = listing(tmp_path)
     assert call(main, given) == 2

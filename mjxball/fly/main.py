@@ -32,7 +32,11 @@ URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
 LOOP_RATE = 100.0  # [Hz] at least: the policy's period is a whole number of ticks
 # Numbers with least and most: of the battery, and of the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
-WORSE = {"loss": "share of lost datagrams", "delay": "seconds that each is late", "jitter": "seconds more, at random"}
+WORSE = {  # once the motors turn: cflib connects over a good link only
+    "loss": "share of lost datagrams",
+    "delay": "seconds that each is late",
+    "jitter": "seconds more, at random",
+}
 CURVES = {"linear": LINEAR, "older": OLDER}
 
 

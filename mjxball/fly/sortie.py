@@ -29,6 +29,7 @@ from mjxball.fly.preflight import Preflight, check, prepare
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.watchdog import NOTHING, Watchdog
 
+BUSY = 0.02  # [s]: ticks that come later than that are no fault of drones or policy
 SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
 
 
@@ -141,6 +142,10 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     journal.note("end", code=code, cause=str(cause) if cause else "", timing=timing, overwritten=sent)
     if cause is not None:
         _say(f"ended by {cause.event.name.lower().replace('_', ' ')}{': ' + cause.detail if cause.detail else ''}")
+        if cause.event in (Event.DEADLINES, Event.STALE) and timing.largest > BUSY:
+            _say(
+                f"this computer was too busy: a tick came {1e3 * timing.largest:.0f} ms late; close what else runs on it"
+            )
     if flight.settings.dry_run and flight.highest:
         text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
         _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")

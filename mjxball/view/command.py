@@ -10,12 +10,11 @@ from pathlib import Path
 from mjxball.cli import Parser, make_parser, output_file, run_command
 from mjxball.errors import InputError
 from mjxball.policy.file import write_whole
-from mjxball.scenario import Scenario
 from mjxball.view.flight_file import save_flight
 from mjxball.view.page import flight_page
 from mjxball.view.sources import flight_from
 
-REFERENCE = Scenario()
+CHANGES = ("omega", "amplitude", "mass", "goal", "seconds")  # flags, and fields of a scenario
 
 
 def parser() -> Parser:
@@ -35,12 +34,14 @@ def parser() -> Parser:
     )
     live.add_argument("--port", type=int, default=None, metavar="PORT", help="of that page (a free one)")
     live.add_argument("--attached", action="store_true", help=argparse.SUPPRESS)  # end when standard input does
-    flown = result.add_argument_group("scenario of what is flown on the spot")
-    flown.add_argument("--omega", type=float, default=REFERENCE.omega, help="CG speed [rad/s] (default %(default)s)")
-    flown.add_argument("--amplitude", type=float, default=REFERENCE.amplitude, help="of the CG [m] (%(default)s)")
-    flown.add_argument("--mass", type=float, default=REFERENCE.mass, help="of the object [kg] (%(default)s)")
-    flown.add_argument("--goal", nargs=3, type=float, default=REFERENCE.goal, metavar=("X", "Y", "Z"), help="[m]")
-    flown.add_argument("--seconds", type=float, default=REFERENCE.seconds, help="length of the flight (%(default)s)")
+    flown = result.add_argument_group(
+        "scenario of what is flown on the spot", "the follower's reference scenario, changed by"
+    )
+    flown.add_argument("--omega", type=float, metavar="W", help="CG speed [rad/s]")
+    flown.add_argument("--amplitude", type=float, metavar="A", help="of the CG [m]")
+    flown.add_argument("--mass", type=float, metavar="M", help="of the object [kg]")
+    flown.add_argument("--goal", nargs=3, type=float, metavar=("X", "Y", "Z"), help="[m]")
+    flown.add_argument("--seconds", type=float, metavar="S", help="length of the flight")
     flown.add_argument("--physics", choices=("newton-euler", "mjx", "mujoco"), default="newton-euler")
     return result
 
@@ -59,14 +60,8 @@ def _view(options: argparse.Namespace) -> int:
     for path, suffix in ((options.out, ".html"), (options.save, ".npz")):
         if path:
             output_file(path, suffix)
-    scenario = Scenario(
-        omega=options.omega,
-        amplitude=options.amplitude,
-        mass=options.mass,
-        goal=tuple(options.goal),
-        seconds=options.seconds,
-    )
-    flight = flight_from(options.source, scenario, options.physics)
+    given = {name: getattr(options, name) for name in CHANGES if getattr(options, name) is not None}
+    flight = flight_from(options.source, given, options.physics)
     if options.save:
         save_flight(options.save, flight)
         print(f"the flight is {options.save}")  # noqa: T201

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mjxball.config import preset
 from mjxball.control import rotations
 from mjxball.errors import InputError
-from mjxball.scenario import Scenario
 from mjxball.view.flight_file import Flight, check_flight, flight_of, is_flight, load_flight
 
 
-def flight_from(source: str, scenario: Scenario, physics: str) -> Flight:
+def flight_from(source: str, changes: Mapping[str, Any], physics: str) -> Flight:
     """The flight that `source` names.
 
-    A flight file or a flight log is read; a policy file, a run directory (its `policy.npz`) or the name of a classical
-    follower is flown through `scenario` on the `paper` plant. Raises InputError if it is none of these.
+    A flight file or a flight log is read. A policy file, a run directory (its `policy.npz`) or the name of a classical
+    follower is flown through its reference scenario with `changes` to the fields of `Scenario`, on the paper's plant;
+    a policy made for Crazyflies on its own. Raises InputError if it is none of these.
     """
     path = Path(source)
     if path.suffix == ".npz" and is_flight(path):
         return load_flight(path)
     if path.is_file() and path.suffix != ".npz":
         return read_log(path)
-    return _flown(source, scenario, physics)
+    return _flown(source, changes, physics)
 
 
 def read_log(path: Path) -> Flight:
@@ -58,24 +61,38 @@ def read_log(path: Path) -> Flight:
     return check_flight(Flight(title, recording.config.plant, arrays), str(path))
 
 
-def _flown(source: str, scenario: Scenario, physics: str) -> Flight:
-    from mjxball.control.followers import LAWS, Follower, make_baseline
-    from mjxball.evaluate.cells import load_policy
+def _flown(source: str, changes: Mapping[str, Any], physics: str) -> Flight:
+    from mjxball.control.followers import LAWS, make_baseline
+    from mjxball.evaluate.cells import REFERENCE, load_policy, standard_scenarios
+    from mjxball.evaluate.homes import own_home
     from mjxball.rollout import simulate
 
-    setup, path = preset("paper"), Path(source)
-    follower: Follower
+    setup, reference, path = preset("paper"), REFERENCE, Path(source)
     if source in LAWS:
-        follower = make_baseline(source, setup)
-    elif path.is_dir():
+        follower: Any = make_baseline(source, setup)
+    else:
+        file = _policy_file(path)
+        home = own_home(file)
+        if home is not None:
+            setup, reference = home, standard_scenarios(home)[-1]
+        follower = load_policy(file, setup)
+        follower.name = path.name if path.is_dir() else follower.name
+    tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
+    scenario = dataclasses.replace(reference, **tuples)
+    flown = simulate(setup, follower, scenario, physics)
+    motion = f"CG ±{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s"
+    if setup.motion.kind == "rolling":
+        motion = f"ball from {100 * scenario.ball_start:g} cm"
+    return flight_of(flown, setup.plant, f"{follower.name}: {motion}, {scenario.mass:g} kg")
+
+
+def _policy_file(path: Path) -> Path:
+    if path.is_dir():
         if not (path / "policy.npz").exists():
             raise InputError(f"run directory {path} has no policy.npz; python -m mjxball.export makes one")
-        follower = load_policy(path / "policy.npz", setup)
-        follower.name = path.name
-    elif path.suffix == ".npz":
-        follower = load_policy(path, setup)
-    else:
-        raise InputError(f"{source} is no flight, policy file, run directory or one of {', '.join(LAWS)}")
-    flown = simulate(setup, follower, scenario, physics)
-    title = f"{follower.name}: CG ±{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s, {scenario.mass:g} kg"
-    return flight_of(flown, setup.plant, title)
+        return path / "policy.npz"
+    if path.suffix == ".npz":
+        return path
+    from mjxball.control.followers import LAWS
+
+    raise InputError(f"{path} is no flight, policy file, run directory or one of {', '.join(LAWS)}")

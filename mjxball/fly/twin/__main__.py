@@ -26,7 +26,7 @@ def main() -> int:
     parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), metavar=("LEADER", "FOLLOWER"))
     parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
     for name in ("loss", "delay", "jitter"):
-        parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links")
+        parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links, once motors turn")
     parser.add_argument("--fault", type=read_strike, action="append", default=[], metavar="KIND:DRONE@S")
     options = parser.parse_args()
     return run_command(lambda: serve(options))
@@ -36,9 +36,9 @@ def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` ask for until standard input ends."""
     card = load_file(options.policy).card if options.policy else None
     with urgent(), Twin(make_pair(card), TwinSettings(ports=tuple(options.ports))) as twin:
-        for drone in range(2):
-            twin.set_link(drone, LinkFaults(options.loss, options.delay, options.jitter))
-        for one in options.fault:
+        worse = LinkFaults(options.loss, options.delay, options.jitter)
+        links = [Strike(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
+        for one in (*links, *options.fault):
             threading.Thread(target=strike, args=(twin, one), daemon=True).start()
         print(json.dumps({"uris": twin.uris}), flush=True)  # noqa: T201
         try:
