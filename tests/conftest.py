@@ -31,6 +31,7 @@ from mjxball.train.program import statistics
 hypothesis.settings.register_profile("mjxball", deadline=None, derandomize=True, database=None, max_examples=60)
 hypothesis.settings.load_profile("mjxball")
 
+BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
 QUEUE, ROOM = Path(__file__), Path(__file__).parent  # locked, never written: they are there on every machine
 
 
@@ -170,7 +171,7 @@ def saved(trained: Trained, tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     """A real Chromium without a window."""
-    program = shutil.which("chromium-headless-shell") or shutil.which("chromium")
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         pytest.skip("no Chromium is installed")
     from playwright.sync_api import sync_playwright

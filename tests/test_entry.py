@@ -13,7 +13,10 @@ from command_line import REPOSITORY, assert_one_line, environment, run
 
 from mjxball import __version__
 
-MODULES = ("mjxball.export", "mjxball.assembly", "mjxball.fly", "mjxball.fly.twin", "mjxball.view")
+MODULES = (
+    *("mjxball.export", "mjxball.assembly", "mjxball.view", "mjxball.rig.gains", "mjxball.rig.identify"),
+    *("mjxball.fly", "mjxball.fly.twin", "mjxball.fly.watchdog"),
+)
 COMMANDS = {
     "train.py": [REPOSITORY / "train.py"],
     "eval.py": [REPOSITORY / "eval.py"],

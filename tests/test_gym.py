@@ -49,7 +49,7 @@ def test_every_preset_is_registered():
     assert {"mjxball/Transport-v0", "mjxball/Paper-v0", "mjxball/Robust-v0"} <= ours
 
 
-@pytest.mark.parametrize("name", ["Transport", "Robust"])
+@pytest.mark.parametrize("name", ["Transport", "TransportLarge", "Paper", "Robust", "Stand", "Flight"])
 def test_gymnasiums_checker_finds_nothing(name: str):
     with warnings.catch_warnings(record=True) as raised:
         warnings.simplefilter("always")

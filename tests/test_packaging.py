@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
 import tarfile
+import venv
 import zipfile
 from importlib import metadata
 from pathlib import Path
@@ -87,6 +89,39 @@ def test_the_unpacked_wheel_finds_its_own_policies(wheel: Path, tmp_path: Path) 
     )
     expected = tmp_path / "mjxball" / "policies" / "transport.npz"
     assert done.stdout.split() == [str(expected), str(len(shipped_policies()))]
+
+
+# extra -> what it is for, in one program.
+WORKS = {
+    "": "from mjxball.policy import Policy, shipped_policy; Policy.load(shipped_policy('robust')).reset()",
+    "fly": "import sys; from mjxball.fly.main import main\n"
+    "sys.exit(main([str(shipped_policy('stand')), '--rehearse', '--dry-run', '--seconds', '1']) > 1)",
+    "onnx": "import runpy, sys; sys.argv = ['x', str(shipped_policy('flight')), 'flight.onnx']\n"
+    "runpy.run_module('mjxball.export', run_name='__main__')",
+    "gym": "import gymnasium, mjxball.gym; env = gymnasium.make('mjxball/Flight-v0')\n"
+    "env.reset(seed=0); env.step(env.action_space.sample())",
+    "view": "import sys; from mjxball.view.command import main\n"
+    "sys.exit(main([str(shipped_policy('flight')), '--seconds', '2', '--out', 'flight.html']))",
+    "train": "import sys; from mjxball.entry import evaluate; sys.argv = ['mjxball-eval', '--followers', 'copy', '--seconds',"
+    " '1']\nsys.exit(evaluate())",
+    "docs": "import furo, myst_parser, nbclient, sphinx",
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", WORKS)
+def test_each_extra_works_in_a_clean_environment(extra: str, wheel: Path, tmp_path: Path) -> None:
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    wanted = f"{wheel}[{extra}]" if extra else str(wheel)
+    constraints = ["-c", REPOSITORY / "constraints.txt"]
+    subprocess.run([python, "-m", "pip", "install", "-q", *constraints, wanted], check=True, timeout=600)
+    program = f"from mjxball.policy import shipped_policy\n{WORKS[extra]}"
+    plain = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [python, "-c", program], cwd=tmp_path, env=plain, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_sdist_builds_the_same_package(built: Path) -> None:

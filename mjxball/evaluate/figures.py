@@ -10,6 +10,7 @@ from mjxball.evaluate.cells import Cell
 from mjxball.plotting import pyplot
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e933c", "#edae49", "#6f4a8e", "#00798c", "#8d6a4f", "#444444")
+LEAST_SPAN = 0.01  # of an axis [m], [deg], [m/s2]
 PANELS = (
     ("position", 0, "x [m]"),
     ("position", 1, "y [m]"),
@@ -72,6 +73,9 @@ def _draw_panel(axis: Any, cells: Sequence[Cell], kind: str, index: int | None, 
             axis.plot(time, factor * followed[:, index], color=colour, linewidth=1.1, label=f"{cell.follower}")
             name = None if number else "dashed: their leaders"
             axis.plot(time, factor * led[:, index], color=colour, linewidth=0.8, linestyle="--", label=name, alpha=0.7)
+    low, high = axis.get_ylim()
+    if high - low < LEAST_SPAN:  # rounding errors must not look like motion
+        axis.set_ylim((low + high - LEAST_SPAN) / 2, (low + high + LEAST_SPAN) / 2)
     axis.set_ylabel(label, fontsize="small")
     axis.grid(alpha=0.25)
     axis.margins(x=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,14 +13,17 @@ from mjxball.evaluate.figures import COLOURS, draw_flights
 from mjxball.plotting import pyplot
 
 MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
+LOST = 0.25  # [m] of difference from which on a simulation that nobody steers says nothing more
 
 
 def draw(cells: Sequence[Cell], stand: bool, leader_mount: Sequence[float], out: Path) -> list[Path]:
-    """Draw a recorded and a simulated flight into the directory `out`; the files that were written.
+    """Draw a recorded flight, and a simulated one until it is `LOST`, into the directory `out`; the files written.
 
     The first is the figure of every simulated flight; of a `stand` there is the one of the paper's experiment too.
     """
     out.mkdir(parents=True, exist_ok=True)
+    recorded, simulated = cells
+    cells = [recorded, _cut(simulated, followed(recorded, simulated))]
     files = [out / "flight.png"]
     draw_flights(cells, files[0])
     if stand:
@@ -59,4 +63,25 @@ def differences(recorded: Cell, simulated: Cell) -> str:
         roll = np.degrees(a.euler[rows, 0] - b.euler[rows, 0])
         numbers = np.linalg.norm(apart, axis=1).max(), np.abs(apart[:, 2]).max(), np.abs(roll).max()
         lines.append(f"{moment:6.1f}{1e3 * numbers[0]:14.1f}{1e3 * numbers[1]:12.1f}{numbers[2]:11.2f}")
+    known = followed(recorded, simulated)
+    if known < len(a.time):
+        lines.append(
+            f"nothing steers the simulation: {LOST:g} m away after {a.time[known]:.1f} s, it is not drawn from there on"
+        )
     return "\n".join(lines)
+
+
+def followed(recorded: Cell, simulated: Cell) -> int:
+    """For how many rows the simulation is less than `LOST` from the recorded flight."""
+    apart = np.linalg.norm(recorded.flight.position - simulated.flight.position, axis=1)
+    lost = np.flatnonzero(~(apart < LOST))
+    return int(lost[0]) if len(lost) else len(apart)
+
+
+def _cut(cell: Cell, rows: int) -> Cell:
+    """`cell` with nothing to draw of its motion after `rows`."""
+    flight, parts = cell.flight, {}
+    for name in ("position", "velocity", "euler", "cg_offset"):
+        parts[name] = np.array(getattr(flight, name), float)
+        parts[name][rows:] = np.nan
+    return dataclasses.replace(cell, flight=dataclasses.replace(flight, **parts))

@@ -109,8 +109,10 @@ def check_options(options: argparse.Namespace) -> None:
             raise InputError(f"--{name} must be {low:g} to {high:g}, not {value:g}")
     if options.goal is not None and not all(math.isfinite(value) for value in options.goal):
         raise InputError("--goal must be three finite numbers")
-    if options.log is not None and (options.log.exists() or not options.log.absolute().parent.is_dir()):
-        raise InputError(f"log file {options.log} exists or its directory does not; choose another name")
+    if options.log is not None and options.log.exists():
+        raise InputError(f"log file {options.log} exists; choose another name")
+    if options.log is not None and not options.log.absolute().parent.is_dir():
+        raise InputError(f"the directory of log file {options.log} does not exist")
     if options.view is not None and ((options.rehearse and options.log is None) or not 0 <= options.view <= 65535):
         raise InputError("--view takes a port of 1 to 65535, or none, and shows what is logged: it needs --log FILE")
 

@@ -143,9 +143,7 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     if cause is not None:
         _say(f"ended by {cause.event.name.lower().replace('_', ' ')}{': ' + cause.detail if cause.detail else ''}")
         if cause.event in (Event.DEADLINES, Event.STALE) and timing.largest > BUSY:
-            _say(
-                f"this computer was too busy: a tick came {1e3 * timing.largest:.0f} ms late; close what else runs on it"
-            )
+            _say(f"this computer was too busy: a tick came {1e3 * timing.largest:.0f} ms late")
     if flight.settings.dry_run and flight.highest:
         text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
         _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")

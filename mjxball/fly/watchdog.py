@@ -19,6 +19,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from mjxball.cli import make_parser
 from mjxball.fly import packets
 from mjxball.fly.maneuver import Glimpse, blind_shares
 from mjxball.fly.packets import Packet, Setpoint
@@ -162,18 +163,21 @@ def _open(crtp: Any, uri: str) -> Any:
 
 def main(arguments: Sequence[str]) -> int:
     """`python -m mjxball.fly.watchdog RUNNER_PID URI URI`: watch standard input."""
+    parser = make_parser("python -m mjxball.fly.watchdog", "Watch over a flight; started by mjxball.fly, not by hand.")
+    parser.add_argument("runner", type=int, metavar="RUNNER_PID")
+    parser.add_argument("uris", nargs=2, metavar="URI")
+    options = parser.parse_args(arguments)
     import cflib.crtp
 
-    runner, uris = int(arguments[0]), arguments[1:]
     cflib.crtp.init_drivers()
     os.write(sys.stdout.fileno(), b"\n")
-    left = watch(sys.stdin.fileno(), runner)
+    left = watch(sys.stdin.fileno(), options.runner)
     if left is None:
         return 0
     start = time.monotonic()
     threads = [
         threading.Thread(target=bring_down, args=(uri, way_down(number, *left), start), daemon=True)
-        for number, uri in enumerate(uris)
+        for number, uri in enumerate(options.uris)
     ]
     for thread in threads:
         thread.start()

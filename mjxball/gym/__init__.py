@@ -7,7 +7,10 @@ Observation, reward, endings and the worlds that are drawn are those of `mjxball
 
 from __future__ import annotations
 
-import gymnasium
+try:
+    import gymnasium
+except ModuleNotFoundError:
+    raise ModuleNotFoundError("gymnasium is not installed; pip install 'mjxball[gym]'", name="gymnasium") from None
 
 from mjxball.config import PRESETS
 

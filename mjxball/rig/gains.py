@@ -78,6 +78,12 @@ def report(designs: Sequence[Design], lag: float) -> str:
         f"over lag {1e3 * low:.0f} to {1e3 * high:.0f} ms, inertia x {ASKED.inertias[0]:g} to {ASKED.inertias[1]:g}, "
         f"delay {1e3 * ASKED.worst_delay:.0f} ms"
     ]
+    for one in designs:
+        if one.nominal.phase and not one.worst.phase:
+            alone = ", as one drone alone with delivered gains is" if one.gains == stock(one.axis) else ""
+            lines.append(
+                f"{one.axis.name} is unstable in the worst corner{alone}: measure the lag (mjxball.rig.identify)"
+            )
     return "\n".join(lines)
 
 
