@@ -102,8 +102,8 @@ WORKS = {
     "env.reset(seed=0); env.step(env.action_space.sample())",
     "view": "import sys; from mjxball.view.command import main\n"
     "sys.exit(main([str(shipped_policy('flight')), '--seconds', '2', '--out', 'flight.html']))",
-    "train": "import sys; from mjxball.entry import evaluate; sys.argv = ['mjxball-eval', '--followers', 'copy', '--seconds',"
-    " '1']\nsys.exit(evaluate())",
+    "train": "import sys; from mjxball.entry import evaluate\n"
+    "sys.argv = ['mjxball-eval', '--followers', 'copy', '--seconds', '1']; sys.exit(evaluate())",
     "docs": "import furo, myst_parser, nbclient, sphinx",
 }
 
