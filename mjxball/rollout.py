@@ -116,6 +116,10 @@ def simulate(
     `physics` is mjx, newton-euler or mujoco. Raises InputError for an unsound scenario or a policy of another rate.
     """
     config = plant if isinstance(plant, Config) else dataclasses.replace(preset("paper"), plant=plant)
+    period = config.timing.control_period
+    wanted = getattr(follower, "control_period", period)
+    if abs(wanted - period) > 1e-9:
+        raise InputError(f"{follower.name} was made for a control period of {wanted:g} s, not {period:g} s")
     return simulate_batch(config, [(follower, [scenario or Scenario()])], physics).world(0)
 
 
@@ -140,9 +144,6 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     parts = [slice(end - len(part), end) for end, (_, part) in zip(ends, flights, strict=True)]
     followers = [follower for follower, _ in flights]
     for follower in followers:
-        wanted = getattr(follower, "control_period", config.timing.control_period)
-        if abs(wanted - config.timing.control_period) > 1e-9:
-            raise InputError(f"{follower.name} acts every {wanted:g} s, not every {config.timing.control_period:g} s")
         follower.reset()
 
     def act(seen: np.ndarray, brief: Brief) -> np.ndarray:

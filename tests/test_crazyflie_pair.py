@@ -12,6 +12,7 @@ import pytest
 
 from mjxball.config import Autopilot, Config, preset
 from mjxball.control import rotations
+from mjxball.errors import InputError
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import hover_rotor_force, make_autopilot, make_control_step, start_state
@@ -161,3 +162,8 @@ def test_the_flight_policy_goes_where_waypoints_lead() -> None:
     for number, place in enumerate((*corners, (0.0, 0.0, 0.0))):
         end = flown.position[round(12 * (number + 1) / PAIR.timing.control_period) - 1]
         assert np.linalg.norm(end - place) < 0.03
+
+
+def test_a_policy_of_another_rate_is_refused() -> None:
+    with pytest.raises(InputError, match="made for a control period of 0.01 s, not 0.02 s"):
+        simulate(preset("paper"), Policy.load(shipped_policy("flight")))
