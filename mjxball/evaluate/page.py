@@ -110,7 +110,7 @@ def verdict(scores: Sequence[Score], cards: Mapping[str, Mapping[str, Any]]) -> 
     lines.append(f"Smallest steady-state peak in {total} levels (the oracle, which is told the CG, left out): {tally}.")
     for policy, card in cards.items():
         lost = False
-        for rival in (name for name in ("adaptive", "lqg") if name in best):
+        for rival in (name for name in ("adaptive", "lqg", "lqg-slow") if name in best):
             text, behind = _against(scores, policy, rival)
             lines.append(text)
             lost |= behind
