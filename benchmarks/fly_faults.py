@@ -29,7 +29,7 @@ import numpy as np
 
 from mjxball.fly import journal, packets
 from mjxball.fly.loop import urgent
-from mjxball.fly.twin.faults import DroneFaults, LinkFaults
+from mjxball.fly.twin.faults import STRIKES, LinkFaults, Strike
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Truth, Twin
 from mjxball.policy import load_file
@@ -39,20 +39,20 @@ POLICY = ROOT / "policies" / "transport.npz"
 LATEST = 4.0  # [s] after the motors first turn: ramp, flight and landing are all hit
 FLOWN = 2.0  # [s] under both laws
 Runner = subprocess.Popen
-Strike = Callable[[Twin, Runner, int], None]  # twin, runner, drone
+Action = Callable[[Twin, Runner, int], None]  # twin, runner, drone
 
 
-def link(**faults: Any) -> Strike:
+def link(**faults: float) -> Action:
     """A fault of one drone's link."""
     return lambda twin, runner, drone: twin.set_link(drone, LinkFaults(**faults))
 
 
-def drone(**faults: Any) -> Strike:
-    """A fault of one drone."""
-    return lambda twin, runner, number: twin.set_faults(number, DroneFaults(**faults))
+def struck(kind: str) -> Action:
+    """What `mjxball.fly --rehearse --fault` can bring about."""
+    return lambda twin, runner, drone: twin.strike(Strike(STRIKES[kind], drone, 0.0))
 
 
-def host(*numbers: int) -> Strike:
+def host(*numbers: int) -> Action:
     """Signals to the runner, a tenth of a second apart."""
 
     def strike(twin: Twin, runner: Runner, number: int) -> None:
@@ -70,24 +70,24 @@ def watchdog_killed(twin: Twin, runner: Runner, number: int) -> None:
             os.kill(int(child), signal.SIGKILL)
 
 
-KINDS: dict[str, Strike] = {
-    "link silent": link(silent_up=True, silent_down=True),
-    "link silent downward": link(silent_down=True),
-    "link silent upward": link(silent_up=True),
+KINDS: dict[str, Action] = {
+    "link silent": struck("silent"),
+    "link silent downward": struck("silent-down"),
+    "link silent upward": struck("silent-up"),
     "link loses 30 %": link(loss=0.3),
     "link loses 95 %": link(loss=0.95),
     "link 50 ms late": link(delay=0.05),
     "link 300 ms late": link(delay=0.3),
     "link jitters 200 ms": link(jitter=0.2),
-    "port closed": lambda twin, runner, number: twin.close_port(number),
-    "drone without power": lambda twin, runner, number: twin.kill(number),
-    "drone crashed": lambda twin, runner, number: twin.crash(number),
-    "drone reboots": lambda twin, runner, number: twin.reboot(number),
-    "estimator frozen": drone(frozen=True),
-    "clock stopped": drone(clock_stopped=True),
-    "position jumps 0.4 m": drone(offset=(0.0, 0.0, 0.4)),
-    "battery empty": drone(battery=-1.2),
-    "hostile datagrams": drone(garbage=3.0),
+    "port closed": struck("port"),
+    "drone without power": struck("power"),
+    "drone crashed": struck("crash"),
+    "drone reboots": struck("reboot"),
+    "estimator frozen": struck("frozen"),
+    "clock stopped": struck("clock"),
+    "position jumps 0.4 m": struck("jump"),
+    "battery empty": struck("battery"),
+    "hostile datagrams": struck("garbage"),
     "runner: Ctrl-C": host(signal.SIGINT),
     "runner: Ctrl-C twice": host(signal.SIGINT, signal.SIGINT),
     "runner: SIGTERM": host(signal.SIGTERM),

@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 import pytest
+from plants import BEAM
 
 from mjxball import config as configs
-from mjxball.config import Config, Leader, Plant, ball_reach
+from mjxball.config import Config, Leader, ball_reach
 from mjxball.control.constants import plant_constants
 from mjxball.control.followers import make_baseline
 from mjxball.evaluate.paper import experiment
@@ -20,15 +21,8 @@ from mjxball.policy.shipped import shipped_policy
 
 def pivoted() -> Config:
     """The reference pair laid across a pivot at O, its attitude loops ideal, its CG prescribed."""
-    across = Plant(
-        stand="pivot",
-        cg_axis="y",
-        object_size=(0.10, 0.34, 0.05),
-        leader_mount=(0.0, 0.17, 0.0),
-        follower_mount=(0.0, -0.17, 0.0),
-    )
     gains = Leader(kp=(1.0, 1.0, 0.1), kd=(2.0, 2.0, 5.0), error="own")
-    return configs.validate(dataclasses.replace(configs.preset("paper"), plant=across, leader=gains))
+    return configs.validate(dataclasses.replace(configs.preset("paper"), plant=BEAM, leader=gains))
 
 
 def test_still_cg_tilts_a_copying_pair_as_far_as_its_attitude_loops_give_way() -> None:

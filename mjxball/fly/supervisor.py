@@ -114,8 +114,8 @@ def _table() -> dict[tuple[State, Event], State]:
 
 
 TRANSITIONS = {pair: state for pair, state in _table().items() if pair[0] is not state}
-# Of several events at once the one that leads furthest counts; the flight's exit code is 1 after any of these.
 SHORT = (S.ARM, S.RAMP)  # states whose time limit is only reached if something is wrong
+# The flight's exit code is 1 after any of these, or after a state of SHORT that lasted too long.
 FAULTS = frozenset(E) - {E.READY, E.ARMED, E.HOVERING, E.TIME_UP, E.INTERRUPT, E.TOUCHED_DOWN, E.TIMEOUT}
 
 
