@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -11,14 +10,14 @@ import numpy as np
 
 from mjxball.config import Config, ball_reach
 from mjxball.control import crazyflie, observation, rotations
-from mjxball.control.constants import plant_constants, trim_reach
 from mjxball.control.recall import recall_of
+from mjxball.draws import Draws
 from mjxball.nuisance import Nuisances
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mjx import jax_repeat, make_engine
 from mjxball.physics.motion import object_mass
-from mjxball.physics.step import ControlStep, make_cg_offset, make_control_step, start_state
+from mjxball.physics.step import ControlStep, make_cg_offset, make_control_step
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.quiet import import_brax_env
 from mjxball.rewards import paper_reward, task_reward
@@ -31,9 +30,6 @@ else:
     Env, State = import_brax_env()
 STEADY_AFTER = 8.0  # [s] of an episode, after which its error counts as steady state in the metrics
 SECRETS = 4  # numbers that privileged critics see more where nothing is disturbed
-DRAWS = 18  # random numbers of a reset
-DRAWN_BACK = 8  # times at most that a world's thrust is drawn back by three tenths
-PLACES = 16  # that a CG visits, where it does, before it begins again
 RATE_BOUND = 50.0  # [rad/s] beyond which a world has diverged
 
 
@@ -45,7 +41,7 @@ class World(NamedTuple):
     goal: Array  # (3,) of O [m]
     integral: Array  # (3,) of the leader's error [m s]
     nuisance: Any  # see `nuisance.Nuisance`, () if there is none
-    memory: Array  # (m,) see `control.recall`
+    memory: Any  # (m,) see `control.recall`, () if there is none: XLA's partitioner cannot bear arrays of no elements
     action: Array  # (3,) last network action in [-1, 1]
     steps: Array  # () control steps since the reset
 
@@ -79,17 +75,7 @@ class CoupledPairEnv(Env):
         self._ball_reach = ball_reach(config.plant)
         self._recall = recall_of(config)
         self._nuisances = Nuisances(config)
-        scenario = config.scenario
-        scales = (
-            scenario.rotor_lag_scale,
-            scenario.thrust_scale,
-            scenario.thrust_common,
-            scenario.inertia_scale,
-        )
-        self._varies = any(scale != (1.0, 1.0) for scale in scales)
-        constants = plant_constants(config.plant, config.attitude)
-        self._drones = np.asarray(config.plant.leader_inertia) + config.plant.follower_inertia
-        self._object = constants.object_inertia_per_mass
+        self._draws = Draws(config)
         self._secrets = self._count_secrets() if config.sac.privileged else 0
         self._cg = make_cg_offset(config)
         self._commanded = np.array(observation.commanded(config.follower.load_axis_only, config.plant.cg_axis))
@@ -130,46 +116,8 @@ class CoupledPairEnv(Env):
         return self.config.timing.control_period
 
     def reset(self, rng: Array, reach: Array | float = 1.0) -> State:
-        """A fresh world at rest or nearly so, drawn from `config.scenario`.
-
-        `reach` () in [0, 1]: the lower share of the ranges of the CG's amplitude and speed, which is drawn from.
-        """
-        scenario = self.config.scenario
-        # One draw for everything: a reset runs beside every training step, and each draw is kernels to launch.
-        drawn = iter(jnp.split(jax.random.uniform(rng, (DRAWS,)), DRAWS))
-
-        def between(low: float, high: Array | float) -> Array:
-            return low + (high - low) * next(drawn)[0]
-
-        def symmetric(reach: float, size: int = 3) -> Array:
-            return reach * (2.0 * jnp.concatenate([next(drawn) for _ in range(size)]) - 1.0)
-
-        mass = between(*scenario.object_mass)
-        nominal = jnp.full_like(mass, self.config.plant.object_mass)
-        believed = mass if scenario.mass_known else nominal
-        load = Load(
-            object_mass=mass,
-            believed_mass=believed,
-            cg_amplitude=between(*shortened(scenario.cg_amplitude, reach)),
-            cg_speed=between(*shortened(scenario.cg_speed, reach)),
-            cg_phase=between(0.0, 2 * jnp.pi),
-            mass_change=between(*scenario.mass_change)[None],
-            mass_change_time=between(*scenario.mass_change_time)[None],
-        )
-        if self._varies:
-            load = self._varied(load, jax.random.fold_in(rng, 2))
-        if scenario.cg_visits > 0:
-            load = self._visiting(load, jax.random.fold_in(rng, 3))
-        load = load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude, jnp.maximum(self._trimmed(load), 0.0)))
-        plant = start_state(
-            self.config,
-            euler=jnp.append(symmetric(scenario.start_tilt, 2), 0.0),
-            position=symmetric(scenario.start_position),
-            velocity=symmetric(scenario.start_velocity),
-            believed_mass=load.believed_mass,
-            ball_offset=symmetric(scenario.ball_start, 1)[0],
-        )
-        goal = symmetric(scenario.goal_reach)
+        """A fresh world at rest or nearly so, drawn from `config.scenario`; `reach` as in `Draws.draw`."""
+        load, plant, goal = self._draws.draw(rng, reach)
         truth = self._observe(plant, goal)
         nuisance, first = self._nuisances.start(jax.random.fold_in(rng, 1), truth)
         world = World(
@@ -178,7 +126,7 @@ class CoupledPairEnv(Env):
             goal=goal,
             integral=jnp.zeros(3),
             nuisance=nuisance,
-            memory=self._recall.start(first),
+            memory=self._recall.start(first) if self._recall.size else (),
             action=jnp.zeros(3),
             steps=jnp.zeros((), jnp.int32),
         )
@@ -233,7 +181,7 @@ class CoupledPairEnv(Env):
             plant=plant,
             nuisance=nuisance,
             integral=self._wiring.integrated(world.integral, world.plant, world.goal, timing.control_period),
-            memory=self._recall.next(world.memory, seen, action),
+            memory=self._recall.next(world.memory, seen, action) if self._recall.size else (),
             action=action,
             steps=steps,
         )
@@ -258,48 +206,9 @@ class CoupledPairEnv(Env):
     def _observe(self, plant: PlantState, goal: Array) -> Array:
         return self._wiring.observe(plant, goal)
 
-    def _trimmed(self, load: Load) -> Array:
-        """CG amplitude that can be trimmed before and after the mass changes [m]; negative: none."""
-        masses = (load.object_mass, load.object_mass + load.mass_change[0])
-        margin, plant = self.config.scenario.trim_margin, self.config.plant
-        thrust = (1.0, 1.0) if load.thrust_scale is None else (load.thrust_scale[0], load.thrust_scale[1])
-        if self.config.leader.ki[2] > 0:  # it finds the thrust for its share of the weight by itself
-            reaches = (trim_reach(plant, mass, margin, None, (1.0, thrust[1])) for mass in masses)
-        else:
-            reaches = (trim_reach(plant, mass, margin, load.believed_mass, thrust) for mass in masses)
-        return jnp.minimum(*reaches)
-
-    def _varied(self, load: Load, key: Array) -> Load:
-        """`load` with rotors and inertia of its own."""
-        scenario, share = self.config.scenario, jax.random.uniform(key, (5,))
-        each = (scenario.thrust_scale, scenario.thrust_scale)
-        ranges = (scenario.rotor_lag_scale, scenario.inertia_scale, *each, scenario.thrust_common)
-        drawn = (low + (high - low) * u for (low, high), u in zip(ranges, share, strict=True))
-        lag, inertia, leader, follower, common = drawn
-        thrust = common * jnp.stack([leader, follower])
-        own = jnp.asarray(self._drones) + jnp.asarray(self._object) * load.object_mass
-        load = load._replace(
-            rotor_lag_scale=lag, thrust_scale=thrust, added_inertia=((inertia - 1.0) * own).astype(own.dtype)
-        )
-        if scenario.thrust_scale == scenario.thrust_common == (1.0, 1.0):
-            return load
-        # A leader that lifts too little can leave more than any follower trims: its world is drawn back towards 1.
-        for _ in range(DRAWN_BACK):
-            scales: Array = load.thrust_scale
-            milder = load._replace(thrust_scale=1.0 + 0.7 * (scales - 1.0))
-            load = jax.tree.map(functools.partial(jnp.where, self._trimmed(load) < 0), milder, load)
-        return load
-
-    def _visiting(self, load: Load, key: Array) -> Load:
-        """`load` whose CG perhaps goes from place to place."""
-        path_key, key = jax.random.split(key)
-        places = jax.random.uniform(path_key, (PLACES,), minval=-1.0, maxval=1.0)
-        visits = jax.random.uniform(key) < self.config.scenario.cg_visits
-        return load._replace(cg_path=places, cg_visits=visits.astype(jnp.float32))
-
     def _input(self, seen: Array, truth: Array, world: World) -> Array:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are told."""
-        shown = self._recall.network_input(seen, world.memory)
+        shown = self._recall.network_input(seen, world.memory) if self._recall.size else seen
         return jnp.concatenate([shown, self._told(truth, world)]) if self._secrets else shown
 
     def _told(self, truth: Array, world: World) -> Array:
@@ -309,7 +218,7 @@ class CoupledPairEnv(Env):
         if self._nuisances.present:
             nuisance = world.nuisance
             parts += [truth[3:], nuisance.push, jnp.stack([nuisance.noise, nuisance.delay.astype(jnp.float32)])]
-        if self._varies:
+        if self._draws.varies:
             lag: Array = world.load.rotor_lag_scale
             parts += [lag[None], world.load.thrust_scale, world.load.added_inertia]
         if world.plant.loops is not None:
@@ -322,7 +231,7 @@ class CoupledPairEnv(Env):
     def _count_secrets(self) -> int:
         clean = observation.OBSERVATION_SIZE - 3 + 5 if self._nuisances.present else 0
         firmware, rolls = self.config.autopilot.kind == "crazyflie", self.config.motion.kind == "rolling"
-        return SECRETS + clean + 6 * self._varies + 6 * firmware + rolls
+        return SECRETS + clean + 6 * self._draws.varies + 6 * firmware + rolls
 
     def _follower_command(self, action: Array, seen: Array) -> Array:
         follower, law = self.config.follower, self.config.leader
@@ -362,9 +271,3 @@ class CoupledPairEnv(Env):
 def _make_step(config: Config, physics: str) -> ControlStep:
     make = make_engine if physics == "mjx" else newton_euler.make_engine
     return make_control_step(config, make(config.plant, config.attitude), jax_repeat)
-
-
-def shortened(ends: tuple[float, float], share: Array | float) -> tuple[float, Array | float]:
-    """The lower `share` () of the range between `ends`."""
-    low, high = ends
-    return low, high if isinstance(share, float) and share == 1.0 else low + share * (high - low)

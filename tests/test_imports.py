@@ -25,6 +25,7 @@ FLOORS = (
     {"physics", "scene"},
     {"rewards", "sensing", "wiring"},
     {"scenario", "nuisance"},
+    {"draws"},
     {"rollout", "env"},
     {"train"},
     {"evaluate"},

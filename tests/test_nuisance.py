@@ -173,7 +173,7 @@ def test_no_world_is_drawn_whose_thrust_nobody_could_trim() -> None:
     config = preset("robust")
     env = CoupledPairEnv(config, "newton-euler")
     load = jax.vmap(env.reset)(jax.random.split(jax.random.key(1), 2000)).pipeline_state.load
-    assert float(jax.vmap(env._trimmed)(load).min()) > -1e-3
+    assert float(jax.vmap(env._draws.trimmed)(load).min()) > -1e-3
     # The follower's own rotors keep most of their range; a leader that lifts too much or too little does not.
     led, followed = load.thrust_scale.T
     assert float(followed.min()) < 0.83

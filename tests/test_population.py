@@ -20,7 +20,7 @@ from mjxball.policy import Policy
 from mjxball.policy.file import load_file
 from mjxball.train import program as programs
 from mjxball.train.members import best_member, read_members
-from mjxball.train.population import Population
+from mjxball.train.population import Population, _partitioned_by_gspmd
 from mjxball.train.sweep import read_sweep
 
 REPOSITORY = Path(__file__).parents[1]
@@ -167,8 +167,9 @@ for name, value in {SMALL!r}.items():
     config = C.replace(config, "sac." + name, value)
 population = Population(config, "newton-euler", 2)
 assert population.devices == jax.local_device_count() == 2
-state, _ = jax.jit(population.advance)(population.create(5), P.prefill(10))
-state, _ = jax.jit(population.advance)(state, P.train(5, 1))
+compiled = population.compile(creating=True)
+state, _ = compiled.advance(population.start(compiled, 5), population.mode(P.prefill(10)))
+state, _ = compiled.advance(state, population.mode(P.train(5, 1)))
 leaves = jax.tree.leaves(state.learner.policy)
 assert len(leaves[0].sharding.device_set) == 2
 single = Population(config, "newton-euler", 2, devices=jax.local_devices()[:1])
@@ -189,3 +190,11 @@ for a, b in zip(leaves, jax.tree.leaves(alone.learner.policy)):
         timeout=240,
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("spread", [True, False])
+def test_only_what_is_spread_over_devices_is_left_to_gspmd(spread: bool) -> None:
+    mesh, before = jax.make_mesh((1,), ("members",)), jax.config.jax_use_shardy_partitioner
+    with _partitioned_by_gspmd(mesh if spread else None):
+        inside = jax.config.jax_use_shardy_partitioner
+    assert (inside, jax.config.jax_use_shardy_partitioner) == (before and not spread, before)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import with_settings
 
+from mjxball import config as configs
 from mjxball.train import program as programs
 from mjxball.train.program import Program, TrainState
 
@@ -48,6 +49,13 @@ def raw(tree: Any) -> Any:
 
 def assert_identical(first: Any, second: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, raw(first), raw(second))
+
+
+@pytest.mark.parametrize("name", configs.PRESETS)
+def test_a_training_state_has_no_array_without_elements(name: str) -> None:
+    """Over several GPUs XLA's partitioner ends the process by a segfault on one."""
+    state = jax.eval_shape(Program(configs.preset(name), "newton-euler").create, jax.random.PRNGKey(0))
+    assert all(leaf.size for leaf in jax.tree.leaves(state))
 
 
 def recorded(state: TrainState) -> np.ndarray:

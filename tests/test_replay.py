@@ -46,7 +46,8 @@ def filled(steps: int, **endings) -> replay.Replay:
 
 
 def draw(buffer: replay.Replay, steps: int, batch: int = 2000) -> Transitions:
-    sampled = replay.sample(buffer, jax.random.key(0), batch, WORLDS, SEEN, ACTIONS, steps, GAMMA)
+    draws = jax.random.bits(jax.random.key(0), (batch,))
+    sampled = replay.sample(buffer, draws, WORLDS, SEEN, ACTIONS, steps, GAMMA)
     return Transitions(*map(np.asarray, sampled))
 
 

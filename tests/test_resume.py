@@ -16,6 +16,7 @@ import pytest
 
 from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS
+from mjxball.train.provenance import PACKAGE, SOURCES
 
 REPOSITORY = Path(__file__).parents[1]
 TINY = [
@@ -131,3 +132,15 @@ def test_changed_program_is_refused_with_the_differences(
 def test_compilation_cache_is_filled(whole: Path, cache: Path) -> None:
     assert whole.is_dir()
     assert any(path.name.startswith("jit_advance") for path in cache.iterdir())
+
+
+def test_the_source_hash_covers_what_the_training_program_imports() -> None:
+    code = (
+        "import sys, mjxball.train.program\n"
+        "print(*[m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'mjxball'], sep='\\n')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY, capture_output=True, text=True)
+    used = {Path(line).relative_to(PACKAGE).as_posix() for line in done.stdout.splitlines()}
+    computes = used - {"__init__.py", "cache.py", "cli.py", "errors.py", "quiet.py"}
+    assert {"env.py", "train/program.py"} <= computes
+    assert not {name for name in computes if name not in SOURCES and name.split("/")[0] not in SOURCES}

@@ -31,7 +31,8 @@ def run(config: Sac, updates: int) -> list[sac.Learner]:
     batch = Transitions(seen, action, reward, ones, after, 0 * ones)
     learners = [learner]
     for number in range(updates):
-        learners.append(update(learners[-1], batch, jax.random.PRNGKey(number), jnp.ones(()))[0])
+        keys = jax.random.split(jax.random.PRNGKey(number), 3)
+        learners.append(update(learners[-1], batch, keys, jnp.ones(()))[0])
     return learners
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -23,10 +24,12 @@ from mjxball.train.sweep import Sweep
 from mjxball.train.traced import Traced
 
 Array = Any
-# Settings that enter the compiled program as numbers, and may therefore differ between members.
 # Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
 # (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/results.md.)
-GPU_OPTIONS = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
+GPU_OPTIONS: dict[str, bool | int | float | str] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
+# One follower's products of layers of 64 are small enough for plain loops, which spare XLA a kernel in Triton for each
+# (2 - 5 s to compile). For many followers at once Triton's are faster (64: by a quarter).
+PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in both matrices
 
 
 class Executables(NamedTuple):
@@ -107,14 +110,16 @@ class Population:
 
     def compile(self, creating: bool) -> Executables:
         """Compile everything a run needs, side by side; `create` only if `creating`."""
-        lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
-        options = GPU_OPTIONS if jax.default_backend() == "gpu" else None
-        # XLA compiles outside Python's lock; two at once end a process that shares GPUs with others by a segfault.
-        with ThreadPoolExecutor(len(lowered) if jax.process_count() == 1 else 1) as pool:
-            advance, fresh, *create = pool.map(lambda work: work.compile(compiler_options=options), lowered)
+        options = (GPU_OPTIONS | (PLAIN_PRODUCTS if self._single else {})) if jax.default_backend() == "gpu" else None
+        # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
+        # end a process that shares GPUs with others by a segfault.
+        with _partitioned_by_gspmd(self.mesh), ThreadPoolExecutor(3 if jax.process_count() == 1 else 1) as pool:
+            lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
+            pending = [pool.submit(work.compile, compiler_options=options) for work in lowered]
+            advance, fresh, *create = (work.result() for work in pending)
         return Executables(create[0] if create else self._create, advance, fresh)
 
-    def _lower_here(self, creating: bool) -> list[Any]:
+    def _lower_here(self, creating: bool) -> Iterator[Any]:
         """advance, fresh worlds and, if `creating`, create on one device; traced programs come from the cache."""
         key = {
             "config": configs.to_dict(self.config),
@@ -128,28 +133,22 @@ class Population:
         mode, state = jax.tree.map(_shape, prefill(1)), self.template()
         tally = Tally._make([*[0] * (len(Tally._fields) - 1), Losses._make([0] * len(Losses._fields))])
         one_key = _shape(jax.random.PRNGKey(0))
-        lowered = [
-            Traced("advance", key, self.advance, (state, mode), (state, tally)).lower(donate=0),
-            Traced("fresh", key, self._fresh, (values, one_key), state.worlds).lower(),
-        ]
+        yield Traced("advance", key, self.advance, (state, mode), (state, tally)).lower(donate=0)
+        yield Traced("fresh", key, self._fresh, (values, one_key), state.worlds).lower()
         if creating:
-            lowered.append(Traced("create", key, self._create, (values, keys), state).lower())
-        return lowered
+            yield Traced("create", key, self._create, (values, keys), state).lower()
 
-    def _lower_on_mesh(self, creating: bool) -> list[Any]:
+    def _lower_on_mesh(self, creating: bool) -> Iterator[Any]:
         """The same on several devices."""
         values, keys = self._starts(0)
         key = self.place(np.asarray(jax.random.PRNGKey(0)), PartitionSpec())
         state = self._placed_shapes(self.template(), self._state_spec)
         mode = self.mode(prefill(1))
         results = self._results(self._state_spec, self._tally_spec)
-        lowered = [
-            jax.jit(self.advance, donate_argnums=0, **results).lower(state, mode),
-            jax.jit(self._fresh, **self._results(self._split)).lower(values, key),
-        ]
+        yield jax.jit(self.advance, donate_argnums=0, **results).lower(state, mode)
+        yield jax.jit(self._fresh, **self._results(self._split)).lower(values, key)
         if creating:
-            lowered.append(jax.jit(self._create, **self._results(self._state_spec)).lower(values, keys))
-        return lowered
+            yield jax.jit(self._create, **self._results(self._state_spec)).lower(values, keys)
 
     def start(self, executables: Executables, seed: int) -> TrainState:
         """`create(seed)` with a compiled program."""
@@ -218,7 +217,7 @@ class Population:
         return self.members // (self.mesh.shape["members"] if self.mesh else 1)
 
     def _results(self, *specs: Any) -> dict[str, Any]:
-        """Where `jax.jit` shall leave its results; said, because else arrays without elements end up anywhere."""
+        """Where `jax.jit` shall leave its results."""
         mesh = self.mesh
         if mesh is None:
             return {}
@@ -239,6 +238,25 @@ class Population:
 
     def _of(self, values: Mapping[str, Array]) -> Program:
         return Program(self.config, self._physics, values, self._shards) if values else self.program
+
+
+@contextlib.contextmanager
+def _partitioned_by_gspmd(mesh: Mesh | None) -> Iterator[None]:
+    """Leave the partitioning over `mesh` to XLA's older partitioner, GSPMD.
+
+    The newer one, Shardy, ends the process by a segfault where a constant that `shard_map` closes over is simplified
+    away (jax 0.11.2, `ManualComputationUnusedInputsPattern`), and MJX's model is hundreds of constants.
+    """
+    if mesh is None:
+        yield
+        return
+    settings: Any = jax.config  # its settings are made while JAX is imported: no type checker knows them
+    before = settings.jax_use_shardy_partitioner
+    settings.update("jax_use_shardy_partitioner", False)
+    try:
+        yield
+    finally:
+        settings.update("jax_use_shardy_partitioner", before)
 
 
 def _shape(array: Any) -> jax.ShapeDtypeStruct:

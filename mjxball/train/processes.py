@@ -78,12 +78,8 @@ def gather(tree: Any) -> Any:
     leaves, structure = jax.tree.flatten(tree)
     spread = [k for k, leaf in enumerate(leaves) if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable]
     if spread:
-        mesh = next(leaves[k].sharding.mesh for k in spread if leaves[k].size)
-        wanted = [k for k in spread if leaves[k].size]
-        together = _replicate(mesh)([leaves[k] for k in wanted])
-        for k in spread:
-            leaves[k] = np.zeros(leaves[k].shape, leaves[k].dtype)
-        for k, leaf in zip(wanted, together, strict=True):
+        together = _replicate(leaves[spread[0]].sharding.mesh)([leaves[k] for k in spread])
+        for k, leaf in zip(spread, together, strict=True):
             leaves[k] = leaf.addressable_data(0)
     return jax.tree.unflatten(structure, [np.array(leaf) for leaf in leaves])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +23,7 @@ class Mode(NamedTuple):
     """What a call of `Program.advance` does; all traced, so that one executable serves every phase."""
 
     steps: Array  # steps of all worlds
-    updates: Array  # gradient updates after each step
+    updates: Array  # gradient updates after each step, at most the configuration's
     random: Array  # act uniformly at random
     deterministic: Array  # act with the averaged policy's mean
     record: Array  # write transitions to the replay and update the normaliser
@@ -148,8 +148,11 @@ class Program:
         tally = Tally(zero, zero, zero, jnp.zeros(self._worlds), zero, zero, zero, zero, losses)
 
         def body(_: Array, carry: tuple[TrainState, Tally]) -> tuple[TrainState, Tally]:
-            state, tally = self._collect(*carry, mode)
-            return self._learn(state, tally, mode)
+            # One draw for many keys: each draw is kernels to compile and to launch.
+            *keys, key = jax.random.split(carry[0].key, 6)
+            state, tally = self._collect(*carry, keys[:3], mode)
+            state, tally = self._learn(state, tally, keys[3:], mode)
+            return state._replace(key=key), tally
 
         with jax.default_matmul_precision(MATMUL_PRECISION):
             state, tally = jax.lax.fori_loop(0, mode.steps, body, (state, tally))
@@ -169,8 +172,8 @@ class Program:
             losses=mean(tally.losses),
         )
 
-    def _act(self, learner: sac.Learner, seen: Array, key: Array, mode: Mode) -> Array:
-        sample_key, random_key = jax.random.split(key)
+    def _act(self, learner: sac.Learner, seen: Array, keys: Sequence[Array], mode: Mode) -> Array:
+        sample_key, random_key = map(self._shards.own, keys)
         policy = jax.tree.map(
             lambda mean, new: jnp.where(mode.deterministic, mean, new), learner.average, learner.policy
         )
@@ -181,14 +184,13 @@ class Program:
         chosen = jnp.where(mode.random, uniform, sampled)
         return jnp.where(mode.deterministic, distribution.mode(parameters), chosen)
 
-    def _collect(self, state: TrainState, tally: Tally, mode: Mode) -> tuple[TrainState, Tally]:
-        act_key, reset_key, key = jax.random.split(state.key, 3)
+    def _collect(self, state: TrainState, tally: Tally, keys: Sequence[Array], mode: Mode) -> tuple[TrainState, Tally]:
         worlds = state.worlds
-        action = self._act(state.learner, worlds.obs, self._shards.own(act_key), mode)
+        action = self._act(state.learner, worlds.obs, keys[:2], mode)
         after = self._step(worlds, action)
         terminated = after.done * (1 - after.info["truncation"])
         transitions = replay.Transitions(worlds.obs, action, after.reward, 1 - terminated, after.obs, after.done)
-        fresh = self.fresh_worlds(reset_key, self._reach(state.steps, mode.record))
+        fresh = self.fresh_worlds(keys[2], self._reach(state.steps, mode.record))
 
         def reset_if_done(new: Array, old: Array) -> Array:
             done = after.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
@@ -203,7 +205,7 @@ class Program:
             learner=state.learner._replace(normaliser=normaliser),
             replay=replay.insert(state.replay, transitions, mode.record),
             worlds=jax.tree.map(reset_if_done, fresh, after),
-            key=key,
+            key=state.key,
             steps=state.steps + jnp.where(mode.record, self.config.sac.worlds, 0),
         )
         return moved, tally._replace(
@@ -217,26 +219,25 @@ class Program:
             vertical_error=tally.vertical_error + metrics["vertical_error"].mean(),
         )
 
-    def _sample(self, buffer: replay.Replay, key: Array) -> replay.Transitions:
+    def _sample(self, buffer: replay.Replay, draws: Array) -> replay.Transitions:
         limits = self.config.sac
-        steps, discount = limits.return_steps, limits.discount
-        batch = limits.batch // self._shards.parts
-        return replay.sample(buffer, key, batch, self._worlds, *self.sizes, steps, discount)
+        return replay.sample(buffer, draws, self._worlds, *self.sizes, limits.return_steps, limits.discount)
 
-    def _learn(self, state: TrainState, tally: Tally, mode: Mode) -> tuple[TrainState, Tally]:
+    def _learn(self, state: TrainState, tally: Tally, keys: Sequence[Array], mode: Mode) -> tuple[TrainState, Tally]:
         limits = self.config.sac
         progress = jnp.minimum(state.steps / limits.steps, 1.0)
         rate = 1.0 + (limits.learning_rate_end - 1.0) * progress
-        keys = jax.random.split(state.key)
-        own_key = self._shards.own(keys[1])
+        draws_key, update_key = map(self._shards.own, keys)
+        draws = jax.random.bits(draws_key, (limits.updates, limits.batch // self._shards.parts), jnp.uint32)
+        update_keys = jax.random.split(update_key, (limits.updates, 3))
 
         def update(number: Array, carry: tuple[sac.Learner, sac.Losses]) -> tuple[sac.Learner, sac.Losses]:
-            sample_key, update_key = jax.random.split(jax.random.fold_in(own_key, number))
-            batch = self._sample(state.replay, sample_key)
-            moved, losses = self._update(carry[0], batch, update_key, rate)
+            batch = self._sample(state.replay, draws[number])
+            moved, losses = self._update(carry[0], batch, update_keys[number], rate)
             due, last = carry[0].updates % limits.policy_delay == 0, carry[1]
             policy, entropy = (jnp.where(due, *pair) for pair in zip(losses[1:], last[1:], strict=True))
             return moved, sac.Losses(losses.critic, policy, entropy)
 
-        learner, losses = jax.lax.fori_loop(0, mode.updates, update, (state.learner, tally.losses))
-        return state._replace(learner=learner, key=keys[0]), tally._replace(losses=losses)
+        updates = jnp.minimum(mode.updates, limits.updates)
+        learner, losses = jax.lax.fori_loop(0, updates, update, (state.learner, tally.losses))
+        return state._replace(learner=learner), tally._replace(losses=losses)

@@ -13,7 +13,19 @@ from typing import Any
 
 PACKAGE = Path(__file__).parents[1]
 # What a training result depends on; the judge and the flight code are not among it.
-SOURCES = ("config", "assembly.py", "env.py", "nuisance.py", "rewards.py", "sensing.py", "control", "physics", "train")
+SOURCES = (
+    "config",
+    "assembly.py",
+    "draws.py",
+    "env.py",
+    "nuisance.py",
+    "rewards.py",
+    "sensing.py",
+    "wiring.py",
+    "control",
+    "physics",
+    "train",
+)
 LIBRARIES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
 
 

@@ -49,15 +49,14 @@ def insert(replay: Replay, transitions: Transitions, record: Array) -> Replay:
 
 def sample(
     replay: Replay,
-    key: Array,
-    batch: int,
+    draws: Array,
     worlds: int,
     observation_size: int,
     action_size: int,
     steps: int,
     discount: Array | float,
 ) -> Transitions:
-    """Draw `batch` transitions of up to `steps` steps, uniformly with replacement from those recorded.
+    """Transitions of up to `steps` steps, one for each of `draws` (batch,), uniform 32-bit numbers, of those recorded.
 
     Rewards are summed with `discount` (gamma) until `steps` or the episode's end, whichever comes first.
     The buffer must hold at least `steps` steps of all worlds.
@@ -65,10 +64,11 @@ def sample(
     capacity = replay.rows.shape[0] - worlds
     size = jnp.minimum(replay.inserted, capacity)
     oldest = jnp.where(replay.inserted < capacity, 0, replay.inserted)
-    age = jax.random.randint(key, (batch,), 0, jnp.maximum(size - (steps - 1) * worlds, 1))
+    found = jnp.maximum(size - (steps - 1) * worlds, 1)
+    age = (draws % found.astype(draws.dtype)).astype(found.dtype)  # uneven by less than `found` / 2^32
     first = oldest + age
     rows = _unpack(replay.rows[first % capacity], observation_size, action_size)
-    reward, factor, last, bootstrap = rows.reward, jnp.ones(batch), rows.last, rows
+    reward, factor, last, bootstrap = rows.reward, jnp.ones(len(draws)), rows.last, rows
     for step in range(1, steps):
         rows_k = _unpack(replay.rows[(first + step * worlds) % capacity], observation_size, action_size)
         going = last == 0

@@ -118,7 +118,7 @@ def create(networks: Networks, config: Sac, observation_size: int, key: Array) -
 def make_update(
     networks: Networks, config: Sac, action_size: int, mean: Callable[[Any], Any] = lambda value: value
 ) -> Any:
-    """Return `update(learner, transitions, key, rate) -> (learner, losses)`; `rate` scales all learning rates.
+    """Return `update(learner, transitions, three keys, rate) -> (learner, losses)`; `rate` scales all learning rates.
 
     `mean` averages gradients and entropies over learners that share their parameters (data parallel).
     """
@@ -171,8 +171,8 @@ def make_update(
         )
         return moved, Losses(jnp.zeros(()), value, entropy)
 
-    def update(learner: Learner, batch: Transitions, key: Array, rate: Array) -> tuple[Learner, Losses]:
-        alpha_key, critic_key, policy_key = jax.random.split(key, 3)
+    def update(learner: Learner, batch: Transitions, keys: Array, rate: Array) -> tuple[Learner, Losses]:
+        alpha_key, critic_key, policy_key = keys
         transitions = _brax_transitions(batch)
         evaluate = value_step if config.state_value else critic_step
         moved, critic_value = evaluate(learner, transitions, critic_key, rate * config.learning_rate)
