@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from cells import AMPLITUDES, MASSES, SPEEDS, WANTED, fly, reach_of, wanted, wins_of
+from cells import WANTED, feasible, fly, wanted, wins_of
 
 from mjxball import __version__
 from mjxball import config as configs
@@ -105,8 +105,7 @@ def train(out: Path, rows: list[str], steps: int, seeds: int, physics: str) -> N
 def judge(out: Path, noisy: bool) -> list[dict[str, Any]]:
     """A row for each trained one."""
     config = preset("paper")
-    every = [(w, a, m) for w in SPEEDS for a in AMPLITUDES for m in MASSES]
-    cells = [cell for cell in every if cell[1] <= reach_of(config, cell[2], True)]
+    cells = feasible(config)
     told = fly(make_baseline("lqg", config), cells, {}, False, 1)
     rival = fly(make_baseline("adaptive", config), cells, {}, noisy, 1)
     bars = [wanted(a, b) for a, b in zip(rival, told, strict=True)]

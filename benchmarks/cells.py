@@ -39,6 +39,8 @@ from mjxball.sensing import Disturbance
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 AMPLITUDES = (0.05, 0.10, 0.17)
 MASSES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+Cell = tuple[float, float, float]  # CG speed [rad/s], amplitude [m], mass [kg]
+EVERY: list[Cell] = [(w, a, m) for w in SPEEDS for a in AMPLITUDES for m in MASSES]
 MARGIN, BELIEVED = 0.15, 0.2
 WANTED = ("peak", "overshoot", "settling", "rmse")
 
@@ -71,6 +73,11 @@ def fly(follower: Follower, cells: list[Any], common: dict[str, Any], disturbed:
 def reach_of(config: Config, mass: float, known: bool) -> float:
     """CG offset that can be trimmed [m]."""
     return trim_reach(config.plant, mass, MARGIN, mass if known else BELIEVED)
+
+
+def feasible(config: Config) -> list[Cell]:
+    """Of `EVERY` cell those that can be trimmed, mass known."""
+    return [cell for cell in EVERY if cell[1] <= reach_of(config, cell[2], True)]
 
 
 def wanted(adaptive: dict[str, float], lqg: dict[str, float]) -> dict[str, float]:
@@ -167,10 +174,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
     config = preset("paper")
-    every = [(w, a, m) for w in SPEEDS for a in AMPLITUDES for m in MASSES]
-    cells = [cell for cell in every if cell[1] <= reach_of(config, cell[2], True)]
-    lost = ", ".join(f"{a:g} m with {m:g} kg" for a, m in sorted({c[1:] for c in every} - {c[1:] for c in cells}))
-    print(f"{len(cells)} of {len(every)} cells are feasible, not at any speed: {lost}")
+    cells = feasible(config)
+    lost = ", ".join(f"{a:g} m with {m:g} kg" for a, m in sorted({c[1:] for c in EVERY} - {c[1:] for c in cells}))
+    print(f"{len(cells)} of {len(EVERY)} cells are feasible, not at any speed: {lost}")
     policies = [load_policy(path, config) for path in options.policies]
     robust = [load_policy(path, config) for path in options.robust] if options.robust else policies
     summaries, missed = judge(config, policies, robust, options.told, cells, options.seeds)

@@ -15,7 +15,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from cells import AMPLITUDES, MASSES, SPEEDS, reach_of
+from cells import feasible
 from rivals import fly
 
 from mjxball.config import preset
@@ -61,8 +61,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
     config, found = preset("paper"), []
-    every = [(w, a, m) for w in SPEEDS for a in AMPLITUDES for m in MASSES]
-    cells = [cell for cell in every if cell[1] <= reach_of(config, cell[2], True)]
+    cells = feasible(config)
     for tuning in TUNINGS:
         for disturbed in (False, True):
             row = judged(tuning, disturbed, cells)

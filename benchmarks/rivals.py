@@ -18,7 +18,7 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from cells import AMPLITUDES, MASSES, SPEEDS, WANTED, numbers_of, reach_of
+from cells import WANTED, feasible, numbers_of
 
 from mjxball.config import preset
 from mjxball.control.followers import Follower, make_baseline
@@ -71,8 +71,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
     config, found = preset("paper"), []
-    every = [(w, a, m) for w in SPEEDS for a in AMPLITUDES for m in MASSES]
-    cells = [cell for cell in every if cell[1] <= reach_of(config, cell[2], True)]
+    cells = feasible(config)
     paths = options.policies or [shipped_policy(name) for name in SHIPPED]
     policies = [load_policy(path, config) for path in paths]
     for disturbed in (False, True):

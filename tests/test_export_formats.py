@@ -69,9 +69,11 @@ def limited(remembering: Trained) -> PolicyFile:
     return dataclasses.replace(remembering.contents, card={**card, "command_limits": [0.05, 0.6]})
 
 
-@pytest.fixture(params=["trained", "direct", "remembering", "limited", "transport", "flight", "paper"])
+@pytest.fixture(
+    params=["trained", "direct", "remembering", "limited", "transport", "robust", "flight", "stand", "paper"]
+)
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
-    if request.param in ("transport", "flight", "paper"):
+    if request.param in ("transport", "robust", "flight", "stand", "paper"):
         return load_file(shipped_policy(request.param))
     made = request.getfixturevalue(request.param)
     return made.contents if isinstance(made, Trained) else made

@@ -117,7 +117,7 @@ def _robust() -> Config:
             cg_visits=0.3,
         ),
         bounds=Bounds(x_peak=0.03, settling_time=3.5, rmse=0.355),
-        reward=replace(large.reward, velocity=15.0),
+        reward=replace(large.reward, velocity=12.0, smoothness=10.0),
         sac=replace(large.sac, steps=4_096_000, replay=1_024_000, learning_rate=2e-3),
     )
 
