@@ -1,6 +1,6 @@
 """Seconds from process start to a policy at the quality bar: `train.py` beside stock Brax SAC; populations.
 
-`python benchmarks/training.py [--parts ours stock population scaling] [--seeds K] [--json FILE] ...`
+`python benchmarks/training.py [--parts ours stock population scaling distributed] [--seeds K] [--json FILE] ...`
 
 - `ours`: `train.py transport` with the settings below, seed 0 with an empty compilation cache (cold), then every seed
   with that cache (warm). The clock starts before the process and stops when its policy file is written.
@@ -9,7 +9,8 @@
   policies at each of `--snapshots` parts of the way are judged, so that it may reach the bar before its end.
 - `population`: training rate of 1 and of `--members` followers in one program, compilation left out, and memory.
 - `scaling`: training rate of a population on 1, 2, 4, ... of the GPUs here, with the members on one GPU kept the same
-  (weak) and with their total kept the same (strong), and over processes with one GPU each (`--distributed`).
+  (weak) and with their total kept the same (strong).
+- `distributed`: the rate of `train.py --distributed` over `--processes` processes with one GPU each.
 
 The bar: on the reference scenario (CG 0.05 m at 0.31 rad/s, 0.2 kg, goal 1 1 1 m, 45 s) x-peak <= 0.02 m, settling
 <= 3.5 s, RMSE <= 0.35 m, each as the median over the seeds.
