@@ -25,7 +25,7 @@ pytestmark = pytest.mark.alone  # by the clock
 SHORT = Deadlines(connect=1.5, parameter=0.5, first_state=0.7, close=1.0)
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 3.0) -> bool:
+def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
     end = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > end:

@@ -23,7 +23,7 @@ cflib = pytest.importorskip("cflib")
 pytestmark = pytest.mark.alone  # by the clock
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
+def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
     """True once `condition` holds; false after `seconds`."""
     end = time.monotonic() + seconds
     while not condition():

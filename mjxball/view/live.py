@@ -143,9 +143,9 @@ def follow(path: Path, port: int = 0, attached: bool = False) -> int:
 
     Prints the address, and unless attached what happens to the log. Raises InputError if `path` is no flight log.
     """
+    feed = Feed(path)
     with contextlib.suppress(OSError, AttributeError):
         os.nice(10)  # whatever flies comes first
-    feed = Feed(path)
     board, leave = Board(feed), threading.Event()
     with contextlib.closing(feed), _serving(Server(port, board)) as address, _until(leave, attached):
         begun = board.update()

@@ -144,7 +144,12 @@ class Twin:
     def _wait(self, seconds: float) -> None:
         """Sleep until the next step, or until a datagram comes, which is taken in at once."""
         alive = [n for n in range(2) if not self._dead[n]]
-        readable, _, _ = select.select([self._sockets[n] for n in alive], [], [], seconds)
+        try:
+            readable, _, _ = select.select([self._sockets[n] for n in alive], [], [], seconds)
+        except (OSError, ValueError):
+            if not any(self._dead[n] for n in alive):
+                raise
+            return  # a port was closed just now
         for number in alive:
             if self._sockets[number] in readable:
                 with self._lock:
