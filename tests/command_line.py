@@ -25,7 +25,7 @@ def call(main: Main, arguments: Sequence[object]) -> int:
         return int(stop.code or 0)
 
 
-def run(arguments: Sequence[object], cwd: Path, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+def run(arguments: Sequence[object], cwd: Path, timeout: float = 300) -> subprocess.CompletedProcess[str]:
     """Run `python ARGUMENTS` in the directory `cwd`; the scripts are given by `script`."""
     command = [sys.executable, *map(str, arguments)]
     return subprocess.run(

@@ -27,6 +27,13 @@ from mjxball.policy.export import policy_file
 from mjxball.train import sac
 from mjxball.train.program import statistics
 
+# Programs here are small and run once: not to optimise them halves the time of tests that compile. XLA reads its flags
+# when it first compiles; processes that tests start compile as users' do.
+HASTY = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+with pytest.MonkeyPatch.context() as patched:
+    patched.setenv("XLA_FLAGS", f"{HASTY} {os.environ.get('XLA_FLAGS', '')}")
+    jax.jit(lambda: jnp.zeros(1))()
+
 # Derandomised: the same examples on every machine, so that a red build is never a matter of luck.
 hypothesis.settings.register_profile("mjxball", deadline=None, derandomize=True, database=None, max_examples=60)
 hypothesis.settings.load_profile("mjxball")

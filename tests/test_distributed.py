@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from conftest import HASTY
 
 from mjxball.commands.train import main as train
 from mjxball.errors import InputError
@@ -34,7 +35,7 @@ def launch(arguments: list[str], cache: Path) -> list[subprocess.Popen[str]]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     meeting = ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--processes", "2", "--process"]
-    environment = {**os.environ, "MJXBALL_CACHE": str(cache), "JAX_PLATFORMS": "cpu"}
+    environment = {**os.environ, "MJXBALL_CACHE": str(cache), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": HASTY}
     return [
         subprocess.Popen(
             [sys.executable, "train.py", *arguments, *meeting, str(process)],

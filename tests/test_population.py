@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from conftest import with_settings
+from conftest import HASTY, with_settings
 
 from mjxball.commands.train import main as train
 from mjxball.config import Config
@@ -174,12 +174,14 @@ leaves = jax.tree.leaves(state.learner.policy)
 assert len(leaves[0].sharding.device_set) == 2
 single = Population(config, "newton-euler", 2, devices=jax.local_devices()[:1])
 assert single.devices == 1
-alone, _ = jax.jit(single.advance)(single.create(5), P.prefill(10))
-alone, _ = jax.jit(single.advance)(alone, P.train(5, 1))
+advance = jax.jit(single.advance)
+alone, _ = advance(single.create(5), P.prefill(10))
+alone, _ = advance(alone, P.train(5, 1))
 for a, b in zip(leaves, jax.tree.leaves(alone.learner.policy)):
     np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=1e-5)
 """
-    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    flags = f"{HASTY} --xla_force_host_platform_device_count=2"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
         [sys.executable, "-c", code],
         check=False,
