@@ -68,7 +68,9 @@ def until_policy(child: subprocess.Popen[str], started: float, policy: Path) -> 
 
 def read_libraries(options: argparse.Namespace, place: Path) -> None:
     """Run the trainers for a moment, so that no counted run is the first to read their libraries from the disk."""
-    short = options.worlds * 20
+    from mjxball.config import preset
+
+    short = 2 * preset("transport").sac.prefill
     out, policy = place / "first", place / "first.npz"
     firsts = {
         "ours": (our_command(options, 0, out, short), out / "policy.npz"),
