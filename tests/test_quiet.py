@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import importlib
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
+from command_line import REPOSITORY, run
 
 from mjxball import quiet
 
-REPOSITORY = Path(__file__).parents[1]
 
-
-def run(code: str) -> str:
+def printed_by(code: str) -> str:
     """What a fresh Python prints."""
-    done = subprocess.run(
-        [sys.executable, "-c", code], check=False, cwd=REPOSITORY, capture_output=True, text=True, timeout=120
-    )
+    done = run(["-c", code], REPOSITORY)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 def test_training_loads_no_mesh_library() -> None:
     """A quarter of the time of its imports."""
-    printed = run("""
+    printed = printed_by("""
 import sys
 import mjxball.train.run
 from mjxball.config import preset
@@ -38,7 +33,7 @@ print([name for name in ("trimesh", "scipy.spatial", "scipy.optimize", "jaxopt._
 
 def test_what_is_left_out_is_there_once_it_is_used() -> None:
     """A mesh, whose convex hull MJX asks of SciPy and trimesh."""
-    printed = run("""
+    printed = printed_by("""
 import sys
 import mujoco
 from mjxball.quiet import LATE, import_brax_env, import_mjx
