@@ -135,11 +135,19 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
 def _linearise(start: Array, step: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
     """(fixed point, its residual, Jacobian there) of `step`, found from `start`."""
     z = jax.lax.fori_loop(0, SETTLE, lambda _, z: step(z), start)
-    jacobian = jax.jacfwd(step)
+    still = jnp.eye(len(z))
+    slopes = jax.jacfwd(lambda z: (step(z) - z,) * 2, has_aux=True)
 
-    def polish(_: Array, z: Array) -> Array:
-        better = z + jnp.linalg.solve(jnp.eye(len(z)) - jacobian(z), step(z) - z)
-        return jnp.where(jnp.abs(step(better) - better).max() < jnp.abs(step(z) - z).max(), better, z)
+    def polish(count: Array, found: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        """The better of `found` (point, its change over a step, the change's Jacobian) and Newton's next point.
 
-    z = jax.lax.fori_loop(0, NEWTON, polish, z)
-    return z, jnp.abs(step(z) - z).max(), jacobian(z)
+        The first of them is the point itself: so `slopes`, long to compile, stands in the program once.
+        """
+        point, change, slope = found
+        there = point - jnp.linalg.solve(slope, change)
+        slope_there, change_there = slopes(there)
+        nearer = (count == 0) | (jnp.abs(change_there).max() < jnp.abs(change).max())
+        return jax.tree.map(lambda new, old: jnp.where(nearer, new, old), (there, change_there, slope_there), found)
+
+    z, change, slope = jax.lax.fori_loop(0, NEWTON + 1, polish, (z, jnp.zeros_like(z), still))
+    return z, jnp.abs(change).max(), slope + still
