@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from command_line import REPOSITORY, environment
+from conftest import HASTY
 
 # Loaded by every Python process that finds it: notes what it sees, one line each.
 HOOK = """
@@ -58,6 +59,7 @@ def watched(tmp_path: Path) -> dict[str, str]:
     (tmp_path / "hook" / "sitecustomize.py").write_text(HOOK)
     return {
         **environment(),
+        "XLA_FLAGS": HASTY,
         "PYTHONPATH": f"{tmp_path / 'hook'}:{REPOSITORY}",
         "NETWORK_LOG": str(tmp_path / "network.log"),
     }

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import HASTY
 
 from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS
@@ -41,7 +42,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
 
 
 def launch(arguments: list[str], cache: Path) -> subprocess.Popen:
-    environment = {**os.environ, "MJXBALL_CACHE": str(cache), "JAX_PLATFORMS": "cpu"}
+    environment = {**os.environ, "MJXBALL_CACHE": str(cache), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": HASTY}
     command = [sys.executable, str(REPOSITORY / "train.py"), *arguments]
     return subprocess.Popen(
         command, cwd=REPOSITORY, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True

@@ -16,13 +16,13 @@ from mjxball.scenario import Scenario
 
 CASES = {
     "sine": (paper_with(), Scenario(omega=1.0, seconds=20)),
-    "waveform": (paper_with(motion=SAMPLES), Scenario(seconds=20)),
+    "waveform": (paper_with(motion=SAMPLES), Scenario(seconds=8)),
     "rolling": (paper_with(motion=ROLLING), Scenario(seconds=20, ball_start=0.03, goal=(0.3, 0.2, 0.1))),
-    "mass": (paper_with(), Scenario(seconds=20, mass_changes=((4.0, 0.2), (12.0, -0.3)), goal=(0.2, 0.2, 0.2))),
-    "light_ball": (paper_with(LIGHT_BALL), Scenario(seconds=20, amplitude=0.08)),
-    "varied": (paper_with(VARIED), Scenario(seconds=20, amplitude=0.08, mass=0.35)),
+    "mass": (paper_with(), Scenario(seconds=8, mass_changes=((2.0, 0.2), (5.0, -0.3)), goal=(0.2, 0.2, 0.2))),
+    "light_ball": (paper_with(LIGHT_BALL), Scenario(seconds=8, amplitude=0.08)),
+    "varied": (paper_with(VARIED), Scenario(seconds=8, amplitude=0.08, mass=0.35)),
     "pivot": (paper_with(PIVOT, ROLLING), Scenario(seconds=5, goal=(0, 0, 0), ball_start=0.01)),
-    "heave": (paper_with(HEAVE), Scenario(seconds=20, goal=(0, 0, 0.2))),
+    "heave": (paper_with(HEAVE), Scenario(seconds=8, goal=(0, 0, 0.2))),
 }
 
 
