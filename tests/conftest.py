@@ -27,9 +27,9 @@ from mjxball.policy.export import policy_file
 from mjxball.train import sac
 from mjxball.train.program import statistics
 
-# Programs here are small and run once: to optimise them little takes a third off the time of tests that compile. Level 0
-# compiles no sooner than 1 and computes four times as slowly. XLA reads its flags when it first compiles; processes that
-# tests start compile as users' do, unless they are given these.
+# Programs here are small and run once: to optimise them little takes a third off the time of tests that compile. Level
+# 0 compiles no sooner than level 1 and computes four times as slowly. XLA reads its flags when it first compiles;
+# processes that tests start compile as users' do, unless they are given these.
 HASTY = "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true"
 with pytest.MonkeyPatch.context() as patched:
     patched.setenv("XLA_FLAGS", f"{HASTY} {os.environ.get('XLA_FLAGS', '')}")
