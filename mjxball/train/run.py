@@ -91,9 +91,8 @@ class Run:
                 write_config(out, config, self.origin)
         self.progress = Progress(out / METRICS if self._writes else None, config.sac.steps, done, origin["seeds"])
         self.members = MemberLog(out if self._writes else None, origin["seed"], done)
-        # One thread writes checkpoints; Orbax takes half a second to load: beside the compilation, not before it.
-        self._writer = ThreadPoolExecutor(1)
-        self._checkpoints = self._writer.submit(_open_checkpoints, out) if self._writes else None
+        self._writer = ThreadPoolExecutor(1)  # writes checkpoints
+        self._checkpoints: Future[Any] | None = None
         self._pending: Future[None] | None = None
         self._state = resumed
         self._saved_at = self._saving = 0.0  # [s]
@@ -147,6 +146,8 @@ class Run:
             self._export()
         else:
             self.state = self.population.place_state(self.state)
+        if self._writes:  # Orbax takes a second to load: while the device trains, not before
+            self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
 
     def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
