@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 REPOSITORY = Path(__file__).parents[1]
 TRANSPORT = REPOSITORY / "policies" / "transport.npz"
@@ -54,6 +55,28 @@ def assert_one_line(errors: str) -> None:
     assert errors.endswith("\n")
     assert len(errors.splitlines()) == 1, errors
     assert "Traceback" not in errors
+
+
+def assert_refused(main: Main, arguments: Sequence[object], here: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """`main` refuses with exit code 2, prints one line on stderr (returned), and changes not a byte in `here`."""
+    before = listing(here)
+    code = call(main, arguments)
+    captured = capsys.readouterr()
+    assert code == 2, captured
+    assert_one_line(captured.err)
+    assert not captured.out
+    assert listing(here) == before
+    return captured.err
+
+
+def assert_process_refuses(arguments: Sequence[object], here: Path) -> None:
+    """`python ARGUMENTS` in `here`, the same as a process."""
+    before = listing(here)
+    done = run(arguments, here)
+    assert done.returncode == 2
+    assert_one_line(done.stderr)
+    assert not done.stdout
+    assert listing(here) == before
 
 
 def load_arrays(path: Path = TRANSPORT) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import TRANSPORT, assert_one_line, call, listing, load_arrays, run, script, write_arrays
+from command_line import TRANSPORT, assert_process_refuses, assert_refused, load_arrays, script, write_arrays
 
 from mjxball.commands.evaluate import main
 
@@ -64,27 +64,21 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def assert_refused(here: Path, arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> str:
-    """Exit code 2, one line on stderr, and not a byte of the working directory changed."""
-    before = listing(here)
-    code = call(main, arguments)
-    captured = capsys.readouterr()
-    assert code == 2, captured
-    assert_one_line(captured.err)
-    assert listing(here) == before
-    return captured.err
+def refused(here: Path, arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> str:
+    """What `eval.py` says when it refuses."""
+    return assert_refused(main, arguments, here, capsys)
 
 
 @pytest.mark.parametrize("arguments", BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
 def test_bad_argument_is_refused(here: Path, arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    assert_refused(here, [*FAST, *arguments, "--json", "new.json", "--out", "new"], capsys)
+    refused(here, [*FAST, *arguments, "--json", "new.json", "--out", "new"], capsys)
 
 
 @pytest.mark.parametrize("arguments", BAD_OUTPUTS.values(), ids=BAD_OUTPUTS)
 def test_bad_output_is_refused_before_the_flight(
     here: Path, arguments: list[Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert_refused(here, [*FAST, "--followers", "copy", "--seconds", 0.1, *arguments], capsys)
+    refused(here, [*FAST, "--followers", "copy", "--seconds", 0.1, *arguments], capsys)
 
 
 def _first_weight(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict, dict], None]:
@@ -143,7 +137,7 @@ def test_unusable_policy_is_named_and_refused(
     arrays, card = load_arrays()
     damage(arrays, card)
     write_arrays(here / "odd.npz", arrays, card)
-    message = assert_refused(here, [*FAST, "odd.npz", "--json", "new.json", "--out", "new"], capsys)
+    message = refused(here, [*FAST, "odd.npz", "--json", "new.json", "--out", "new"], capsys)
     assert "odd.npz" in message
     assert word in message
 
@@ -162,13 +156,13 @@ def test_damaged_bytes_are_refused(
     here: Path, change: Callable[[bytes], bytes], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (here / "odd.npz").write_bytes(change(TRANSPORT.read_bytes()))
-    assert "odd.npz" in assert_refused(here, [*FAST, "odd.npz", "--json", "new.json", "--out", "new"], capsys)
+    assert "odd.npz" in refused(here, [*FAST, "odd.npz", "--json", "new.json", "--out", "new"], capsys)
 
 
 def test_card_that_is_not_json_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arrays, _ = load_arrays()
     np.savez(here / "odd.npz", **arrays, card=np.array("{"))
-    assert "card" in assert_refused(here, [*FAST, "odd.npz"], capsys)
+    assert "card" in refused(here, [*FAST, "odd.npz"], capsys)
 
 
 @pytest.mark.parametrize(
@@ -176,9 +170,4 @@ def test_card_that_is_not_json_is_refused(here: Path, capsys: pytest.CaptureFixt
 )
 def test_refusal_of_a_real_process(here: Path, arguments: list[str]) -> None:
     (here / "odd.npz").write_bytes(TRANSPORT.read_bytes()[:2000])
-    before = listing(here)
-    done = run([script("eval.py"), *arguments], here)
-    assert done.returncode == 2
-    assert_one_line(done.stderr)
-    assert not done.stdout
-    assert listing(here) == before
+    assert_process_refuses([script("eval.py"), *arguments], here)

@@ -15,7 +15,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import assert_one_line, call, environment, listing, load_arrays, run, script
+from command_line import (
+    assert_process_refuses,
+    assert_refused,
+    call,
+    environment,
+    listing,
+    load_arrays,
+    run,
+    script,
+)
 
 from mjxball import config as configs
 from mjxball import export
@@ -251,13 +260,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("arguments", BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
 def test_bad_argument_is_refused(here: Path, arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    before = listing(here)
-    code = call(main, arguments)
-    captured = capsys.readouterr()
-    assert code == 2, captured
-    assert_one_line(captured.err)
-    assert not captured.out
-    assert listing(here) == before
+    assert_refused(main, arguments, here, capsys)
 
 
 BAD_EXPORTS = {
@@ -275,19 +278,9 @@ BAD_EXPORTS = {
 @pytest.mark.parametrize("arguments", BAD_EXPORTS.values(), ids=BAD_EXPORTS)
 def test_bad_export_is_refused(here: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     (here / "old.npz").write_bytes(b"old")
-    before = listing(here)
-    code = call(export.main, arguments)
-    captured = capsys.readouterr()
-    assert code == 2, captured
-    assert_one_line(captured.err)
-    assert listing(here) == before
+    assert_refused(export.main, arguments, here, capsys)
 
 
 @pytest.mark.parametrize("arguments", [["holiday"], ["--out", "full"]], ids=["preset", "output"])
 def test_refusal_of_a_real_process(here: Path, arguments: list[str]) -> None:
-    before = listing(here)
-    done = run([script("train.py"), *arguments], here)
-    assert done.returncode == 2
-    assert_one_line(done.stderr)
-    assert not done.stdout
-    assert listing(here) == before
+    assert_process_refuses([script("train.py"), *arguments], here)
