@@ -97,7 +97,8 @@ def train(out: Path, rows: list[str], steps: int, seeds: int, physics: str) -> N
         with tempfile.TemporaryDirectory() as folder:
             run = Path(folder) / "run"
             run.mkdir()
-            Run(settings_of(row, steps), run, origin, None).train()
+            if not Run(settings_of(row, steps), run, origin, None).train():
+                raise SystemExit(130)  # Ctrl-C: a row that is not whole is no row
             (run / "members").rename(out / row)
         print(f"{row}: {time.monotonic() - began:.0f} s", flush=True)
 
