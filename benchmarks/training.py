@@ -149,9 +149,9 @@ def judge(rows: list[dict[str, Any]]) -> None:
     from mjxball.config import preset
     from mjxball.evaluate.cells import REFERENCE, load_policy, run_cells
 
-    for row in rows:
-        settings = preset("transport")
-        (cell,) = run_cells(settings, [load_policy(row["policy"], settings)], [REFERENCE], "newton-euler")
+    settings = preset("transport")
+    policies = [load_policy(row["policy"], settings) for row in rows]
+    for row, cell in zip(rows, run_cells(settings, policies, [REFERENCE], "newton-euler"), strict=True):
         record = cell.record()
         row |= {name: record[name] for name in BAR}
         row["policy"] = row["policy"].name
