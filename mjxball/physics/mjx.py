@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjxball.assembly import ASSEMBLY, BALL, build_model
 from mjxball.config import Attitude, Plant
@@ -60,9 +61,9 @@ class _Stages:
         # MJX's own choice is the first device of all processes, which only the first process can reach.
         here = {"device": jax.local_devices()[0], "impl": "jax"}
         self._model, self._blank = self._mjx.put_model(model, **here), self._mjx.make_data(model, **here)
-        self._bodies = jnp.array([model.body(ASSEMBLY).id, model.body(BALL).id])
-        self._fractions = jnp.array([1 - plant.moving_fraction, plant.moving_fraction])
-        self._inertias = jnp.array([constants.shell_inertia_per_mass, constants.ball_inertia_per_mass])
+        self._bodies = np.array([model.body(ASSEMBLY).id, model.body(BALL).id])
+        self._fractions = np.array([1 - plant.moving_fraction, plant.moving_fraction])
+        self._inertias = np.array([constants.shell_inertia_per_mass, constants.ball_inertia_per_mass])
         self._stand, self._rigid = plant.stand, plant.moving_fraction == 1
         self.root = model.nv - 1  # degrees of freedom of the root; the ball's slide comes last
 

@@ -32,12 +32,15 @@ GPU_OPTIONS: dict[str, bool | int | float | str] = {"xla_gpu_autotune_level": 0,
 PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in both matrices
 
 
+EVALUATION_DRAW = 20_261_121  # tells the evaluation's worlds from those of any seed
+
+
 class Executables(NamedTuple):
     """A population's compiled functions."""
 
     create: Callable[[Any, Any], TrainState]  # (swept values, keys) -> state
     advance: Callable[[TrainState, Mode], tuple[TrainState, Tally]]  # gives away the state's memory
-    fresh_worlds: Callable[[Any, Array], Any]  # (swept values, key) -> worlds
+    evaluation_worlds: Callable[[Any, Array], Any]  # (swept values, key) -> worlds
 
 
 class Population:
@@ -113,7 +116,11 @@ class Population:
         options = (GPU_OPTIONS | (PLAIN_PRODUCTS if self._single else {})) if jax.default_backend() == "gpu" else None
         # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
         # end a process that shares GPUs with others by a segfault.
-        with _partitioned_by_gspmd(self.mesh), ThreadPoolExecutor(3 if jax.process_count() == 1 else 1) as pool:
+        with (
+            _partitioned_by_gspmd(self.mesh),
+            _without_locations(),
+            ThreadPoolExecutor(3 if jax.process_count() == 1 else 1) as pool,
+        ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
             pending = [pool.submit(work.compile, compiler_options=options) for work in lowered]
             advance, fresh, *create = (work.result() for work in pending)
@@ -132,16 +139,15 @@ class Population:
         values, keys = jax.tree.map(_shape, self._starts(0))
         mode, state = jax.tree.map(_shape, prefill(1)), self.template()
         tally = Tally._make([*[0] * (len(Tally._fields) - 1), Losses._make([0] * len(Losses._fields))])
-        one_key = _shape(jax.random.PRNGKey(0))
         yield Traced("advance", key, self.advance, (state, mode), (state, tally)).lower(donate=0)
-        yield Traced("fresh", key, self._fresh, (values, one_key), state.worlds).lower()
+        yield Traced("fresh", key, self._fresh, (values, _shape(_first_key())), state.worlds).lower()
         if creating:
             yield Traced("create", key, self._create, (values, keys), state).lower()
 
     def _lower_on_mesh(self, creating: bool) -> Iterator[Any]:
         """The same on several devices."""
         values, keys = self._starts(0)
-        key = self.place(np.asarray(jax.random.PRNGKey(0)), PartitionSpec())
+        key = self._everywhere(_first_key())
         state = self._placed_shapes(self.template(), self._state_spec)
         mode = self.mode(prefill(1))
         results = self._results(self._state_spec, self._tally_spec)
@@ -154,10 +160,10 @@ class Population:
         """`create(seed)` with a compiled program."""
         return executables.create(*self._starts(seed))
 
-    def fresh_worlds(self, executables: Executables, key: Array) -> Any:
-        """Newly reset worlds, the same draw for every member."""
+    def evaluation_worlds(self, executables: Executables) -> Any:
+        """Newly reset worlds, the same for every member and every evaluation."""
         values, _ = self._starts(0)
-        return executables.fresh_worlds(values, self.place(np.asarray(key), PartitionSpec()))
+        return executables.evaluation_worlds(values, self._everywhere(_first_key()))
 
     def place_state(self, state: TrainState) -> TrainState:
         """A whole state of NumPy arrays, the same in every process, spread over the devices."""
@@ -169,7 +175,11 @@ class Population:
 
     def mode(self, mode: Mode) -> Mode:
         """`mode` where every device sees it."""
-        return self.place(mode, PartitionSpec())
+        return self._everywhere(mode)
+
+    def _everywhere(self, tree: Any) -> Any:
+        """NumPy arrays as they are for one device, which takes them; whole on every device of several."""
+        return tree if self.mesh is None else self.place(tree, PartitionSpec())
 
     def place(self, tree: Any, spec: PartitionSpec) -> Any:
         """Arrays that every process holds alike, cut over the devices as `spec` says."""
@@ -188,7 +198,8 @@ class Population:
         return keys[0] if self._single else keys
 
     def _starts(self, seed: int) -> tuple[Any, Array]:
-        return self.place(self._values, self._whole), self.place(self._keys(seed), self._whole)
+        starts = self._values, self._keys(seed)
+        return starts if self.mesh is None else tuple(self.place(part, self._whole) for part in starts)
 
     def _create(self, values: Any, keys: Array) -> TrainState:
         return self._on_mesh(lambda program, key: program.create(key), (self._whole,), self._state_spec, (0,))(
@@ -196,7 +207,7 @@ class Population:
         )
 
     def _fresh(self, values: Any, key: Array) -> Any:
-        draw = lambda program, key: program.fresh_worlds(key)  # noqa: E731
+        draw = lambda program, key: program.fresh_worlds(jax.random.fold_in(key, EVALUATION_DRAW))  # noqa: E731
         return self._on_mesh(draw, (PartitionSpec(),), self._split, (None,))(values, key)
 
     def _on_mesh(self, one: Callable[..., Any], specs: Any, results: Any, axes: tuple[int | None, ...]) -> Any:
@@ -257,6 +268,22 @@ def _partitioned_by_gspmd(mesh: Mesh | None) -> Iterator[None]:
         yield
     finally:
         settings.update("jax_use_shardy_partitioner", before)
+
+
+@contextlib.contextmanager
+def _without_locations() -> Iterator[None]:
+    """Leave the lines of Python out of what is lowered: XLA sorts and prints them for profiles, a second's work."""
+    settings: Any = jax.config
+    before = settings.jax_traceback_in_locations_limit
+    settings.update("jax_traceback_in_locations_limit", 0)
+    try:
+        yield
+    finally:
+        settings.update("jax_traceback_in_locations_limit", before)
+
+
+def _first_key() -> np.ndarray:
+    return np.asarray(jax.random.PRNGKey(0))
 
 
 def _shape(array: Any) -> jax.ShapeDtypeStruct:

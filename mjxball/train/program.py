@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjxball import config as configs
 from mjxball.config import Config
@@ -45,8 +46,8 @@ def evaluate(steps: int) -> Mode:
 
 
 def _mode(steps: int, updates: int, random: bool, deterministic: bool, record: bool) -> Mode:
-    flags = (jnp.asarray(flag) for flag in (random, deterministic, record))
-    return Mode(jnp.asarray(steps, jnp.int32), jnp.asarray(updates, jnp.int32), *flags)
+    # NumPy's: each of JAX's own would compile a program to make it.
+    return Mode(*(np.asarray(n, np.int32) for n in (steps, updates)), *map(np.asarray, (random, deterministic, record)))
 
 
 class TrainState(NamedTuple):

@@ -33,7 +33,6 @@ from mjxball.train.record import CONFIG_FILE, METRICS, POLICY, write_config
 
 CHUNKS = 50  # rows of metrics.csv in a run
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
-EVALUATION_DRAW = 20_261_121  # tells the evaluation's worlds from those of any seed
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
 
 
@@ -215,8 +214,7 @@ class Run:
         """Add the evaluation of the averaged policies, on the same fresh worlds every time."""
         steps = min(round(EVALUATION_SECONDS / self.config.timing.control_period), self.config.timing.episode_steps)
         kept = self.state
-        draw = jax.random.fold_in(jax.random.PRNGKey(0), EVALUATION_DRAW)
-        worlds = self.population.fresh_worlds(self._compiled, draw)
+        worlds = self.population.evaluation_worlds(self._compiled)
         keys = processes.gather(kept.key)
         lent = kept._replace(worlds=worlds, key=self.population.place_keys(keys))
         after, tally = self._advance(lent, programs.evaluate(steps))

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from mjxball.config import Sac
@@ -88,7 +89,7 @@ def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = N
 
 def _normaliser(mask: Any) -> Callable[[Array, Any], Array]:
     """Normalisation of an observation by running statistics, with zeros where `mask` (n,) has them."""
-    shown = jnp.asarray(mask, jnp.float32)
+    shown = np.asarray(mask, np.float32)
     return lambda seen, statistics: brax.running_statistics.normalize(seen, statistics) * shown
 
 
