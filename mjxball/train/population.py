@@ -40,7 +40,7 @@ class Executables(NamedTuple):
 
     create: Callable[[Any, Any], TrainState]  # (swept values, keys) -> state
     advance: Callable[[TrainState, Mode], tuple[TrainState, Tally]]  # gives away the state's memory
-    evaluation_worlds: Callable[[Any, Array], Any]  # (swept values, key) -> worlds
+    evaluation_worlds: Callable[[Any, Array], Any]  # (swept values, `_first_key()`) -> worlds
 
 
 class Population:
