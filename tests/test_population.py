@@ -77,7 +77,7 @@ def test_swept_settings_differ_between_members_and_between_traced_programs(
         state, _ = compiled.advance(state, population.mode(programs.prefill(10)))
         state, _ = compiled.advance(state, population.mode(programs.train(20, 1)))
         moved.append(np.abs(np.asarray(jax.tree.leaves(state.learner.policy)[-1]) - before).max(axis=(1, 2)))
-    # Nor is anything in it for XLA to print that only says which line of Python made it, and where that file lies.
+    # No traced program says which files of Python made it: XLA would print them all.
     assert not any(b".py" in path.read_bytes() for path in tmp_path.iterdir())
     (still, quick), (quick_too, still_too) = moved[:2]
     assert max(still, still_too) < 1e-4  # 20 steps of 1e-6

@@ -30,8 +30,6 @@ GPU_OPTIONS: dict[str, bool | int | float | str] = {"xla_gpu_autotune_level": 0,
 # One follower's products of layers of 64 are small enough for plain loops, which spare XLA a kernel in Triton for each
 # (2 - 5 s to compile). For many followers at once Triton's are faster (64: by a quarter).
 PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in both matrices
-
-
 EVALUATION_DRAW = 20_261_121  # tells the evaluation's worlds from those of any seed
 
 
@@ -118,7 +116,8 @@ class Population:
         # end a process that shares GPUs with others by a segfault.
         with (
             _partitioned_by_gspmd(self.mesh),
-            _without_locations(),
+            # Lines of Python in what is lowered are for profiles; XLA sorts and prints them all, a second's work.
+            _set("jax_traceback_in_locations_limit", 0),
             ThreadPoolExecutor(3 if jax.process_count() == 1 else 1) as pool,
         ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
@@ -147,7 +146,7 @@ class Population:
     def _lower_on_mesh(self, creating: bool) -> Iterator[Any]:
         """The same on several devices."""
         values, keys = self._starts(0)
-        key = self._everywhere(_first_key())
+        key = self._lent(_first_key(), PartitionSpec())
         state = self._placed_shapes(self.template(), self._state_spec)
         mode = self.mode(prefill(1))
         results = self._results(self._state_spec, self._tally_spec)
@@ -162,8 +161,8 @@ class Population:
 
     def evaluation_worlds(self, executables: Executables) -> Any:
         """Newly reset worlds, the same for every member and every evaluation."""
-        values, _ = self._starts(0)
-        return executables.evaluation_worlds(values, self._everywhere(_first_key()))
+        values, key = self._lent(self._values, self._whole), self._lent(_first_key(), PartitionSpec())
+        return executables.evaluation_worlds(values, key)
 
     def place_state(self, state: TrainState) -> TrainState:
         """A whole state of NumPy arrays, the same in every process, spread over the devices."""
@@ -175,11 +174,7 @@ class Population:
 
     def mode(self, mode: Mode) -> Mode:
         """`mode` where every device sees it."""
-        return self._everywhere(mode)
-
-    def _everywhere(self, tree: Any) -> Any:
-        """NumPy arrays as they are for one device, which takes them; whole on every device of several."""
-        return tree if self.mesh is None else self.place(tree, PartitionSpec())
+        return self._lent(mode, PartitionSpec())
 
     def place(self, tree: Any, spec: PartitionSpec) -> Any:
         """Arrays that every process holds alike, cut over the devices as `spec` says."""
@@ -193,13 +188,16 @@ class Population:
 
         return jax.tree.map(cut, tree)
 
+    def _lent(self, tree: Any, spec: PartitionSpec) -> Any:
+        """`place` for arguments that no program keeps: one device takes NumPy's arrays as they are."""
+        return tree if self.mesh is None else self.place(tree, spec)
+
     def _keys(self, seed: int) -> np.ndarray:
         keys = np.stack([np.asarray(jax.random.PRNGKey(seed + member)) for member in range(self.members)])
         return keys[0] if self._single else keys
 
     def _starts(self, seed: int) -> tuple[Any, Array]:
-        starts = self._values, self._keys(seed)
-        return starts if self.mesh is None else tuple(self.place(part, self._whole) for part in starts)
+        return self._lent(self._values, self._whole), self._lent(self._keys(seed), self._whole)
 
     def _create(self, values: Any, keys: Array) -> TrainState:
         return self._on_mesh(lambda program, key: program.create(key), (self._whole,), self._state_spec, (0,))(
@@ -251,35 +249,25 @@ class Population:
         return Program(self.config, self._physics, values, self._shards) if values else self.program
 
 
-@contextlib.contextmanager
-def _partitioned_by_gspmd(mesh: Mesh | None) -> Iterator[None]:
+def _partitioned_by_gspmd(mesh: Mesh | None) -> contextlib.AbstractContextManager[None]:
     """Leave the partitioning over `mesh` to XLA's older partitioner, GSPMD.
 
     The newer one, Shardy, ends the process by a segfault where a constant that `shard_map` closes over is simplified
     away (jax 0.11.2, `ManualComputationUnusedInputsPattern`), and MJX's model is hundreds of constants.
     """
-    if mesh is None:
-        yield
-        return
-    settings: Any = jax.config  # its settings are made while JAX is imported: no type checker knows them
-    before = settings.jax_use_shardy_partitioner
-    settings.update("jax_use_shardy_partitioner", False)
-    try:
-        yield
-    finally:
-        settings.update("jax_use_shardy_partitioner", before)
+    return contextlib.nullcontext() if mesh is None else _set("jax_use_shardy_partitioner", False)
 
 
 @contextlib.contextmanager
-def _without_locations() -> Iterator[None]:
-    """Leave the lines of Python out of what is lowered: XLA sorts and prints them for profiles, a second's work."""
-    settings: Any = jax.config
-    before = settings.jax_traceback_in_locations_limit
-    settings.update("jax_traceback_in_locations_limit", 0)
+def _set(name: str, value: Any) -> Iterator[None]:
+    """One of JAX's settings, put back afterwards."""
+    settings: Any = jax.config  # its settings are made while JAX is imported: no type checker knows them
+    before = getattr(settings, name)
+    settings.update(name, value)
     try:
         yield
     finally:
-        settings.update("jax_traceback_in_locations_limit", before)
+        settings.update(name, before)
 
 
 def _first_key() -> np.ndarray:
