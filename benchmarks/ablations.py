@@ -22,24 +22,24 @@ from cells import WANTED, feasible, fly, wanted, wins_of
 
 from mjxball import __version__
 from mjxball import config as configs
+from mjxball.baselines import make_baseline
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config, preset
-from mjxball.control.followers import make_baseline
-from mjxball.evaluate.cells import load_policy
+from mjxball.evaluate.policies import load_policy
 from mjxball.physics.stepper import TRAINING_ENGINES
 
 BASE = "transport-large"
 # What the preset was when the rows were trained; its smoothness and return steps were chosen after them.
-THEN = {"reward.smoothness": 0.02, "sac.return_steps": 10}
+THEN = {"reward.smoothness": 0.02, "sac.n_step": 10}
 ROWS: dict[str, dict[str, Any]] = {
     "base": {},
-    "no-memory": {"follower.filters": ()},
-    "four-observations": {"follower.filters": (), "follower.history": 4, "follower.previous_action": True},
-    "third-average-1s": {"follower.filters": (0.05, 0.2, 1.0)},
+    "no-memory": {"follower.observation_averages": ()},
+    "four-observations": {"follower.observation_averages": (), "follower.history": 4, "follower.previous_action": True},
+    "third-average-1s": {"follower.observation_averages": (0.05, 0.2, 1.0)},
     "direct-action": {"follower.action": "direct"},
-    "critics-not-told": {"sac.privileged": False},
-    "1-step": {"sac.return_steps": 1},
-    "5-step": {"sac.return_steps": 5},
+    "critics-not-told": {"sac.privileged_critic": False},
+    "1-step": {"sac.n_step": 1},
+    "5-step": {"sac.n_step": 5},
     "critic-layernorm": {"sac.critic_layer_norm": True},
     "2x64": {"sac.policy_layers": (64, 64), "sac.critic_layers": (64, 64)},
     "2x256": {"sac.policy_layers": (256, 256), "sac.critic_layers": (256, 256)},
@@ -68,7 +68,7 @@ ROWS: dict[str, dict[str, Any]] = {
 
 def settings_of(row: str, steps: int) -> Config:
     """`BASE` as it was THEN, with `steps` and the change of `row`."""
-    config = configs.replace(preset(BASE), "sac.steps", steps)
+    config = configs.replace(preset(BASE), "sac.total_steps", steps)
     for name, value in {**THEN, **ROWS[row]}.items():
         config = configs.replace(config, name, value)
     return configs.validate(config)

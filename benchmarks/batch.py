@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.baselines import make_baseline
 from mjxball.config import preset
-from mjxball.control.followers import Follower, make_baseline
+from mjxball.control.followers import Follower
 from mjxball.evaluate.batch import Batch
 from mjxball.policy import Policy
-from mjxball.scenario import Scenario
+from mjxball.sim.scenario import Scenario
 
 SHIPPED = Path(__file__).parents[1] / "policies" / "transport.npz"
 

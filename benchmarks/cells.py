@@ -28,13 +28,14 @@ import statistics
 from pathlib import Path
 from typing import Any
 
+from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_reach
-from mjxball.control.followers import Follower, make_baseline
+from mjxball.control.followers import Follower
 from mjxball.evaluate.batch import Batch
-from mjxball.evaluate.cells import load_policy
-from mjxball.scenario import Scenario
-from mjxball.sensing import Disturbance
+from mjxball.evaluate.policies import load_policy
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.scenario import Scenario
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 AMPLITUDES = (0.05, 0.10, 0.17)

@@ -27,9 +27,9 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.fly import journal, packets
+from mjxball.fly import flight_log, packets
 from mjxball.fly.loop import urgent
-from mjxball.fly.twin.faults import STRIKES, LinkFaults, Strike
+from mjxball.fly.twin.faults import FAULT_KINDS, Injection, LinkFaults
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Truth, Twin
 from mjxball.policy import load_file
@@ -47,20 +47,30 @@ def link(**faults: float) -> Action:
     return lambda twin, runner, drone: twin.set_link(drone, LinkFaults(**faults))
 
 
-def struck(kind: str) -> Action:
+def injected(kind: str) -> Action:
     """What `mjxball.fly --rehearse --fault` can bring about."""
-    return lambda twin, runner, drone: twin.strike(Strike(STRIKES[kind], drone, 0.0))
+    return lambda twin, runner, drone: twin.inject(Injection(FAULT_KINDS[kind], drone, 0.0))
+
+
+def both(kind: str) -> Action:
+    """The same fault of both drones."""
+
+    def inject(twin: Twin, runner: Runner, number: int) -> None:
+        for drone in range(2):
+            twin.inject(Injection(FAULT_KINDS[kind], drone, 0.0))
+
+    return inject
 
 
 def host(*numbers: int) -> Action:
     """Signals to the runner, a tenth of a second apart."""
 
-    def strike(twin: Twin, runner: Runner, number: int) -> None:
+    def inject(twin: Twin, runner: Runner, number: int) -> None:
         for one in numbers:
             runner.send_signal(one)
             time.sleep(0.1)
 
-    return strike
+    return inject
 
 
 def watchdog_killed(twin: Twin, runner: Runner, number: int) -> None:
@@ -71,23 +81,33 @@ def watchdog_killed(twin: Twin, runner: Runner, number: int) -> None:
 
 
 KINDS: dict[str, Action] = {
-    "link silent": struck("silent"),
-    "link silent downward": struck("silent-down"),
-    "link silent upward": struck("silent-up"),
+    "link silent": injected("silent"),
+    "link silent downward": injected("silent-down"),
+    "link silent upward": injected("silent-up"),
     "link loses 30 %": link(loss=0.3),
     "link loses 95 %": link(loss=0.95),
     "link 50 ms late": link(delay=0.05),
     "link 300 ms late": link(delay=0.3),
     "link jitters 200 ms": link(jitter=0.2),
-    "port closed": struck("port"),
-    "drone without power": struck("power"),
-    "drone crashed": struck("crash"),
-    "drone reboots": struck("reboot"),
-    "estimator frozen": struck("frozen"),
-    "clock stopped": struck("clock"),
-    "position jumps 0.4 m": struck("jump"),
-    "battery empty": struck("battery"),
-    "hostile datagrams": struck("garbage"),
+    "port closed": injected("port"),
+    "drone without power": injected("power"),
+    "drone crashed": injected("crash"),
+    "drone reboots": injected("reboot"),
+    "estimator frozen": injected("frozen"),
+    "clock stopped": injected("clock"),
+    "position jumps 0.4 m": injected("jump"),
+    "battery empty": injected("battery"),
+    "hostile datagrams": injected("garbage"),
+    "firmware stopped": injected("stopped"),
+    "firmware killed, outputs held": injected("killed"),
+    "stabilizer task dead": injected("stabilizer"),
+    "IMU dead": injected("imu"),
+    "pose frozen": injected("pose-frozen"),
+    "pose lost": injected("pose-lost"),
+    "both poses lost": both("pose-lost"),
+    "pose jumps 0.4 m": injected("pose-jump"),
+    "battery sags to 3.0 V": both("sag"),
+    "motors 10 % weaker": injected("weak"),
     "runner: Ctrl-C": host(signal.SIGINT),
     "runner: Ctrl-C twice": host(signal.SIGINT, signal.SIGINT),
     "runner: SIGTERM": host(signal.SIGTERM),
@@ -114,9 +134,9 @@ def trial(job: tuple[int, str, int, Path]) -> dict[str, Any]:
                 if not running(twin, runner):
                     return {**row, "outcome": "not flown"}
                 time.sleep(moment)
-                struck = twin.truth.time
+                injected_at = twin.truth.time
                 KINDS[kind](twin, runner, which)
-                judged = judge(twin, struck, expects_end=kind != "runner: stopped", runner=runner)
+                judged = judge(twin, injected_at, expects_end=kind != "runner: stopped", runner=runner)
             finally:
                 runner.kill()
                 assert runner.stderr is not None
@@ -133,16 +153,16 @@ def running(twin: Twin, runner: Runner) -> bool:
     return True
 
 
-def judge(twin: Twin, struck: float, expects_end: bool, runner: Runner) -> dict[str, Any]:
+def judge(twin: Twin, injected_at: float, expects_end: bool, runner: Runner) -> dict[str, Any]:
     """Watch until the motors have been off for two seconds, for twenty at most, and say how it went."""
     off_since = None
-    while twin.truth.time < struck + 20:
+    while twin.truth.time < injected_at + 20:
         truth = twin.truth
-        off_since = (off_since or truth.time) if truth.thrust == (0, 0) else None
+        off_since = (off_since or truth.time) if truth.pwm.max() == 0 else None
         if off_since is not None and truth.time - off_since > 2.0:
             break
         time.sleep(0.005)
-    after = [truth for truth in twin.history if truth.time >= struck]
+    after = [truth for truth in twin.history if truth.time >= injected_at]
     if off_since is None:
         return {"outcome": "UNSAFE: a motor still turns", "safe": False}
     cut = next((truth for truth in after if truth.time >= off_since - 0.06), after[-1])
@@ -158,7 +178,7 @@ def judge(twin: Twin, struck: float, expects_end: bool, runner: Runner) -> dict[
         "outcome": "down, level" if height < 0.06 and worst_tilt(flown) < 35 else "motors off",
         "safe": twin.failure is None and not hung,
         "hung": hung,
-        "seconds": max(off_since - struck, 0.0),
+        "seconds": max(off_since - injected_at, 0.0),
         "cut_height": height,
         "worst_tilt": worst_tilt(flown),
         "highest_thrust": max((max(truth.thrust) for truth in after), default=0),
@@ -175,13 +195,13 @@ def worst_tilt(truths: list[Truth]) -> float:
 
 def told(log: Path, kind: str) -> dict[str, Any]:
     """What the flight log says: the way through the states, the cause, and whether it is whole."""
-    records = list(journal.read(log)) if log.exists() else []
+    remarks: list[str] = []
+    records = list(flight_log.read(log, remarks.append)) if log.exists() else []
     ends = [record for record in records if record["kind"] == "end"]
-    lines = len(log.read_bytes().splitlines()) if log.exists() else 0
     cut_short = kind in ("runner: kill -9", "runner: stopped")
     states = [record["after"] for record in records if record["kind"] == "transition"]
     cause = ends[-1]["cause"].split(":")[0].split(".")[-1].strip(" <>'") if ends and ends[-1]["cause"] else ""
-    whole = len(records) >= lines - 1 and (bool(ends) or cut_short)
+    whole = len(remarks) <= cut_short and (bool(ends) or cut_short)  # a killed writer may leave its last line torn
     return {"states": states, "cause": cause, "log_complete": whole}
 
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.control.observation import OBSERVATION_SIZE
-from mjxball.fly import journal
+from mjxball.fly import flight_log
 from mjxball.policy import Policy
 
 ROOT = Path(__file__).parents[1]
@@ -42,7 +42,7 @@ def rehearse(policy: Path, seconds: float) -> dict[str, Any]:
         surroundings = {**os.environ, "PYTHONPATH": str(ROOT)}
         more = {"env": surroundings, "capture_output": True, "timeout": seconds + 90, "check": False}
         done = subprocess.run([*command, "--log", str(log)], **more)  # noqa: PLW1510
-        records = list(journal.read(log))
+        records = list(flight_log.read(log))
     late = 1e3 * np.array([record["late"] for record in records if record["kind"] == "tick"])
     ages = 1e3 * np.array([max(record["ages"]) for record in records if record["kind"] == "tick"])
     granted = [record["granted"] for record in records if record["kind"] == "priority"]

@@ -34,7 +34,7 @@ from mutations import ANY, CSV, JSON, POLICY, WITNESS
 from mjxball import config as configs
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
-from mjxball.evaluate.cells import load_policy
+from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy, shipped_policies
 from mjxball.train.curves import told_by_the_run
 from mjxball.train.members import read_members
@@ -222,11 +222,11 @@ def small_run(place: Path) -> Path:
         "--physics": "newton-euler",
         "--seeds": 2,
         "--out": place / "run",
-        "--sac.steps": 4096,
-        "--sac.worlds": 32,
-        "--sac.replay": 3200,
-        "--sac.prefill": 1024,
-        "--sac.updates": 1,
+        "--sac.total_steps": 4096,
+        "--sac.num_envs": 32,
+        "--sac.replay_size": 3200,
+        "--sac.warmup_steps": 1024,
+        "--sac.updates_per_step": 1,
         "--timing.episode_steps": 100,
         "--sac.policy_layers": "8,8",
         "--sac.critic_layers": "8,8",

@@ -18,8 +18,8 @@ from typing import Any
 from cells import feasible
 from rivals import fly
 
+from mjxball.baselines.lqg import SLOW, Lqg, Tuning
 from mjxball.config import preset
-from mjxball.control.baselines.lqg import SLOW, Lqg, Tuning
 from mjxball.control.followers import Baseline
 
 SHOWN = ("settling", "peak", "overshoot", "rmse", "smoothness")
@@ -28,9 +28,9 @@ TUNINGS = (
     SLOW,
     # Weights of position and velocity, and how much tilt they may ask for, with the default filter.
     *(Tuning(position, velocity) for position, velocity in ((0.15, 1.0), (0.15, 0.6), (0.12, 0.4))),
-    *(Tuning(0.15, 0.6, tilt_reach=reach) for reach in (0.2, 0.3, 0.4)),
-    *(Tuning(0.25, 1.0, tilt_reach=reach) for reach in (0.2, 0.4)),
-    *(Tuning(0.1, 0.6, tilt_reach=reach) for reach in (0.25, 0.5)),
+    *(Tuning(0.15, 0.6, tilt_limit=reach) for reach in (0.2, 0.3, 0.4)),
+    *(Tuning(0.25, 1.0, tilt_limit=reach) for reach in (0.2, 0.4)),
+    *(Tuning(0.1, 0.6, tilt_limit=reach) for reach in (0.25, 0.5)),
     # Slower filters.
     *(Tuning(torque_walk=walk) for walk in (1.0, 0.1, 0.03, 0.01, 0.003, 0.001)),
     *(Tuning(0.15, 0.6, walk) for walk in (1.0, 0.01)),

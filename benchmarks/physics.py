@@ -20,18 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball import config as configs
-from mjxball.physics import fused, kernel, mjx, newton_euler
+from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_control_step, python_repeat, start_state
 from mjxball.physics.stepper import make_stepper
 
 REPEATS = 5
 ENGINES = {"newton-euler": newton_euler.make_engine, "mjx": mjx.make_engine}
-ROADS = {
-    "newton-euler": ("loop", "unrolled", "fused", "kernel"),
-    "mjx": ("loop", "unrolled"),
-}  # How the physics steps of a control step are compiled: a compiled loop, unrolled, unrolled on split components, or
-# one Triton kernel (GPU only). Both engines train on `loop`.
+LOOPS = {"loop": mjx.jax_repeat, "unrolled": python_repeat}  # the physics steps of a control step; training uses `loop`
 
 
 def batch(config: configs.Config, worlds: int, dtype: type) -> tuple[PlantState, np.ndarray, Load]:
@@ -47,28 +43,20 @@ def batch(config: configs.Config, worlds: int, dtype: type) -> tuple[PlantState,
     return start_state(config, zero, euler, zero, mass, zero[:, 0]), commands, load
 
 
-def make_run(config: configs.Config, name: str, road: str, control_steps: int) -> Any:
+def make_run(config: configs.Config, name: str, loop: str, control_steps: int) -> Any:
     """A function (state, commands, load) -> state that advances a batch `control_steps` control steps."""
-    if road == "fused":
-        step = fused.make_fused_step(config)
-    elif road == "kernel":
-        step = kernel.make_kernel_step(config)
-    else:
-        engine = ENGINES[name](config.plant, config.attitude)
-        step = jax.vmap(make_control_step(config, engine, python_repeat if road == "unrolled" else mjx.jax_repeat))
+    engine = ENGINES[name](config.plant, config.attitude)
+    step = jax.vmap(make_control_step(config, engine, LOOPS[loop]))
 
     def run(state: PlantState, commands: Any, load: Load) -> PlantState:
-        if road == "kernel":
-            state, commands, load = fused.split_state(state), fused.split(commands, 2), fused.split_load(load)
-        state = jax.lax.fori_loop(0, control_steps, lambda _, s: step(s, commands, load), state)
-        return fused.join_state(state) if road == "kernel" else state
+        return jax.lax.fori_loop(0, control_steps, lambda _, s: step(s, commands, load), state)
 
     return run
 
 
-def time_jax(config: configs.Config, name: str, worlds: int, control_steps: int, road: str) -> dict[str, float]:
+def time_jax(config: configs.Config, name: str, worlds: int, control_steps: int, loop: str) -> dict[str, float]:
     """Steps/s and compile seconds of one JAX engine at one size."""
-    run = make_run(config, name, road, control_steps)
+    run = make_run(config, name, loop, control_steps)
     arguments = jax.tree.map(jnp.asarray, batch(config, worlds, np.float32))
     started = time.perf_counter()
     compiled = jax.jit(run).lower(*arguments).compile()
@@ -121,7 +109,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, nargs="+", default=[256, 1024, 8192, 65536, 1048576])
     parser.add_argument("--engines", nargs="+", choices=[*ENGINES, "mujoco"], default=[*ENGINES, "mujoco"])
-    parser.add_argument("--roads", nargs="+", choices=ROADS["newton-euler"], default=ROADS["newton-euler"])
+    parser.add_argument("--loops", nargs="+", choices=LOOPS, default=list(LOOPS))
     parser.add_argument("--work", type=float, default=2e7, help="physics steps in a timed call, at most")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -129,20 +117,18 @@ def main() -> None:
     device = jax.devices()[0].device_kind
     rows = []
     print(f"{device}, jax {jax.__version__}, float32, {config.physics_step * 1e3:g} ms steps")
-    print(f"{'engine':>14} {'road':>9} {'worlds':>9} {'M steps/s':>11} {'compile s':>10}", flush=True)
+    print(f"{'engine':>14} {'loop':>9} {'worlds':>9} {'M steps/s':>11} {'compile s':>10}", flush=True)
 
-    def report(engine: str, road: str, worlds: int, figures: dict[str, float]) -> None:
-        rows.append({"engine": engine, "road": road, "worlds": worlds, "device": device, **figures})
+    def report(engine: str, loop: str, worlds: int, figures: dict[str, float]) -> None:
+        rows.append({"engine": engine, "loop": loop, "worlds": worlds, "device": device, **figures})
         compiled = f"{figures['compile_seconds']:10.2f}" if "compile_seconds" in figures else f"{'-':>10}"
-        print(f"{engine:>14} {road:>9} {worlds:>9} {figures['steps_per_second'] / 1e6:>11.3f} {compiled}", flush=True)
+        print(f"{engine:>14} {loop:>9} {worlds:>9} {figures['steps_per_second'] / 1e6:>11.3f} {compiled}", flush=True)
 
     for name in (engine for engine in options.engines if engine in ENGINES):
-        for road in (road for road in ROADS[name] if road in options.roads):
-            if road == "kernel" and jax.default_backend() != "gpu":
-                continue
+        for loop in options.loops:
             for worlds in options.worlds:
                 steps = max(2, min(500, int(options.work / worlds / config.timing.physics_steps)))
-                report(name, road, worlds, time_jax(config, name, worlds, steps, road))
+                report(name, loop, worlds, time_jax(config, name, worlds, steps, loop))
     if "mujoco" in options.engines:
         report("mujoco (ours)", "-", 1, time_mujoco(config, 500))
         report("mj_step", "-", 1, time_mj_step(config))

@@ -3,7 +3,7 @@
 `python benchmarks/rehearsal.py [--seconds 30] [--flights 3] [--json FILE]`
 
 The runner flies `policies/flight.npz` and `policies/stand.npz` with cflib against the twin, in real time. The pure
-simulation (`mjxball.rollout.simulate`, closed form, no protocol, no estimator, no contact) begins where each flight
+simulation (`mjxball.sim.rollout.simulate`, closed form, no protocol, no estimator, no contact) begins where each flight
 came under both laws: its place, velocity, roll, CG phase or place of the ball, the same goal. It is flown twice, the
 follower reading exact numbers, and numbers in the steps in which a drone's state comes over the wire. Compared are
 figures from 5 s on; attitude and ball are the twin's truth, positions the flight's log. Medians over the flights.
@@ -33,8 +33,8 @@ from mjxball.fly.twin.conditions import Conditions
 from mjxball.fly.twin.coupled import CoupledPair
 from mjxball.fly.twin.server import Twin
 from mjxball.policy import Policy, shipped_policy
-from mjxball.rollout import simulate
-from mjxball.scenario import Scenario
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
 NAMES = ("flight", "stand")

@@ -20,13 +20,14 @@ from typing import Any
 
 from cells import WANTED, feasible, numbers_of
 
+from mjxball.baselines import make_baseline
 from mjxball.config import preset
-from mjxball.control.followers import Follower, make_baseline
+from mjxball.control.followers import Follower
 from mjxball.evaluate.batch import Batch
-from mjxball.evaluate.cells import load_policy
+from mjxball.evaluate.policies import load_policy
 from mjxball.policy.shipped import shipped_policy
-from mjxball.scenario import Scenario
-from mjxball.sensing import Disturbance
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.scenario import Scenario
 
 CLASSICAL = ("lqg", "lqg-slow", "adaptive", "copy")
 TOLD = CLASSICAL[:2]

@@ -19,15 +19,16 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_reach
-from mjxball.control.followers import Follower, make_baseline
+from mjxball.control.followers import Follower
 from mjxball.evaluate.batch import Batch, law_of
-from mjxball.evaluate.cells import load_policy
+from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.stability import delay_margins, hovers
 from mjxball.plotting import pyplot
-from mjxball.rollout import simulate_batch
-from mjxball.scenario import Scenario
+from mjxball.sim.rollout import simulate_batch
+from mjxball.sim.scenario import Scenario
 
 OFFSETS = (-0.17, -0.1, -0.05, 0.0, 0.05, 0.1, 0.17)
 MASSES = (0.1, 0.2, 0.4, 0.6)

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from mjxball import config
-from mjxball.control.followers import make_baseline
-from mjxball.rollout import Trajectory, simulate_batch
-from mjxball.scenario import Scenario
+from mjxball.baselines import make_baseline
+from mjxball.sim.rollout import Trajectory, simulate_batch
+from mjxball.sim.scenario import Scenario
 
 OMEGAS = (0.31, 0.62, 1.0, 2.0, 3.1)  # [rad/s]
 REFERENCE_STEPS = 100  # physics steps in a control period of 20 ms: 0.2 ms

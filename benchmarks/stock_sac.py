@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import functools
-import types
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from mjxball import config as configs
+from mjxball.algorithms.base import Policy
 from mjxball.cache import enable_compilation_cache
 from mjxball.env import CoupledPairEnv
 from mjxball.policy import save_file
@@ -86,7 +86,7 @@ def train(config: configs.Config, options: argparse.Namespace, export: Callable[
             max_devices_per_host=1,
             reward_scaling=options.reward_scale,
             tau=options.target_rate,
-            min_replay_size=config.sac.prefill,
+            min_replay_size=config.sac.warmup_steps,
             max_replay_size=options.replay,
             grad_updates_per_step=options.updates,
             network_factory=functools.partial(
@@ -119,8 +119,9 @@ def main() -> None:
     card = {"trainer": "brax.training.agents.sac.train", "seed": options.seed, "physics": options.physics}
 
     def export(steps: int, parameters: Any) -> None:
-        learner = types.SimpleNamespace(average=parameters[1], normaliser=parameters[0])
-        exported = policy_file(config, learner, steps, card)
+        seen, mask = parameters[0], CoupledPairEnv(config, options.physics).input_mask
+        learnt = Policy(parameters[1]["params"], seen.mean, seen.std, mask)
+        exported = policy_file(config, learnt, steps, card)
         save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)
         if steps >= options.steps:
             save_file(options.out, exported)

@@ -70,7 +70,7 @@ def read_libraries(options: argparse.Namespace, place: Path) -> None:
     """Run the trainers for a moment, so that no counted run is the first to read their libraries from the disk."""
     from mjxball.config import preset
 
-    short = 2 * preset("transport").sac.prefill
+    short = 2 * preset("transport").sac.warmup_steps
     out, policy = place / "first", place / "first.npz"
     firsts = {
         "ours": (our_command(options, 0, out, short), out / "policy.npz"),
@@ -86,9 +86,9 @@ def read_libraries(options: argparse.Namespace, place: Path) -> None:
 def our_command(options: argparse.Namespace, seed: int, out: Path, steps: int) -> list[str]:
     """`train.py` with the settings to be measured."""
     replay = math.ceil(steps / options.worlds) * options.worlds
-    flags = ["--sac.steps", steps, "--sac.replay", replay, "--sac.evaluations", 1]
-    flags += ["--sac.learning_rate", options.learning_rate, "--sac.worlds", options.worlds]
-    flags += ["--sac.updates", options.updates, "--sac.batch", options.batch]
+    flags = ["--sac.total_steps", steps, "--sac.replay_size", replay, "--sac.num_evaluations", 1]
+    flags += ["--sac.learning_rate", options.learning_rate, "--sac.num_envs", options.worlds]
+    flags += ["--sac.updates_per_step", options.updates, "--sac.batch_size", options.batch]
     command = ["train.py", "transport", "--seed", seed, "--out", out, "--physics", options.physics, *flags]
     return [str(word) for word in command]
 
@@ -147,11 +147,13 @@ def _steps_of(snapshot: Path) -> int:
 def judge(rows: list[dict[str, Any]]) -> None:
     """Add the metrics of the reference scenario to every row."""
     from mjxball.config import preset
-    from mjxball.evaluate.cells import REFERENCE, load_policy, run_cells
+    from mjxball.evaluate.policies import load_policy
+    from mjxball.evaluate.results import fly_scenarios
+    from mjxball.evaluate.scenarios import REFERENCE
 
     settings = preset("transport")
     policies = [load_policy(row["policy"], settings) for row in rows]
-    for row, cell in zip(rows, run_cells(settings, policies, [REFERENCE], "newton-euler"), strict=True):
+    for row, cell in zip(rows, fly_scenarios(settings, policies, [REFERENCE], "newton-euler"), strict=True):
         record = cell.record()
         row |= {name: record[name] for name in BAR}
         row["policy"] = row["policy"].name
@@ -195,13 +197,13 @@ def rate_of(members: int, devices: list[Any], options: argparse.Namespace) -> di
     population = Population(preset("transport"), options.physics, members, devices=devices)
     compiled = population.compile(creating=True)
     state = population.start(compiled, 0)
-    state, _ = compiled.advance(state, population.mode(programs.prefill(100)))
+    state, *_ = compiled.advance(state, population.mode(programs.warmup(100)))
     steps, rates = options.chunk, []
     for _ in range(4):
         started = time.perf_counter()
-        state, _ = compiled.advance(state, population.mode(programs.train(steps, population.config.sac.updates)))
+        state, *_ = compiled.advance(state, population.mode(programs.train(steps)))
         jax.block_until_ready(state)
-        rates.append(members * population.config.sac.worlds * steps / (time.perf_counter() - started))
+        rates.append(members * population.config.sac.num_envs * steps / (time.perf_counter() - started))
     held = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / members
     stats = devices[0].memory_stats() or {}
     return {
@@ -245,7 +247,7 @@ def distributed(options: argparse.Namespace, place: Path, count: int) -> dict[st
         port = free.getsockname()[1]
     out, members = place / f"distributed{count}", options.members[-1] * count
     command = ["train.py", "--out", str(out), "--physics", options.physics, "--seeds", str(members)]
-    command += ["--sac.steps", str(options.chunk * 128 * 4), "--sac.evaluations", "1"]
+    command += ["--sac.total_steps", str(options.chunk * 128 * 4), "--sac.num_evaluations", "1"]
     command += ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--processes", str(count)]
     children = [
         launch([*command, "--process", str(k)], place / f"cache{k}", CUDA_VISIBLE_DEVICES=str(k)) for k in range(count)

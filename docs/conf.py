@@ -13,7 +13,15 @@ from mjxball import __version__  # noqa: E402
 project, author, release = "mjxball", "the mjxball authors", __version__
 project_copyright = f"{author}, Apache-2.0"
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "mathml", "markdown_docstrings", "settings_table", "notebooks"]
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "mathml",
+    "markdown_docstrings",
+    "settings_table",
+    "notebooks",
+    "generated",
+]
 exclude_patterns = ["_site", "_static"]
 html_theme = "furo"
 html_title = f"mjxball {release}"

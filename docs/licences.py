@@ -19,12 +19,12 @@ REPOSITORY = Path(__file__).parents[1]
 PAGE = REPOSITORY / "docs" / "licences.md"
 HEAD = """# Licences of what mjxball installs
 
-mjxball itself is Apache-2.0. Made by `python docs/licences.py` from the metadata of the packages that `constraints.txt`
-pins; `tests/test_licences.py` compares the two.
+mjxball itself is Apache-2.0. `python docs/licences.py` writes this page from the metadata of the packages that
+`constraints.txt` pins; `tests/test_licences.py` compares the two.
 
-**cflib is under the GPL**, which is why it is an extra (`fly`) that nobody gets without asking; nothing imports it but
-what opens a radio. Whoever distributes mjxball together with cflib must heed the GPL. docutils, which only builds these
-pages, is in the public domain or under BSD licences but for an Emacs mode, which is under the GPL and not installed.
+**cflib is under the GPL**, so it is an extra (`fly`) that must be asked for, and only the code that opens a radio
+imports it. The GPL applies to distributions of mjxball together with cflib. docutils, which only builds these pages, is
+in the public domain or under BSD licences, except for an Emacs mode under the GPL that is not installed.
 
 | package | licence | installed by |
 |---|---|---|
@@ -38,7 +38,8 @@ def plain(name: str) -> str:
 
 def pinned() -> list[str]:
     """Names in constraints.txt, in its order."""
-    return [line.split("==")[0] for line in (REPOSITORY / "constraints.txt").read_text().split()]
+    lines = (REPOSITORY / "constraints.txt").read_text().splitlines()
+    return list(dict.fromkeys(line.split("==")[0] for line in lines if line))
 
 
 def licence(name: str) -> str:
@@ -48,7 +49,9 @@ def licence(name: str) -> str:
         return expression
     classifiers = [text.split(" :: ")[-1] for text in told.get_all("Classifier", []) if text.startswith("License ::")]
     named = [text for text in classifiers if text != "OSI Approved"]
-    text = (told.get("License") or "").strip().splitlines()
+    files = [f"licenses/{path}" for path in told.get_all("License-File", [])]
+    written = [told.get("License"), *(metadata.distribution(name).read_text(path) for path in files)]
+    text = next((one for one in written if one and one.strip()), "").strip().splitlines()
     return " / ".join(named) or (text[0][:60] if text else "not stated")
 
 

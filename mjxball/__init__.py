@@ -7,14 +7,14 @@ __all__ = ["Policy", "Scenario", "Trajectory", "__version__", "simulate"]
 
 if TYPE_CHECKING:
     from mjxball.policy import Policy
-    from mjxball.rollout import Trajectory, simulate
-    from mjxball.scenario import Scenario
+    from mjxball.sim.rollout import Trajectory, simulate
+    from mjxball.sim.scenario import Scenario
 
 _HOMES = {
     "Policy": "mjxball.policy",
-    "Scenario": "mjxball.scenario",
-    "Trajectory": "mjxball.rollout",
-    "simulate": "mjxball.rollout",
+    "Scenario": "mjxball.sim.scenario",
+    "Trajectory": "mjxball.sim.rollout",
+    "simulate": "mjxball.sim.rollout",
 }
 
 

@@ -19,8 +19,8 @@ def policy_of_run(run: Path) -> PolicyFile:
     from mjxball.train.checkpoint import restore_policy
     from mjxball.train.curves import told_by_the_run
 
-    config, learner, steps, origin = restore_policy(run)
-    policy = policy_file(config, learner, steps, {**origin, **told_by_the_run(run, origin["seed"])})
+    config, learnt, steps, origin = restore_policy(run)
+    policy = policy_file(config, learnt, steps, {**origin, **told_by_the_run(run, origin["seed"])})
     if not is_sound(policy):
         raise InputError(f"the newest checkpoint of {run} holds values that are not finite")
     return policy

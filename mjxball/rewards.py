@@ -1,12 +1,29 @@
-"""Rewards of one control step, on NumPy or JAX arrays."""
+"""Rewards of one control step, on NumPy or JAX arrays of any batch shape."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from mjxball.config import Reward
 
 Array = Any
+
+
+class Transition(NamedTuple):
+    """What a reward may depend on: the truth after one control step, and what was commanded in it."""
+
+    error: Array  # (..., 3) e_o, goal less position of O [m]
+    velocity: Array  # (..., 3) of O [m/s]
+    euler: Array  # (..., 3) roll, pitch, yaw [rad]
+    rates: Array  # (..., 3) about the body axes [rad/s]
+    action: Array  # (..., 3) of the network in [-1, 1]
+    last_action: Array  # (..., 3) the one before
+    action_average: Array | None  # (..., 3) over the longest of `follower.observation_averages`; None: there is none
+    leader_command: Array  # (..., 3) roll, pitch [rad], vertical acceleration [m/s2]
+    follower_command: Array  # (..., 3) likewise
+    tilt_disagreement: Array  # (...) follower's less leader's command about the axis that no load turns [rad]
+    ball: Array  # (...) a rolling ball's offset over its end stop's
+    terminated: Array  # (...) bool, whether the episode ended by leaving the termination distance or by diverging
 
 
 def paper_reward(leader_command: Array, follower_command: Array) -> Array:
@@ -15,24 +32,42 @@ def paper_reward(leader_command: Array, follower_command: Array) -> Array:
     return -10.0 * xp.abs(leader_command - follower_command).sum(axis=-1)
 
 
-def task_reward(
-    weights: Reward, error: Array, velocity: Array, euler: Array, rates: Array, action: Array, last_action: Array
-) -> Array:
-    """What the user wants (ours): minus a weighted sum of costs, all vectors (..., 3) -> (...).
+def task_reward(weights: Reward, step: Transition) -> Array:
+    """Minus a weighted sum of costs -> (...) (ours); every term but that of `weights.termination`.
 
     The error's cost is a pseudo-Huber: |e| / scale far away, (e / scale)^2 / 2 near the goal.
     """
-    xp = error.__array_namespace__()
+    xp = step.error.__array_namespace__()
 
     def square(vector: Array) -> Array:
         return (vector * vector).sum(axis=-1)
 
-    distance = xp.sqrt(1.0 + square(error) / weights.error_scale**2) - 1.0
-    return -(
+    distance = xp.sqrt(1.0 + square(step.error) / weights.error_scale**2) - 1.0
+    total = -(
         weights.error * distance
-        + weights.velocity * square(velocity)
-        + weights.tilt * square(euler[..., :2])
-        + weights.rates * square(rates)
-        + weights.effort * square(action)
-        + weights.smoothness * square(action - last_action)
+        + weights.velocity * square(step.velocity)
+        + weights.tilt * square(step.euler[..., :2])
+        + weights.rates * square(step.rates)
+        + weights.effort * square(step.action)
+        + weights.smoothness * square(step.action - step.last_action)
     )
+    if _used(weights.tilt_disagreement):
+        total = total - weights.tilt_disagreement * step.tilt_disagreement**2
+    if _used(weights.ball):
+        total = total - weights.ball * step.ball**2
+    if _used(weights.steady_action) and step.action_average is not None:
+        total = total - weights.steady_action * square(step.action_average)
+    return total
+
+
+def _used(weight: Array) -> bool:
+    """False for a weight of 0; one that a sweep traces may be anything."""
+    return not isinstance(weight, (int, float)) or weight != 0
+
+
+def reward(weights: Reward, step: Transition) -> Array:
+    """The reward (...) of `weights.kind`, less the cost of a termination."""
+    xp = step.error.__array_namespace__()
+    mimics = weights.kind == "paper"
+    earned = paper_reward(step.leader_command, step.follower_command) if mimics else task_reward(weights, step)
+    return earned - xp.where(step.terminated, weights.termination, 0.0)

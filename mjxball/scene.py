@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import mujoco
@@ -12,24 +13,27 @@ from mjxball.assembly import BALL_JOINT, build_spec
 from mjxball.config import Plant
 
 Array = Any
-GOAL_COLOUR = (0.2, 0.8, 0.3, 0.6)
-DISTANCE, AZIMUTH, ELEVATION = 2.3, 120.0, -12.0  # of the camera [m], [degrees]
+GOAL_COLOUR = (0.18, 0.62, 0.27, 0.55)
+TRAIL_COLOUR = np.array([0.15, 0.35, 0.55, 0.35], np.float32)
+AZIMUTH, ELEVATION = 112.0, -24.0  # of the camera [degrees]
 
 
 class Scene:
     """A plant and its goal, seen by a camera that stands still."""
 
-    def __init__(self, plant: Plant, goal: Array, size: tuple[int, int], look_at: Array):
-        """`goal` of O (3,) [m], `size` = (height, width) in pixels, the camera looks at `look_at` (3,) [m]."""
+    def __init__(self, plant: Plant, goal: Array, size: tuple[int, int], look_at: Array, distance: float = 2.3):
+        """`goal` of O (3,) [m], `size` = (height, width) in pixels; camera `distance` [m] from `look_at` (3,)."""
         spec = build_spec(dataclasses.replace(plant, stand="free"))  # a stand's pose is one of free flight
+        _light(spec)
         ball = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [0.03, 0, 0], "rgba": GOAL_COLOUR}
         spec.worldbody.add_geom(name="goal", pos=list(map(float, goal)), contype=0, conaffinity=0, **ball)
+        spec.visual.global_.offwidth, spec.visual.global_.offheight = max(640, size[1]), max(480, size[0])
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._slide = self._model.jnt_qposadr[self._model.joint(BALL_JOINT).id]
         self._share = plant.moving_fraction
         self._camera = mujoco.MjvCamera()
-        self._camera.distance, self._camera.azimuth, self._camera.elevation = DISTANCE, AZIMUTH, ELEVATION
+        self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, AZIMUTH, ELEVATION
         self._camera.lookat[:] = look_at
         self._renderer = mujoco.Renderer(self._model, *size)
 
@@ -38,15 +42,45 @@ class Scene:
         self._model.geom("goal").pos[:] = goal
         self._camera.lookat[:] = look_at
 
-    def picture(self, position: Array, quaternion: Array, cg_offset: float) -> np.ndarray:
-        """Pixels (height, width, 3) uint8 with O at `position` (3,) [m], attitude (w, x, y, z), CG offset [m]."""
+    def picture(self, position: Array, quaternion: Array, cg_offset: float, path: Array = ()) -> np.ndarray:
+        """Pixels (height, width, 3) uint8 with O at `position` (3,) [m], attitude (w, x, y, z), CG offset [m].
+
+        `path` (n, 3) [m] is drawn as a line behind the pair.
+        """
         data = self._data
         data.qpos[:3], data.qpos[3:7] = position, quaternion
         data.qpos[self._slide] = cg_offset / self._share
         mujoco.mj_forward(self._model, data)
         self._renderer.update_scene(data, self._camera)
+        for begin, end in itertools.pairwise(path):
+            self._add_line(begin, end)
         return self._renderer.render().copy()
 
     def close(self) -> None:
         """Free the GL context."""
         self._renderer.close()
+
+    def _add_line(self, begin: Array, end: Array) -> None:
+        scene = self._renderer.scene
+        if scene.ngeom >= scene.maxgeom:
+            return
+        geom, kind = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_CAPSULE
+        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), TRAIL_COLOUR)
+        mujoco.mjv_connector(geom, kind, 0.004, np.asarray(begin, float), np.asarray(end, float))
+        scene.ngeom += 1
+
+
+def _light(spec: mujoco.MjSpec) -> None:
+    """A bright sky, a light floor and a soft headlight beside the model's own lamp."""
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
+    sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [0.80, 0.88, 0.96], [0.97, 0.98, 0.99]
+    grid = spec.texture("grid")
+    grid.rgb1, grid.rgb2 = [0.60, 0.64, 0.68], [0.66, 0.70, 0.74]
+    spec.geom("floor").size = [0, 0, 0.1]  # without end
+    spec.geom("shell").rgba = [0.80, 0.68, 0.42, 0.30]
+    ball, shell = spec.geom("cg"), spec.geom("shell")
+    ball.rgba, ball.size = [0.98, 0.72, 0.05, 1.0], [1.4 * shell.size[2], 0, 0]  # seen from outside the object
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35, 0.35, 0.35], [0.30, 0.30, 0.30]
+    spec.visual.headlight.specular = [0.1, 0.1, 0.1]
+    spec.visual.quality.shadowsize = 4096
+    spec.visual.map.haze = 0.0

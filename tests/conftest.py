@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 
 from mjxball import config as configs
+from mjxball.algorithms import sac
+from mjxball.algorithms.base import Policy
 from mjxball.config import Config
 from mjxball.env import CoupledPairEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
-from mjxball.train import sac
-from mjxball.train.program import statistics
 
 # Programs here are small and run once: to optimise them little takes a third off the time of tests that compile. Level
 # 0 compiles no sooner than level 1 and computes four times as slowly. XLA reads its flags when it first compiles;
@@ -54,6 +54,14 @@ def locked(place: Path, kind: int) -> Iterator[None]:
         os.close(handle)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The second tier is what is marked `slow`, what flies by the clock (`alone`) and what opens a browser."""
+    for item in items:
+        if item.get_closest_marker("alone") or "browser" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.slow)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """With workers side by side (`-n 2`), a test marked `alone` has the machine to itself.
@@ -70,7 +78,7 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
 
 
 def with_settings(config: Config, **sections: dict[str, Any]) -> Config:
-    """`config` with leaves replaced, one dictionary for each section: `scenario={"goal_reach": 0.0}`."""
+    """`config` with leaves replaced, one dictionary for each section: `scenario={"goal_range": 0.0}`."""
     changed = {
         name: dataclasses.replace(getattr(config, name), **leaves) if isinstance(leaves, dict) else leaves
         for name, leaves in sections.items()
@@ -117,15 +125,20 @@ def pair(transport: Config, engine: str) -> CompiledEnv:
 
 
 @pytest.fixture(scope="session")
-def mimic(transport: Config, engine: str) -> CompiledEnv:
-    """The transport environment with the paper's reward, on each engine."""
-    return compile_env(with_settings(transport, reward={"kind": "paper"}), engine)
+def mimic(transport: Config) -> CompiledEnv:
+    """The transport environment with the paper's reward, on closed-form physics."""
+    return compile_env(with_settings(transport, reward={"kind": "paper"}), "newton-euler")
 
 
 @pytest.fixture(scope="session")
 def fast_pair(transport: Config) -> CompiledEnv:
     """The transport environment on closed-form physics, for tests that do not concern the engine."""
     return compile_env(transport, "newton-euler")
+
+
+def policy_of(env: CoupledPairEnv, learner: sac.Learner) -> Policy:
+    """What SAC exports."""
+    return Policy(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, np.array(env.input_mask))
 
 
 class Trained(NamedTuple):
@@ -145,8 +158,8 @@ def make_trained(config: Config) -> Trained:
     random = np.random.default_rng(4)
     spread, centre = random.uniform(0.05, 3.0, env.observation_size), random.normal(size=env.observation_size)
     seen = jnp.asarray(centre + spread * random.normal(size=(500, env.observation_size)), jnp.float32)
-    learner = learner._replace(normaliser=statistics.update(learner.normaliser, seen))
-    return Trained(config, networks, learner, policy_file(config, learner, steps=1234))
+    learner = learner._replace(normaliser=sac.brax.running_statistics.update(learner.normaliser, seen))
+    return Trained(config, networks, learner, policy_file(config, policy_of(env, learner), steps=1234))
 
 
 @pytest.fixture(scope="session")
@@ -158,8 +171,8 @@ def trained(transport: Config) -> Trained:
 @pytest.fixture(scope="session")
 def remembering(transport: Config) -> Trained:
     """A follower with everything that it can remember; its critics are told more than it."""
-    follower = {"history": 3, "previous_action": True, "filters": (0.1, 0.5)}
-    return make_trained(with_settings(transport, follower=follower, sac={"privileged": True}))
+    follower = {"history": 3, "previous_action": True, "observation_averages": (0.1, 0.5)}
+    return make_trained(with_settings(transport, follower=follower, sac={"privileged_critic": True}))
 
 
 @pytest.fixture(scope="session")

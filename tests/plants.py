@@ -6,8 +6,9 @@ import dataclasses
 
 import numpy as np
 
+from mjxball.baselines import make_baseline
 from mjxball.config import Config, Motion, Plant, preset
-from mjxball.control.followers import Baseline, make_baseline
+from mjxball.control.followers import Baseline
 from mjxball.physics.engine import CgState, PlantState, Wrench
 
 REFERENCE = Plant()

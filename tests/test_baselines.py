@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
 
+from mjxball.baselines import LAWS, lqg, make_baseline, make_law
+from mjxball.baselines.load_axis import pitch_axis
 from mjxball.config import preset, replace
-from mjxball.control.baselines import lqg
-from mjxball.control.baselines.gains import pitch_gains
-from mjxball.control.followers import LAWS, make_baseline, make_law
 from mjxball.errors import InputError
-from mjxball.evaluate.cells import REFERENCE, Cell, cross, run_cells
 from mjxball.evaluate.metrics import measure
-from mjxball.rollout import simulate
-from mjxball.scenario import Scenario
-from mjxball.sensing import Disturbance
+from mjxball.evaluate.results import Result, fly_scenarios
+from mjxball.evaluate.scenarios import REFERENCE, cross
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import Scenario
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 # From an independent float64 simulation, RK4 at 1 kHz, attitude loop at 500 Hz:
@@ -30,11 +29,11 @@ REFERENCE_NUMBERS = {
 
 
 @pytest.fixture(scope="module")
-def cells() -> dict[tuple[str, float], Cell]:
+def cells() -> dict[tuple[str, float], Result]:
     """Every baseline at every speed, closed-form physics."""
     config = preset("paper")
     followers = [make_baseline(name, config) for name in LAWS]
-    flown = run_cells(config, followers, cross(SPEEDS, [0.05], [0.2]), "newton-euler")
+    flown = fly_scenarios(config, followers, cross(SPEEDS, [0.05], [0.2]), "newton-euler")
     return {(cell.follower, cell.scenario.omega): cell for cell in flown}
 
 
@@ -80,40 +79,52 @@ def test_only_the_slow_filter_bears_late_commands() -> None:
 
 
 @pytest.mark.parametrize("law", [lqg.Lqg, lqg.SlowLqg])
-def test_feedback_is_the_riccati_solution_of_scipy(law: type[lqg.Lqg]) -> None:
-    plant = pitch_gains(preset("paper"), "lqg")
+def test_feedback_is_that_of_the_hamiltonians_stable_subspace(law: type[lqg.Lqg]) -> None:
+    plant = pitch_axis(preset("paper"), "lqg")
     wn, zeta, g = 10.0, 0.9, 9.81
     a = np.array([[0, 1, 0, 0], [0, 0, g, 0], [0, 0, 0, 1], [0, 0, -wn * wn, -2 * zeta * wn]])
     b = np.array([[0.0], [0], [0], [wn * wn]])
     q, r = np.diag([law.tuning.position**-2, law.tuning.velocity**-2, 0.0, 0.0]), np.array([[0.15**-2]])
-    expected = np.linalg.solve(r, b.T @ solve_continuous_are(a, b, q, r))[0]
-    np.testing.assert_allclose(lqg.feedback(plant, law.tuning).pitch, expected, rtol=1e-8)
+    values, vectors = np.linalg.eig(np.block([[a, -b @ b.T / r], [-q, -a.T]]))
+    stable = vectors[:, values.real < 0]
+    cost = np.real(stable[4:] @ np.linalg.inv(stable[:4]))
+    np.testing.assert_allclose(lqg.feedback(plant, law.tuning).pitch, (b.T @ cost / r)[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("walk", [9.0, 0.003])
-def test_filter_is_the_steady_kalman_filter_of_scipy(walk: float) -> None:
-    plant = pitch_gains(preset("paper"), "lqg")
+def test_filter_is_the_fixed_point_of_the_kalman_recursion(walk: float) -> None:
+    plant = pitch_axis(preset("paper"), "lqg")
     found = lqg.kalman(plant, walk)
-    a = np.zeros((6, 6))
-    a[0, 1] = a[2, 3] = 1
-    a[1, 2] = a[1, 4] = 1 / plant.inertia
-    a[4, [0, 1, 4, 5]] = np.array([-2 * plant.kp, -2 * plant.kd, -1, 1]) / plant.lag
-    whole = expm(a * plant.period)
-    np.testing.assert_allclose(found.transition, whole[:5, :5], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.drive, whole[:5, 5], rtol=1e-9, atol=1e-12)
-    noise, seen = np.zeros((5, 5)), np.eye(2, 5)
+    noise, measured, covariance = np.zeros((5, 5)), np.eye(2, 5), np.eye(5)
     noise[3, 3] = walk * plant.period
-    measurement = np.diag([2e-3**2, 2e-2**2])
-    predicted = solve_discrete_are(found.transition.T, seen.T, noise, measurement)
-    gain = predicted @ seen.T @ np.linalg.inv(seen @ predicted @ seen.T + measurement)
-    np.testing.assert_allclose(found.gain, gain, rtol=1e-6)
+    for _ in range(3000):
+        predicted = found.transition @ covariance @ found.transition.T + noise
+        innovation = measured @ predicted @ measured.T + np.diag([2e-3**2, 2e-2**2])
+        gain = predicted @ measured.T @ np.linalg.inv(innovation)
+        covariance = (np.eye(5) - gain @ measured) @ predicted
+    np.testing.assert_allclose(found.gain, gain, rtol=1e-8)
+
+
+def test_sampled_model_is_the_integrated_one() -> None:
+    """x' = A x + b u over 20 ms against 2000 steps of RK4."""
+    random = np.random.default_rng(0)
+    a, b, x = random.normal(size=(4, 4)), random.normal(size=(4, 2)), random.normal(size=4)
+    u, step, end = np.array([0.3, -0.7]), 1e-5, x.copy()
+    for _ in range(2000):
+        k1 = a @ end + b @ u
+        k2 = a @ (end + step / 2 * k1) + b @ u
+        k3 = a @ (end + step / 2 * k2) + b @ u
+        k4 = a @ (end + step * k3) + b @ u
+        end = end + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    transition, drive = lqg.discretise(a, b, 0.02)
+    np.testing.assert_allclose(transition @ x + drive @ u, end, rtol=1e-11)
 
 
 def test_adaptive_polynomial_is_stable_as_designed() -> None:
     """J p^3 + K p^2 + K w p + K w^2 r / 2 is Hurwitz iff 2 K > J w r."""
-    from mjxball.control.baselines.adaptive import BANDWIDTH, RATIO
+    from mjxball.baselines.adaptive import BANDWIDTH, RATIO
 
-    plant = pitch_gains(preset("paper"), "adaptive")
+    plant = pitch_axis(preset("paper"), "adaptive")
     k = 2 * plant.kd
     roots = np.roots([plant.inertia, k, k * BANDWIDTH, k * BANDWIDTH**2 * RATIO / 2])
     assert roots.real.max() < -1
@@ -123,9 +134,9 @@ def test_adaptive_polynomial_is_stable_as_designed() -> None:
 def test_gains_follow_the_plant() -> None:
     """Section 3: per-drone Kp 3.22, Kd 0.579 in pitch; they move with the attitude loop's frequency."""
     config = preset("paper")
-    plant = pitch_gains(config, "lqg")
+    plant = pitch_axis(config, "lqg")
     assert (plant.kp, plant.kd, plant.inertia) == pytest.approx((3.22, 0.579, 0.0644), rel=2e-3)
-    slower = pitch_gains(replace(config, "attitude.natural_frequency", (10.0, 5.0, 4.0)), "lqg")
+    slower = pitch_axis(replace(config, "attitude.natural_frequency", (10.0, 5.0, 4.0)), "lqg")
     assert slower.kp == pytest.approx(plant.kp / 4)
 
 

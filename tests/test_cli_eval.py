@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from command_line import TRANSPORT, assert_one_line, call, listing, load_arrays, run, script, write_arrays
 
+from mjxball.baselines import BASELINES
 from mjxball.commands.evaluate import main
-from mjxball.control.followers import BASELINES
-from mjxball.evaluate.homes import by_home
+from mjxball.evaluate.policies import group_by_plant
 from mjxball.policy.shipped import shipped_policies
 
 FAST = ["--physics", "newton-euler"]
@@ -45,11 +45,12 @@ def one(cells: list[dict[str, Any]], **wanted: Any) -> dict[str, Any]:
     return found[0]
 
 
+@pytest.mark.slow
 def test_no_arguments_judge_every_shipped_policy_and_baseline(standard: list[dict[str, Any]]) -> None:
-    here, homes = by_home(shipped_policies())
+    here, others = group_by_plant(shipped_policies())
     names = {*BASELINES, *(path.stem for path in here)}
     assert {"transport", "robust", "paper"} <= names
-    assert {config.preset for config, _ in homes} == {"flight", "stand"}
+    assert {config.preset for config, _ in others} == {"flight", "stand"}
     scenarios = {(0.31, 0.0), *((omega, 0.05) for omega in SPEEDS)}
     assert {(cell["follower"], cell["omega"], cell["amplitude"]) for cell in standard} == {
         (name, *scenario) for name in names for scenario in scenarios
@@ -57,6 +58,7 @@ def test_no_arguments_judge_every_shipped_policy_and_baseline(standard: list[dic
     assert len(standard) == len(names) * len(scenarios)
 
 
+@pytest.mark.slow
 def test_cells_have_the_fixed_keys_and_types(standard: list[dict[str, Any]]) -> None:
     for cell in standard:
         assert set(cell) == {"follower", *SCENARIO_KEYS, *NUMBERS, "failed"}
@@ -68,6 +70,7 @@ def test_cells_have_the_fixed_keys_and_types(standard: list[dict[str, Any]]) -> 
 
 
 # From an independent simulation that runs its attitude loop at 500 Hz; 5 % covers the difference.
+@pytest.mark.slow
 @pytest.mark.parametrize(("omega", "x_peak"), zip(SPEEDS, (0.296, 0.258, 0.163, 0.050, 0.023), strict=True))
 def test_copy_sways_as_the_reference_says(standard: list[dict[str, Any]], omega: float, x_peak: float) -> None:
     cell = one(standard, follower="copy", omega=omega, amplitude=0.05)
@@ -76,6 +79,7 @@ def test_copy_sways_as_the_reference_says(standard: list[dict[str, Any]], omega:
     assert not cell["failed"]
 
 
+@pytest.mark.slow
 def test_copy_reaches_the_reference_rmse_and_never_settles(standard: list[dict[str, Any]]) -> None:
     cell = one(standard, follower="copy", omega=0.31, amplitude=0.05)
     assert cell["rmse"] == pytest.approx(0.520, rel=0.05)
@@ -83,6 +87,7 @@ def test_copy_reaches_the_reference_rmse_and_never_settles(standard: list[dict[s
     assert cell["action_error"] < 1e-9  # copying is its definition
 
 
+@pytest.mark.slow
 def test_copy_without_cg_motion_settles_as_the_reference_says(standard: list[dict[str, Any]]) -> None:
     cell = one(standard, follower="copy", amplitude=0.0)
     assert cell["settling_time"] == pytest.approx(7.96, rel=0.05)
@@ -149,16 +154,23 @@ def test_families_refuse_a_policy_for_crazyflies(capsys: pytest.CaptureFixture[s
 # --- check ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_shipped_policy_meets_its_card_from_anywhere(tmp_path: Path) -> None:
-    """A real process, MJX physics, another working directory, another scenario than the card's."""
+    """A real process, another working directory, another scenario than the card's."""
     shipped = shipped_policies()
     assert {"paper", "transport"} <= {path.stem for path in shipped}
-    done = run([script("eval.py"), *shipped, "--check", "--seconds", 1], tmp_path)
+    done = run([script("eval.py"), *shipped, *FAST, "--check", "--seconds", 1], tmp_path)
     assert done.returncode == 0, done.stderr
     for path in shipped:
         assert f"check {path.stem}: ok" in done.stdout
     assert not done.stderr
     assert listing(tmp_path) == {}
+
+
+@pytest.mark.slow
+def test_a_policy_meets_its_card_on_mjx(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(main, [TRANSPORT, "--check", "--seconds", 1]) == 0
+    assert "check transport: ok" in capsys.readouterr().out
 
 
 def test_check_fails_a_policy_that_misses_its_card(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

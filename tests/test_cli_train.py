@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import io
 import json
 import re
 import shutil
@@ -25,6 +27,7 @@ from command_line import (
     run,
     script,
 )
+from tables import rows
 
 from mjxball import config as configs
 from mjxball import export
@@ -36,11 +39,11 @@ WORLDS = 32
 TINY: dict[str, Any] = {
     "--physics": "newton-euler",
     "--timing.episode_steps": 100,
-    "--sac.worlds": WORLDS,
-    "--sac.replay": 32_000,
-    "--sac.prefill": 1024,
-    "--sac.batch": 64,
-    "--sac.updates": 1,
+    "--sac.num_envs": WORLDS,
+    "--sac.replay_size": 32_000,
+    "--sac.warmup_steps": 1024,
+    "--sac.batch_size": 64,
+    "--sac.updates_per_step": 1,
     "--sac.policy_layers": "16,16",
     "--sac.critic_layers": "16,16",
 }
@@ -75,10 +78,9 @@ def command_of(policy: Path) -> np.ndarray:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run in a fresh working directory."""
     here = tmp_path_factory.mktemp("finished")
-    done = run(command(out="run", seed=3, sac__steps=STEPS), here)
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    assert "run/policy.npz" in done.stdout
+    with contextlib.chdir(here), contextlib.redirect_stdout(io.StringIO()) as said:
+        assert call(main, command(out="run", seed=3, sac__total_steps=STEPS)[1:]) == 0
+    assert "run/policy.npz" in said.getvalue()
     assert sorted(path.name for path in here.iterdir()) == ["run"]
     return here / "run"
 
@@ -95,7 +97,7 @@ def test_run_records_what_made_it(finished: Path) -> None:
     record = json.loads((finished / "config.json").read_text())
     config = configs.validate(configs.from_dict(record["config"]))
     assert record["config_hash"] == configs.config_hash(config)
-    assert config.sac.steps == STEPS
+    assert config.sac.total_steps == STEPS
     assert config.sac.policy_layers == (16, 16)
     assert (record["seed"], record["physics"]) == (3, "newton-euler")
     _, card = load_arrays(finished / "policy.npz")
@@ -139,7 +141,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that got one Ctrl-C after its first row of progress."""
     here = tmp_path_factory.mktemp("interrupted")
     child = subprocess.Popen(
-        [sys.executable, *map(str, command(out="run", sac__steps=LONG))],
+        [sys.executable, *map(str, command(out="run", sac__total_steps=LONG))],
         cwd=here,
         env=environment(),
         stdout=subprocess.PIPE,
@@ -165,6 +167,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here / "run"
 
 
+@pytest.mark.slow
 def test_interrupted_run_keeps_policy_and_checkpoint(interrupted: Path) -> None:
     steps = int(rows_of(interrupted)[-1]["steps"])
     assert steps < LONG
@@ -175,12 +178,14 @@ def test_interrupted_run_keeps_policy_and_checkpoint(interrupted: Path) -> None:
     assert names == {"config.json", "metrics.csv", "tensorboard", "checkpoints", "policy.npz"}
 
 
+@pytest.mark.slow
 def test_export_of_an_interrupted_run(interrupted: Path, tmp_path: Path) -> None:
     done = run(["-m", "mjxball.export", interrupted, "exported.npz"], tmp_path)
     assert done.returncode == 0, done.stderr
     np.testing.assert_array_equal(command_of(tmp_path / "exported.npz"), command_of(interrupted / "policy.npz"))
 
 
+@pytest.mark.slow
 def test_a_run_quit_while_it_compiled_is_started_anew(finished: Path, tmp_path: Path) -> None:
     """Ctrl-C twice before the first checkpoint leaves `config.json` and an empty table: enough to resume from."""
     run_directory = tmp_path / "run"
@@ -192,6 +197,7 @@ def test_a_run_quit_while_it_compiled_is_started_anew(finished: Path, tmp_path: 
     np.testing.assert_array_equal(command_of(run_directory / "policy.npz"), command_of(finished / "policy.npz"))
 
 
+@pytest.mark.slow
 def test_resume_finishes_an_interrupted_run(interrupted: Path) -> None:
     before = rows_of(interrupted)
     recorded = (interrupted / "config.json").read_bytes()
@@ -222,7 +228,7 @@ BAD_ARGUMENTS = {
     "resume of another directory": ["--resume", "full"],
     "resume of a damaged run": ["--resume", "damaged"],
     "resume of a run without checkpoints": ["--resume", "unborn"],
-    "resume with a setting": ["--resume", "full", "--sac.steps", 5],
+    "resume with a setting": ["--resume", "full", "--sac.total_steps", 5],
     "resume with an output": ["--resume", "full", "--out", "new"],
     "negative mass": ["--plant.object_mass", -1],
     "negative drone mass": ["--plant.leader_mass", -1],
@@ -230,12 +236,12 @@ BAD_ARGUMENTS = {
     "mass range with a negative end": ["--scenario.object_mass=-0.1,0.2"],
     "range of one number": ["--scenario.object_mass", 0.2],
     "range upside down": ["--scenario.cg_speed", "3,1"],
-    "goal beyond d_term": ["--scenario.goal_reach", 2],
+    "goal beyond d_term": ["--scenario.goal_range", 2],
     "amplitude beyond the object": ["--scenario.cg_amplitude", "0,0.2"],
     "slow physics": ["--timing.physics_steps", 1],
-    "negative steps": ["--sac.steps", -1],
-    "steps not whole": ["--sac.steps", 1.5],
-    "replay does not fit the worlds": ["--sac.replay", 1000],
+    "negative steps": ["--sac.total_steps", -1],
+    "steps not whole": ["--sac.total_steps", 1.5],
+    "replay does not fit the worlds": ["--sac.replay_size", 1000],
     "no layers": ["--sac.policy_layers", ""],
     "unknown choice": ["--follower.action", "nothing"],
     "not a switch": ["--sac.alpha_fixed", "maybe"],
@@ -258,7 +264,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("arguments", BAD_ARGUMENTS.values(), ids=BAD_ARGUMENTS)
+@rows("arguments", BAD_ARGUMENTS.values())
 def test_bad_argument_is_refused(here: Path, arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     assert_refused(main, arguments, here, capsys)
 
@@ -275,12 +281,11 @@ BAD_EXPORTS = {
 }
 
 
-@pytest.mark.parametrize("arguments", BAD_EXPORTS.values(), ids=BAD_EXPORTS)
+@rows("arguments", BAD_EXPORTS.values())
 def test_bad_export_is_refused(here: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     (here / "old.npz").write_bytes(b"old")
     assert_refused(export.main, arguments, here, capsys)
 
 
-@pytest.mark.parametrize("arguments", [["holiday"], ["--out", "full"]], ids=["preset", "output"])
-def test_refusal_of_a_real_process(here: Path, arguments: list[str]) -> None:
-    assert_process_refuses([script("train.py"), *arguments], here)
+def test_refusal_of_a_real_process(here: Path) -> None:
+    assert_process_refuses([script("train.py"), "--out", "full"], here)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
+from tables import rows
 
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.policy.file import load_file
 
 PATHS = [path for path, _, _ in configs.leaves(Config())]
-each_preset = pytest.mark.parametrize("name", configs.PRESETS)
-each_leaf = pytest.mark.parametrize("path", PATHS)
+each_preset = rows("name", configs.PRESETS)
+each_leaf = rows("path", PATHS)
 
 
 def value_at(config: Config, path: str) -> Any:
@@ -63,7 +67,7 @@ class TestJson:
             configs.preset("papper")
         assert "papper" in str(error.value)
 
-    @pytest.mark.parametrize(
+    @rows(
         ("change", "named"),
         [
             (lambda data: data.update(wings=2), "wings"),
@@ -72,7 +76,6 @@ class TestJson:
             (lambda data: data.pop("sac"), "sac"),
             (lambda data: data.update(sac=3), "sac"),
         ],
-        ids=["unknown section", "unknown leaf", "missing leaf", "missing section", "number for a section"],
     )
     def test_other_fields_are_named(self, change, named):
         data = configs.to_dict(configs.preset("paper"))
@@ -80,12 +83,12 @@ class TestJson:
         with pytest.raises(InputError, match=named):
             configs.from_dict(data)
 
-    @pytest.mark.parametrize("data", [None, [], 3, "paper"])
+    @rows("data", [None, [], 3, "paper"])
     def test_not_an_object(self, data):
         with pytest.raises(InputError):
             configs.from_dict(data)
 
-    @pytest.mark.parametrize(
+    @rows(
         ("section", "leaf", "value"),
         [
             ("plant", "leader_mass", "heavy"),
@@ -148,7 +151,7 @@ class TestOverride:
         wanted = another(value_at(config, path))
         assert value_at(configs.override(config, path, text_of(wanted)), path) == wanted
 
-    @pytest.mark.parametrize(("text", "value"), [("true", True), ("False", False), ("1", True), ("0", False)])
+    @rows(("text", "value"), [("true", True), ("False", False), ("1", True), ("0", False)])
     def test_switches(self, text, value):
         assert configs.override(Config(), "sac.alpha_fixed", text).sac.alpha_fixed is value
 
@@ -160,19 +163,19 @@ class TestOverride:
         configs.override(config, "plant.arm", "0.2")
         assert config == Config()
 
-    @pytest.mark.parametrize("path", ["plant.wings", "plant", "arm", "", "plant.arm.x", "preset"])
+    @rows("path", ["plant.wings", "plant", "arm", "", "plant.arm.x", "preset"])
     def test_unknown_path(self, path):
         with pytest.raises(InputError, match="not a setting"):
             configs.override(Config(), path, "1")
 
-    @pytest.mark.parametrize(
+    @rows(
         ("path", "text"),
         [
             ("plant.arm", "long"),
             ("plant.arm", ""),
             ("plant.arm", "0.1,0.2"),
-            ("sac.worlds", "12.5"),
-            ("sac.worlds", "1e3"),
+            ("sac.num_envs", "12.5"),
+            ("sac.num_envs", "1e3"),
             ("plant.leader_inertia", "1,2,x"),
             ("plant.leader_inertia", "1;2;3"),
             ("sac.policy_layers", "64,"),
@@ -186,7 +189,7 @@ class TestOverride:
 
 
 class TestValidate:
-    @pytest.mark.parametrize(
+    @rows(
         ("path", "value"),
         [
             ("plant.leader_mass", -1.0),
@@ -207,18 +210,17 @@ class TestValidate:
             ("reward.kind", "fun"),
             ("reward.error_scale", 0.0),
             ("sac.discount", 1.0),
-            ("sac.batch", 0),
+            ("sac.batch_size", 0),
             ("sac.policy_layers", ()),
             ("sac.policy_layers", (64, 0)),
             ("sac.alpha", 0.0),
-            ("sac.target_rate", 1.5),
+            ("sac.tau", 1.5),
         ],
     )
     def test_leaf_out_of_bounds_is_named(self, path, value):
         assert path in refusal(configs.replace(Config(), path, value))
 
-    @each_leaf
-    @pytest.mark.parametrize("number", [float("nan"), float("inf"), float("-inf")])
+    @rows("path, number", list(zip(PATHS, itertools.cycle([float("nan"), float("inf"), float("-inf")]), strict=False)))
     def test_every_number_must_be_finite(self, path, number):
         value = value_at(Config(), path)
         if isinstance(value, (bool, str)):
@@ -229,23 +231,22 @@ class TestValidate:
             changed = number
         assert path in refusal(configs.replace(Config(), path, changed))
 
-    @pytest.mark.parametrize(
+    @rows(
         ("changes", "named"),
         [
             ({"scenario.cg_amplitude": (0.0, 0.18)}, "cg_amplitude"),
             ({"plant.object_size": (0.09, 0.1, 0.05)}, "cg_amplitude"),
-            ({"scenario.goal_reach": 1.5}, "termination_distance"),
-            ({"scenario.goal_reach": 1.0, "scenario.start_position": 0.5}, "termination_distance"),
+            ({"scenario.goal_range": 1.5}, "termination_distance"),
+            ({"scenario.goal_range": 1.0, "scenario.start_position": 0.5}, "termination_distance"),
             ({"scenario.termination_distance": 1.7}, "termination_distance"),
             ({"plant.leader_mount": (-0.2, 0.0, 0.0)}, "leader_mount"),
             ({"timing.physics_steps": 3}, "ms"),
             ({"timing.control_period": 0.04}, "ms"),
-            ({"sac.worlds": 2048, "sac.replay": 1024}, "replay"),
-            ({"sac.batch": 2048, "sac.replay": 1024}, "replay"),
-            ({"sac.worlds": 100, "sac.replay": 1050}, "multiple"),
-            ({"sac.worlds": 128, "sac.replay": 256, "sac.return_steps": 3}, "replay"),
+            ({"sac.num_envs": 2048, "sac.replay_size": 1024}, "replay"),
+            ({"sac.batch_size": 2048, "sac.replay_size": 1024}, "replay"),
+            ({"sac.num_envs": 100, "sac.replay_size": 1050}, "multiple"),
+            ({"sac.num_envs": 128, "sac.replay_size": 256, "sac.n_step": 3}, "replay"),
         ],
-        ids=lambda value: value if isinstance(value, str) else ",".join(value),
     )
     def test_leaves_that_do_not_fit_together(self, changes, named):
         config = Config()
@@ -253,13 +254,13 @@ class TestValidate:
             config = configs.replace(config, path, value)
         assert named in refusal(config)
 
-    @pytest.mark.parametrize(
+    @rows(
         ("path", "value"),
         [
             ("scenario.cg_amplitude", (0.17, 0.17)),  # half the object's length: the sweep's widest
             ("timing.physics_steps", 4),  # 5 ms: the slowest attitude loop
-            ("scenario.goal_reach", 1.44),  # sqrt(3) 1.44 = 2.494 m < d_term
-            ("sac.replay", 256),  # one batch
+            ("scenario.goal_range", 1.44),  # sqrt(3) 1.44 = 2.494 m < d_term
+            ("sac.replay_size", 256),  # one batch
         ],
     )
     def test_limits_themselves_are_allowed(self, path, value):
@@ -278,7 +279,50 @@ def test_a_record_of_an_older_version_gets_the_defaults() -> None:
     assert found.plant == configs.preset("flight").plant
 
 
-@pytest.mark.parametrize("changed", [{"nothing": 1}, {"autopilot": 3}, {"plant": {"x": 1}}])
+@rows("changed", [{"nothing": 1}, {"autopilot": 3}, {"plant": {"x": 1}}])
 def test_a_record_that_does_not_fit_is_refused(changed: dict) -> None:
     with pytest.raises(InputError, match="configuration"):
         configs.from_record({**configs.to_dict(configs.preset("flight")), **changed})
+
+
+class TestOldNames:
+    """Files and command lines of earlier versions keep their meaning."""
+
+    def test_every_old_name_leads_to_a_setting_and_is_none_itself(self):
+        assert set(configs.RENAMED.values()) <= set(PATHS)
+        assert not set(configs.RENAMED) & set(PATHS)
+
+    def test_a_nested_record_with_old_names_is_the_same_configuration(self):
+        config = configs.preset("flight")
+        recorded = json.loads(configs.to_json(config))
+        for old, new in configs.RENAMED.items():
+            (part, name), (new_part, new_name) = old.split("."), new.split(".")
+            recorded[part][name] = recorded[new_part].pop(new_name)
+        assert configs.from_dict(recorded) == configs.from_record(recorded) == config
+
+    def test_dotted_names(self):
+        assert configs.override(Config(), "sac.worlds", "64").sac.num_envs == 64
+        assert configs.apply_overrides(Config(), {"sac.target_rate": 1}).sac.tau == 1.0
+
+    def test_two_names_of_one_setting_contradict_each_other(self):
+        recorded = configs.to_dict(Config())
+        recorded["sac"]["worlds"] = 64
+        with pytest.raises(InputError, match=r"sac\.num_envs is given twice"):
+            configs.from_dict(recorded)
+
+    def test_a_constant_must_have_its_value(self, monkeypatch):
+        monkeypatch.setitem(configs.CONSTANT, "sac.luck", (1.0, 2.0))
+        recorded = configs.to_dict(Config())
+        recorded["sac"]["luck"] = [1.0, 2.0]
+        assert configs.from_dict(recorded) == configs.apply_overrides(Config(), {"sac.luck": [1.0, 2.0]}) == Config()
+        recorded["sac"]["luck"] = [1.0, 3.0]
+        with pytest.raises(InputError, match="no setting any more"):
+            configs.from_dict(recorded)
+
+    @rows("path", sorted(Path(__file__).parents[1].glob("policies/*.npz")))
+    def test_the_card_of_every_shipped_policy(self, path):
+        card = load_file(path).card
+        config = configs.validate(configs.from_record(card["config"]))
+        old = card["config"]["sac"]
+        assert (config.sac.num_envs, config.sac.tau) == (old["worlds"], old["target_rate"])
+        assert config.preset == card["preset"]

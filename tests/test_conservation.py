@@ -12,12 +12,12 @@ from mjxball.control.constants import plant_constants
 from mjxball.physics import mujoco, newton_euler
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
 from mjxball.physics.motion import sine
-from mjxball.rollout import simulate
-from mjxball.scenario import Scenario
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import Scenario
 
 WORLDS = 4
 STEP = 0.001  # [s], classical Runge-Kutta of order 4
-SECONDS = 3.0
+SECONDS = 1.0
 
 
 def derivative(engine: Engine, mass: np.ndarray, sines: tuple, state: PlantState) -> PlantState:
@@ -98,7 +98,7 @@ def test_free_fall_conserves_momentum(plant: Plant, make_engine: object) -> None
     later_linear, later_angular = momenta(plant, mass, sine(state.time, *sines), state)
     fallen = np.zeros((WORLDS, 3))
     fallen[:, 2] = -(plant.leader_mass + plant.follower_mass + mass) * plant.gravity * SECONDS
-    # 1e-9 relative is the bound: RK4 at 1 ms leaves a truncation error near (3 rad/s x 1 ms)^4 x 3 s.
+    # 1e-9 relative is the bound: RK4 at 1 ms leaves a truncation error near (3 rad/s x 1 ms)^4 x 1 s.
     scale_linear = np.linalg.norm(linear + fallen, axis=-1).max()
     assert np.abs(later_linear - linear - fallen).max() <= 1e-9 * scale_linear
     assert (np.linalg.norm(later_angular - angular, axis=-1) <= 1e-9 * np.linalg.norm(angular, axis=-1)).all()

@@ -17,7 +17,8 @@ from mjxball.config._crazyflie import DRONES, autopilot, rig
 from mjxball.control import crazyflie, mixer
 from mjxball.errors import InputError
 from mjxball.fly import packets
-from mjxball.fly.command import CommandMap, ForceCurve, to_setpoint
+from mjxball.fly.command import CommandMap, to_setpoint
+from mjxball.fly.thrust import ForceCurve
 
 STOCK = Autopilot(kind="crazyflie")
 LEVEL, STILL = np.zeros(3), np.zeros(3)
@@ -181,8 +182,8 @@ class TestSent:
     def test_simulation_and_flight_send_the_same_numbers(self, law: str, curve, command, mass: float) -> None:
         config = dataclasses.replace(STOCK, thrust_law=law, motor_curve=curve)
         simulated = crazyflie.setpoints(config, np.array(command), np.array(mass), 9.81)
-        free = CommandMap(law, carried_mass=mass, curve=ForceCurve(*curve), tilt_slew=1e9, thrust_slew=1e9)
-        flown = to_setpoint(np.array(command), 0.0, packets.ZERO, 0.01, free).setpoint
+        free = CommandMap(law, carried_mass=mass, curve=ForceCurve(*curve))
+        flown = to_setpoint(np.array(command), 0.0, free).setpoint
         # float32 on the wire: 1e-7 of 15 degrees. A thrust half way between two units may round either way.
         np.testing.assert_allclose(simulated[:3], packets.unpack_setpoint(packets.pack_setpoint(flown))[:3], atol=2e-6)
         assert abs(simulated[3] - flown.thrust) <= (0 if law == "paper" and command[2] == round(command[2]) else 1)
@@ -231,11 +232,13 @@ class TestRefused:
     def test_variants_are_plant_files_by_name(self, drone: str) -> None:
         # Only the leader's firmware integrates in any preset.
         expected = replace(self.with_drone(drone), "autopilot.follower_integrals", 0.0)
+        for path, value in (("cg_amplitude", (0.0, 0.034)), ("uncompensated_share", 0.0)):
+            expected = replace(expected, f"scenario.{path}", value)
         assert apply_plant(preset("flight"), Path(f"crazyflie-{drone}")) == expected
 
-    def test_the_plain_drone_on_the_newest_firmware_does_not(self) -> None:
-        with pytest.raises(InputError, match="leaves 20%, where 30% are needed"):
-            validate(self.with_drone("2.1-linear"))
+    def test_the_plain_drone_with_a_heavier_object_does_not(self) -> None:
+        with pytest.raises(InputError, match="leaves 18%, where 20% are needed"):
+            validate(replace(self.with_drone("2.1"), "scenario.object_mass", (0.015, 0.022)))
 
     def test_too_heavy_a_load(self) -> None:
         with pytest.raises(InputError, match="thrust"):

@@ -17,13 +17,14 @@ from mjxball.commands.train import main as train
 from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.train.checkpoint import CHECKPOINTS
-from mjxball.train.population import check_parts, grid
+from mjxball.train.population import grid
 from mjxball.train.processes import Rendezvous
+from mjxball.train.program import Program
 
 REPOSITORY = Path(__file__).parents[1]
 SMALL = [
-    *("--physics", "newton-euler", "--sac.worlds", "8", "--sac.replay", "800", "--sac.batch", "16"),
-    *("--sac.prefill", "100", "--sac.updates", "1", "--timing.episode_steps", "60"),
+    *("--physics", "newton-euler", "--sac.num_envs", "8", "--sac.replay_size", "800", "--sac.batch_size", "16"),
+    *("--sac.warmup_steps", "100", "--sac.updates_per_step", "1", "--timing.episode_steps", "60"),
     *("--sac.policy_layers", "8", "--sac.critic_layers", "8"),
 ]
 LIMIT = 240  # [s] for a pair of processes
@@ -67,7 +68,7 @@ def checkpoints(run: Path) -> list[int]:
 def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None:
     """Two members, one on each process."""
     run, cache = tmp_path / "run", tmp_path / "cache"
-    children = launch([*SMALL, "--seeds", "2", "--sac.steps", "200000", "--out", str(run)], cache)
+    children = launch([*SMALL, "--seeds", "2", "--sac.total_steps", "200000", "--out", str(run)], cache)
     try:
         deadline = time.monotonic() + LIMIT
         while not checkpoints(run) and children[0].poll() is None and time.monotonic() < deadline:
@@ -102,7 +103,7 @@ def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None
 @pytest.mark.alone
 def test_worlds_of_one_follower_are_split_over_the_processes(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    children = launch([*SMALL, "--sac.steps", "2400", "--out", str(run)], tmp_path / "cache")
+    children = launch([*SMALL, "--sac.total_steps", "2400", "--out", str(run)], tmp_path / "cache")
     outputs = finish(children)
     assert [child.returncode for child in children] == [0, 0], outputs
     assert Policy.load(run / "policy.npz").card["training_steps"] == 2400
@@ -138,6 +139,7 @@ print("traced by", jax.process_index())
 """
 
 
+@pytest.mark.slow
 def test_every_process_can_trace_mjx() -> None:
     """MJX's own choice of a device is the first of all processes, whose arrays no other process may use."""
     with socket.socket() as free:
@@ -174,9 +176,9 @@ def test_unsound_meetings_are_refused(meeting, word) -> None:
 
 
 def test_sizes_that_cannot_be_split_are_refused(transport) -> None:
-    check_parts(transport, 4)
-    with pytest.raises(InputError, match=r"sac\.worlds = 128"):
-        check_parts(transport, 3)
+    Program(transport, "newton-euler").algorithm.check_parts(4)
+    with pytest.raises(InputError, match=r"sac\.num_envs = 128"):
+        Program(transport, "newton-euler").algorithm.check_parts(3)
 
 
 def test_meeting_flags_need_distributed(capsys: pytest.CaptureFixture) -> None:

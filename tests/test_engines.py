@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from plants import PLANTS, ROLLING, SAMPLES, paper_with, random_motion, random_states, random_wrench
+from tables import rows
 
 from mjxball.config import Attitude, Motion
 from mjxball.control.constants import plant_constants
@@ -17,7 +18,12 @@ from mjxball.physics.step import make_accelerations, total_wrench
 
 STATES = 10_000
 FEWER = 300  # for plants beside the reference: one world of C MuJoCo takes 50 us
-TOLERANCE = 1e-9  # the issue's bound; float64 leaves about 1e-14
+TOLERANCE = 1e-9  # float64 leaves about 1e-14
+FUNCTIONS = ("prescribed", "rolling")
+MOTIONS = [(Motion(), 0), (SAMPLES, 0), (ROLLING, 0), (Motion(), 2)]
+SECOND = mujoco.make_engine
+# MJX takes seconds to compile for a plant: one of them is flown by every other test that is quick.
+FIRST_OR_SLOW = [pytest.param(name, marks=() if name == "varied" else pytest.mark.slow) for name in PLANTS]
 
 
 def relative_difference(found: tuple, expected: tuple) -> float:
@@ -30,36 +36,47 @@ def relative_difference(found: tuple, expected: tuple) -> float:
     return worst
 
 
-def engines(plant, function: str):
-    """The function of all three engines on batches of NumPy arrays."""
+def jitted(make):
+    """The law of MJX that `make()` gives, on batches of NumPy arrays, in float64."""
     with jax.enable_x64(True):
-        batched = jax.jit(jax.vmap(getattr(mjx.make_engine(plant, Attitude()), function)))
+        batched = jax.jit(jax.vmap(make()))
 
-    def mjx_engine(*arguments):
+    def called(*arguments):
         with jax.enable_x64(True):
             return batched(*arguments)
 
-    closed, second = newton_euler.make_engine(plant, Attitude()), mujoco.make_engine(plant, Attitude())
-    return getattr(closed, function), mjx_engine, getattr(second, function)
+    return called
 
 
-@pytest.mark.parametrize("name", PLANTS)
-@pytest.mark.parametrize("function", ["prescribed", "rolling"])
-def test_engines_agree_on_every_plant(name: str, function: str) -> None:
-    plant, random = PLANTS[name], np.random.default_rng(1)
+def arguments_for(plant, function: str, seed: int) -> tuple:
+    """States, wrenches, object masses and what moves the CG for `function` of an engine."""
+    random = np.random.default_rng(seed)
     mass = random.uniform(0.1, 0.6, FEWER)
     last = random_motion(plant, FEWER, random) if function == "prescribed" else random.normal(size=FEWER)
-    arguments = (random_states(plant, FEWER, random), random_wrench(FEWER, random), mass, last)
-    closed, fast, second = engines(plant, function)
-    expected = second(*arguments)
-    assert relative_difference(closed(*arguments), expected) <= TOLERANCE
-    assert relative_difference(fast(*arguments), expected) <= TOLERANCE
+    return random_states(plant, FEWER, random), random_wrench(FEWER, random), mass, last
 
 
-@pytest.mark.parametrize(
-    ("motion", "changes"), [(Motion(), 0), (SAMPLES, 0), (ROLLING, 0), (Motion(), 2)], ids=lambda value: str(value)[:24]
-)
-def test_engines_agree_on_10_000_states_for_every_motion(motion: Motion, changes: int) -> None:
+@rows("name", PLANTS)
+@rows("function", FUNCTIONS)
+def test_engines_agree_on_every_plant(name: str, function: str) -> None:
+    plant = PLANTS[name]
+    arguments = arguments_for(plant, function, 1)
+    closed, second = (getattr(make(plant, Attitude()), function) for make in (newton_euler.make_engine, SECOND))
+    assert relative_difference(closed(*arguments), second(*arguments)) <= TOLERANCE
+
+
+@pytest.mark.parametrize("name", FIRST_OR_SLOW)
+def test_mjx_agrees_on_every_plant(name: str) -> None:
+    plant = PLANTS[name]
+    closed = newton_euler.make_engine(plant, Attitude())
+    for function in FUNCTIONS:
+        arguments = arguments_for(plant, function, 1)
+        fast = jitted(lambda: getattr(mjx.make_engine(plant, Attitude()), function))(*arguments)  # noqa: B023
+        assert relative_difference(fast, getattr(closed, function)(*arguments)) <= TOLERANCE, function
+
+
+def violent(motion: Motion, changes: int) -> tuple:
+    """(config, states, wrenches, loads) of 10 000 worlds."""
     random, config = np.random.default_rng(2), paper_with(motion=motion)
     state = random_states(config.plant, STATES, random)
     load = Load(
@@ -73,38 +90,57 @@ def test_engines_agree_on_10_000_states_for_every_motion(motion: Motion, changes
     )
     constants = plant_constants(config.plant, config.attitude)
     wrench = total_wrench(np, state.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust)
+    return config, state, wrench, load
 
-    def accelerations(engine):
-        return make_accelerations(config, engine)(state, wrench, load)
 
-    expected = accelerations(mujoco.make_engine(config.plant, config.attitude))
-    closed = accelerations(newton_euler.make_engine(config.plant, config.attitude))
-    with jax.enable_x64(True):
-        law = make_accelerations(config, mjx.make_engine(config.plant, config.attitude))
-        fast = jax.jit(jax.vmap(law))(state, wrench, load)
+@rows("motion, changes", MOTIONS)
+def test_engines_agree_on_10_000_states_for_every_motion(motion: Motion, changes: int) -> None:
+    config, *arguments = violent(motion, changes)
+    closed, expected = (
+        make_accelerations(config, make(config.plant, config.attitude))(*arguments)
+        for make in (newton_euler.make_engine, SECOND)
+    )
     assert relative_difference(closed, expected) <= TOLERANCE
-    assert relative_difference(fast, expected) <= TOLERANCE
     assert np.abs(expected[1]).max() > 10  # the states are violent enough to mean something [rad/s2]
 
 
-@pytest.mark.parametrize("name", ["reference", "pivot", "heave"])
-@pytest.mark.parametrize("function", ["prescribed", "rolling"])
-def test_added_inertia_is_that_of_drones_which_have_it(name: str, function: str) -> None:
-    plant, random = PLANTS[name], np.random.default_rng(5)
-    added = random.uniform(-1e-3, 4e-3, 3)
+@pytest.mark.slow
+@pytest.mark.parametrize(("motion", "changes"), MOTIONS[1:], ids=lambda value: str(value)[:24])
+def test_mjx_agrees_on_10_000_states_for_every_motion(motion: Motion, changes: int) -> None:
+    config, *arguments = violent(motion, changes)
+    closed = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
+    fast = jitted(lambda: make_accelerations(config, mjx.make_engine(config.plant, config.attitude)))
+    assert relative_difference(fast(*arguments), closed(*arguments)) <= TOLERANCE
+
+
+def with_more_inertia(name: str, function: str) -> tuple:
+    """(plant, its arguments, more inertia (FEWER, 3), accelerations of a plant whose leader has it)."""
+    plant = PLANTS[name]
+    added = np.random.default_rng(5).uniform(-1e-3, 4e-3, 3)
     heavier = dataclasses.replace(plant, leader_inertia=tuple(np.add(plant.leader_inertia, added)))
-    mass = random.uniform(0.1, 0.6, FEWER)
-    last = random_motion(plant, FEWER, random) if function == "prescribed" else random.normal(size=FEWER)
-    arguments = (random_states(plant, FEWER, random), random_wrench(FEWER, random), mass, last)
-    closed, fast, second = engines(plant, function)
-    expected = engines(heavier, function)[2](*arguments)
-    everywhere = np.broadcast_to(added, (FEWER, 3))
-    assert relative_difference(closed(*arguments, everywhere), expected) <= TOLERANCE
-    assert relative_difference(fast(*arguments, everywhere), expected) <= TOLERANCE
+    arguments = arguments_for(plant, function, 6)
+    expected = getattr(SECOND(heavier, Attitude()), function)(*arguments)
+    return plant, arguments, np.broadcast_to(added, (FEWER, 3)), expected
+
+
+@rows("name", ["reference", "pivot", "heave"])
+@rows("function", FUNCTIONS)
+def test_added_inertia_is_that_of_drones_which_have_it(name: str, function: str) -> None:
+    plant, arguments, more, expected = with_more_inertia(name, function)
+    closed, second = (getattr(make(plant, Attitude()), function) for make in (newton_euler.make_engine, SECOND))
+    assert relative_difference(closed(*arguments, more), expected) <= TOLERANCE
     with pytest.raises(NotImplementedError, match="without mass"):
-        second(*arguments, everywhere)
-    for without, zero in zip(second(*arguments), second(*arguments, 0.0 * everywhere), strict=True):
+        second(*arguments, more)
+    for without, zero in zip(second(*arguments), second(*arguments, 0.0 * more), strict=True):
         np.testing.assert_array_equal(without, zero)  # worlds that vary in other ways carry a zero
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "function"), [("reference", "prescribed"), ("heave", "rolling")])
+def test_mjx_takes_added_inertia(name: str, function: str) -> None:
+    plant, arguments, more, expected = with_more_inertia(name, function)
+    fast = jitted(lambda: getattr(mjx.make_engine(plant, Attitude()), function))
+    assert relative_difference(fast(*arguments, more), expected) <= TOLERANCE
 
 
 def test_closed_form_matches_the_hand_solution_of_design_section_4() -> None:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
+import runpy
 import signal
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from command_line import REPOSITORY, assert_one_line, environment, run
+from tables import rows
 
 from mjxball import __version__
 
@@ -17,33 +22,59 @@ MODULES = (
     *("mjxball.export", "mjxball.assembly", "mjxball.view", "mjxball.rig.gains", "mjxball.rig.identify"),
     *("mjxball.fly", "mjxball.fly.twin", "mjxball.fly.watchdog"),
 )
-COMMANDS = {
-    "train.py": [REPOSITORY / "train.py"],
-    "eval.py": [REPOSITORY / "eval.py"],
-    **{f"-m {name}": ["-m", name] for name in MODULES},
-}
+COMMANDS = (*MODULES, "train.py", "eval.py")
 
 
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
-def test_version(command: list[object], tmp_path: Path) -> None:
-    done = run([*command, "--version"], tmp_path)
+class Called(NamedTuple):
+    """How a command ended in this process."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def called(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[str, str], Called]:
+    """Run a command with one flag as Python would run it, but in this process."""
+
+    def run_here(command: str, flag: str) -> Called:
+        monkeypatch.setattr(sys, "argv", [command, flag])
+        handler = signal.getsignal(signal.SIGINT)
+        try:
+            if command.endswith(".py"):
+                runpy.run_path(str(REPOSITORY / command), run_name="__main__")
+            else:
+                if not hasattr(sys.modules.get(command), "__path__"):  # of a package runpy runs another module
+                    sys.modules.pop(command, None)  # else runpy warns that it runs it twice
+                runpy.run_module(command, run_name="__main__", alter_sys=True)
+        except SystemExit as stop:
+            return Called(int(stop.code or 0), *capsys.readouterr())
+        finally:
+            signal.signal(signal.SIGINT, handler)
+        raise AssertionError(f"{command} went on after {flag}")
+
+    return run_here
+
+
+@rows("command", COMMANDS)
+def test_every_command_has_help_and_version_and_refuses_what_it_does_not_know(
+    command: str, called: Callable[[str, str], Called]
+) -> None:
+    assert called(command, "--version") == (0, f"mjxball {__version__}\n", "")
+    helped = called(command, "--help")
+    assert helped.code == 0
+    assert {"--version", "--help"} <= set(re.findall(r"--\w+", helped.out))
+    refused = called(command, "--frobnicate")
+    assert (refused.code, refused.out) == (2, "")
+    assert_one_line(refused.err)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", COMMANDS)
+def test_version_of_a_real_process(command: str, tmp_path: Path) -> None:
+    words = [REPOSITORY / command] if command.endswith(".py") else ["-m", command]
+    done = run([*words, "--version"], tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, f"mjxball {__version__}\n", "")
-
-
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
-def test_help(command: list[object], tmp_path: Path) -> None:
-    done = run([*command, "--help"], tmp_path)
-    assert done.returncode == 0
-    assert done.stdout.startswith("usage: ")
-    assert "--version" in done.stdout
-    assert "--help" in done.stdout
-
-
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
-def test_unknown_flag(command: list[object], tmp_path: Path) -> None:
-    done = run([*command, "--frobnicate"], tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert_one_line(done.stderr)
 
 
 def test_the_version_stands_in_one_number_everywhere() -> None:

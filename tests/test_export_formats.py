@@ -22,8 +22,10 @@ from mjxball.policy.formats.onnx_file import onnx_model
 from mjxball.policy.shipped import shipped_policy
 
 STEPS = 60
-TOLERANCE = 1e-6  # of one step's action in [-1, 1] by C, against NumPy in the same dtype
-ONNX_TOLERANCE = 3e-6  # its matrix products add up in an order of their own; 0.9e-6 and 1.5e-6 were seen
+# Of one step's action in [-1, 1] by C, against NumPy in the same dtype: what docs/policy-file.md promises of float32.
+# The steepest policies, whose inputs are scaled by up to 370, were seen at 7e-6.
+TOLERANCE = 1e-5
+ONNX_TOLERANCE = 1e-5  # likewise; its matrix products add up in an order of their own
 HARNESS = """
 #include <stdio.h>
 #include "follower.h"
@@ -154,6 +156,7 @@ def compiled(contents: PolicyFile, place: Path, real: str) -> Path:
     return place / "harness"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("real", ["float", "double"])
 def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_path: Path):
     dtype = np.float32 if real == "float" else np.float64
@@ -185,6 +188,7 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
 
 
+@pytest.mark.slow
 def test_a_card_cannot_leave_the_comment(trained: Trained, tmp_path: Path):
     evil = '*/ #error "out" /* \\\n'
     card = {**trained.contents.card, "preset": evil, "package_version": evil}

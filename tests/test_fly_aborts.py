@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from fly_virtual import World, thrusts
 
-from mjxball.fly.contract import FlightSettings
 from mjxball.fly.maneuver import Times
 from mjxball.fly.packets import THRUST_CEILING
+from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import Event, State
 
 
@@ -53,7 +53,7 @@ def empty(world: World, number: int) -> None:
 
 
 def crash(world: World, number: int) -> None:
-    world.drones[number].firmware.crashed = True
+    world.drones[number].firmware.supervisor.crash()
 
 
 def reboot(world: World, number: int) -> None:
@@ -69,8 +69,8 @@ def stuck(world: World, number: int) -> None:
 
 
 def broken_policy(world: World, number: int) -> None:
-    world.flight.pilot.policy.reset()
-    world.flight.pilot.policy._biases[-1][:] = math.nan
+    world.flight.controller.policy.reset()
+    world.flight.controller.policy._biases[-1][:] = math.nan
 
 
 def interrupt(world: World, number: int) -> None:
@@ -90,9 +90,9 @@ FAULTS: dict[Callable[[World, int], None], tuple[Event | None, str]] = {
     reboot: (Event.STALE, "hold"),
     lost: (Event.LINK_LOST, "hold"),
     stuck: (Event.LINK_LOST, "hold"),
-    jump: (Event.STICK, "stop"),
+    jump: (Event.ESTIMATOR, "descend"),
     crash: (Event.DRONE_DOWN, "stop"),
-    away: (Event.FENCE, "descend"),
+    away: (Event.ESTIMATOR, "descend"),
     broken_policy: (Event.BAD_STATE, "descend"),
     empty: (Event.BATTERY, "land"),
     interrupt: (None, "land"),
@@ -103,8 +103,15 @@ SECONDS = 8.0
 SAFE_WITHIN = 9.0  # [s] battery_time 5, then LAND; all others are far below
 
 
-@pytest.mark.parametrize("number", [0, 1])
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+# Every fault at one drone in the first tier, alternately, and at the other in the second.
+AT = [
+    pytest.param(fault, number, marks=() if index % 2 == number else pytest.mark.slow, id=f"{fault.__name__}-{number}")
+    for index, fault in enumerate(FAULTS)
+    for number in (0, 1)
+]
+
+
+@pytest.mark.parametrize(("fault", "number"), AT)
 def test_any_fault_brings_both_down(fault: Callable[[World, int], None], number: int) -> None:
     event, first = FAULTS[fault]
     world = World(FlightSettings(seconds=SECONDS + 10, times=QUICK))
@@ -113,7 +120,7 @@ def test_any_fault_brings_both_down(fault: Callable[[World, int], None], number:
     fault(world, number)
     world.fly_for(SECONDS + SAFE_WITHIN)
     assert world.flight.supervisor.state is State.DONE
-    assert world.notes.transitions()[3] == first
+    assert world.notes.transitions()[4] == first
     cause = world.flight.supervisor.cause
     assert (cause.event if cause else None) is event
     world.advance(2.5)  # beyond the firmware's own watchdog
@@ -154,21 +161,71 @@ def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> No
     world.fly_until(State.STOP)
     # It cannot be told from one that only is not heard, but for the stick that tips: 100 ms to miss it, then its fall.
     assert world.now - began < 0.6
-    assert world.notes.transitions()[3:5] == ["hold", "stop"]
+    assert world.notes.transitions()[4:6] == ["hold", "stop"]
     world.fly_until(State.DONE)
     assert world.running() == [False, False]
 
 
-def test_a_drone_that_hears_nothing_but_is_heard_levels_and_locks() -> None:
+def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -> None:
     world = World(FlightSettings(seconds=20.0))
     world.fly_until(State.FLY)
     world.fly_for(1.0)
     silence_up(world, 1)
+    began = world.now
+    world.fly_until(State.HOLD)
+    # Its echo is too old after 0.3 s, and four packets of 50 ms must miss it; its own motors stop after 2 s.
+    assert world.now - began < 0.6
+    assert world.flight.supervisor.cause.event is Event.UNHEARD
+    world.fly_until(State.STOP)
+    assert world.now - began == pytest.approx(2.0, abs=0.1)
     world.fly_until(State.DONE)
-    # Over a radio this cannot be: states come with the acknowledgements. Here the flight finds it by what follows.
-    assert world.flight.supervisor.cause is not None
     world.advance(2.5)
     assert world.running() == [False, False]
+
+
+@pytest.mark.parametrize("seconds", [0.4, pytest.param(0.11, marks=pytest.mark.slow)])
+def test_a_gap_in_the_states_is_flown_through(seconds: float) -> None:
+    world = World(FlightSettings(seconds=6.0))
+    world.fly_until(State.FLY)
+    world.fly_for(2.0)
+    for number in range(2):
+        world.disturb(number, silent_down=True)
+    world.fly_for(seconds)
+    for number in range(2):
+        world.disturb(number, silent_down=False)
+    world.fly_until(State.DONE)
+    assert world.notes.transitions() == ["arm", "spin", "ramp", "fly", "hold", "fly", "land", "stop", "done"]
+    assert world.flight.supervisor.cause is None
+    assert world.flight.lifted
+
+
+@pytest.mark.parametrize(
+    "state", [State.FLY, *(pytest.param(state, marks=pytest.mark.slow) for state in (State.RAMP, State.LAND))]
+)
+def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
+    """States that come and go must not let hold and descent take turns for ever."""
+    world = World(FlightSettings(seconds=1.0))
+    world.fly_until(state)
+    world.fly_for(0.5)
+    for number in range(2):
+        world.disturb(number, loss=0.95)
+    world.fly_for(15.0)
+    assert world.flight.supervisor.state is State.DONE
+    world.advance(2.5)
+    assert world.running() == [False, False]
+
+
+def test_states_that_break_off_again_and_again_end_the_flight() -> None:
+    world = World(FlightSettings(seconds=60.0))
+    world.fly_until(State.FLY)
+    for _ in range(world.flight.settings.limits.gaps + 1):
+        world.fly_for(0.5)
+        silence_down(world, 1)
+        world.fly_for(0.15)
+        world.disturb(1, silent_down=False)
+    world.fly_until(State.LAND)
+    world.fly_until(State.DONE)
+    assert world.flight.supervisor.cause.event is Event.GAPS
 
 
 def test_a_frozen_estimator_is_found() -> None:

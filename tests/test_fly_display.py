@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from command_line import environment
 
-from mjxball.fly.contract import View
 from mjxball.fly.display import RED, Display, lines
 from mjxball.fly.limits import Limits
 from mjxball.fly.packets import ZERO, DroneState
+from mjxball.fly.protocols import View
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 
 pytestmark = pytest.mark.alone  # keys and pictures by the clock
@@ -67,7 +67,7 @@ def test_what_is_no_terminal_gets_nothing() -> None:
 
 SCRIPT = """
 import sys, time
-from mjxball.fly.keys import listening
+from mjxball.fly.display import listening
 heard = []
 with listening(*(lambda word=word: heard.append(word) for word in ("land", "interrupt", "kill"))):
     print("ready", flush=True)

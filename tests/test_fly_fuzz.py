@@ -14,17 +14,40 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjxball.fly import packets
-from mjxball.fly.link import Deadlines, Link, LinkError
+from mjxball.fly.connection import Deadlines
+from mjxball.fly.link import Link
+from mjxball.fly.parameters import LinkError
 from mjxball.fly.twin import tables
 from mjxball.fly.twin.faults import DroneFaults, garbage
-from mjxball.fly.twin.firmware import Firmware
+from mjxball.fly.twin.firmware import BOOT_TIME, Firmware
 from mjxball.fly.twin.protocol import MAX_DATA, Peer
 from mjxball.fly.twin.server import HOST, Twin
 from mjxball.fly.twin.standin import StandIn
 
 READINGS = {name: 1e12 for name, _ in tables.LOG_VARIABLES}
 ports = st.sampled_from(
-    [0x2C, 0x2D, 0x2E, 0x2F, 0x3C, 0x4C, 0x5C, 0x5D, 0x7C, 0x7D, 0x9C, 0x9D, 0xDD, 0xFC, 0xFD, 0xFF]
+    [
+        0x2C,
+        0x2D,
+        0x2E,
+        0x2F,
+        0x3C,
+        0x4C,
+        0x5C,
+        0x5D,
+        0x6C,
+        0x6D,
+        0x6E,
+        0x7C,
+        0x7D,
+        0x9C,
+        0x9D,
+        0xDC,
+        0xDD,
+        0xFC,
+        0xFD,
+        0xFF,
+    ]
 )
 datagrams = st.one_of(
     st.binary(max_size=64), st.tuples(ports, st.binary(max_size=30)).map(lambda p: bytes([p[0]]) + p[1])
@@ -39,12 +62,12 @@ def test_the_twin_takes_any_bytes(received: list[bytes]) -> None:
         now = 0.01 * number
         answers = peer.receive(datagram, now) + peer.log_data(READINGS, now)
         assert all(1 <= len(answer) <= 1 + MAX_DATA for answer in answers)
-        out = peer.firmware.step(now, 9.81, True)
+        out = peer.firmware.step(now).setpoint
         assert all(map(math.isfinite, out))
         assert out.thrust == 0 or 1000 <= out.thrust <= 60000
         assert all(abs(angle) <= 180 for angle in out[:3])
-    assert len(peer.blocks) <= 16
-    assert all(block.size <= 26 for block in peer.blocks.values())
+    assert len(peer.logs.by_number) <= 16
+    assert all(block.size <= 26 for block in peer.logs.by_number.values())
 
 
 def test_truncated_requests_are_survived_at_every_length() -> None:
@@ -81,6 +104,7 @@ def test_cflib_still_connects_after_a_storm() -> None:
         time.sleep(0.1)
         for drone in twin.drones:
             drone.reboot()
+        time.sleep(BOOT_TIME + 0.5)
         link = opened(twin)
         assert link.telemetry.received > 0
         link.close()

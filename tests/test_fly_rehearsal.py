@@ -12,7 +12,7 @@ import pytest
 from command_line import REPOSITORY, environment
 
 from mjxball.fly import card
-from mjxball.fly.journal import read
+from mjxball.fly.flight_log import read
 from mjxball.fly.recording import fly_again, read_recording
 from mjxball.policy import load_file
 from mjxball.policy.shipped import shipped_policy
@@ -70,6 +70,7 @@ def test_the_cards_gains_are_uploaded(name: str, flown: Path) -> None:
 
 def test_it_flies_and_its_commands_simulated_do_the_same(name: str, flown: Path) -> None:
     recording = read_recording(flown)
+    assert recording.remarks == ()  # every record is of the schema, and no drone was unheard
     heights = recording.position[np.array(recording.phase) == "fly", 2]
     least, most = HEIGHTS[name]
     assert least < heights.max() < most

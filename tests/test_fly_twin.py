@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,24 +12,16 @@ import pytest
 
 from mjxball.control import rotations
 from mjxball.fly import packets
+from mjxball.fly.mocap_source import wait_until
 from mjxball.fly.packets import Setpoint
 from mjxball.fly.twin import tables
-from mjxball.fly.twin.body import PairState
+from mjxball.fly.twin.body import RUNNING, Modes, PairState
 from mjxball.fly.twin.server import HOST, Twin
 from mjxball.fly.twin.standin import StandIn
 
 cflib = pytest.importorskip("cflib")
 pytestmark = pytest.mark.alone  # by the clock
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
-    """True once `condition` holds; false after `seconds`."""
-    end = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.01)
-    return True
+LIMIT = 10.0  # [s] that an answer may take on a busy machine
 
 
 class Told(StandIn):
@@ -44,9 +35,9 @@ class Told(StandIn):
     def set_parameter(self, drone: int, name: str, value: float) -> None:
         self.parameters.append((drone, name, value))
 
-    def advance(self, setpoints: np.ndarray, dt: float) -> PairState:
+    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
         self.setpoints = setpoints
-        return super().advance(setpoints, dt)
+        return super().advance(setpoints, dt, modes)
 
 
 @pytest.fixture(scope="module")
@@ -84,11 +75,11 @@ def test_cflib_finds_every_table_entry(flown: tuple[Twin, Told, Any]) -> None:
 def test_a_parameter_is_written_read_back_and_reaches_the_physics(flown: tuple[Twin, Told, Any]) -> None:
     _, physics, crazyflie = flown
     crazyflie.param.set_value("pid_attitude.roll_kp", 4.5)
-    assert wait_for(lambda: crazyflie.param.get_value("pid_attitude.roll_kp") == "4.5")
+    assert wait_until(lambda: crazyflie.param.get_value("pid_attitude.roll_kp") == "4.5", LIMIT)
     assert (0, "pid_attitude.roll_kp", 4.5) in physics.parameters
     defaults: list[Any] = []
     crazyflie.param.get_default_value("pid_attitude.roll_kp", lambda name, value: defaults.append(value))
-    assert wait_for(lambda: bool(defaults))
+    assert wait_until(lambda: bool(defaults), LIMIT)
     assert defaults == [6.0]
 
 
@@ -102,7 +93,7 @@ def test_all_of_a_state_comes_in_one_packet_at_100_hz(flown: tuple[Twin, Told, A
     block.data_received_cb.add_callback(lambda stamp, values, config: seen.append((stamp, values)))
     crazyflie.log.add_config(block)
     block.start()
-    assert wait_for(lambda: len(seen) >= 30)
+    assert wait_until(lambda: len(seen) >= 30, LIMIT)
     block.stop()
     block.delete()
     assert set(seen[-1][1]) == {name for name, _ in packets.STATE_VARIABLES}
@@ -116,15 +107,15 @@ def test_setpoints_and_supervisor(flown: tuple[Twin, Told, Any]) -> None:
     twin, physics, crazyflie = flown
     crazyflie.commander.send_setpoint(0, 0, 0, 0)
     crazyflie.commander.send_setpoint(1.0, 2.0, 3.0, 12000)
-    assert wait_for(lambda: physics.setpoints[0, 3] == 12000)
+    assert wait_until(lambda: physics.setpoints[0, 3] == 12000, LIMIT)
     assert physics.setpoints[0].tolist() == [1.0, -2.0, 3.0, 12000]
     crazyflie.commander.send_stop_setpoint()
-    assert wait_for(lambda: physics.setpoints[0, 3] == 0)
+    assert wait_until(lambda: physics.setpoints[0, 3] == 0, LIMIT)
     assert crazyflie.supervisor.is_armed
     assert crazyflie.supervisor.can_fly
     crazyflie.supervisor.send_emergency_stop()
-    assert wait_for(lambda: bool(twin.truth.info[0] & packets.LOCKED))
-    assert wait_for(lambda: crazyflie.supervisor.is_locked)
+    assert wait_until(lambda: bool(twin.truth.info[0] & packets.LOCKED), LIMIT)
+    assert wait_until(lambda: crazyflie.supervisor.is_locked, LIMIT)
     assert not twin.truth.info[1] & packets.LOCKED
 
 

@@ -56,20 +56,20 @@ def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_damaged_policies(fuzz: ModuleType, tmp_path: Path) -> None:
-    """210 files, 15 of each kind of damage. Seed 1: the benchmark's own files are others."""
-    counts = fuzz.fuzz_policies(210, 1, tmp_path)
+    """70 files, 5 of each kind of damage. Seed 1: the benchmark's own files are others."""
+    counts = fuzz.fuzz_policies(70, 1, tmp_path)
     assert [count for count in counts if count.faults] == []
-    assert sum(count.files for count in counts) == 210
-    assert sum(count.loaded for count in counts) > 5, "nothing loads: the mutations are not what they say"
-    assert sum(count.refused for count in counts) > 150
+    assert sum(count.files for count in counts) == 70
+    assert sum(count.loaded for count in counts) > 1, "nothing loads: the mutations are not what they say"
+    assert sum(count.refused for count in counts) > 50
 
 
 def test_damaged_records_of_a_run(fuzz: ModuleType, run_directory: Path) -> None:
     fuzz.read_records(run_directory)
-    counts = fuzz.fuzz_records(run_directory, 57, 1)
+    counts = fuzz.fuzz_records(run_directory, 19, 1)
     assert [count for count in counts if count.faults] == []
-    assert sum(count.loaded for count in counts) > 5
-    assert sum(count.refused for count in counts) > 20
+    assert sum(count.loaded for count in counts) > 1
+    assert sum(count.refused for count in counts) > 7
 
 
 class TestTheJudge:

@@ -49,7 +49,16 @@ def test_every_preset_is_registered():
     assert {"mjxball/Transport-v0", "mjxball/Paper-v0", "mjxball/Robust-v0"} <= ours
 
 
-@pytest.mark.parametrize("name", ["Transport", "TransportLarge", "Paper", "Robust", "Stand", "Flight"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Transport",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("TransportLarge", "Paper", "Robust", "Stand", "Flight")
+        ),
+    ],
+)
 def test_gymnasiums_checker_finds_nothing(name: str):
     with warnings.catch_warnings(record=True) as raised:
         warnings.simplefilter("always")
@@ -61,7 +70,7 @@ def test_gymnasiums_checker_finds_nothing(name: str):
     assert [text for text in odd if "infinity" not in text] == []
 
 
-@pytest.mark.parametrize("name", ["transport", "robust"])
+@pytest.mark.parametrize("name", ["transport", pytest.param("robust", marks=pytest.mark.slow)])
 def test_it_flies_as_the_brax_environment(name: str, request: pytest.FixtureRequest):
     """Float64 against the training environment in float32, from the same drawn world, 50 steps.
 
@@ -197,6 +206,7 @@ np.savez("pictures.npz", first=first, last=last)
 """
 
 
+@pytest.mark.slow
 def test_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """In a process of its own, which a failing GL library may end."""
     monkeypatch.setenv("MUJOCO_GL", "egl")
@@ -209,8 +219,6 @@ def test_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         first, last = stored["first"].astype(int), stored["last"].astype(int)
     assert first.shape == (360, 480, 3)
     assert (np.abs(first - last).max(axis=-1) > 30).sum() > 200  # the pair has moved
-    green = (first[..., 1] > first[..., 0] + 40) & (first[..., 1] > first[..., 2] + 40)
-    assert green.sum() > 20  # the goal
 
 
 class Restarting:
@@ -264,7 +272,7 @@ def test_playgrounds_wrappers_take_the_adapter():
     np.testing.assert_array_equal(state.data.plant.position, first.data.plant.position)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_stable_baselines3_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """SAC of Stable-Baselines3 beats the copying follower, as docs/gym.md says."""
     pytest.importorskip("stable_baselines3")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
 import yaml
 from command_line import REPOSITORY
+from tables import rows
 
 DOCUMENTS = sorted([*REPOSITORY.glob("*.md"), *(REPOSITORY / "docs").rglob("*.md")])
 
@@ -31,14 +31,14 @@ def test_ci_checks_style_and_types() -> None:
         assert f".venv/bin/{command}\n" in text
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(REPOSITORY)))
+@rows("path", DOCUMENTS)
 def test_links_lead_somewhere(path: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", path.read_text()):
         if "://" not in target:
             assert (path.parent / target).exists(), target
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(REPOSITORY)))
+@rows("path", DOCUMENTS)
 def test_scripts_that_documents_name_exist(path: Path) -> None:
     for name in re.findall(r"(?:python |`)((?:benchmarks|docs|tests)/[\w/]+\.py)", path.read_text()):
         assert (REPOSITORY / name).exists(), name

@@ -1,4 +1,5 @@
-"""Imports run one way, along the data: config -> control -> policy | assembly -> physics -> env -> train -> evaluate.
+"""Imports run one way, along the data: config -> control -> policy | assembly -> physics -> env -> algorithms -> train
+-> evaluate.
 
 Read from the syntax tree of every module, so that a lazy import inside a function counts as well.
 """
@@ -20,13 +21,12 @@ FLOORS = (
     {"config"},
     {"cli", "cache", "quiet", "plotting"},
     {"control"},
-    {"policy"},
+    {"policy", "baselines"},
     {"assembly"},
     {"physics", "scene"},
-    {"rewards", "sensing", "wiring"},
-    {"scenario", "nuisance"},
-    {"draws"},
-    {"rollout", "env"},
+    {"rewards", "sim"},
+    {"env"},
+    {"algorithms"},
     {"train"},
     {"evaluate"},
     {"fly", "gym"},
@@ -190,7 +190,7 @@ class TestTheReader:
         return read(place / OURS)
 
     def test_upward(self, tmp_path: Path) -> None:
-        found = direction_faults(self.package(tmp_path, control="from mjxball.train import sac", train=""))
+        found = direction_faults(self.package(tmp_path, control="from mjxball.train import run", train=""))
         assert any("not below it" in fault for fault in found)
 
     def test_lazily_upward(self, tmp_path: Path) -> None:
@@ -198,7 +198,7 @@ class TestTheReader:
         assert direction_faults(self.package(tmp_path, train=text, evaluate=""))
 
     def test_between_neighbours(self, tmp_path: Path) -> None:
-        assert direction_faults(self.package(tmp_path, env="import mjxball.rollout", rollout=""))
+        assert direction_faults(self.package(tmp_path, sim="import mjxball.env", env=""))
 
     def test_unknown_part(self, tmp_path: Path) -> None:
         (fault,) = direction_faults(self.package(tmp_path, attic=""))

@@ -1,4 +1,4 @@
-"""Scenario families, scores over seeds, the verdict, and the report in a real browser."""
+"""Benchmark suites, scores over seeds, the verdict, and the report in a real browser."""
 
 from __future__ import annotations
 
@@ -11,64 +11,65 @@ import numpy as np
 import pytest
 from conftest import opened
 
+from mjxball.baselines import make_baseline
 from mjxball.commands.evaluate import main as evaluate
 from mjxball.config import preset
-from mjxball.control.followers import make_baseline
 from mjxball.errors import InputError
-from mjxball.evaluate import families, page
-from mjxball.evaluate.judge import Score, bootstrap, by_level, judge, wins
-from mjxball.scenario import check_scenario
+from mjxball.evaluate import suites
+from mjxball.evaluate.benchmark import Score, bootstrap, by_variant, run_benchmark, wins
+from mjxball.evaluate.report import compare, verdict
+from mjxball.sim.scenario import check_scenario
 
 CONFIG = preset("paper")
 SHORT = ("delay", "mass-change")
 
 
-def shortened(name: str, seconds: float = 24.0) -> families.Family:
-    """A family whose flights are cut short."""
-    family = families.BY_NAME[name]
-    levels = tuple(
-        dataclasses.replace(level, scenario=dataclasses.replace(level.scenario, seconds=seconds))
-        for level in family.levels
+def shortened(name: str, seconds: float = 24.0) -> suites.Suite:
+    """A suite whose flights are cut short."""
+    suite = suites.BY_NAME[name]
+    variants = tuple(
+        dataclasses.replace(variant, scenario=dataclasses.replace(variant.scenario, seconds=seconds))
+        for variant in suite.variants
     )
-    return dataclasses.replace(family, levels=levels)
+    return dataclasses.replace(suite, variants=variants)
 
 
 @pytest.fixture(scope="module")
 def scores() -> list[Score]:
-    """Three followers on two short families, two seeds."""
+    """Three followers on two short suites, two seeds."""
     followers = [make_baseline(name, CONFIG) for name in ("copy", "adaptive", "oracle")]
-    return judge(CONFIG, followers, [shortened(name) for name in SHORT], 2, "newton-euler")
+    return run_benchmark(CONFIG, followers, [shortened(name) for name in SHORT], 2, "newton-euler")
 
 
-def test_every_level_is_sound_for_every_seed() -> None:
-    for family in families.FAMILIES:
-        assert len({level.label for level in family.levels}) == len(family.levels)
-        for level in family.levels:
-            for seed in range(5):
-                check_scenario(level.config(CONFIG, seed), level.seeded(seed))
+def test_every_variant_is_sound_for_every_seed() -> None:
+    for suite in suites.SUITES:
+        assert len({variant.label for variant in suite.variants}) == len(suite.variants)
+        for variant in suite.variants:
+            for seed in range(2):
+                check_scenario(variant.config(CONFIG, seed), variant.seeded(seed))
 
 
 def test_seeds_are_reproducible_and_differ() -> None:
-    level = families.BY_NAME["noise"].levels[0]
-    assert level.seeded(3) == level.seeded(3)
-    assert level.seeded(3) != level.seeded(4)
-    assert level.seeded(0).phase == 0.0
-    walk = families.BY_NAME["waveform"].levels[1]
+    variant = suites.BY_NAME["noise"].variants[0]
+    assert variant.seeded(3) == variant.seeded(3)
+    assert variant.seeded(3) != variant.seeded(4)
+    assert variant.seeded(0).phase == 0.0
+    walk = suites.BY_NAME["waveform"].variants[1]
     assert walk.config(CONFIG, 1).motion == walk.config(CONFIG, 1).motion != walk.config(CONFIG, 2).motion
 
 
 def test_rolling_balls_differ_between_seeds() -> None:
-    level = families.BY_NAME["rolling-ball"].levels[0]
-    starts = {level.seeded(seed).ball_start for seed in range(6)}
+    variant = suites.BY_NAME["rolling-ball"].variants[0]
+    starts = {variant.seeded(seed).ball_start for seed in range(6)}
     assert len(starts) == 6
-    assert max(map(abs, starts)) == level.scenario.ball_start
+    assert max(map(abs, starts)) == variant.scenario.ball_start
 
 
-def test_unknown_family_is_refused() -> None:
-    with pytest.raises(InputError, match="unknown scenario family"):
-        families.find(["cg-speeds"])
-    assert families.find(["all"]) == list(families.FAMILIES)
-    assert [family.name for family in families.find(["delay", "noise", "delay"])] == ["delay", "noise"]
+def test_unknown_suite_is_refused() -> None:
+    with pytest.raises(InputError, match="unknown suite"):
+        suites.find_suites(["cg-speeds"])
+    assert suites.find_suites(["all"]) == list(suites.SUITES)
+    assert [suite.name for suite in suites.find_suites(["delay", "noise", "delay"])] == ["delay", "noise"]
 
 
 def test_bootstrap_interval_covers_the_median_as_often_as_it_says() -> None:
@@ -94,14 +95,14 @@ def test_scores_hold_every_seed_and_one_flight(scores) -> None:
         assert len(score.metrics) == 2
         assert score.shown.flight is not None
         assert score.failures == 0
-    delays = [s.summary("peak").median for s in scores if s.family == "delay" and s.follower == "copy"]
-    assert len(set(delays)) == 3  # the levels really differ
+    delays = [s.summary("peak").median for s in scores if s.suite == "delay" and s.follower == "copy"]
+    assert len(set(delays)) == 3  # the variants really differ
 
 
 def test_oracle_is_left_out_of_the_wins(scores) -> None:
     won = wins(scores)
     assert "oracle" not in won
-    assert sum(won.values()) == len(by_level(scores)) == 6
+    assert sum(won.values()) == len(by_variant(scores)) == 6
     assert won["adaptive"] == 6
 
 
@@ -110,15 +111,16 @@ def with_peaks(score: Score, name: str, peak: float) -> Score:
     return dataclasses.replace(score, follower=name, metrics=metrics)
 
 
-@pytest.mark.parametrize(
-    ("kind", "peak", "explained"), [("paper", 5.0, True), ("paper", 1e-6, False), ("task", 5.0, False)]
-)
-def test_verdict_says_that_a_mimic_loses_and_why(scores, kind: str, peak: float, explained: bool) -> None:
-    mine = [with_peaks(s, "mine", peak) for s in scores if s.follower == "copy"]
-    lines = page.verdict([*scores, *mine], {"mine": {"config": {"reward": {"kind": kind}}}})
-    text = next(line for line in lines if line.startswith("mine has a smaller"))
-    assert sum(page.WHY_COPYING_LOSES in line for line in lines) == explained  # said once, or not at all
-    assert ("in 0 levels" in text) == (peak == 5.0)
+def test_verdict_counts_wins_and_compares_peaks(scores) -> None:
+    """`mine` has the largest peak of all, then the smallest."""
+    for peak, won, duel in ((5.0, "0", "0 : 6"), (1e-6, "6", "6 : 0")):
+        mine = [with_peaks(s, "mine", peak) for s in scores if s.follower == "copy"]
+        found = verdict([*scores, *mine])
+        row = next(row for row in found["rows"] if row["follower"] == "mine")
+        assert row["cells"][0]["text"] == won
+        assert row["cells"][-1]["text"] == duel
+        assert len(found["heads"]) == len(row["cells"]) == 6
+        assert compare([*scores, *mine], "mine", "adaptive") == (6 - 6 * (peak > 1), 6 * (peak > 1))
 
 
 # --- the command line and the page ------------------------------------------------------------------------------
@@ -126,13 +128,14 @@ def test_verdict_says_that_a_mimic_loses_and_why(scores, kind: str, peak: float,
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of two followers on one family, through the command line."""
+    """The report of two followers on one suite, through the command line."""
     out = tmp_path_factory.mktemp("judged") / "report"
-    flags = ["--followers", "copy", "adaptive", "policies/transport.npz", "--families", "delay", "start-errors"]
+    flags = ["--followers", "copy", "adaptive", "policies/transport.npz", "--suite", "delay", "start-errors"]
     assert evaluate([*flags, "--seeds", "2", "--physics", "newton-euler", "--out", str(out)]) == 0
     return out
 
 
+@pytest.mark.slow
 def test_scores_are_json_without_infinities(report: Path) -> None:
     def refuse(text: str) -> None:
         raise AssertionError(text)
@@ -146,21 +149,21 @@ def test_scores_are_json_without_infinities(report: Path) -> None:
     assert never == [None, None, None]
 
 
-def test_list_names_every_family(capsys: pytest.CaptureFixture) -> None:
+def test_list_names_every_suite(capsys: pytest.CaptureFixture) -> None:
     assert evaluate(["--list"]) == 0
     printed = capsys.readouterr().out
-    assert all(f"{family.name}: " in printed for family in families.FAMILIES)
+    assert all(f"{suite.name}: " in printed for suite in suites.SUITES)
 
 
 @pytest.mark.parametrize(
     ("flags", "word"),
     [
-        (["--families", "nothing"], "unknown scenario family"),
-        (["--families", "delay", "--omega", "1"], "drop --omega"),
-        (["--families", "delay", "--mass-change", "1:0.1"], "drop --mass-change"),
-        (["--families", "delay", "--check"], "drop --check"),
-        (["--families", "delay", "--seeds", "0"], "--seeds must be"),
-        (["--seeds", "3"], "--seeds belongs"),
+        (["--suite", "nothing"], "unknown suite"),
+        (["--suite", "delay", "--omega", "1"], "drop --omega"),
+        (["--suite", "delay", "--mass-change", "1:0.1"], "drop --mass-change"),
+        (["--suite", "delay", "--check"], "drop --check"),
+        (["--suite", "delay", "--seeds", "0"], "--num-seeds must be"),
+        (["--seeds", "3"], "--num-seeds belongs"),
     ],
 )
 def test_unsound_requests_are_refused(flags, word, capsys: pytest.CaptureFixture) -> None:
@@ -173,8 +176,12 @@ def test_unsound_requests_are_refused(flags, word, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize("width", [1280, 390], ids=["desktop", "phone"])
 def test_report_opens_in_a_browser(browser, report: Path, width: int) -> None:
     tab = opened(browser, report / "report.html", width)
-    assert "Smallest steady-state peak" in tab.inner_text("#verdict")
-    assert tab.locator("#wins-table tbody tr").count() == 4 + 2  # metrics over all levels, then the families
+    assert tab.locator("#verdict-table tbody tr").count() == 3
+    assert tab.locator("#wins-table tbody tr").count() == 2
+    tab.evaluate("window.scrollTo(0, 2000)")
+    tab.wait_for_function("window.scrollY > 500")
+    assert tab.locator("nav").bounding_box()["y"] == pytest.approx(0, abs=1)  # it stays in view
+    tab.evaluate("window.scrollTo({top: 0, behavior: 'instant'})")
     for section in ("delay", "start-errors"):
         assert tab.locator(f"h2#{section} ~ svg").count() >= 1
         box = tab.locator(f"h2#{section} ~ svg").first.bounding_box()
@@ -199,13 +206,14 @@ def test_report_sorts_and_filters(browser, report: Path) -> None:
     assert len(column()) == 18
     tab.select_option("#follower", "transport")
     assert len(column()) == 6
-    tab.select_option("#family", "delay")
+    tab.select_option("#suite", "delay")
     assert len(column()) == 3
     tab.close()
 
 
+@pytest.mark.slow
 def test_report_says_how_it_was_made(report: Path) -> None:
     text = (report / "report.html").read_text()
     assert "python eval.py --followers copy adaptive" in text
     assert "card of <b>transport</b>" in text
-    assert "image/webp;base64" in text or "No animation: MuJoCo" in text
+    assert "image/webp;base64" in text or "No picture: MuJoCo" in text

@@ -1,4 +1,4 @@
-"""One law, one home: every function in `control/` gives the same on NumPy and on JAX, jitted or not."""
+"""One law, one home: every function in `control/` gives the same on NumPy and on JAX."""
 
 import inspect
 from collections.abc import Callable
@@ -6,14 +6,14 @@ from typing import Any
 
 import jax
 import numpy as np
-import pytest
+from tables import rows
 
+from mjxball.baselines import LAWS as FOLLOWERS
+from mjxball.baselines import make_law
 from mjxball.config import Autopilot, preset
 from mjxball.control import attitude, crazyflie, leader, mixer, observation, rotations
 from mjxball.control.attitude import AttitudeGains
-from mjxball.control.baselines.law import Brief
-from mjxball.control.followers import LAWS as FOLLOWERS
-from mjxball.control.followers import make_law
+from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.recall import Recall
 
 WORLDS = 64
@@ -36,18 +36,19 @@ MOUNT = np.array([-0.17, 0.0, 0.0])
 LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
 RECALL = Recall(history=3, previous_action=True, filters=(0.1, 0.5))
 SEEN, MEMORY, ACTION = normal(18), normal(RECALL.size), random.uniform(-1, 1, (WORLDS, 3))
-BRIEF = Brief(random.uniform(0.1, 0.3, WORLDS), 0.01 * normal(), 0.01 * normal(), random.uniform(2.1, 2.3, WORLDS))
-FLIGHT = 0.1 * normal(4, 18)  # four observations in a row
+MASSES = random.uniform(0.1, 0.3, WORLDS)
+PRIVILEGED = PrivilegedInfo(MASSES, 0.01 * normal(), 0.01 * normal(), random.uniform(2.1, 2.3, WORLDS))
+FLIGHT = 0.1 * normal(2, 18)  # two observations in a row
 
 
 def flown(name: str, plant: str = "paper") -> Callable[..., Any]:
-    """The commands (WORLDS, 4, 3) of a classical follower of the preset `plant` that is shown `FLIGHT`."""
+    """The commands (WORLDS, 2, 3) of a classical follower of the preset `plant` that is shown `FLIGHT`."""
     law = make_law(name, preset(plant))
 
-    def commands(flight: Any, *brief: Any) -> Any:
+    def commands(flight: Any, *privileged: Any) -> Any:
         memory, given = law.start(flight[..., 0, :]), []
-        for step in range(4):
-            memory, command = law.step(memory, flight[..., step, :], Brief(*brief))
+        for step in range(2):
+            memory, command = law.step(memory, flight[..., step, :], PrivilegedInfo(*privileged))
             given.append(command)
         return flight.__array_namespace__().stack(given, axis=-2)
 
@@ -115,9 +116,9 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
         lambda a, s: observation.follower_command(a, s, True, REACH, KP, KD, G, LIMITS),
         (ACTION, 3 * SEEN),
     ),
-    **{f"baseline {name}": (flown(name), (FLIGHT, *BRIEF)) for name in FOLLOWERS},
+    **{f"baseline {name}": (flown(name), (FLIGHT, *PRIVILEGED)) for name in FOLLOWERS},
     **{
-        f"baseline {name} {plant}": (flown(name, plant), (FLIGHT, *BRIEF))
+        f"baseline {name} {plant}": (flown(name, plant), (FLIGHT, *PRIVILEGED))
         for name, plant in (("adaptive", "flight"), ("oracle", "flight"), ("lqg", "flight"), ("lqg", "stand"))
     },
 }
@@ -131,7 +132,7 @@ NOT_LAWS = {
     "crazyflie.integral_shares",
     "observation.commanded",
 }
-each_law = pytest.mark.parametrize("name", LAWS)
+each_law = rows("name", LAWS)
 
 
 def difference(first: Any, second: Any) -> float:
@@ -152,28 +153,27 @@ def test_every_law_is_compared():
 
 
 @each_law
-@pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
-def test_float64_agrees(name, compiled):
+def test_float64_agrees(name):
     law, arrays = LAWS[name]
     expected = law(*arrays)
     with jax.enable_x64(True):
-        result = (jax.jit(law) if compiled else law)(*map(jax.numpy.asarray, arrays))
+        result = jax.jit(law)(*map(jax.numpy.asarray, arrays))
         assert result.dtype == np.float64
     # Both round to 1e-16; sin and cos of the two libraries differ by an ulp.
     assert difference(result, expected) < 1e-10
 
 
 @each_law
-@pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
-def test_float32_agrees(name, compiled):
+def test_float32_agrees(name):
     law, arrays = LAWS[name]
     single = [array.astype(np.float32) for array in arrays]
     on_numpy = law(*single)
-    on_jax = (jax.jit(law) if compiled else law)(*map(jax.numpy.asarray, single))
+    on_jax = jax.jit(law)(*map(jax.numpy.asarray, single))
     assert on_numpy.dtype == on_jax.dtype == np.float32
-    # float32 rounding, about 1e-5 of full scale.
-    assert difference(on_jax, on_numpy) < 1e-5
-    assert difference(on_numpy, law(*arrays)) < 1e-5
+    # float32 rounding, about 1e-5 of full scale; motor commands are whole numbers, of which rounding may move one by 2.
+    tolerance = 2.5 / 65535 if name == "crazyflie.cascade motors" else 1e-5
+    assert difference(on_jax, on_numpy) < tolerance
+    assert difference(on_numpy, law(*arrays)) < tolerance
 
 
 @each_law

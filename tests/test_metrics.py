@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjxball.evaluate.metrics import Metrics, measure, measure_batch
-from mjxball.rollout import Trajectory
+from mjxball.sim.rollout import Trajectory
 
 TIME = np.arange(1501) * 0.02  # 30 s
 GOAL = np.array([1.0, -2.0, 0.0])

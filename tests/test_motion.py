@@ -7,16 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 from plants import BEAM, ROLLING, SAMPLES, copying, paper_with
+from scipy.interpolate import CubicSpline
 
 from mjxball import config as configs
 from mjxball.commands.train import main as train
 from mjxball.config import Attitude, Motion, Plant
 from mjxball.errors import InputError
-from mjxball.evaluate.waveform import read_waveform
+from mjxball.evaluate.scenarios import read_waveform
 from mjxball.physics import motion, newton_euler
 from mjxball.physics.engine import PlantState, Wrench
-from mjxball.rollout import simulate
-from mjxball.scenario import Scenario
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import Scenario
 
 GAP = 1e-4  # [s] of the central differences below
 PLACES = np.array([0.3, -1.0, 1.0, 0.9, -0.2])
@@ -51,6 +52,16 @@ def test_visits_rest_at_every_place_and_are_hardly_faster_than_the_sine() -> Non
     # From end to end: 15/8 of the mean speed, 10/sqrt(3) of its change over the time.
     assert np.abs(moving.rate).max() == pytest.approx(15 / 8 * 2 * amplitude / way, rel=1e-4)
     assert np.abs(moving.acceleration).max() == pytest.approx(10 / np.sqrt(3) * 2 * amplitude / way**2, rel=1e-4)
+
+
+def test_spline_is_scipys_clamped_one_between_its_samples() -> None:
+    spline, time = (
+        motion.fit_spline(SAMPLES.times, SAMPLES.offsets),
+        np.linspace(*SAMPLES.times[:: len(SAMPLES.times) - 1], 999),
+    )
+    exact = CubicSpline(SAMPLES.times, SAMPLES.offsets, bc_type="clamped")
+    for order, found in enumerate(motion.follow_spline(spline, time)):
+        np.testing.assert_allclose(found, exact(time, order), rtol=0, atol=1e-12)  # rounding of numbers below 1
 
 
 def test_spline_passes_its_samples_and_stands_still_outside() -> None:

@@ -29,9 +29,9 @@ WORK = """
 import sys
 from mjxball import export
 from mjxball.commands import evaluate, train
-tiny = ["--physics", "newton-euler", "--sac.steps", "1100", "--sac.worlds", "32", "--sac.replay", "3200",
-        "--sac.prefill", "1024", "--sac.updates", "1", "--timing.episode_steps", "50", "--sac.policy_layers", "8,8",
-        "--sac.critic_layers", "8,8", "--out", "run"]
+tiny = ["--physics", "newton-euler", "--sac.total_steps", "1100", "--sac.num_envs", "32", "--sac.replay_size", "3200",
+        "--sac.warmup_steps", "1024", "--sac.updates_per_step", "1", "--timing.episode_steps", "50",
+        "--sac.policy_layers", "8,8", "--sac.critic_layers", "8,8", "--out", "run"]
 codes = [
     train.main(tiny),
     export.main(["run", "out.npz"]),
@@ -74,6 +74,7 @@ def run(text: str, place: Path, env: dict[str, str]) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_training_export_and_judging_stay_off_the_network(tmp_path: Path, watched: dict[str, str]) -> None:
     said = run(WORK, tmp_path, watched)
     assert json.loads(said.splitlines()[-1]) == [0, 0, 0]
@@ -82,6 +83,7 @@ def test_training_export_and_judging_stay_off_the_network(tmp_path: Path, watche
     assert not log.exists(), log.read_text()
 
 
+@pytest.mark.slow
 def test_the_watch_sees_a_connection_of_a_child(tmp_path: Path, watched: dict[str, str]) -> None:
     run(CONTROL, tmp_path, watched)
     lines = (tmp_path / "network.log").read_text().splitlines()

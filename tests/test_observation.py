@@ -96,3 +96,10 @@ def test_command_never_leaves_the_shared_limits():
         assert (np.abs(command) <= [0.6, 0.6, 6.0]).all()
     wide = layout.follower_command(np.ones(3), seen, False, (1.0, 20.0), **LAW)
     np.testing.assert_array_equal(wide, [0.6, 0.6, 6.0])
+
+
+def test_a_follower_of_the_load_axis_alone_commands_the_angle_that_the_load_turns():
+    """A load along x pitches the pair, one along y rolls it."""
+    assert layout.commanded(False, "x") == (1.0, 1.0, 1.0)
+    assert layout.commanded(True, "x") == (0.0, 1.0, 1.0)
+    assert layout.commanded(True, "y") == (1.0, 0.0, 1.0)

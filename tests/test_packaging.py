@@ -47,7 +47,8 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def parts() -> set[str]:
     """What a page of `mjxball.view` is made of."""
-    return {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "mjxball" / "view" / "parts").iterdir()}
+    places = (REPOSITORY / "mjxball" / "view" / "parts", REPOSITORY / "mjxball" / "evaluate" / "templates")
+    return {str(path.relative_to(REPOSITORY)) for place in places for path in place.iterdir()}
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +57,16 @@ def wheel(built: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_module_and_policy_and_nothing_else(wheel: Path) -> None:
     held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     modules = {str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "mjxball").rglob("*.py")}
     policies = {f"mjxball/{path.relative_to(REPOSITORY)}" for path in (REPOSITORY / "policies").rglob("*.npz")}
     assert len(policies) >= 3
-    assert held == modules | policies | parts() | {"mjxball/py.typed"}
+    assert held == modules | policies | parts() | {"mjxball/py.typed", "mjxball/fly/twin/names.csv"}
 
 
+@pytest.mark.slow
 def test_the_wheel_says_what_it_is(wheel: Path) -> None:
     assert wheel.name == f"mjxball-{__version__}-py3-none-any.whl"
     archive = zipfile.ZipFile(wheel)
@@ -77,6 +80,7 @@ def test_the_wheel_says_what_it_is(wheel: Path) -> None:
     assert "mjxball-eval = mjxball.entry:evaluate" in commands
 
 
+@pytest.mark.slow
 def test_the_unpacked_wheel_finds_its_own_policies(wheel: Path, tmp_path: Path) -> None:
     zipfile.ZipFile(wheel).extractall(tmp_path)
     script = (
@@ -108,7 +112,7 @@ WORKS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("extra", WORKS)
 def test_each_extra_works_in_a_clean_environment(extra: str, wheel: Path, tmp_path: Path) -> None:
     venv.create(tmp_path / "venv", with_pip=True)
@@ -124,6 +128,7 @@ def test_each_extra_works_in_a_clean_environment(extra: str, wheel: Path, tmp_pa
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_sdist_builds_the_same_package(built: Path) -> None:
     (path,) = built.glob("*.tar.gz")
     with tarfile.open(path) as archive:
@@ -141,6 +146,7 @@ def test_a_source_tree_finds_the_policies_beside_it() -> None:
 
 def test_an_unknown_policy_is_refused_with_the_names_of_those_there_are() -> None:
     with pytest.raises(
-        ValueError, match="no shipped policy is called 'nobody'; there are flight, paper, robust, stand, transport"
+        ValueError,
+        match="'nobody'; there are flight-brushless, flight-upgrade, flight, paper, robust, stand, transport",
     ):
         shipped_policy("nobody")

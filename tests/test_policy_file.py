@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import Trained
+from conftest import Trained, policy_of
 
 from mjxball.control import observation as layout
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.export import policy_file
+from mjxball.train.extensions import OURS, make_env
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 18))
 
@@ -96,7 +97,7 @@ class TestInference:
         policy = Policy.load(saved)
         seen = OBSERVATIONS.astype(np.float32)
         follower, leader, gravity = config.follower, config.leader, config.plant.gravity
-        reach = np.array([follower.tilt_limit, follower.tilt_limit, follower.vertical_limit])
+        reach = np.array([follower.action_scale_tilt, follower.action_scale_tilt, follower.action_scale_vertical])
         limit = np.array([leader.tilt_limit, leader.tilt_limit, leader.vertical_limit])
         wanted = np.array(leader.kp) * seen[:, 12:15] + np.array(leader.kd) * seen[:, 15:18]
         copied = np.stack([-wanted[:, 1] / gravity, wanted[:, 0] / gravity, wanted[:, 2]], axis=1)
@@ -159,5 +160,5 @@ def test_export_masks_what_the_network_ignores(trained):
 
 def test_export_takes_the_averaged_policy(trained):
     learner = trained.learner._replace(policy=jax.tree.map(jnp.zeros_like, trained.learner.policy))
-    contents = policy_file(trained.config, learner, steps=1)
+    contents = policy_file(trained.config, policy_of(make_env(OURS, trained.config, "newton-euler"), learner), steps=1)
     jax.tree.map(np.testing.assert_array_equal, contents.weights, trained.contents.weights)

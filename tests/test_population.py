@@ -25,14 +25,14 @@ from mjxball.train.sweep import read_sweep
 
 REPOSITORY = Path(__file__).parents[1]
 SMALL = {
-    "worlds": 8,
-    "replay": 800,
-    "batch": 16,
+    "num_envs": 8,
+    "replay_size": 800,
+    "batch_size": 16,
     "policy_layers": (8,),
     "critic_layers": (8,),
-    "updates": 1,
-    "steps": 4000,
-    "prefill": 100,
+    "updates_per_step": 1,
+    "total_steps": 4000,
+    "warmup_steps": 100,
 }
 FLAGS = [word for name, value in SMALL.items() for word in (f"--sac.{name}", str(value).strip("(),"))]
 FLAGS += ["--physics", "newton-euler", "--timing.episode_steps", "60"]
@@ -46,22 +46,26 @@ def small(transport: Config) -> Config:
 def trained(population: Population) -> object:
     state = population.create(5)
     advance = jax.jit(population.advance)
-    state, _ = advance(state, programs.prefill(10))
-    return advance(state, programs.train(20, 1))[0]
+    state, *_ = advance(state, programs.warmup(10))
+    return advance(state, programs.train(20))[0]
 
 
+@pytest.mark.slow
 def test_members_are_the_runs_of_their_seeds(small: Config) -> None:
     population, single = Population(small, "newton-euler", 2), Population(small, "newton-euler")
     together, advance = trained(population), jax.jit(single.advance)
     for member in range(2):
-        state, _ = advance(single.create(5 + member), programs.prefill(10))
-        alone, _ = advance(state, programs.train(20, 1))
+        state, *_ = advance(single.create(5 + member), programs.warmup(10))
+        alone, *_ = advance(state, programs.train(20))
         mine = population.member(together, member)
-        for a, b in zip(jax.tree.leaves(mine.learner.policy), jax.tree.leaves(alone.learner.policy), strict=True):
+        for a, b in zip(
+            jax.tree.leaves(mine.algorithm.learner.policy), jax.tree.leaves(alone.algorithm.learner.policy), strict=True
+        ):
             # Batched matrix products may round differently; 20 updates amplify that a little.
             np.testing.assert_allclose(a, b, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_swept_settings_differ_between_members_and_between_traced_programs(
     small: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,10 +77,10 @@ def test_swept_settings_differ_between_members_and_between_traced_programs(
         assert [population.member_config(k).sac.learning_rate for k in (0, 1)] == rates
         compiled = population.compile(creating=True)
         state = population.start(compiled, 5)
-        before = np.asarray(jax.tree.leaves(state.learner.policy)[-1])
-        state, _ = compiled.advance(state, population.mode(programs.prefill(10)))
-        state, _ = compiled.advance(state, population.mode(programs.train(20, 1)))
-        moved.append(np.abs(np.asarray(jax.tree.leaves(state.learner.policy)[-1]) - before).max(axis=(1, 2)))
+        before = np.asarray(jax.tree.leaves(state.algorithm.learner.policy)[-1])
+        state, *_ = compiled.advance(state, population.mode(programs.warmup(10)))
+        state, *_ = compiled.advance(state, population.mode(programs.train(20)))
+        moved.append(np.abs(np.asarray(jax.tree.leaves(state.algorithm.learner.policy)[-1]) - before).max(axis=(1, 2)))
     # No traced program says which files of Python made it: XLA would print them all.
     assert not any(b".py" in path.read_bytes() for path in tmp_path.iterdir())
     (still, quick), (quick_too, still_too) = moved[:2]
@@ -92,7 +96,7 @@ def test_swept_settings_differ_between_members_and_between_traced_programs(
         ("{", "cannot be read"),
         ("[]", "object"),
         ("{}", "object"),
-        ('{"sac.batch": [1, 2]}', "cannot differ"),
+        ('{"sac.batch_size": [1, 2]}', "cannot differ"),
         ('{"sac.discount": [0.9]}', "2 numbers"),
         ('{"sac.discount": [0.9, 1.5]}', "at most"),
         ('{"sac.discount": [0.9, "x"]}', "numbers"),
@@ -116,9 +120,10 @@ def test_best_member_has_the_highest_finite_return_of_the_last_evaluation() -> N
     assert best_member([]) == 0
 
 
+@pytest.mark.slow
 def test_population_run_exports_every_member_and_the_best(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out, sweep = tmp_path / "run", tmp_path / "sweep.json"
-    sweep.write_text(json.dumps({"follower.tilt_limit": [0.1, 0.2]}))
+    sweep.write_text(json.dumps({"follower.action_scale_tilt": [0.1, 0.2]}))
     assert train([*FLAGS, "--seeds", "2", "--seed", "7", "--sweep", str(sweep), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "seed7" in printed
@@ -141,6 +146,7 @@ def test_population_run_exports_every_member_and_the_best(tmp_path: Path, capsys
     assert train(["--resume", str(out)]) == 0
 
 
+@pytest.mark.slow
 def test_members_are_spread_over_devices() -> None:
     """Two CPU devices in a process of their own: the same members as on one, up to rounding."""
     code = f"""
@@ -154,16 +160,16 @@ for name, value in {SMALL!r}.items():
 population = Population(config, "newton-euler", 2)
 assert population.devices == jax.local_device_count() == 2
 compiled = population.compile(creating=True)
-state, _ = compiled.advance(population.start(compiled, 5), population.mode(P.prefill(10)))
-state, _ = compiled.advance(state, population.mode(P.train(5, 1)))
-leaves = jax.tree.leaves(state.learner.policy)
+state, *_ = compiled.advance(population.start(compiled, 5), population.mode(P.warmup(10)))
+state, *_ = compiled.advance(state, population.mode(P.train(5)))
+leaves = jax.tree.leaves(state.algorithm.learner.policy)
 assert len(leaves[0].sharding.device_set) == 2
 single = Population(config, "newton-euler", 2, devices=jax.local_devices()[:1])
 assert single.devices == 1
 advance = jax.jit(single.advance)
-alone, _ = advance(single.create(5), P.prefill(10))
-alone, _ = advance(alone, P.train(5, 1))
-for a, b in zip(leaves, jax.tree.leaves(alone.learner.policy)):
+alone, *_ = advance(single.create(5), P.warmup(10))
+alone, *_ = advance(alone, P.train(5))
+for a, b in zip(leaves, jax.tree.leaves(alone.algorithm.learner.policy)):
     np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=1e-5)
 """
     flags = f"{HASTY} --xla_force_host_platform_device_count=2"

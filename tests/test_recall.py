@@ -54,6 +54,14 @@ def test_history_keeps_the_newest_first() -> None:
     np.testing.assert_array_equal(seen, [*[5.0] * 18, *[4.0] * 18, *[3.0] * 18, *actions[4]])
 
 
+def test_the_slowest_action_is_that_of_the_longest_average() -> None:
+    """After one step with the action 1 an average of tau has come 1 - exp(-T / tau) of the way, whatever the order."""
+    for filters in ((0.1, 0.5), (0.5, 0.1)):
+        recall = FULL._replace(filters=filters)
+        memory = recall.next(recall.start(np.zeros(18)), np.zeros(18), np.ones(3))
+        np.testing.assert_allclose(recall.slowest_action(memory), 1 - math.exp(-0.02 / 0.5), rtol=1e-12)
+
+
 def test_a_ramp_lags_its_average_by_the_time_constant() -> None:
     """In the long run the average of k t is k (t - tau_d), with tau_d = T q / (1 - q) of the sampled filter."""
     recall = Recall(filters=(0.1,), period=0.02)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxball.train import replay
-from mjxball.train.replay import Transitions
+from mjxball.algorithms import replay
+from mjxball.algorithms.replay import Transitions
 
 WORLDS, CAPACITY, SEEN, ACTIONS = 3, 12, 2, 1
 GAMMA = 0.5  # powers of two: returns of small integers are exact in float32

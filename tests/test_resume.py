@@ -21,8 +21,17 @@ from mjxball.train.provenance import PACKAGE, SOURCES
 
 REPOSITORY = Path(__file__).parents[1]
 TINY = [
-    *("--physics", "newton-euler", "--sac.steps", "24000", "--sac.worlds", "32", "--sac.replay", "3200"),
-    *("--sac.prefill", "1024", "--sac.updates", "2", "--timing.episode_steps", "120", "--sac.policy_layers", "16,16"),
+    *("--physics", "newton-euler", "--sac.total_steps", "24000", "--sac.num_envs", "32", "--sac.replay_size", "3200"),
+    *(
+        "--sac.warmup_steps",
+        "1024",
+        "--sac.updates_per_step",
+        "2",
+        "--timing.episode_steps",
+        "120",
+        "--sac.policy_layers",
+        "16,16",
+    ),
     *("--sac.critic_layers", "16,16"),
 ]
 
@@ -59,6 +68,7 @@ def complete(run: Path) -> list[int]:
     return sorted(int(path.name) for path in place.iterdir() if path.name.isdigit()) if place.is_dir() else []
 
 
+@pytest.mark.slow
 def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: Path, cache: Path) -> None:
     run = tmp_path / "killed"
     child = launch(["--out", str(run), *TINY], cache)
@@ -81,6 +91,7 @@ def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: P
     assert steps == [line.split(",")[0] for line in (whole / "metrics.csv").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_damaged_checkpoint_is_skipped_with_a_warning(whole: Path, tmp_path: Path, cache: Path) -> None:
     run = tmp_path / "damaged"
     shutil.copytree(whole, run)
@@ -102,6 +113,7 @@ def test_damaged_checkpoint_is_skipped_with_a_warning(whole: Path, tmp_path: Pat
     assert "skipped" not in output
 
 
+@pytest.mark.slow
 def test_changed_configuration_is_refused(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     run = tmp_path / "changed"
     shutil.copytree(whole, run)
@@ -114,6 +126,7 @@ def test_changed_configuration_is_refused(whole: Path, tmp_path: Path, capsys: p
     assert (run / "policy.npz").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_changed_program_is_refused_with_the_differences(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -130,6 +143,7 @@ def test_changed_program_is_refused_with_the_differences(
     assert "jax 0.0.1 is now" in message
 
 
+@pytest.mark.slow
 def test_compilation_cache_is_filled(whole: Path, cache: Path) -> None:
     assert whole.is_dir()
     assert any(path.name.startswith("jit_advance") for path in cache.iterdir())

@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 
 from mjxball.config import Reward
-from mjxball.rewards import paper_reward, task_reward
+from mjxball.rewards import Transition, paper_reward, reward, task_reward
 
 ZERO = np.zeros(3)
 ERROR_ONLY = Reward(error=2.0, error_scale=0.1, velocity=0, tilt=0, rates=0, effort=0, smoothness=0)
 
 
-def task(weights=ERROR_ONLY, error=ZERO, velocity=ZERO, euler=ZERO, rates=ZERO, action=ZERO, last=ZERO):
-    return task_reward(weights, *(np.asarray(v, float) for v in (error, velocity, euler, rates, action, last)))
+STILL = Transition(*[ZERO] * 9, tilt_disagreement=0.0, ball=0.0, terminated=np.array(False))
+
+
+def task(weights=ERROR_ONLY, **parts):
+    return task_reward(weights, STILL._replace(**{name: np.asarray(value, float) for name, value in parts.items()}))
 
 
 def test_paper_reward_is_ten_times_the_absolute_differences():
@@ -29,7 +32,8 @@ def test_task_reward_is_zero_at_the_goal_and_nowhere_positive():
     assert task(Reward()) == 0
     random = np.random.default_rng(0)
     everything = Reward(tilt=1.0)
-    rewards = [task(everything, *random.normal(size=(6, 3))) for _ in range(20)]
+    names = ("error", "velocity", "euler", "rates", "action", "last_action")
+    rewards = [task(everything, **dict(zip(names, random.normal(size=(6, 3)), strict=True))) for _ in range(20)]
     assert max(rewards) < 0
 
 
@@ -52,7 +56,8 @@ def test_error_cost_depends_on_the_distance_alone():
 
 def test_error_cost_has_a_finite_gradient_at_the_goal():
     zero = jnp.zeros(3)
-    gradient = jax.grad(lambda e: task_reward(Reward(), e, zero, zero, zero, zero, zero))(zero)
+    still = jax.tree.map(jnp.asarray, STILL)
+    gradient = jax.grad(lambda error: task_reward(Reward(), still._replace(error=error)))(zero)
     np.testing.assert_array_equal(gradient, zero)
 
 
@@ -62,11 +67,20 @@ def test_error_cost_has_a_finite_gradient_at_the_goal():
         ({"velocity": 3.0}, {"velocity": [1.0, 2.0, -2.0]}, -27.0),
         ({"tilt": 3.0}, {"euler": [1.0, 2.0, 100.0]}, -15.0),  # yaw is no tilt
         ({"rates": 3.0}, {"rates": [1.0, 2.0, -2.0]}, -27.0),
-        ({"effort": 3.0}, {"action": [1.0, 0.0, -1.0], "last": [1.0, 0.0, -1.0]}, -6.0),
-        ({"smoothness": 3.0}, {"action": [1.0, 0.5, 0.0], "last": [0.0, 0.5, -1.0]}, -6.0),
+        ({"effort": 3.0}, {"action": [1.0, 0.0, -1.0], "last_action": [1.0, 0.0, -1.0]}, -6.0),
+        ({"steady_action": 3.0}, {"action_average": [1.0, 0.5, 0.0]}, -3.75),
+        ({"tilt_disagreement": 3.0}, {"tilt_disagreement": -0.5}, -0.75),
+        ({"ball": 3.0}, {"ball": -0.5}, -0.75),
+        ({"smoothness": 3.0}, {"action": [1.0, 0.5, 0.0], "last_action": [0.0, 0.5, -1.0]}, -6.0),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
 def test_each_weight_scales_its_own_square(weights, values, expected):
     off = {"error": 0.0, "velocity": 0.0, "tilt": 0.0, "rates": 0.0, "effort": 0.0, "smoothness": 0.0}
     assert task(Reward(**{**off, **weights}), **values) == pytest.approx(expected, rel=1e-15)
+
+
+def test_a_termination_costs_its_weight_once_and_for_both_kinds():
+    ended = STILL._replace(terminated=np.array([True, False]))
+    for kind in ("task", "paper"):
+        np.testing.assert_array_equal(reward(Reward(kind=kind, termination=7.0), ended), [-7.0, 0.0])

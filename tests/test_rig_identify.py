@@ -1,4 +1,4 @@
-"""Identification from simulated logs whose truth is known, and what becomes of the plant file."""
+"""Identification from simulated arrays whose truth is known, and what becomes of the plant file."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from mjxball.config import Config, preset, validate
 from mjxball.control import crazyflie, rotations
 from mjxball.control.constants import plant_constants
 from mjxball.errors import InputError
-from mjxball.fly import packets
-from mjxball.fly.journal import Journal
 from mjxball.fly.preflight import read_gains
 from mjxball.physics.engine import Load
 from mjxball.physics.step import start_state
@@ -96,6 +94,7 @@ def found(logs) -> dict[str, Found]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RIGS)
 def test_truth_is_found(found, name: str) -> None:
     """The errors that docs/crazyflie.md states: 20 s of noisy flight."""
@@ -105,26 +104,6 @@ def test_truth_is_found(found, name: str) -> None:
     assert one.lag == pytest.approx(0.05 * truth.lag, rel=0.12)
     assert one.delay == pytest.approx(PERIOD * truth.late, abs=0.005)
     assert one.misfit < 1
-
-
-def test_journal_and_arrays_tell_the_same(tmp_path: Path, logs) -> None:
-    """A flight's own log: packed states, setpoints as they were sent, other states of the runner left out."""
-    log = {name: rows[:300] for name, rows in logs["weak and slow"].items()}
-    path = tmp_path / "flight.jsonl"
-    with Journal(path) as journal:
-        journal.note("tick", -1.0, state="ramp", sent=[[0, 0, 0, 0]] * 2)
-        for t, sent, states in zip(log["time"], log["setpoints"], log["states"], strict=True):
-            for drone, row in zip(("leader", "follower"), states, strict=True):
-                state = packets.DroneState(row[:3], row[3:6], row[6:10], row[10:], packets.FLYING, 3.9)
-                journal.note("state", float(t), drone=drone, raw=packets.pack_state(state).hex())
-            journal.note("tick", float(t), state="fly", sent=sent)
-    np.savez(tmp_path / "flight.npz", **log)
-    packed, plain = read_log(path), read_log(tmp_path / "flight.npz")
-    assert packed.every == plain.every == 5
-    np.testing.assert_array_equal(packed.setpoints, plain.setpoints)
-    np.testing.assert_allclose(packed.climb, plain.climb, atol=6e-4)  # whole mm/s
-    np.testing.assert_allclose(packed.rates, plain.rates, atol=6e-4)
-    np.testing.assert_allclose(packed.euler, plain.euler, atol=3e-3)  # three components of 9 bits
 
 
 @pytest.mark.parametrize(
@@ -146,9 +125,6 @@ def test_damaged_logs_are_refused(tmp_path: Path, change: dict[str, np.ndarray],
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "a.jsonl").write_text("nothing\n")
-    with pytest.raises(InputError, match="no guided flight"):
-        read_log(tmp_path / "a.jsonl")
     with pytest.raises(InputError, match="cannot be read"):
         read_log(tmp_path / "none.npz")
 
@@ -160,7 +136,7 @@ def test_too_short_a_flight_is_refused(logs) -> None:
         identify(PAIR, short)
 
 
-SOME = Found(0.95, COMPUTED + 4e-4, 0.06, 0.02, (0.001, 0.01, 0.02, 0.001), 0.8, 19)
+SOME = Found(1.05, COMPUTED + 4e-4, 0.06, 0.02, (0.001, 0.01, 0.02, 0.001), 0.8, 19)
 
 
 class TestPlantFile:

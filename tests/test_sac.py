@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjxball.algorithms import sac
+from mjxball.algorithms.replay import Transitions
 from mjxball.config import Sac, preset
-from mjxball.train import sac
-from mjxball.train.replay import Transitions
 
 SMALL = Sac(policy_layers=(16,), critic_layers=(32, 32), learning_rate=3e-3, alpha_fixed=True)
-PAPER = dataclasses.replace(SMALL, state_value=True, critics=1)  # the paper's V, Q and pi
+PAPER = dataclasses.replace(SMALL, state_value=True, num_critics=1)  # the paper's V, Q and pi
 ADAPTIVE = dataclasses.replace(SMALL, alpha_fixed=False)
 BATCH, UPDATES = 256, 3000
 STATE = jnp.zeros((1, 1))  # the only state of every problem here
@@ -62,10 +62,18 @@ def compiled(config: Sac, updates: int) -> Any:
     return jax.jit(run)
 
 
+TRACED = (
+    "target_entropy",
+    "tau",
+    "policy_ema_rate",
+    "learning_rate",
+    "alpha_learning_rate",
+)  # settings that differ between tests
+
+
 def one_update(rate: float = 1.0, config: Sac = ADAPTIVE, **changes: float) -> tuple[sac.Learner, sac.Learner, float]:
     """(learner before, learner after one update, entropy) on a bandit."""
-    names = ("target_entropy", "target_rate", "policy_average", "learning_rate", "alpha_learning_rate")
-    changes = {name: jnp.asarray(changes.get(name, getattr(config, name))) for name in names}
+    changes = {name: jnp.asarray(changes.get(name, getattr(config, name))) for name in TRACED}
     before = parts(config)[1]
     # Away from their sources, which they equal at the start.
     shifted = {name: jax.tree.map(lambda leaf: leaf + 0.5, getattr(before, name)) for name in ("target", "average")}
@@ -78,7 +86,7 @@ def learn(
     loop: Loop, alpha: float, discount: float = 0.0, reward_scale: float = 1.0, config: Sac = SMALL
 ) -> sac.Learner:
     """The learner after `UPDATES` updates with a fixed temperature `alpha`."""
-    changes = {"discount": jnp.asarray(discount), "reward_scale": jnp.asarray(reward_scale), "target_rate": RATE * 0.1}
+    changes = {"discount": jnp.asarray(discount), "reward_scale": jnp.asarray(reward_scale), "tau": RATE * 0.1}
     learner = parts(config)[1]._replace(log_alpha=jnp.log(jnp.asarray(alpha)))
     loop = Loop(*(jnp.asarray(number) for number in loop))
     return compiled(config, UPDATES)(changes, learner, loop, RATE)[0]
@@ -110,14 +118,25 @@ def test_fixed_alpha_stays():
 
 
 def test_target_critic_moves_by_tau():
-    before, after, _ = one_update(target_rate=0.125)
+    before, after, _ = one_update(tau=0.125)
     expected = jax.tree.map(lambda new, old: 0.125 * new + 0.875 * old, after.critic, before.target)
     assert largest_difference(after.target, expected) < 2e-7  # float32, weights up to 1
     assert largest_difference(after.target, before.target) > 1e-4
 
 
+def test_the_critic_learns_from_the_slow_copy():
+    """What follows is worth what the target says: with all else equal another target is another error."""
+    changes = {name: jnp.asarray(getattr(ADAPTIVE, name)) for name in TRACED}
+    before = parts(ADAPTIVE)[1]
+    errors = []
+    for shift in (0.0, 0.5):
+        learner = before._replace(target=jax.tree.map(lambda leaf, shift=shift: leaf + shift, before.target))
+        errors.append(compiled(ADAPTIVE, 1)(changes, learner, Loop(reward=0.1, continues=1.0), RATE)[1].critic[0])
+    assert abs(float(errors[1] - errors[0])) > 1e-2  # the weights of 32 units are half a unit larger
+
+
 def test_average_policy_moves_by_its_rate():
-    before, after, _ = one_update(policy_average=0.25)
+    before, after, _ = one_update(policy_ema_rate=0.25)
     expected = jax.tree.map(lambda new, old: 0.25 * new + 0.75 * old, after.policy, before.average)
     assert largest_difference(after.average, expected) < 2e-7  # float32, weights up to 1
     assert largest_difference(after.average, before.average) > 1e-4
@@ -173,7 +192,7 @@ def test_state_value_is_the_soft_value():
 
 def test_paper_preset_has_one_critic_and_a_state_value():
     config = preset("paper").sac
-    assert (config.state_value, config.critics, config.alpha_fixed, config.alpha) == (True, 1, True, 0.3)
+    assert (config.state_value, config.num_critics, config.alpha_fixed, config.alpha) == (True, 1, True, 0.3)
     networks = sac.make_networks(config, (1.0,), 1)
     learner = sac.create(networks, config, 1, jax.random.key(0))
     assert networks.q_network.apply(learner.normaliser, learner.critic, STATE, STATE).shape == (1, 1)
@@ -192,6 +211,7 @@ def test_reward_scale_multiplies_the_reward_in_the_critic():
     np.testing.assert_allclose(values, 0.6, rtol=0, atol=0.02)  # a regression on a constant
 
 
+@pytest.mark.slow
 def test_two_halves_of_a_batch_make_the_update_of_the_whole():
     """Data parallel: gradients averaged over an axis. With gamma = 0 the critic's update has no noise of its own."""
     networks, before = parts(SMALL)

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
-from mjxball.control.followers import make_baseline
 from mjxball.evaluate.batch import law_of
 from mjxball.evaluate.stability import delay_margins, hovers
-from mjxball.rollout import simulate_batch
-from mjxball.scenario import Scenario
-from mjxball.sensing import Disturbance
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.rollout import simulate_batch
+from mjxball.sim.scenario import Scenario
 
 CASES = [(0.0, 0.2, 0.2), (0.1, 0.2, 0.2), (0.05, 0.4, 0.4)]
 MISTAKEN = (0.0, 0.25, 0.2)  # the hover thrust believes 0.2 kg
@@ -39,6 +39,7 @@ def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: 
     assert mistaken.error == pytest.approx(0.05 * 9.81 / (2 * 1.1 * 0.5), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_delay_margin_is_where_flights_begin_to_grow(paper: Config) -> None:
     """LQG, which is told of no delay."""
     lqg = make_baseline("lqg", paper)

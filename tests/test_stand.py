@@ -10,11 +10,10 @@ import pytest
 from plants import BEAM
 
 from mjxball import config as configs
+from mjxball.baselines import make_baseline
 from mjxball.config import Config, Leader, ball_reach
 from mjxball.control.constants import plant_constants
-from mjxball.control.followers import make_baseline
-from mjxball.evaluate.paper import experiment
-from mjxball.evaluate.paper.stand import LEVEL, SCENARIO, SETTINGS, StandFlight, fly_stand, stand_config
+from mjxball.evaluate.paper_figures import LEVEL, SETTINGS, STAND_START, StandFlight, fly_stand, stand_config
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policy
 
@@ -29,7 +28,7 @@ def test_still_cg_tilts_a_copying_pair_as_far_as_its_attitude_loops_give_way() -
     """m_o g c cos(phi) = 2 Kp phi on the pivot: equal vertical commands exert no torque about O."""
     setup = pivoted()
     still = dataclasses.replace(
-        SCENARIO, mass=0.2, amplitude=0.05, omega=0.0, phase=math.pi / 2, ball_start=0.0, seconds=6.0
+        STAND_START, mass=0.2, amplitude=0.05, omega=0.0, phase=math.pi / 2, ball_start=0.0, seconds=6.0
     )
     flight = fly_stand(setup, make_baseline("copy", setup), True, "newton-euler", still)
     kp = plant_constants(setup.plant, setup.attitude).gains.kp[0]
@@ -43,9 +42,9 @@ def test_still_cg_tilts_a_copying_pair_as_far_as_its_attitude_loops_give_way() -
 def test_leader_on_the_stand_flies_on_its_own_position() -> None:
     """Roll alone lifts the leader off its place: the error that copying is shown commands it down, O's does not."""
     setup = stand_config()
-    start = dataclasses.replace(SCENARIO, start_position=(0.0, 0.0, 0.0), seconds=0.02)
+    start = dataclasses.replace(STAND_START, start_position=(0.0, 0.0, 0.0), seconds=0.02)
     own, objects = (fly_stand(setup, make_baseline("copy", setup), shown, "newton-euler", start) for shown in (1, 0))
-    rise = 0.15 * math.sin(SCENARIO.start_tilt[0])
+    rise = 0.15 * math.sin(STAND_START.start_tilt[0])
     assert own.height[0] == pytest.approx(LEVEL + rise)
     assert own.vertical[0] == pytest.approx(-0.1 * rise, rel=1e-3)  # kp_z of the paper's experiment
     assert objects.vertical[0] == pytest.approx(0.0, abs=1e-12)
@@ -54,7 +53,7 @@ def test_leader_on_the_stand_flies_on_its_own_position() -> None:
 @pytest.fixture(scope="module")
 def flown() -> dict[str, dict[str, StandFlight]]:
     """30 s of copying and of the shipped follower, with the paper's settings and with better ones."""
-    scenario, mine = dataclasses.replace(SCENARIO, seconds=30.0), Policy.load(shipped_policy("stand"))
+    scenario, mine = dataclasses.replace(STAND_START, seconds=30.0), Policy.load(shipped_policy("stand"))
     setups = {settings: stand_config(settings) for settings in SETTINGS}
     return {
         settings: {
@@ -65,41 +64,29 @@ def flown() -> dict[str, dict[str, StandFlight]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_shipped_follower_keeps_the_ball_that_copying_loses(settings: str, flown: dict) -> None:
     mine, copied = flown[settings]["mine"], flown[settings]["copy"]
     reach = ball_reach(stand_config().plant)
     assert np.abs(mine.ball).max() < 0.9 * reach
-    assert np.abs(copied.ball).max() > reach - experiment.AT_STOP
-    assert experiment.roll_rms(mine) < 0.1
-    assert experiment.height_peak(mine) < 0.5 * experiment.height_peak(copied)
+    assert np.abs(copied.ball).max() > reach - 1e-3
+    assert mine.roll_rms < 0.1
+    # With better settings copying, whose ball lies still at its stop, holds height to 2 mm as well.
+    assert mine.height_peak < max(0.5 * copied.height_peak, 5e-3)
 
 
+@pytest.mark.slow
 def test_better_settings_do_not_let_the_height_drift(flown: dict) -> None:
     """The paper's leader has kp_z = 0.1: what a copying pair loses in height while the ball rolls stays lost."""
-    assert experiment.height_peak(flown["better"]["copy"]) < 0.2 * experiment.height_peak(flown["paper"]["copy"])
+    assert flown["better"]["copy"].height_peak < 0.2 * flown["paper"]["copy"].height_peak
 
 
-def stand_flight(roll_degrees: float, height: float, ball: float) -> StandFlight:
-    """40 s of a still roll, height and ball, from 3 degrees and 3 cm off."""
+def test_numbers_of_a_stand_flight_are_of_the_time_after_20_s() -> None:
     time = np.arange(0, 40.001, 0.02)
-    roll = np.full_like(time, np.radians(roll_degrees))
-    roll[0] = np.radians(3)
-    heights = np.full_like(time, LEVEL + height)
-    heights[0] = LEVEL - 0.03
-    return StandFlight(time, heights, roll, np.zeros_like(time), np.linspace(0, ball, time.size))
-
-
-def test_stand_caption_says_what_is_left_of_roll_height_and_ball() -> None:
-    flights = {"copy": stand_flight(0.5, 0.02, 0.08), "mine": stand_flight(0.25, 0.001, -0.04)}
-    assert experiment.ball_range(flights["mine"]) == pytest.approx(0.02)
-    agrees, differs = experiment.judged({"paper": flights, "better": {"copy": stand_flight(4.0, 0.0, 0.0)}}, 0.08)
-    start = "the roll of 3.00 deg at the start"
-    assert agrees == (
-        f'With the paper\'s gains {start} is smaller after 20 s with copy (0.50 deg rms) and "mine" (0.25 deg rms).',
-    )
-    assert differs == (
-        "With the paper's gains the ball runs into a stop with copy.",
-        "With the paper's gains the leader is still off its height after 20 s with copy (20.0 mm).",
-        f"With better settings {start} is not reduced by copy (4.00 deg rms).",
-    )
+    late = time >= 20
+    roll, height = np.where(late, np.radians(0.5), 1.0), np.where(late, LEVEL - 0.02, 0.0)
+    flight = StandFlight(time, height, roll, np.zeros_like(time), np.linspace(0, 0.08, time.size))
+    assert flight.roll_rms == pytest.approx(0.5)
+    assert flight.height_peak == pytest.approx(0.02)
+    assert flight.ball_range == pytest.approx(0.04)

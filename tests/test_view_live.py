@@ -20,17 +20,14 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment
 from fly_policies import untrained
-from fly_virtual import World
+from fly_virtual import World, log_header
 
-from mjxball import config as configs
-from mjxball.control.firmware_gains import to_json
 from mjxball.errors import InputError
-from mjxball.fly import card
-from mjxball.fly.contract import FlightSettings
-from mjxball.fly.journal import Journal
+from mjxball.fly.display import LiveView
+from mjxball.fly.flight_log import Journal
 from mjxball.fly.main import main as fly
+from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.recording import read_recording
-from mjxball.fly.spectator import Spectator
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.view.command import main
@@ -44,13 +41,7 @@ LIMIT = 20.0  # [s] that anything may take here on a busy machine
 def lines(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     """The lines of a log of 2 s of free flight in virtual time, as the runner writes it."""
     path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
-    config = card.config_of(contents.card)
-    header = {
-        "policy": "nobody",
-        "config": configs.to_dict(config),
-        "gains": to_json(card.gains_of(config)),
-    }
-    with Journal(path, **header) as notes:
+    with Journal(path, **log_header(contents)) as notes:
         settings = FlightSettings(seconds=2.0, goal=(0.1, 0.0, 0.4))
         world = World(settings, contents=contents, physics=make_pair(contents.card), notes=notes)
         world.fly_until(State.DONE)
@@ -109,7 +100,7 @@ def test_a_log_in_pieces_gives_the_same_rows(lines: list[bytes], tmp_path: Path)
     ("contents", "message"),
     [
         (b'{"t": 0.0, "kind": "tick"}\n', "does not begin with a header"),
-        (b'{"t": 0.0, "kind": "header", "config": {}}\n', "does not begin with a header"),
+        (b'{"t": 0.0, "kind": "header", "config": {}}\n', "has schema version"),
         (b"PK\x03\x04\n\x00", "does not begin with a header"),
         (b"x" * (3 << 20), "a line of more than 1 MiB"),
     ],
@@ -238,7 +229,8 @@ def test_a_page_follows_a_log(lines: list[bytes], browser: Any, tmp_path: Path) 
         with path.open("ab", buffering=0) as stream:
             stream.write(lines[0])
             shows("connecting and checking")
-            half = len(lines) // 2
+            flying = [i for i, line in enumerate(lines) if b'"state": "fly"' in line]
+            half = flying[len(flying) // 2]  # the log pauses in the middle of free flight
             stream.write(b"".join(lines[1:half]) + lines[half][:40])
             tab.wait_for_function("time => player && player.now > time", arg=newest(lines[:half]) - 1.5 * STEP)
             assert float(tab.inner_text("#now-time").split()[0]) <= newest(lines[:half]) + 0.005
@@ -276,13 +268,13 @@ def test_a_log_that_turns_out_to_be_none(tmp_path: Path) -> None:
 
 def test_a_flight_starts_and_ends_its_view(lines: list[bytes], tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
-    with Spectator(path) as spectator:
-        address = re.fullmatch(r"the live view is at (http://127\.0\.0\.1:(\d+)/), and waits for .*", spectator.line)
+    with LiveView(path) as live_view:
+        address = re.fullmatch(r"the live view is at (http://127\.0\.0\.1:(\d+)/), and waits for .*", live_view.line)
         path.write_bytes(b"".join(lines))
         with urllib.request.urlopen(address[1], timeout=LIMIT) as page:
             assert page.status == 200
         with pytest.raises(InputError, match="the port of --view"):
-            Spectator(path, int(address[2]))
+            LiveView(path, int(address[2]))
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", int(address[2])), LIMIT)
 

@@ -7,36 +7,32 @@ import dataclasses
 import json
 import shlex
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mjxball import cli, config
+from mjxball.baselines import BASELINES, LAWS, make_baseline
 from mjxball.commands.flight_log import evaluate_log
-from mjxball.commands.scenarios import SCENARIO_FLAGS, home_scenarios, scenarios_of, setup_of
-from mjxball.control.followers import BASELINES, LAWS, Baseline, Follower, make_baseline
+from mjxball.commands.scenarios import SCENARIO_FLAGS, native_scenarios, scenarios_of, setup_of
+from mjxball.control.followers import Baseline, Follower
 from mjxball.errors import InputError
-from mjxball.evaluate import families
-from mjxball.evaluate.cells import (
-    REFERENCE,
-    Cell,
-    check_bounds,
-    load_policy,
-    run_cells,
-    standard_scenarios,
-)
-from mjxball.evaluate.homes import by_home
-from mjxball.evaluate.judging import judge_families, scores_of, write_judgement
-from mjxball.evaluate.paper import command as paper
-from mjxball.evaluate.report import to_json, write_report
-from mjxball.evaluate.table import table
+from mjxball.evaluate import paper_figures
+from mjxball.evaluate.benchmark import run_benchmark, scores_of, text_table
+from mjxball.evaluate.plots import write_results
+from mjxball.evaluate.policies import check_bounds, group_by_plant, load_policy, native_config
+from mjxball.evaluate.report import write_page, write_report
+from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
+from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
+from mjxball.evaluate.suites import Suite, find_suites, list_suites
 from mjxball.physics.stepper import ENGINES
 from mjxball.policy import Policy, PolicyFileError
 from mjxball.policy.shipped import shipped_policies
-from mjxball.scenario import Scenario
+from mjxball.sim.scenario import Scenario
 from mjxball.train.provenance import versions
 
-# What the paper's figures settle themselves.
-NOT_WITH_FIGURES = ("families", "seeds", "check", "followers", "json", "wn_pitch", "plant", *SCENARIO_FLAGS)
+# What `--figures` fixes itself.
+NOT_WITH_FIGURES = ("suite", "num_seeds", "check", "followers", "json", "wn_pitch", "plant", *SCENARIO_FLAGS)
 
 
 def parser() -> cli.Parser:
@@ -71,14 +67,15 @@ def parser() -> cli.Parser:
     result.add_argument("--json", type=Path, metavar="FILE", help="write the cells as JSON")
     result.add_argument("--out", type=Path, metavar="DIR", help="write report.html, JSON and figures")
     result.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its card")
-    result.add_argument("--families", nargs="+", metavar="NAME", help="scenario families, or all; see --list")
-    result.add_argument("--seeds", type=int, metavar="N", help="seeds of each level of a family (default 3)")
-    result.add_argument("--figures", nargs="+", metavar="NAME", help=f"the paper's: {', '.join(paper.NAMES)}, or all")
+    result.add_argument("--suite", "--families", nargs="+", metavar="NAME", help="benchmark suites, or all; see --list")
+    result.add_argument("--num-seeds", "--seeds", type=int, metavar="N", help="of each variant of a suite (default 3)")
+    figures = ", ".join(paper_figures.NAMES)
+    result.add_argument("--figures", nargs="+", metavar="NAME", help=f"the paper's: {figures}, or all")
     result.add_argument(
         "--flight", type=Path, metavar="LOG", help="draw a flight log, its commands simulated beside it"
     )
     result.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
-    result.add_argument("--list", action="store_true", help="list the scenario families and stop")
+    result.add_argument("--list", action="store_true", help="list the benchmark suites and stop")
     return result
 
 
@@ -89,53 +86,53 @@ def main(arguments: list[str] | None = None) -> int:
     return cli.run_command(lambda: _evaluate(options, given) if options.flight is None else _flight(options))
 
 
-def _families(options: argparse.Namespace) -> list[families.Family]:
-    if options.families is None:
-        if options.seeds is not None:
-            raise InputError("--seeds belongs to --families")
+def _suites(options: argparse.Namespace) -> list[Suite]:
+    if options.suite is None:
+        if options.num_seeds is not None:
+            raise InputError("--num-seeds belongs to --suite")
         return []
     given = [name for name in SCENARIO_FLAGS if getattr(options, name) is not None]
     given += ["plant"] if options.plant else []
     if given or options.check:
         flag = "check" if options.check else given[0].replace("_", "-")
-        raise InputError(f"--families fly their own scenarios; drop --{flag}")
-    if options.seeds is not None and not 1 <= options.seeds <= 1000:
-        raise InputError(f"--seeds must be between 1 and 1000, not {options.seeds}")
-    return families.find([name for name in options.families if not name.endswith(".npz")])
+        raise InputError(f"--suite flies scenarios of its own; drop --{flag}")
+    if options.num_seeds is not None and not 1 <= options.num_seeds <= 1000:
+        raise InputError(f"--num-seeds must be between 1 and 1000, not {options.num_seeds}")
+    return find_suites([name for name in options.suite if not name.endswith(".npz")])
 
 
 def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.list:
-        print(families.listing())  # noqa: T201
+        print(list_suites())  # noqa: T201
         return 0
     if options.figures is not None:
         return _figures(options, arguments)
     setup = setup_of(options)
-    chosen = _families(options)
+    chosen = _suites(options)
     scenarios = scenarios_of(options, setup)
     if options.out:
         cli.output_directory(options.out)
     if options.json:
         cli.output_file(options.json, ".json")
     # `--followers copy mine.npz` reads as it looks: a file name among the followers is a policy.
-    listed = [name for name in (*options.followers, *(options.families or [])) if name.endswith(".npz")]
+    listed = [name for name in (*options.followers, *(options.suite or [])) if name.endswith(".npz")]
     files = [*options.policies, *map(Path, listed)]
     named = [name for name in options.followers if not name.endswith(".npz")]
     asked = bool(files or named)
     paths = files if asked else shipped_policies()
     if options.check and not paths:
         raise InputError("--check needs a policy")
-    here, homes = (paths, []) if options.force or options.plant else by_home(paths)
-    if chosen and homes:
+    here, others = (paths, []) if options.force or options.plant else group_by_plant(paths)
+    if chosen and others:
         if asked:
-            raise InputError(f"families fly the paper's plant, and {homes[0][1][0]} was made for two Crazyflies")
-        homes = []
+            raise InputError(f"--suite flies the paper's plant, and {others[0][1][0]} was made for two Crazyflies")
+        others = []
     # Only policies for Crazyflies: then the baselines beside them fly their plant, and nothing the paper's.
-    groups = [] if homes and not here else [Group(setup, scenarios, named, here, asked)]
-    groups += [Group(home, home_scenarios(options, home), named or ["copy"], there, True) for home, there in homes]
+    groups = [] if others and not here else [Group(setup, scenarios, named, here, asked)]
+    groups += [Group(own, native_scenarios(options, own), named or ["copy"], files, True) for own, files in others]
     command = shlex.join(["python", "eval.py", *arguments])
     if chosen:
-        return _judge(groups[0], chosen, options, command)
+        return _benchmark(groups[0], chosen, options, command)
     return _compare(groups, options, command)
 
 
@@ -163,17 +160,22 @@ class Group:
         return [make_baseline(name, self.setup) for name in dict.fromkeys(self.named if self.asked else every)]
 
 
-def _judge(group: Group, chosen: list[families.Family], options: argparse.Namespace, command: str) -> int:
-    """Fly scenario families."""
+def _benchmark(group: Group, suites: list[Suite], options: argparse.Namespace, command: str) -> int:
+    """Fly benchmark suites, with progress on stderr."""
     policies = group.policies(options)
     followers: list[Follower] = [*group.baselines(list(LAWS)), *policies]
     _refuse_same_names([follower.name for follower in followers])
-    seeds = 3 if options.seeds is None else options.seeds
-    scores = judge_families(group.setup, followers, chosen, seeds, options.physics)
+    num_seeds, started = options.num_seeds or 3, time.monotonic()
+
+    def progress(text: str) -> None:
+        print(f"{time.monotonic() - started:6.1f} s  {text}", file=sys.stderr)  # noqa: T201
+
+    scores = run_benchmark(group.setup, followers, suites, num_seeds, options.physics, progress)
+    print(text_table(scores))  # noqa: T201
     if options.json:
         options.json.write_text(json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
-        write_judgement(options.out, group.setup, scores, chosen, policies, command, versions())
+        write_report(options.out, group.setup.plant, scores, suites, policies, command, versions())
         print(f"the report is {options.out / 'report.html'}")  # noqa: T201
     return 0
 
@@ -183,23 +185,23 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
     loaded = [(group, group.baselines(list(BASELINES)), group.policies(options)) for group in groups]
     for _, baselines, policies in loaded:
         _refuse_same_names([*(follower.name for follower in baselines), *(policy.name for policy in policies)])
-    every: list[Cell] = []
+    every: list[Result] = []
     code = 0
     for number, (group, baselines, policies) in enumerate(loaded):
-        cells = run_cells(group.setup, [*baselines, *policies], group.scenarios, options.physics)
+        results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
         if number:
             print(f"\n{group.setup.preset}: two Crazyflies, their own plant and scenarios")  # noqa: T201
-        print(table(cells))  # noqa: T201
+        print(table(results))  # noqa: T201
         if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
-            every += cells
+            every += results
         if options.out:
             place = options.out / group.setup.preset if number else options.out
-            write_report(cells, place)
-            scores, shown = scores_of(cells)
-            write_judgement(place, group.setup, scores, shown, policies, command, versions())
+            write_results(results, place)
+            scores, suites = scores_of(results)
+            write_report(place, group.setup.plant, scores, suites, policies, command, versions())
             print(f"report.html, figures and cells.json are in {place}")  # noqa: T201
         if options.check:
-            code = max(code, _check(group.setup, policies, cells, options.physics))
+            code = max(code, _check(group.setup, policies, results, options.physics))
     if options.json:
         options.json.write_text(to_json(every))
     return code
@@ -221,18 +223,36 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     given = [name for name in NOT_WITH_FIGURES if getattr(options, name) not in (None, False, [])]
     if given:
         raise InputError(f"--figures fly the paper's scenarios; drop --{given[0].replace('_', '-')}")
-    names = paper.find([name for name in options.figures if not name.endswith(".npz")])
+    names = paper_figures.find_figures([name for name in options.figures if not name.endswith(".npz")])
     if options.out is None:
         raise InputError("--figures needs --out DIR, a directory to write to")
     cli.output_directory(options.out)
     listed = [Path(name) for name in options.figures if name.endswith(".npz")]
-    paths = [*options.policies, *listed] or paper.fitting(shipped_policies())
-    policies = _load(paths, paper.plant_of, options)
+    paths = [*options.policies, *listed] or [path for path in shipped_policies() if _figure_config(path)]
+    policies = _load(paths, lambda path: _figure_config(path) or config.preset("paper"), options)
     _refuse_same_names([*LAWS, *(policy.name for policy in policies)])
-    figures = paper.draw_figures(names, policies, options.physics)
-    paper.write_figures(options.out, figures, policies, shlex.join(["python", "eval.py", *arguments]), versions())
-    print(f"the figures are in {options.out / paper.PAGE}")  # noqa: T201
+    paper_figures.check_figures(names, policies)
+    figures, started = [], time.monotonic()
+    for name in names:
+        figures.append(paper_figures.draw_figure(name, policies, options.physics))
+        print(f"{time.monotonic() - started:6.1f} s  figure {name}", file=sys.stderr)  # noqa: T201
+    options.out.mkdir(parents=True, exist_ok=True)
+    for figure in figures:
+        (options.out / f"figure-{figure.name}.svg").write_text(figure.svg, encoding="utf-8")
+    page = options.out / "figures.html"
+    links = [(figure.name, figure.title) for figure in figures]
+    context = {"title": "The paper's figures from our flights", "figures": figures, "links": links}
+    command = shlex.join(["python", "eval.py", *arguments])
+    write_page("figures.html", page, context, policies, command, versions())
+    print(f"the figures are in {page}")  # noqa: T201
     return 0
+
+
+def _figure_config(path: Path) -> config.Config | None:
+    """The configuration that the policy file `path` flies with in the figures, None if it fits none."""
+    if paper_figures.on_stand(Policy.load(path)):
+        return paper_figures.stand_config()
+    return config.preset("paper") if native_config(path) is None else None
 
 
 def _load(
@@ -267,15 +287,15 @@ def _refuse_same_names(names: list[str]) -> None:
             raise InputError(f"two followers are called {name!r}; rename a policy file")
 
 
-def _check(setup: config.Config, policies: Sequence[Policy], cells: Sequence[Cell], physics: str) -> int:
-    """Hold every policy against its card on the reference scenario, flown anew if the cells lack it."""
+def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[Result], physics: str) -> int:
+    """Hold every policy against its card on the reference scenario, flown anew if the results lack it."""
     own = setup.autopilot.kind != "ideal"
     plain = setup if own else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
     reference = standard_scenarios(setup)[-1] if own else REFERENCE
-    known = {cell.follower: cell for cell in cells if cell.scenario == reference} if plain == setup else {}
+    known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]
     if missing:
-        known |= {cell.follower: cell for cell in run_cells(plain, missing, [reference], physics)}
+        known |= {result.follower: result for result in fly_scenarios(plain, missing, [reference], physics)}
     failed = False
     for policy in policies:
         misses = check_bounds(policy, known[policy.name].metrics)

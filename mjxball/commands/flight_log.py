@@ -1,46 +1,56 @@
-"""`eval.py --flight LOG`: a flight log in the figures of simulation, with the simulation of the same commands."""
+"""`eval.py --flight LOG`: a recorded flight beside the simulation of the same commands, figures and numbers."""
 
 from __future__ import annotations
 
+import dataclasses
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from mjxball import cli
 from mjxball.control import rotations
-from mjxball.evaluate import flight_log
-from mjxball.evaluate.cells import Cell
 from mjxball.evaluate.metrics import measure
+from mjxball.evaluate.plots import CYCLE, draw_flights
+from mjxball.evaluate.results import Result, scenario_title
 from mjxball.fly.recording import Recording, fly_again, read_recording
 from mjxball.fly.twin.conditions import Conditions
-from mjxball.rollout import Trajectory
-from mjxball.scenario import Scenario
+from mjxball.plotting import pyplot
+from mjxball.sim.rollout import Trajectory
+from mjxball.sim.scenario import Scenario
+
+MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
+DIVERGED = 0.25  # [m] of difference from which on the open-loop simulation is not drawn
 
 
 def evaluate_log(path: Path, out: Path) -> int:
     """Draw the log `path` into the new directory `out`, print how far the simulation is from it; the exit code."""
     recording = read_recording(path)
     cli.output_directory(out)
-    cells = [cell_of(recording, f"{recording.policy}, flown"), cell_of(fly_again(recording), "the same, simulated")]
+    for remark in recording.remarks:
+        print(remark, file=sys.stderr)  # noqa: T201
+    recorded = result_of(recording, f"{recording.policy}, flown")
+    simulated = result_of(fly_again(recording), "the same, simulated")
     plant = recording.config.plant
-    files = flight_log.draw(cells, plant.stand != "free", plant.leader_mount, out)
-    print(flight_log.differences(*cells))  # noqa: T201
+    files = draw(recorded, simulated, plant.stand != "free", plant.leader_mount, out)
+    print(differences(recorded, simulated))  # noqa: T201
     print("figures: " + ", ".join(map(str, files)))  # noqa: T201
     return 0
 
 
-def cell_of(recording: Recording, name: str) -> Cell:
-    """A recording as the judge's figures take it; the scenario is what the simulation assumed."""
+def result_of(recording: Recording, name: str) -> Result:
+    """A recording as a result; the scenario is what the simulation assumed."""
     config, flight = recording.config, trajectory_of(recording)
     met = Conditions.of(config)
     numbers = (met.cg_speed, met.cg_amplitude, met.object_mass)
     scenario = Scenario(*numbers, ball_start=met.ball, seconds=float(flight.time[-1]))
     metrics = measure(flight, config.scenario.termination_distance, config.plant.rotor_force_max)
-    return Cell(name, scenario, metrics, flight, config.motion.kind)
+    return Result(name, scenario, metrics, flight, config.motion.kind)
 
 
 def trajectory_of(recording: Recording) -> Trajectory:
-    """A recording as a simulated flight is kept; what was not measured is NaN."""
+    """A recording as a trajectory; what was not measured is NaN."""
     rows = len(recording.time)
     flying = [number for number, phase in enumerate(recording.phase) if phase == "fly"]
     unknown = np.full((rows, 2, 3), np.nan)
@@ -63,3 +73,73 @@ def trajectory_of(recording: Recording) -> Trajectory:
         target=recording.goal,
         diverged=np.array(False),
     )
+
+
+def draw(recorded: Result, simulated: Result, stand: bool, leader_mount: Sequence[float], out: Path) -> list[Path]:
+    """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the files.
+
+    The first is the figure of single flights; on a `stand` the second is the paper's Fig. 7.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    both = [recorded, _cut(simulated, valid_rows(recorded, simulated))]
+    files = [out / "flight.png"]
+    draw_flights(both, scenario_title(recorded), files[0])
+    if stand:
+        files.append(out / "stand.png")
+        _draw_stand(both, np.array(leader_mount), files[1])
+    return files
+
+
+def _draw_stand(results: Sequence[Result], mount: np.ndarray, path: Path) -> None:
+    """Leader's height, roll and the follower's vertical acceleration over time: the paper's Fig. 7."""
+    plt = pyplot()
+    figure, axes = plt.subplots(3, 1, sharex=True, figsize=(9, 7), constrained_layout=True)
+    for result, colour in zip(results, CYCLE, strict=False):
+        flight, roll = result.flight, result.flight.euler[:, 0]
+        height = flight.position[:, 2] + np.cos(roll) * mount[2] + np.sin(roll) * mount[1]
+        for axis, curve in zip(axes, (height, np.degrees(roll), flight.follower_command[:, 2]), strict=True):
+            axis.plot(flight.time, curve, color=colour, linewidth=1.2, label=result.follower)
+    labels = ("leader's height [m]", "roll [deg]", "follower's vertical command [m/s²]")
+    for axis, label in zip(axes, labels, strict=True):
+        axis.set_ylabel(label, fontsize="small")
+        axis.grid(alpha=0.25)
+        axis.margins(x=0)
+    axes[0].legend(fontsize="small")
+    axes[-1].set_xlabel("time since the motors first turned [s]")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def differences(recorded: Result, simulated: Result) -> str:
+    """How far both are apart, moment by moment: a table."""
+    a, b = recorded.flight, simulated.flight
+    moments = [moment for moment in MOMENTS if moment < a.time[-1]] + [float(a.time[-1])]
+    lines = ["time s   position mm   height mm   roll deg   (largest difference until then)"]
+    for moment in moments:
+        rows = a.time <= moment
+        apart = a.position[rows] - b.position[rows]
+        roll = np.degrees(a.euler[rows, 0] - b.euler[rows, 0])
+        numbers = np.linalg.norm(apart, axis=1).max(), np.abs(apart[:, 2]).max(), np.abs(roll).max()
+        lines.append(f"{moment:6.1f}{1e3 * numbers[0]:14.1f}{1e3 * numbers[1]:12.1f}{numbers[2]:11.2f}")
+    known = valid_rows(recorded, simulated)
+    if known < len(a.time):
+        lines.append(
+            f"the open-loop simulation is {DIVERGED:g} m away after {a.time[known]:.1f} s and not drawn from there on"
+        )
+    return "\n".join(lines)
+
+
+def valid_rows(recorded: Result, simulated: Result) -> int:
+    """For how many rows the simulation is less than `DIVERGED` from the recorded flight."""
+    apart = np.linalg.norm(recorded.flight.position - simulated.flight.position, axis=1)
+    lost = np.flatnonzero(~(apart < DIVERGED))
+    return int(lost[0]) if len(lost) else len(apart)
+
+
+def _cut(result: Result, rows: int) -> Result:
+    """`result` with nothing to draw of its motion after `rows`."""
+    flight, parts = result.flight, {}
+    for name in ("position", "velocity", "euler", "cg_offset"):
+        parts[name] = np.array(getattr(flight, name), float)
+        parts[name][rows:] = np.nan
+    return dataclasses.replace(result, flight=dataclasses.replace(flight, **parts))

@@ -9,9 +9,8 @@ from typing import Any
 
 from mjxball import cli, config
 from mjxball.errors import InputError
-from mjxball.evaluate.cells import REFERENCE, STANDARD, cross, standard_scenarios
-from mjxball.evaluate.waveform import read_waveform
-from mjxball.scenario import Scenario, check_scenario
+from mjxball.evaluate.scenarios import REFERENCE, STANDARD, cross, read_waveform, standard_scenarios
+from mjxball.sim.scenario import Scenario, check_scenario
 
 SCENARIO_FLAGS = (
     "omega",
@@ -62,14 +61,14 @@ def scenarios_of(options: argparse.Namespace, setup: config.Config) -> Sequence[
     return _asked(options, setup, REFERENCE, ball_start=options.rolling or 0.0)
 
 
-def home_scenarios(options: argparse.Namespace, home: config.Config) -> Sequence[Scenario]:
+def native_scenarios(options: argparse.Namespace, setup: config.Config) -> Sequence[Scenario]:
     """The standard scenarios of a Crazyflies' plant, or the last one changed as the flags say."""
-    standard = standard_scenarios(home)
+    standard = standard_scenarios(setup)
     if not _given(options):
         return standard[-1:] if options.policies or options.followers else standard
     if options.waveform or options.rolling is not None:
         raise InputError("--waveform and --rolling are for the paper's plant; a rig's motion stands in its card")
-    return _asked(options, home, standard[-1], ball_start=standard[-1].ball_start)
+    return _asked(options, setup, standard[-1], ball_start=standard[-1].ball_start)
 
 
 def _given(options: argparse.Namespace) -> bool:

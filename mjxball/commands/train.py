@@ -19,13 +19,13 @@ import numpy as np
 from mjxball import __version__, cli, config
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
-from mjxball.evaluate.cells import standard_scenarios
-from mjxball.evaluate.report import CELLS
+from mjxball.evaluate.results import RESULTS
+from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
 from mjxball.train.provenance import commit, differences, source_hash, versions
-from mjxball.train.record import CHECKPOINTS, LARGEST_SEED, MOST_MEMBERS, POLICY
+from mjxball.train.record import CHECKPOINTS, EXTENSIONS, LARGEST_SEED, MOST_MEMBERS, POLICY
 from mjxball.train.sweep import read_sweep
 
 
@@ -46,6 +46,9 @@ def parser() -> cli.Parser:
     result.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
+    result.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
+    result.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state), your own")
+    result.add_argument("--algorithm", metavar="MODULE:CLASS", help="learning algorithm of your own (default SAC)")
     result.add_argument("--physics", choices=TRAINING_ENGINES, help="physics engine (default mjx)")
     result.add_argument("--distributed", action="store_true", help="train with the other processes of this job")
     result.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
@@ -77,7 +80,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
         code = _run(settings, origin, out, options.resume is not None)
         if meeting:
             processes.leave()
-    if writes and code is None and (out / "eval" / CELLS).exists():
+    if writes and code is None and (out / "eval" / RESULTS).exists():
         print(f"{out} was finished and evaluated before; nothing is left to do")
         return 0
     if not writes or code == 1:
@@ -86,6 +89,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
     if code:
         return code
     draw_training(out, settings, out / "eval" / "training.png")
+    if (origin.get("extensions") or {}).get("env"):
+        return 0  # `copy` and the standard scenarios are for the coupled pair
     if origin["seeds"] > 1:
         _compare_members(settings, out, origin)
     return _evaluate(settings, origin["physics"], out, out / POLICY)
@@ -101,8 +106,8 @@ def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: boo
     state = restore_state(out, settings, origin) if resume else None
     if resume and processes.is_writer():
         steps = 0 if state is None else int(np.ravel(state.steps)[0])
-        print(f"continuing {out} after {steps:,} of {settings.sac.steps:,} steps", file=sys.stderr)
-    if state is not None and int(np.ravel(state.steps)[0]) >= settings.sac.steps:
+        print(f"continuing {out} after {steps:,} of {settings.sac.total_steps:,} steps", file=sys.stderr)
+    if state is not None and int(np.ravel(state.steps)[0]) >= settings.sac.total_steps:
         return None
     try:
         return 0 if Run(settings, out, origin, state).train() else 130
@@ -142,7 +147,8 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     members = 1 if options.seeds is None else options.seeds
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--seeds must be between 1 and {MOST_MEMBERS}, not {members}")
-    origin = {
+    extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
+    origin: dict[str, Any] = {
         "command": command,
         "seed": seed,
         "physics": options.physics or "mjx",
@@ -153,7 +159,29 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
         "source_hash": source_hash(),
         "versions": versions(),
     }
+    if extensions:
+        _check_extensions(extensions, settings, origin["physics"])
+        origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
     return settings, origin, out
+
+
+def _digest(names: dict[str, str]) -> str | None:
+    from mjxball.train.extensions import digest
+
+    return digest(names)
+
+
+def _check_extensions(names: dict[str, str], settings: config.Config, physics: str) -> None:
+    """Refuse what cannot be found or does not fit, before anything is written."""
+    from mjxball.train.extensions import Extensions, make_env, resolve
+
+    extensions = resolve(Extensions(**names))
+    make_env(extensions, settings, physics)
+    missing = [name for name in ("init", "collect", "update", "policy") if not hasattr(extensions.algorithm, name)]
+    if extensions.algorithm is not None and missing:
+        raise InputError(
+            f"--algorithm {names['algorithm']} lacks {', '.join(missing)}; see docs/howto/own-algorithm.md"
+        )
 
 
 def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
@@ -162,6 +190,9 @@ def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
 
     settings, origin = read_config(run)
     changed = differences(origin)
+    extensions = origin.get("extensions") or {}
+    if extensions and _digest(extensions) != origin.get("extension_hash"):
+        changed.append(f"{', '.join(extensions.values())} has changed")
     if changed:
         raise InputError(f"{run} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
     return settings, origin
@@ -175,13 +206,13 @@ def _read_sweep(path: Path | None, members: int, settings: config.Config) -> dic
 
 def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) -> None:
     """Print every member on the reference scenario and their median, draw them over training, and tell the card."""
-    from mjxball.evaluate.cells import load_policy, run_cells
-    from mjxball.evaluate.table import table
+    from mjxball.evaluate.policies import load_policy
+    from mjxball.evaluate.results import fly_scenarios, table
     from mjxball.policy.file import load_file, save_file
     from mjxball.train.members import POLICIES, draw_members
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
-    cells = run_cells(settings, policies, standard_scenarios(settings)[-1:], origin["physics"])
+    cells = fly_scenarios(settings, policies, standard_scenarios(settings)[-1:], origin["physics"])
     print(table(cells))
     judged = ("rmse", "settling_time", "x_peak", "overshoot")
     chosen = load_file(out / POLICY)
@@ -203,7 +234,7 @@ def _seed_of(path: Path) -> int:
 
 def _refuse_with_resume(options: argparse.Namespace) -> None:
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    own = ("out", "seed", "seeds", "sweep", "physics", "plant")
+    own = ("out", "seed", "seeds", "sweep", "physics", "plant", *EXTENSIONS)
     given += [f"--{name}" for name in own if getattr(options, name) is not None]
     given += [options.preset] if options.preset else []
     if given:
@@ -212,16 +243,16 @@ def _refuse_with_resume(options: argparse.Namespace) -> None:
 
 def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) -> int:
     """Judge the exported policy against `copy` on its own plant and physics; figures go to DIR/eval."""
-    from mjxball.control.followers import make_baseline
-    from mjxball.evaluate.cells import check_bounds, load_policy, run_cells
-    from mjxball.evaluate.report import write_report
-    from mjxball.evaluate.table import table
+    from mjxball.baselines import make_baseline
+    from mjxball.evaluate.plots import write_results
+    from mjxball.evaluate.policies import check_bounds, load_policy
+    from mjxball.evaluate.results import fly_scenarios, table
 
     scenarios = standard_scenarios(settings)
     trained = load_policy(policy, settings)
-    cells = run_cells(settings, [make_baseline("copy", settings), trained], scenarios, physics)
+    cells = fly_scenarios(settings, [make_baseline("copy", settings), trained], scenarios, physics)
     print(table(cells))
-    write_report(cells, out / "eval")
+    write_results(cells, out / "eval")
     reference = next(cell for cell in cells if cell.follower == trained.name and cell.scenario == scenarios[-1])
     misses = check_bounds(trained, reference.metrics)
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"

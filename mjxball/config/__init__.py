@@ -4,6 +4,7 @@ Importing it needs the standard library only.
 """
 
 from mjxball.config._presets import PRESETS, RIGS, preset
+from mjxball.config._renamed import CONSTANT, RENAMED, current_name, old_names, with_current_names
 from mjxball.config._settings import (
     Attitude,
     Autopilot,
@@ -32,7 +33,9 @@ from mjxball.config._tree import (
 from mjxball.config._validate import ball_reach, cg_reach, validate
 
 __all__ = [
+    "CONSTANT",
     "PRESETS",
+    "RENAMED",
     "RIGS",
     "Attitude",
     "Autopilot",
@@ -50,13 +53,16 @@ __all__ = [
     "ball_reach",
     "cg_reach",
     "config_hash",
+    "current_name",
     "from_dict",
     "from_record",
     "leaves",
+    "old_names",
     "override",
     "preset",
     "replace",
     "to_dict",
     "to_json",
     "validate",
+    "with_current_names",
 ]

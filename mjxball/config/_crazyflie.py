@@ -19,17 +19,19 @@ from mjxball.config._settings import (
     Timing,
 )
 
-# mass [kg], motor curve [N], newest firmware (2026.04 on: linear, with battery compensation) and before.
-DRONES = {
-    "2.1": (0.029, (0.0915, 0.0677)),
-    "2.1-linear": (0.029, (0.0, 0.12)),
-    "thrust-upgrade": (0.0345, (0.0, 0.18)),
-    "brushless": (0.0393, (0.0, 0.20)),
+# mass [kg], motor curve [N], whose motor: firmware of 2025.12.1 on compensates for the battery, force is a line.
+DRONES: dict[str, tuple[float, tuple[float, float], Any]] = {
+    "2.1": (0.029, (0.0, 0.12), "2.1"),
+    "2.1-older": (0.029, (0.0915, 0.0677), "2.1"),  # firmware before that: the command is the PWM
+    "thrust-upgrade": (0.0345, (0.0, 0.18), "thrust-upgrade"),
+    "brushless": (0.0393, (0.0, 0.20), "brushless"),
 }  # with a positioning deck where it is not part of the drone
 
 # Roll, roll rate, yaw, yaw rate of the pair, as `python -m mjxball.rig.gains` computes them; pitch is as delivered.
+# The 2.1's are those of its older curve with the rates in the newer one's units: what leaves more thrust turns faster.
 GAINS = {
-    "2.1": ((3.25, 0.0, 0.0), (937.0, 454.0, 28.1), (1.61, 0.0, 0.0), (1160.0, 17.6, 0.0)),
+    "2.1": ((3.25, 0.0, 0.0), (1530.0, 742.0, 45.9), (1.61, 0.0, 0.0), (1895.0, 28.8, 0.0)),
+    "2.1-older": ((3.25, 0.0, 0.0), (937.0, 454.0, 28.1), (1.61, 0.0, 0.0), (1160.0, 17.6, 0.0)),
     "thrust-upgrade": ((2.41, 0.0, 0.0), (1330.0, 495.0, 26.5), (1.61, 0.0, 0.0), (1640.0, 24.2, 0.0)),
     "brushless": ((2.41, 0.0, 0.0), (1350.0, 445.0, 27.0), (1.61, 0.0, 0.0), (1660.0, 24.2, 0.0)),
 }
@@ -38,9 +40,9 @@ GAINS = {
 def rig(drone: str = "2.1") -> Plant:
     """Two drones 0.30 m apart on a carbon stick along body y, 10 g with its mounts, and a 7.5 g ball that it guides.
 
-    Weighs 75.5 g with the 2.1, which hovers at 46 000 of 65 535, the paper's thr_hov.
+    Weighs 75.5 g with the 2.1, which hovers at 50 562 of 60 000 units, and at the paper's 46 000 on the older curve.
     """
-    mass, curve = DRONES[drone]
+    mass, curve, _ = DRONES[drone]
     return Plant(
         leader_mass=mass,
         follower_mass=mass,
@@ -68,6 +70,7 @@ def autopilot(drone: str = "2.1") -> Autopilot:
     return Autopilot(
         kind="crazyflie",
         motor_curve=DRONES[drone][1],
+        drone=DRONES[drone][2],
         roll=roll,
         roll_rate=roll_rate,
         yaw=yaw,
@@ -75,15 +78,20 @@ def autopilot(drone: str = "2.1") -> Autopilot:
     )
 
 
+# Drones with thrust to spare bear the ball at its stop; all their firmwares compensate for the battery.
+STRONG: dict[str, Any] = {"scenario.cg_amplitude": (0.0, 0.034), "scenario.uncompensated_share": 0.0}
+
+
 def rig_settings(drone: str) -> dict[str, Any]:
     """What a plant file of the pair of `DRONES` says: every setting of plant and autopilot that a 2.1 has otherwise."""
     parts: dict[str, list[Any]] = {"plant": [rig(drone), rig()], "autopilot": [autopilot(drone), autopilot()]}
-    return {
+    told = {
         f"{part}.{item.name}": getattr(mine, item.name)
         for part, (mine, usual) in parts.items()
         for item in fields(mine)
         if getattr(mine, item.name) != getattr(usual, item.name)
     }
+    return told if drone.startswith("2.1") else {**told, **STRONG}
 
 
 PAIR = Config(
@@ -95,26 +103,28 @@ PAIR = Config(
     # Stiff in height and with an integral term, so that the leader finds the thrust for its share of the weight: what
     # the two lift apart acts over half the stick, and beyond 4 % of hover no drone's rotors hold that about roll.
     leader=Leader(
-        kp=(1.0, 1.0, 4.0),
+        kp=(1.0, 1.0, 2.5),
         kd=(1.6, 1.6, 3.5),
-        ki=(0.1, 0.1, 2.0),
-        integral_band=(0.05, 0.05, 1e3),
+        ki=(0.2, 0.2, 1.5),
+        integral_band=(0.1, 0.1, 0.3),
+        integral_lead=1.0,
+        level_gain=10.0,
         tilt_limit=0.26,
-        vertical_limit=3.0,
+        vertical_limit=6.0,
     ),
 )
 
 
 SAC = Sac(
-    steps=2_560_000,
-    worlds=512,
-    batch=512,
-    updates=16,
-    replay=512_000,
+    total_steps=2_560_000,
+    num_envs=512,
+    batch_size=512,
+    updates_per_step=16,
+    replay_size=512_000,
     policy_layers=(128, 128),
     critic_layers=(128, 128),
-    privileged=True,
-    return_steps=15,
+    privileged_critic=True,
+    n_step=15,
     learning_rate=2e-3,
     learning_rate_end=0.02,
 )
@@ -127,7 +137,8 @@ def stand() -> Config:
         preset="stand",
         plant=replace(PAIR.plant, stand="heave"),
         motion=Motion(kind="rolling"),
-        autopilot=replace(PAIR.autopilot, thrust_law="paper"),
+        # The paper's 46 000 and 1000 units, on the older curve, give this force and slope on the newer one.
+        autopilot=replace(PAIR.autopilot, thrust_law="paper", hover_thrust=50568.0, thrust_per_acceleration=1634.5),
         leader=Leader(
             kp=(1.0, 1.0, 0.1),
             kd=(2.0, 2.0, 5.0),
@@ -137,10 +148,14 @@ def stand() -> Config:
             error="own",
         ),
         follower=Follower(
-            action="residual", tilt_limit=0.2, vertical_limit=3.0, filters=(0.05, 0.2, 1.0), ignore_position=True
+            action="residual",
+            action_scale_tilt=0.2,
+            action_scale_vertical=3.0,
+            observation_averages=(0.05, 0.2, 1.0),
+            ignore_position=True,
         ),
         scenario=Scenario(
-            goal_reach=0.0,
+            goal_range=0.0,
             start_position=0.03,
             start_tilt=0.1,
             cg_amplitude=(0.0, 0.0),
@@ -148,6 +163,9 @@ def stand() -> Config:
             ball_start=0.05,
             noise=(0.0, 0.5),
             delay=(0.0, 0.03),
+            estimator_drift=(0.0, 1.0),
+            quantize=True,
+            leader_uses_measurements=True,
             rotor_lag_scale=(0.6, 2.0),
             thrust_scale=(0.99, 1.01),
             thrust_common=(0.99, 1.01),
@@ -155,7 +173,7 @@ def stand() -> Config:
             termination_distance=1.0,
         ),
         reward=Reward(
-            error_scale=0.05, velocity=2.0, tilt=5.0, rates=0.2, ball=10.0, opposition=20.0, termination=200.0
+            error_scale=0.05, velocity=2.0, tilt=5.0, rates=0.2, ball=10.0, tilt_disagreement=20.0, termination=200.0
         ),
         bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.05),
         sac=replace(SAC, discount=0.99, reward_scale=0.1),
@@ -168,26 +186,38 @@ def flight() -> Config:
         PAIR,
         preset="flight",
         # The leader's integral hides what the follower commands where no load turns the pair, until motors are full.
-        follower=Follower(load_axis_only=True, tilt_limit=0.2, vertical_limit=3.0, filters=(0.05, 0.2, 1.0)),
+        follower=Follower(
+            load_axis_only=True,
+            action_scale_tilt=0.12,
+            action_scale_vertical=0.8,
+            observation_averages=(0.05, 0.2, 1.0),
+            shares_integrals=True,
+            washout_time=8.0,
+        ),
         scenario=Scenario(
-            goal_reach=0.5,
+            goal_range=0.5,
             start_velocity=0.1,
             start_tilt=0.05,
             cg_speed=(0.2, 1.2),
-            cg_amplitude=(0.0, 0.034),
+            cg_amplitude=(0.0, 0.02),  # of the plain 2.1, whose thrust leaves no more; see `rig_settings`
             object_mass=(0.015, 0.02),
             mass_known=False,
-            noise=(0.0, 1.0),
-            delay=(0.0, 0.03),
+            noise=(0.0, 0.5),
+            delay=(0.0, 0.05),
+            estimator_drift=(0.0, 3.0),
+            quantize=True,
+            leader_uses_measurements=True,
             gust=(0.0, 0.01),
             rotor_lag_scale=(0.6, 2.0),
-            thrust_scale=(0.97, 1.03),
-            thrust_common=(0.8, 1.2),
+            thrust_scale=(0.9, 1.1),
+            thrust_common=(0.95, 1.05),
+            battery=(3.2, 4.2),
+            uncompensated_share=0.5,
             inertia_scale=(0.6, 1.4),
-            cg_visits=0.3,
+            cg_random_visits=0.3,
             termination_distance=1.5,
         ),
-        reward=Reward(error_scale=0.02, velocity=8.0),
+        reward=Reward(error_scale=0.02, velocity=8.0, steady_action=0.2),
         bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.2),
         sac=replace(SAC, discount=0.985),
     )

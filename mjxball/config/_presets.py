@@ -14,28 +14,28 @@ from mjxball.errors import InputError
 def _paper() -> Config:
     return Config(
         preset="paper",
-        follower=Follower(action="direct", tilt_limit=0.6, vertical_limit=6.0, ignore_position=False),
+        follower=Follower(action="direct", action_scale_tilt=0.6, action_scale_vertical=6.0, ignore_position=False),
         reward=Reward(kind="paper", termination=0.0),
         # Its reward asks for the leader's command, which sways by 0.30 m and settles nowhere.
         bounds=Bounds(x_peak=0.36, settling_time=0.0, rmse=0.55, action_error=0.02),
         sac=Sac(
-            steps=1_000_000,
-            worlds=16,
-            replay=1_000_000,
-            batch=256,
-            updates=8,
-            prefill=10_000,
+            total_steps=1_000_000,
+            num_envs=16,
+            replay_size=1_000_000,
+            batch_size=256,
+            updates_per_step=8,
+            warmup_steps=10_000,
             policy_layers=(256, 256),
             critic_layers=(256, 256),
             learning_rate=3e-4,
             learning_rate_end=1.0,
             discount=0.99,
-            target_rate=0.005,
+            tau=0.005,
             alpha=0.3,
             alpha_fixed=True,
-            critics=1,
+            num_critics=1,
             state_value=True,
-            evaluations=10,
+            num_evaluations=10,
         ),
     )
 
@@ -52,10 +52,10 @@ def _transport() -> Config:
         ),
         reward=Reward(error_scale=0.05),
         sac=Sac(
-            steps=768_000,
-            replay=768_000,
+            total_steps=768_000,
+            replay_size=768_000,
             discount=0.97,
-            return_steps=5,
+            n_step=5,
             learning_rate=2e-3,
             learning_rate_end=0.02,
         ),
@@ -66,7 +66,7 @@ def _transport_large() -> Config:
     """What `transport` becomes with a GPU: all loads that one drone can trim, and a memory."""
     return Config(
         preset="transport-large",
-        follower=Follower(tilt_limit=0.3, filters=(0.05, 0.2)),
+        follower=Follower(action_scale_tilt=0.3, observation_averages=(0.05, 0.2)),
         scenario=Scenario(
             cg_speed=(0.2, 3.2),
             cg_amplitude=(0.0, 0.17),
@@ -82,16 +82,16 @@ def _transport_large() -> Config:
         # Speed is dear so that the goal is not overshot, changes of the command so that noise ends before the rotors.
         reward=Reward(error_scale=0.02, velocity=6.0, smoothness=1.5),
         sac=Sac(
-            steps=2_048_000,
-            worlds=512,
-            batch=512,
-            updates=16,
-            replay=512_000,
+            total_steps=2_048_000,
+            num_envs=512,
+            batch_size=512,
+            updates_per_step=16,
+            replay_size=512_000,
             policy_layers=(128, 128),
             critic_layers=(128, 128),
-            privileged=True,
+            privileged_critic=True,
             discount=0.97,
-            return_steps=5,
+            n_step=5,
             learning_rate=3e-3,
             learning_rate_end=0.02,
         ),
@@ -104,7 +104,7 @@ def _robust() -> Config:
     return replace(
         large,
         preset="robust",
-        follower=replace(large.follower, vertical_limit=6.0, filters=(0.05, 0.2, 1.0)),
+        follower=replace(large.follower, action_scale_vertical=6.0, observation_averages=(0.05, 0.2, 1.0)),
         scenario=replace(
             large.scenario,
             object_mass=(0.1, 0.32),
@@ -114,11 +114,11 @@ def _robust() -> Config:
             rotor_lag_scale=(0.5, 2.0),
             thrust_scale=(0.8, 1.2),
             inertia_scale=(0.6, 1.4),
-            cg_visits=0.3,
+            cg_random_visits=0.3,
         ),
         bounds=Bounds(x_peak=0.03, settling_time=3.5, rmse=0.355),
         reward=replace(large.reward, velocity=12.0, smoothness=10.0),
-        sac=replace(large.sac, steps=4_096_000, replay=1_024_000, learning_rate=2e-3),
+        sac=replace(large.sac, total_steps=4_096_000, replay_size=1_024_000, learning_rate=2e-3),
     )
 
 

@@ -114,6 +114,9 @@ class Autopilot:
     motor_curve: Range = setting(
         (0.0915, 0.0677), "force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]", low=0
     )
+    drone: Literal["", "2.1", "2.1-legacy", "thrust-upgrade", "brushless"] = setting(
+        "", "whose motors follow the battery where scenario.battery is drawn; empty: unknown, they follow the curve"
+    )
     thrust_law: Literal["calibrated", "paper"] = setting(
         "calibrated", "calibrated: the motor curve at m (g + az); paper: hover_thrust + thrust_per_acceleration az"
     )
@@ -134,6 +137,17 @@ class Leader:
         "largest error per axis that is integrated [m]: none winds up on the way to a far goal",
         above=0,
     )
+    integral_lead: float = setting(
+        0.0,
+        "the error is integrated with its rate times this, within the band: nothing winds up on the way to a goal [s]",
+        low=0,
+    )
+    level_gain: float = setting(
+        0.0,
+        "what both drones lift apart for the time integral of the stick's angle error about the axis that the load "
+        "turns, with a follower that shares the integrals [m/s2 per rad s]",
+        low=0,
+    )
     tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", above=0, high=1.2)
     vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", above=0)
     error: Literal["object", "own"] = setting(
@@ -148,8 +162,17 @@ class Follower:
     action: Literal["residual", "direct"] = setting(
         "residual", "residual: added to the PD law on its own observation; direct: the command itself"
     )
-    tilt_limit: float = setting(0.2, "reach of the network's roll and pitch action [rad]", above=0, high=1.2)
-    vertical_limit: float = setting(2.0, "reach of the network's vertical action [m/s2]", above=0)
+    action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", above=0, high=1.2)
+    action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", above=0)
+    shares_integrals: bool = setting(
+        False, "a residual action is added to the leader's whole PID law, integrals included, not to its PD part"
+    )
+    washout_time: float = setting(
+        0.0,
+        "time constant of the average that is taken off a residual action of a follower that shares the integrals, 0: "
+        "none is; what lasts is the integrals' part [s]",
+        low=0,
+    )
     load_axis_only: bool = setting(
         False,
         "of roll and pitch the network commands the one that the load turns; the other follows the PD law or is 0",
@@ -162,7 +185,7 @@ class Follower:
         True, "the network's input omits the absolute position: the dynamics do not depend on it"
     )
     previous_action: bool = setting(False, "the network also sees its last action, scaled to [-1, 1]")
-    filters: tuple[float, ...] = setting(
+    observation_averages: tuple[float, ...] = setting(
         (), "time constants of exponential averages of observations and actions that the network sees [s]", above=1e-3
     )
 
@@ -180,7 +203,7 @@ class Timing:
 class Scenario:
     """What every reset draws anew, uniformly from each range."""
 
-    goal_reach: float = setting(1.0, "each coordinate of the goal is drawn from +- this [m]", low=0)
+    goal_range: float = setting(1.0, "each coordinate of the goal is drawn from +- this [m]", low=0)
     start_position: float = setting(0.0, "each coordinate of the start is drawn from +- this [m]", low=0)
     start_velocity: float = setting(0.0, "each start velocity is drawn from +- this [m/s]", low=0)
     start_tilt: float = setting(0.0, "start roll and pitch are drawn from +- this [rad]", low=0, high=1.0)
@@ -202,6 +225,15 @@ class Scenario:
         ordered=True,
     )
     delay: Range = setting((0.0, 0.0), "delay of the follower's senses [s]", low=0, high=0.5, ordered=True)
+    estimator_drift: Range = setting(
+        (0.0, 0.0), "slow error of the senses, in deviations of a drone's estimator", low=0, ordered=True
+    )
+    quantize: bool = setting(False, "states arrive with the resolution of a Crazyflie's log packets")
+    leader_uses_measurements: bool = setting(False, "the leader flies on what the follower senses, else on the truth")
+    battery: Range = setting((0.0, 0.0), "voltage of the battery; 0: motors follow the curve [V]", low=0, ordered=True)
+    uncompensated_share: float = setting(
+        0.0, "share of the flights with a firmware that does not compensate for the battery", low=0, high=1
+    )
     gust: Range = setting((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0, ordered=True)
     rotor_lag_scale: Range = setting((1.0, 1.0), "factor on the rotors' time constant", above=0, ordered=True)
     thrust_scale: Range = setting((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0, ordered=True)
@@ -214,7 +246,7 @@ class Scenario:
         above=0,
         ordered=True,
     )
-    cg_visits: float = setting(
+    cg_random_visits: float = setting(
         0.0, "share of the flights whose CG goes from place to place at random instead of the sine", low=0, high=1
     )
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
@@ -234,7 +266,10 @@ class Reward:
     effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0)
     smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0)
     ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0)
-    opposition: float = setting(
+    steady_action: float = setting(
+        0.0, "weight of the squared slowest average of the network action: what stands is the integrals' part", low=0
+    )
+    tilt_disagreement: float = setting(
         0.0, "weight of the squared difference of both drones' tilt commands about the axis that no load turns", low=0
     )
     termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0)
@@ -244,39 +279,40 @@ class Reward:
 class Sac:
     """Soft actor-critic and the loop around it."""
 
-    steps: int = setting(1_000_000, "environment steps in all", low=1)
-    worlds: int = setting(128, "worlds that are stepped at once", low=1)
-    batch: int = setting(256, "transitions in an update", low=1)
-    updates: int = setting(4, "gradient updates after each step of all worlds", low=1)
-    prefill: int = setting(12_800, "environment steps with random actions before the first update", low=0)
-    replay: int = setting(1_024_000, "transitions kept, a multiple of worlds", low=1)
+    total_steps: int = setting(1_000_000, "environment steps in all", low=1)
+    num_envs: int = setting(128, "environments that are stepped at once", low=1)
+    batch_size: int = setting(256, "transitions in an update", low=1)
+    updates_per_step: int = setting(4, "gradient updates after each step of all environments", low=1)
+    warmup_steps: int = setting(12_800, "environment steps with random actions before the first update", low=0)
+    replay_size: int = setting(1_024_000, "transitions kept, a multiple of num_envs", low=1)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1)
     critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
-    privileged: bool = setting(False, "the critics, which no flight needs, also see where the CG is and the true mass")
-    critics: int = setting(2, "Q networks, of which the smallest value counts", low=1, high=2)
+    privileged_critic: bool = setting(
+        False, "the critics, which no flight needs, also see where the CG is and the true mass"
+    )
+    num_critics: int = setting(2, "Q networks, of which the smallest value counts", low=1, high=2)
     state_value: bool = setting(
         False, "a state-value network with a slow copy gives the targets (the paper's eqs. 6-8), not slow Q networks"
     )
     learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", above=0)
     alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
-    return_steps: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
+    n_step: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
     curriculum: float = setting(
         0.0,
         "share of training over which the CG's amplitude and speed grow to the scenario's, 0: all from the start",
         low=0,
         high=1,
     )
-    policy_delay: int = setting(1, "critic updates for each update of policy and temperature", low=1, high=1000)
-    gradient_clip: float = setting(0.0, "largest global norm of a gradient, 0: not clipped", low=0)
-    target_rate: float = setting(0.02, "tau of the slow copies that give the targets", above=0, high=1)
+    max_grad_norm: float = setting(0.0, "largest global norm of a gradient, 0: not clipped", low=0)
+    tau: float = setting(0.02, "rate of the slow copies that give the targets", above=0, high=1)
     alpha: float = setting(0.02, "temperature at the start", above=0)
     alpha_fixed: bool = setting(False, "keep the temperature at its start")
     target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]")
     reward_scale: float = setting(1.0, "factor on the reward inside the critic", above=0)
-    evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
-    policy_average: float = setting(
+    num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
+    policy_ema_rate: float = setting(
         0.002, "rate of the running average of the policy that is exported", above=0, high=1
     )
     learning_rate_end: float = setting(0.1, "rate at the end of the run over the rate at its start", above=0, high=1)

@@ -9,6 +9,7 @@ import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mjxball.config._renamed import CONSTANT, check_constant, current_name, with_current_names
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
 
@@ -40,8 +41,8 @@ def override(config: Config, path: str, text: str) -> Config:
     Raises InputError for an unknown path or a text that does not parse to the leaf's type.
     """
     for known, value, _ in leaves(config):
-        if known == path:
-            return replace(config, path, _parse(path, text, value))
+        if known == current_name(path):
+            return replace(config, known, _parse(path, text, value))
     raise InputError(f"--{path} is not a setting; run with --help for the list")
 
 
@@ -51,7 +52,11 @@ def apply_overrides(config: Config, values: Mapping[str, Any]) -> Config:
     Raises InputError for an unknown path.
     """
     known = {path: value for path, value, _ in leaves(config)}
-    for path, value in values.items():
+    for given, value in values.items():
+        path = current_name(given)
+        if path in CONSTANT:
+            check_constant(path, value)
+            continue
         if path not in known:
             raise InputError(f"{path} is not a setting; run train.py --help for the list")
         if isinstance(value, list):
@@ -81,7 +86,12 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
-    """Rebuild a configuration from `to_dict`'s output or parsed JSON; raise InputError on any mismatch."""
+    """Rebuild a configuration from `to_dict`'s output or parsed JSON, with present or earlier names.
+
+    Raises InputError on any mismatch.
+    """
+    if kind is Config:
+        data = with_current_names(data)
     if not isinstance(data, dict):
         raise InputError(f"configuration {path or 'root'} must be an object")
     hints = typing.get_type_hints(kind)
@@ -112,7 +122,7 @@ def from_record(data: Any) -> Any:
     """
     if isinstance(data, dict) and "plant" not in data:
         raise InputError("configuration does not fit this version: missing plant")
-    return from_dict(_completed(data, to_dict(Config())))
+    return from_dict(_completed(with_current_names(data), to_dict(Config())))
 
 
 def _completed(data: Any, default: Any) -> Any:
@@ -132,6 +142,7 @@ def to_json(config: Any) -> str:
 
 
 def config_hash(config: Any) -> str:
-    """First 16 hex digits of the SHA-256 of the configuration's canonical JSON."""
-    compact = json.dumps(to_dict(config), sort_keys=True, separators=(",", ":"))
+    """First 16 hex digits of the SHA-256 of a configuration's canonical JSON; `config` may be its nested dictionary."""
+    settings = config if isinstance(config, dict) else to_dict(config)
+    compact = json.dumps(settings, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(compact.encode()).hexdigest()[:16]

@@ -8,6 +8,7 @@ drone's loops carry is one array, so that many worlds of two drones are stepped 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from mjxball.config import Autopilot
@@ -86,12 +87,21 @@ def setpoints(autopilot: Autopilot, command: Array, carried_mass: Array, gravity
 
 
 def cascade(
-    autopilot: Autopilot, loops: Array, setpoint: Array, euler: Array, rates: Array, integrals: Array | None = None
+    autopilot: Autopilot,
+    loops: Array,
+    setpoint: Array,
+    euler: Array,
+    rates: Array,
+    integrals: Array | None = None,
+    compensate: Callable[[Array], Array] | None = None,
+    rate_share: Array | None = None,
 ) -> tuple[Array, Array]:
     """(loops (..., 13), motor commands (..., 4)) one tick of 2 ms on.
 
     `setpoint` (..., 4) as from `setpoints`, `euler` (..., 3) [rad] and body `rates` (..., 3) [rad/s] as they are;
-    `integrals` (..., 1), if given, a factor on every ki. Without thrust the motors stop and the loops are reset.
+    `integrals` (..., 1), if given, a factor on every ki; `compensate`, if given, turns thrust commands into PWM
+    (`motors.compensated`) before they are capped; `rate_share` (..., 1), if given, a factor on all pid_rate gains.
+    Without thrust the motors stop and the loops are reset.
     """
     xp = euler.__array_namespace__()
     old, attitude, turning = unpack(loops), to_firmware(euler), to_firmware(rates)
@@ -107,10 +117,11 @@ def cascade(
     held, asked = _pid(outer, autopilot.attitude_limits, old.attitude_integral, error, moved, integrals)
     rated = asked - turning, turning - old.rates
     kept, output = _pid(inner, autopilot.rate_limits, old.rate_integral, *rated, integrals)
+    output = output if rate_share is None else rate_share * output
     output = xp.trunc(xp.clip(output, -LARGEST, LARGEST))
     thrust = setpoint[..., 3]
     on = (thrust >= IDLE)[..., None]
-    motors = mix(xp.minimum(thrust, xp.asarray(float(THRUST_CEILING), dtype=thrust.dtype)), output)
+    motors = mix(xp.minimum(thrust, xp.asarray(float(THRUST_CEILING), dtype=thrust.dtype)), output, compensate)
     reset = start_loops(euler, rates)
     after = xp.concat([held, kept, attitude, turning, yaw], axis=-1)
     return xp.where(on, after, reset), xp.where(on, motors, xp.zeros_like(motors))
@@ -121,8 +132,8 @@ def integral_shares(xp: Any, autopilot: Autopilot, dtype: Any) -> Array:
     return xp.asarray([[1.0], [autopilot.follower_integrals]], dtype=dtype)
 
 
-def mix(thrust: Array, output: Array) -> Array:
-    """Motor commands (..., 4) of `thrust` (...) and the rate loops' `output` (..., 3).
+def mix(thrust: Array, output: Array, compensate: Callable[[Array], Array] | None = None) -> Array:
+    """Motor commands (..., 4) of `thrust` (...) and the rate loops' `output` (..., 3); `compensate` as for `cascade`.
 
     M1 front right, M2 back right, M3 back left, M4 front left. What is beyond full power is taken off all four.
     """
@@ -138,6 +149,8 @@ def mix(thrust: Array, output: Array) -> Array:
         ],
         axis=-1,
     )
+    if compensate is not None:
+        motors = compensate(motors)
     excess = xp.maximum(xp.max(motors, axis=-1, keepdims=True) - FULL, xp.zeros_like(motors[..., :1]))
     return xp.clip(motors - excess, 0.0, FULL)
 

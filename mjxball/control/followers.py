@@ -1,82 +1,101 @@
-"""Followers that fly: `follower(observation) -> command`, on NumPy or JAX arrays of any batch shape."""
+"""What flies as a follower: laws as pure functions of NumPy or JAX arrays, and `Baseline`, which remembers for one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from mjxball.config import Config
-from mjxball.control.baselines import Adaptive, Copy, Lqg, Memoryless, Oracle, PairLqg, Random, SlowLqg, Stay
-from mjxball.control.baselines.law import Brief, Law
+from mjxball.control.observation import copy_command
 from mjxball.errors import InputError
 
 Array = Any
 
 
+class PrivilegedInfo(NamedTuple):
+    """What the simulator knows and an observation does not show; every leaf has the observation's batch shape.
+
+    Followers may read `believed_mass`. The rest is the truth half a control step and one rotor lag ahead, for
+    followers with `needs_privileged` alone.
+    """
+
+    believed_mass: Array  # (...) mass of the object that the hover thrust assumes [kg]
+    moment: Array  # (...) object mass x CG offset [kg m]
+    moment_acceleration: Array  # (...) object mass x second derivative of the CG offset [kg m/s2]
+    total_mass: Array  # (...) of the assembly [kg]
+
+
+class Law(Protocol):
+    """A follower as two pure functions of arrays; `state` is a tuple of arrays (possibly empty)."""
+
+    name: str
+    needs_privileged: bool  # it reads the true CG from `PrivilegedInfo`
+
+    def start(self, observation: Array) -> Any:
+        """State at the start of a flight whose first observation is `observation` (..., 18)."""
+
+    def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
+        """(state, command (..., 3): roll, pitch [rad], vertical acceleration [m/s2]) at `observation` (..., 18)."""
+
+
 class Follower(Protocol):
-    """What flies as the follower: a baseline here, or `mjxball.policy.Policy`."""
+    """What flies as the follower: a `Baseline`, or `mjxball.policy.Policy`."""
 
     name: str
 
     def reset(self) -> None:
-        """Start an episode: forget the past."""
+        """Start an episode with a fresh state."""
 
     def __call__(self, observation: Array) -> Array:
         """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18)."""
 
 
 class Baseline:
-    """A `Law` that remembers. Whoever flies it may set `brief` before a call; else the plant's own mass is believed."""
+    """A `Law` with its state. Set `privileged` before a call; without it the plant's own mass is believed."""
 
     def __init__(self, law: Law, config: Config):
         self.law, self.name = law, law.name
-        self.brief: Brief | None = None
+        self.privileged: PrivilegedInfo | None = None
         self._believed_mass = config.plant.object_mass
-        self._memory: Any = None
+        self._state: Any = None
 
     def reset(self) -> None:
         """See `Follower.reset`."""
-        self._memory, self.brief = None, None
+        self._state, self.privileged = None, None
 
     def __call__(self, observation: Array) -> Array:
-        """See `Follower.__call__`."""
-        if self._memory is None:
-            self._memory = self.law.start(observation)
-        brief = self.brief or self._plain(observation)
-        self._memory, command = self.law.step(self._memory, observation, brief)
+        """See `Follower.__call__`. Raises InputError if the law needs `privileged` and it is not set."""
+        if self._state is None:
+            self._state = self.law.start(observation)
+        privileged = self.privileged or self._nominal(observation)
+        self._state, command = self.law.step(self._state, observation, privileged)
         return command
 
-    def _plain(self, observation: Array) -> Brief:
-        if self.law.needs_truth:
+    def _nominal(self, observation: Array) -> PrivilegedInfo:
+        if self.law.needs_privileged:
             raise InputError(f"follower {self.name!r} must be told where the CG is; it flies in simulation only")
         zero = observation.__array_namespace__().zeros_like(observation[..., 0])
-        return Brief(zero + self._believed_mass, zero, zero, zero)
+        return PrivilegedInfo(zero + self._believed_mass, zero, zero, zero)
 
 
-LAWS: dict[str, Callable[[Config], Law]] = {
-    "stay": Stay,
-    "random": Random,
-    "copy": Copy,
-    "adaptive": Adaptive,
-    "adaptive-mass": lambda config: Adaptive(config, adapts_mass=True),
-    "oracle": Oracle,
-    "memoryless": Memoryless,
-    "lqg": lambda config: PairLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
-    "lqg-slow": SlowLqg,
-}
+class Copy:
+    """The leader's PD law on the follower's own observation: the optimum of the paper's reward."""
+
+    name = "copy"
+    needs_privileged = False
+
+    def __init__(self, config: Config):
+        self._gains = copy_gains(config)
+
+    def start(self, observation: Array) -> Any:
+        """See `Law.start`."""
+        return ()
+
+    def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
+        """See `Law.step`."""
+        return state, copy_command(observation, *self._gains)
 
 
-def make_law(name: str, config: Config) -> Law:
-    """The classical follower called `name` with the gains that follow from `config`; raise InputError if unknown."""
-    if name not in LAWS:
-        raise InputError(f"unknown follower {name!r}; baselines are {', '.join(LAWS)}")
-    return LAWS[name](config)
-
-
-def make_baseline(name: str, config: Config) -> Baseline:
-    """`make_law`, ready to fly."""
-    return Baseline(make_law(name, config), config)
-
-
-# What is flown when nobody names followers; the others are variants, flown by name and by the judge.
-BASELINES = tuple(name for name in LAWS if name not in ("adaptive-mass", "lqg-slow"))
+def copy_gains(config: Config) -> tuple[Any, ...]:
+    """The arguments of `observation.copy_command` after the observation, for the configured leader."""
+    law = config.leader
+    return law.kp, law.kd, config.plant.gravity, law.tilt_limit, law.vertical_limit

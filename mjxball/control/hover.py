@@ -21,7 +21,7 @@ class DroneLoop(NamedTuple):
     kdd: float  # [kg m2]
     slow: float  # [N m/rad]
     stiffness: float  # kp of the attitude loop [1/s]
-    reach: float  # largest |z| [rad]
+    integral_limit: float  # largest |z| [rad]
     surplus: float  # thrust that a curved motor gives besides a torque, over its square [1/(N m2)]
 
 
@@ -56,7 +56,7 @@ def drone_loop(config: Config, axis: int) -> DroneLoop:
         kdd=torque * rate[2],
         slow=torque * rate[1],
         stiffness=attitude[0],
-        reach=math.radians(law.rate_limits[axis]),
+        integral_limit=math.radians(law.rate_limits[axis]),
         # Two motors p up and two p down give 4 a p^2 more than none, p = output / 2 / FULL.
         surplus=law.motor_curve[0] * (math.degrees(1) / (torque * crazyflie.FULL)) ** 2,
     )

@@ -78,6 +78,11 @@ class Recall(NamedTuple):
         filtered = [1.0] * (OBSERVATION_SIZE + ACTION_SIZE)
         return shown * self.history + filtered * len(self.filters) + [1.0] * (ACTION_SIZE * self.previous_action)
 
+    def slowest_action(self, memory: Array) -> Array:
+        """(..., 3) the network's own action in [-1, 1], averaged over the longest of `filters`."""
+        slowest = self.filters.index(max(self.filters))
+        return self._averages(memory)[slowest][..., OBSERVATION_SIZE:]
+
     def _averages(self, memory: Array) -> list[Array]:
         width = OBSERVATION_SIZE + ACTION_SIZE
         first = [self._older + k * width for k in range(len(self.filters))]
@@ -86,5 +91,5 @@ class Recall(NamedTuple):
 
 def recall_of(config: Config) -> Recall:
     """What the follower of `config` remembers."""
-    follower = config.follower
-    return Recall(follower.history, follower.previous_action, follower.filters, config.timing.control_period)
+    follower, period = config.follower, config.timing.control_period
+    return Recall(follower.history, follower.previous_action, follower.observation_averages, period)

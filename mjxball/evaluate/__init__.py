@@ -1,1 +1,1 @@
-"""Judge followers: scenarios, metrics, figures, and the tables that `eval.py` prints."""
+"""Evaluation: scenarios, benchmark suites, metrics, figures, and the report."""

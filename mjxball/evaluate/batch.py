@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,12 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxball import rollout
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
 from mjxball.control import rotations
-from mjxball.control.baselines.law import Law
-from mjxball.control.followers import Baseline, Follower
+from mjxball.control.followers import Baseline, Follower, Law
 from mjxball.errors import InputError
 from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
@@ -25,9 +22,10 @@ from mjxball.physics.step import make_control_step
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
-from mjxball.scenario import Scenario, check_scenario
-from mjxball.sensing import Senses
-from mjxball.wiring import Wiring
+from mjxball.sim import rollout
+from mjxball.sim.closed_loop import ClosedLoop, LoopState
+from mjxball.sim.disturbances import Sample, SensorModel, record, sensors_of
+from mjxball.sim.scenario import Scenario, check_scenario
 
 Array = Any
 
@@ -35,22 +33,19 @@ Array = Any
 class Carry(NamedTuple):
     """What flies on from step to step."""
 
-    plant: PlantState
-    integral: Array  # (n, 3) of the leader's error [m s]
+    loop: LoopState
+    observation: Array  # (n, 18)
     follower: Any
-    senses: Any
-    diverged: Array  # (n,)
     tally: metrics.Tally
 
 
-class Draws(NamedTuple):
-    """What happens at each control step, (count + 1, ...)."""
+class Inputs(NamedTuple):
+    """What is given to each control step, (count + 1, ...)."""
 
     number: Array
-    target: Array  # (count + 1, n, 3)
-    noise: Array | None
-    arrives: Array | None
-    push: Array | None
+    goals: tuple[Array, Array]  # (count + 1, n, 3) of O at its beginning and at its end [m]
+    force: Array | None  # (count + 1, n, 3) external force on O in it [N]
+    sample: Sample  # of the measurement at its end
 
 
 class Batch:
@@ -63,9 +58,9 @@ class Batch:
         self._config, self._law = config, law_of(follower)
         make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
         step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
-        self._step = jax.vmap(step)
+        self._physics = jax.vmap(step)
         self._brief = rollout.make_brief(config)
-        self._wiring = Wiring(config)
+        self._shares = np.float32(not isinstance(follower, Baseline))
         self._compiled: dict[Any, Any] = {}
 
     def fly(self, scenarios: Sequence[Scenario]) -> list[Metrics]:
@@ -76,59 +71,49 @@ class Batch:
             raise InputError("scenarios of one batch must last equally long")
         period = self._config.timing.control_period
         count = round(scenarios[0].seconds / period)
-        senses = Senses([scenario.disturbance for scenario in scenarios], count, period)
+        disturbances = [scenario.disturbance for scenario in scenarios]
+        sensors, delays = sensors_of(disturbances, period)
         single = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf, _single(leaf)), tree)  # noqa: E731
         load, start = single((rollout.load_of(scenarios), rollout.start_of(self._config, scenarios)))
-        target = rollout.targets(scenarios, count, period)
-        draws = single(Draws(np.arange(count + 1), target, senses.noise, senses.arrives, senses.pushes))
+        goals, samples = single(
+            (rollout.targets(scenarios, count + 1, period), record(disturbances, count + 2, period))
+        )
+        force, later = samples.at(slice(count + 1)).force, samples.at(slice(1, None))
+        inputs = Inputs(
+            np.arange(count + 1, dtype=np.int32), (goals[:-1], goals[1:]), force, later._replace(force=None)
+        )
         with jax.default_matmul_precision("highest"):
-            tally = self._program(senses)(start, load, draws)
+            tally = self._program(sensors, delays)(start, load, goals[0], samples.at(0), inputs)
         return metrics.results(tally)
 
-    def _program(self, senses: Senses) -> Any:
-        """The compiled flight; delays and biases are constants in it, everything else is given to it."""
-        key = (senses.delays.tobytes(), senses.bias.tobytes())
+    def _program(self, sensors: SensorModel, delays: np.ndarray) -> Any:
+        """The compiled flight; delays, biases and resolutions are constants in it, everything else is given to it."""
+        bias = None if sensors.relay_bias is None else sensors.relay_bias.tobytes()
+        key = (delays.tobytes(), bias, np.asarray(sensors.quantized).tobytes())
         if key not in self._compiled:
-            self._compiled[key] = jax.jit(lambda *parts: self._all(senses, *parts))
+            loop = ClosedLoop(self._config, self._physics, sensors)
+            self._compiled[key] = jax.jit(lambda *parts: self._all(loop, delays, *parts))
         return self._compiled[key]
 
-    def _all(self, senses: Senses, start: PlantState, load: Load, draws: Draws) -> metrics.Tally:
-        seen = self._wiring.observe(start, draws.target[0])
-        noise, arrives = (None if t is None else t[0] for t in (draws.noise, draws.arrives))
-        memory = senses.start(seen)
-        _, first = senses.step(memory, jnp.zeros((), jnp.int32), seen, noise, arrives)
-        carry = Carry(
-            plant=start,
-            integral=jnp.zeros_like(start.position),
-            follower=self._law.start(first),
-            senses=memory,
-            diverged=jnp.zeros(len(start.position), bool),
-            tally=metrics.begin(start.position, draws.target[0], start.rotor_force),
-        )
-        return jax.lax.scan(lambda c, d: (self._tick(senses, load, c, d), None), carry, draws)[0].tally
+    def _all(
+        self, loop: ClosedLoop, delays: Array, start: PlantState, load: Load, goal: Array, first: Sample, inputs: Inputs
+    ) -> metrics.Tally:
+        state, seen = loop.start(start, goal, first, delays)
+        tally = metrics.begin(start.position, goal, start.rotor_force)
+        carry = Carry(state, seen, self._law.start(seen), tally)
+        return jax.lax.scan(lambda c, i: (self._step(loop, load, c, i), None), carry, inputs)[0].tally
 
-    def _tick(self, senses: Senses, load: Load, carry: Carry, draws: Draws) -> Carry:
-        config, plant, goal = self._config, carry.plant, draws.target
-        period = config.timing.control_period
-        seen = self._wiring.observe(plant, goal)
-        memory, seen = senses.step(carry.senses, draws.number, seen, draws.noise, draws.arrives)
-        led = self._wiring.leader_command(plant, goal, carry.integral)
-        follower, command = self._law.step(carry.follower, seen, self._brief(plant, load))
+    def _step(self, loop: ClosedLoop, load: Load, carry: Carry, inputs: Inputs) -> Carry:
+        config, state, seen = self._config, carry.loop, carry.observation
+        plant, goals = state.plant, inputs.goals
+        follower, answer = self._law.step(carry.follower, seen, self._brief(plant, load))
+        acting = load._replace(external_force=inputs.force)
+        moved, after, commands = loop.step(state, seen, answer, acting, goals, inputs.sample, self._shares)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
-        time = draws.number * jnp.float32(period)
-        flown = (time, plant.position, goal, euler, plant.rotor_force, led, command, carry.diverged)
+        time = inputs.number * jnp.float32(config.timing.control_period)
+        flown = (time, plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)
         limits = (config.scenario.termination_distance, config.plant.rotor_force_max)
-        tally = metrics.update(carry.tally, rollout.Tick(*flown), *limits)
-        moved = self._step(plant, jnp.stack([led, command], axis=1), load._replace(push=draws.push))
-        diverged = carry.diverged | rollout.has_diverged(moved)
-        return Carry(
-            plant=plant.each(functools.partial(rollout.keep, diverged), moved),
-            integral=self._wiring.integrated(carry.integral, plant, goal, period),
-            follower=follower,
-            senses=memory,
-            diverged=diverged,
-            tally=tally,
-        )
+        return Carry(moved, after, follower, metrics.update(carry.tally, rollout.Tick(*flown), *limits))
 
 
 def law_of(follower: Follower) -> Law:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.rewards import paper_reward
-from mjxball.rollout import Tick, Trajectory
+from mjxball.sim.rollout import Tick, Trajectory
 
 Array = Any
 RMSE_UNTIL = 20.0  # [s]

@@ -1,30 +1,204 @@
-"""Files that an evaluation leaves: JSON and figures."""
+"""The benchmark's report: one HTML file that works offline, from Jinja2 templates."""
 
 from __future__ import annotations
 
-import itertools
+import base64
+import dataclasses
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from mjxball.evaluate.cells import Cell
-from mjxball.evaluate.figures import draw_flights, scenario_name
+from mjxball.baselines import LAWS
+from mjxball.config import Plant
+from mjxball.evaluate import plots
+from mjxball.evaluate.benchmark import RANKED, Score, Summary, by_variant, winners, wins
+from mjxball.evaluate.render import film
+from mjxball.evaluate.suites import GRID, Suite
+from mjxball.policy import Policy
 
-CELLS = "cells.json"
+TEMPLATES = Path(__file__).parent / "templates"
+UNITS = {"rmse": "m", "settling_time": "s", "x_peak": "m", "peak": "m", "max_tilt": "rad", "effort": "N"}
+UNITS |= {"smoothness": "rad"}
+COUNTED = {"peak": "steady-state peak", "rmse": "RMSE", "settling_time": "settling time", "overshoot": "overshoot"}
+RIVALS = ("adaptive", "lqg", "lqg-slow")  # that followers are compared with one by one
+CARD_HIDES = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
+LEAD_START, LEAD_SECONDS, LEAD_SPEED = 15.0, 20.0, 2.0  # of the lead picture: steady state, where flights are long
+
+Row = dict[str, Any]
 
 
-def to_json(cells: Sequence[Cell]) -> str:
-    """`{"cells": [...]}` as scripts outside the project read it."""
-    return json.dumps({"cells": [cell.record() for cell in cells]}, indent=2, allow_nan=False) + "\n"
-
-
-def write_report(cells: Sequence[Cell], out: Path) -> list[Path]:
-    """Write `cells.json` and one figure per scenario into `out`; return the paths."""
+def write_report(
+    out: Path,
+    plant: Plant,
+    scores: Sequence[Score],
+    suites: Sequence[Suite],
+    policies: Sequence[Policy],
+    command: str,
+    versions: Mapping[str, str],
+) -> None:
+    """Write `report.html` and `scores.json` into the directory `out`, which is made."""
     out.mkdir(parents=True, exist_ok=True)
-    paths = [out / CELLS]
-    paths[0].write_text(to_json(cells))
-    for _, group in itertools.groupby(cells, key=lambda cell: cell.scenario):
-        same = list(group)
-        paths.append(out / f"{scenario_name(same[0])}.png")
-        draw_flights(same, paths[-1])
-    return paths
+    units = [f"{name} {UNITS.get(name, '')}".strip() for name in RANKED]
+    picture, caption = lead_picture(plant, scores, [policy.name for policy in policies])
+    context = {
+        "title": "Benchmark of followers",
+        "picture": base64.b64encode(picture).decode() if picture else "",
+        "caption": caption,
+        "num_seeds": max(len(score.metrics) for score in scores),
+        "variants": len(by_variant(scores)),
+        "verdict": verdict(scores),
+        "wins": wins_by_suite(scores),
+        "heads": ["suite", "variant", "follower", *units, "failed"],
+        "suites": [_suite(suite, [score for score in scores if score.suite == suite.name]) for suite in suites],
+        "followers": list(dict.fromkeys(score.follower for score in scores)),
+        "rows": _rows(scores),
+        "links": [("verdict", "Verdict"), *((s.name, s.name) for s in suites), ("all-scores", "All scores")],
+    }
+    write_page("report.html", out / "report.html", context, policies, command, versions)
+    records = {"command": command, "scores": [score.record() for score in scores]}
+    (out / "scores.json").write_text(json.dumps(records, indent=1, allow_nan=False) + "\n")
+
+
+def write_page(
+    template: str,
+    path: Path,
+    context: Mapping[str, Any],
+    policies: Sequence[Policy],
+    command: str,
+    versions: Mapping[str, str],
+) -> None:
+    """Render `template` with `context` and the section on how the page was made."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    shown = {p.name: {key: value for key, value in p.card.items() if key not in CARD_HIDES} for p in policies}
+    made = {
+        "command": command,
+        "versions": json.dumps(dict(versions), indent=1),
+        "cards": {name: json.dumps(card, indent=1, default=str) for name, card in shown.items()},
+    }
+    path.write_text(environment.get_template(template).render(**context, **made), encoding="utf-8")
+
+
+def verdict(scores: Sequence[Score]) -> dict[str, Any]:
+    """The table of followers: wins by each metric of `COUNTED`, failed flights, comparisons with the `RIVALS`."""
+    counts = {metric: wins(scores, metric) for metric in COUNTED}
+    names = sorted(counts["peak"], key=lambda name: -counts["peak"][name])
+    rivals = [name for name in RIVALS if name in names]
+    failed = {name: sum(score.failures for score in scores if score.follower == name) for name in names}
+    rows = []
+    for name in names:
+        cells = [_count(count[name], max(count.values())) for count in counts.values()]
+        cells.append({"text": str(failed[name]), "style": "" if failed[name] else "zero"})
+        cells += [_comparison(scores, name, rival) for rival in rivals]
+        rows.append({"follower": name, "cells": cells})
+    heads = [f"smallest {label}, of {len(by_variant(scores))}" for label in COUNTED.values()]
+    return {"heads": [*heads, "failed flights", *(f"peak vs. {rival}" for rival in rivals)], "rows": rows}
+
+
+def wins_by_suite(scores: Sequence[Score]) -> dict[str, Any]:
+    """The table of suites: in how many variants each follower has the smallest steady-state peak."""
+    total = wins(scores)
+    names, rows = sorted(total, key=lambda name: -total[name]), []
+    for suite in dict.fromkeys(score.suite for score in scores):
+        mine = [score for score in scores if score.suite == suite]
+        count = wins(mine)
+        cells = [_count(count[name], max(count.values())) for name in names]
+        rows.append({"suite": suite, "total": len(by_variant(mine)), "cells": cells})
+    return {"names": names, "rows": rows}
+
+
+def compare(scores: Sequence[Score], follower: str, rival: str) -> tuple[int, int]:
+    """Variants in which the steady-state peak of `follower` is (smaller, larger) than that of `rival`.
+
+    A follower that failed in any seed of a variant counts as infinitely bad there.
+    """
+    smaller = larger = 0
+    for group in by_variant(scores).values():
+        peaks = {s.follower: math.inf if s.failures else s.summary("peak").median for s in group}
+        mine, other = peaks[follower], peaks[rival]
+        smaller, larger = smaller + (mine < other), larger + (mine > other)  # NaN is neither
+    return smaller, larger
+
+
+def lead_picture(plant: Plant, scores: Sequence[Score], policies: Sequence[str]) -> tuple[bytes | None, str]:
+    """(animated WebP, caption): copy, the best policy and the best other baseline on the first variant.
+
+    (None, reason) if MuJoCo cannot render.
+    """
+    first = next(iter(by_variant(scores).values()))
+    count = wins(scores)
+    classical = [name for name in count if name in LAWS and name not in ("copy", "stay", "random")]
+    trained = [name for name in count if name in policies]
+    best = [max(names, key=lambda name: count[name]) for names in (trained, classical) if names]
+    wanted = ["copy", *best]
+    shown = [score for name in wanted for score in first if score.follower == name] or first[:1]
+    start = LEAD_START if shown[0].shown.flight.time[-1] >= LEAD_START + LEAD_SECONDS else 0.0
+    flights = {score.follower: score.shown.flight for score in shown}
+    picture, why = film(plant, flights, LEAD_SECONDS, start, LEAD_SPEED)
+    if picture is None:
+        return None, f"No picture: {why}."
+    names = ", ".join(flights)
+    what = f"{shown[0].suite}, {shown[0].variant}, seed 0"
+    return picture, f"{names} with the same load ({what}); green: the goal, yellow: the CG, ×{LEAD_SPEED:g}."
+
+
+def _suite(suite: Suite, scores: Sequence[Score]) -> Row:
+    grid = suite.name == GRID
+    found: Row = {
+        "name": suite.name,
+        "about": suite.about,
+        "axis": suite.axis,
+        "grid": grid,
+        "figure": "",
+        "variants": [],
+    }
+    if grid:
+        return {**found, "figure": plots.heat_maps(scores)}
+    if len(suite.variants) > 1:
+        found["figure"] = plots.variant_curves(scores, suite.axis)
+    for (_, label), group in by_variant(scores).items():
+        found["variants"].append({"label": label, "figure": plots.flight_curves(group), "rows": _rows(group)})
+    return found
+
+
+def _rows(scores: Sequence[Score]) -> list[Row]:
+    best = {key: winners(group, "peak") for key, group in by_variant(scores).items()}
+    return [
+        {
+            "suite": score.suite,
+            "variant": score.variant,
+            "follower": score.follower,
+            "best": score.follower in best[score.suite, score.variant],
+            "cells": [
+                *(_number(score.summary(name)) for name in RANKED),
+                {"key": score.failures, "text": f"{score.failures}/{len(score.metrics)}", "interval": ""},
+            ],
+        }
+        for score in scores
+    ]
+
+
+def _number(summary: Summary) -> Row:
+    median, low, high = dataclasses.astuple(summary)
+    if math.isnan(median):
+        return {"key": "1e300", "text": "-", "interval": ""}
+    if math.isinf(median):
+        return {"key": "1e299", "text": "never", "interval": ""}
+    end = f"{high:.3g}" if math.isfinite(high) else "never"
+    return {"key": f"{median:.9g}", "text": f"{median:.3g}", "interval": "" if low == high else f"[{low:.3g}, {end}]"}
+
+
+def _count(count: int, most: int) -> Row:
+    return {"text": str(count), "style": "zero" if not count else "best" if count == most else ""}
+
+
+def _comparison(scores: Sequence[Score], follower: str, rival: str) -> Row:
+    if follower == rival:
+        return {"text": "–", "style": "zero"}
+    smaller, larger = compare(scores, follower, rival)
+    return {"text": f"{smaller} : {larger}", "style": "best" if smaller > larger else ""}

@@ -17,15 +17,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from mjxball import rollout
 from mjxball.config import Config
 from mjxball.control import observation, rotations
-from mjxball.control.baselines.law import Law
+from mjxball.control.followers import Law
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_control_step, start_state
-from mjxball.scenario import Scenario
-from mjxball.wiring import Wiring
+from mjxball.sim import rollout
+from mjxball.sim.closed_loop import ClosedLoop, LoopState
+from mjxball.sim.disturbances import Sample, SensorModel, SensorState
+from mjxball.sim.scenario import Scenario
 
 Array = Any
 SETTLE, NEWTON = 3000, 8  # control steps flown towards the fixed point, then steps of Newton's method
@@ -94,21 +95,17 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
     z holds position, Euler angles, velocity, rates, rotor forces, the follower's memory, older observations.
     """
     period = config.timing.control_period
-    advance = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), mjx.jax_repeat)
-    brief, wiring = rollout.make_brief(config), Wiring(config)
-    goal = jnp.zeros(3)
-
-    def seen_in(plant: PlantState) -> Array:
-        return wiring.observe(plant, goal)
+    physics = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), mjx.jax_repeat)
+    brief, loop = rollout.make_brief(config), ClosedLoop(config, physics, SensorModel(delay))
+    goal, still, zero = jnp.zeros(3), jnp.zeros(3), jnp.zeros(())
 
     def flat(plant: PlantState, memory: Any, past: Array) -> tuple[Array, Any]:
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         return ravel_pytree((plant.position, euler, plant.velocity, plant.rates, plant.rotor_force, memory, past))
 
     def first(load: Load) -> tuple[PlantState, Any, Array]:
-        still = jnp.zeros(3)
-        plant = start_state(config, still, still, still, load.believed_mass, jnp.zeros(()))
-        seen = seen_in(plant)
+        plant = start_state(config, still, still, still, load.believed_mass, zero)
+        seen = loop.observe(plant, goal)
         return plant, law.start(seen), jnp.broadcast_to(seen, (delay, observation.OBSERVATION_SIZE))
 
     def start(load: Load) -> Array:
@@ -116,14 +113,16 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
 
     def step(z: Array, load: Load) -> Array:
         unflatten = flat(*first(load))[1]
-        position, euler, velocity, rates, rotors, memory, past = unflatten(z)
-        zero = jnp.zeros(())
+        position, euler, velocity, rates, rotors, memory, older = unflatten(z)
         plant = PlantState(position, rotations.quaternion_from_euler(euler), velocity, rates, rotors, zero, zero, zero)
-        queue = jnp.concatenate([seen_in(plant)[None], past])
-        led = wiring.leader_command(plant, goal, jnp.zeros(3))
-        memory, followed = law.step(memory, queue[-1], brief(plant, load))
-        moved = advance(plant, jnp.stack([led, followed]), load)
-        return flat(moved._replace(time=zero), memory, queue[:-1])[0]
+        past = jnp.concatenate([loop.observe(plant, goal)[None], older])
+        sensors = SensorState(delay, (), past) if delay else SensorState()
+        state = LoopState(plant, loop.zero_integral(still), sensors, jnp.zeros((), bool))
+        memory, answer = law.step(memory, past[-1], brief(plant, load))
+        moved, _, _ = loop.step(state, past[-1], answer, load, (goal, goal), Sample(), 0.0)
+        older = moved.sensors.past[1:] if delay else older
+        # A flight that diverged stays where it was, which is no hover.
+        return jnp.where(moved.diverged, jnp.nan, flat(moved.plant._replace(time=zero), memory, older)[0])
 
     if config.autopilot.kind != "ideal":
         raise ValueError("a firmware's whole numbers have no derivative: only the ideal autopilot is linearised")

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from mjxball import config as configs
 from mjxball.config import Config
-from mjxball.control import firmware_gains
+from mjxball.control import firmware_gains, motor_curves
 from mjxball.control.firmware_gains import PairGains
-from mjxball.fly.command import LINEAR, CommandMap, ForceCurve
+from mjxball.control.motors import MOTORS, Motor
+from mjxball.fly.command import CommandMap
 from mjxball.fly.maneuver import Times
 from mjxball.fly.pair import Rig
+from mjxball.fly.protocols import Variant, Variants
+from mjxball.fly.thrust import CURVE_NAMES, OLDER, CurveName, ForceCurve
 
 GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
 STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
@@ -60,8 +63,49 @@ class ThrustChoice:
 
     law: Literal["paper", "calibrated"] | None = None
     hover: float | None = None  # [thrust units]
-    curve: ForceCurve | None = None
+    curve: CurveName | None = None
     mass: float | None = None  # of all that flies [kg]
+
+
+def drone_of(config: Config) -> str:
+    """Which Crazyflie the policy was trained for, a key of `motors.MOTORS`."""
+    return str(motor_curves.firmware(config)["drone"])
+
+
+def motor_of(config: Config) -> Motor:
+    """The motor by which a firmware's force curve is recognised."""
+    return MOTORS[drone_of(config)]
+
+
+def curve_of(config: Config, name: CurveName) -> ForceCurve:
+    """Force of a motor from the thrust command, by a firmware with (`linear`) or without battery compensation."""
+    return ForceCurve(0.0, motor_of(config).most) if name == "linear" else OLDER
+
+
+def with_curve(config: Config, name: CurveName) -> Config:
+    """`config` for firmwares of the named force curve, see `motor_curves.with_curve`; others' plants stay."""
+    if not is_crazyflie(config) or name == motor_curves.firmware(config)["curve"]:
+        return config
+    curve = curve_of(config, name)
+    return motor_curves.with_curve(config, (curve.quadratic, curve.linear))
+
+
+def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGains = ({}, {})) -> list[Variants]:
+    """How leader and follower are flown, by the force curve that their firmware may have.
+
+    `choice.curve` leaves one; `more` gains are laid over the card's, whichever the curve.
+    """
+    known = motor_curves.firmware(config)
+    names = [name for name in CURVE_NAMES if name in (known["curve"], *known["converts"], choice.curve)]
+    if choice.curve is not None:
+        names = [choice.curve]
+    found: list[dict[CurveName, Variant]] = [{}, {}]
+    for name in names:
+        own = with_curve(config, name)
+        maps, gains = command_maps(own, replace(choice, curve=name)), gains_of(own)
+        for number in range(2):
+            found[number][name] = Variant(maps[number], {**gains[number], **more[number]})
+    return list(found)
 
 
 def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple[CommandMap, CommandMap]:
@@ -69,7 +113,7 @@ def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple
     plant, autopilot = config.plant, config.autopilot
     known = is_crazyflie(config)
     shares = Rig(plant.leader_mount, plant.follower_mount).weights
-    curve = choice.curve or (ForceCurve(*autopilot.motor_curve) if known else LINEAR)
+    curve = ForceCurve(*autopilot.motor_curve) if known else curve_of(config, choice.curve or "linear")
     hover = autopilot.hover_thrust if choice.hover is None else choice.hover
     law = choice.law or (autopilot.thrust_law if known else "calibrated")
     own = (plant.leader_mass, plant.follower_mass)

@@ -6,32 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
-
-from mjxball.control import crazyflie
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, Setpoint, setpoint
+from mjxball.fly.thrust import LINEAR, ForceCurve
 
 Array = Any
-
-
-@dataclass(frozen=True)
-class ForceCurve:
-    """Force of one motor from p = thrust units / 65535: `quadratic` p^2 + `linear` p [N] (crazyflie.md)."""
-
-    quadratic: float = 0.0  # [N]
-    linear: float = 0.12  # [N] Crazyflie 2.1+ with firmware 2026.04 or later
-
-    def force(self, thrust: float) -> float:
-        """Force of the four motors of one drone [N] at `thrust` units."""
-        return 4 * float(crazyflie.motor_force((self.quadratic, self.linear), thrust))
-
-    def thrust(self, force: float) -> float:
-        """Thrust units at which four motors give `force` [N]; not bounded above, 0 for none."""
-        return float(crazyflie.motor_command((self.quadratic, self.linear), np.float64(force / 4)))
-
-
-LINEAR = ForceCurve()
-OLDER = ForceCurve(0.0915, 0.0677)  # firmware before 2026.04
 
 
 @dataclass(frozen=True)
@@ -49,8 +27,6 @@ class CommandMap:
     gravity: float = 9.81  # [m/s2]
     curve: ForceCurve = LINEAR
     tilt_limit: float = math.radians(15)  # of every commanded roll and pitch [rad]
-    tilt_slew: float = math.radians(200)  # [rad/s]
-    thrust_slew: float = 120_000.0  # [thrust units/s]
     yaw_gain: float = 0.0  # yaw rate command per yaw error [1/s]; the firmware integrates the yaw rate itself
 
     @property
@@ -60,7 +36,7 @@ class CommandMap:
 
 
 class Mapped(NamedTuple):
-    """A setpoint and whether a bound shaped its thrust."""
+    """A setpoint, and whether its thrust was cut at a bound."""
 
     setpoint: Setpoint
     saturated: bool
@@ -75,10 +51,10 @@ def raw_thrust(command: Array, constants: CommandMap) -> float:
     return constants.curve.thrust(constants.carried_mass * (constants.gravity + vertical) / level)
 
 
-def to_setpoint(command: Array, yaw: float, last: Setpoint, period: float, constants: CommandMap) -> Mapped:
-    """The bounded, slew-limited setpoint of `command` (3,), `period` [s] after `last` was sent.
+def to_setpoint(command: Array, yaw: float, constants: CommandMap) -> Mapped:
+    """The bounded setpoint of `command` (3,); `yaw` is the drone's own [rad].
 
-    `yaw` is the drone's own [rad]. Raises packets.PacketError if a number is not finite.
+    Raises packets.PacketError if a number is not finite.
     """
     roll, pitch, vertical = (float(value) for value in command)
     if not all(map(math.isfinite, (roll, pitch, vertical))):
@@ -87,15 +63,4 @@ def to_setpoint(command: Array, yaw: float, last: Setpoint, period: float, const
     roll, pitch = (min(max(value, -limit), limit) for value in (roll, pitch))
     wanted = raw_thrust((roll, pitch, vertical), constants)
     thrust = min(max(wanted, THRUST_FLOOR), THRUST_CEILING)
-    slowed = slewed(setpoint(roll, pitch, -constants.yaw_gain * yaw, thrust), last, period, constants)
-    return Mapped(slowed, thrust != wanted)
-
-
-def slewed(value: Setpoint, last: Setpoint, period: float, constants: CommandMap) -> Setpoint:
-    """`value`, but no further from `last` than the slew limits allow in `period` [s]."""
-    turn, lift = math.degrees(constants.tilt_slew) * period, constants.thrust_slew * period
-    roll, pitch = (
-        min(max(new, old - turn), old + turn) for new, old in ((value.roll, last.roll), (value.pitch, last.pitch))
-    )
-    thrust = min(max(value.thrust, last.thrust - lift), last.thrust + lift)
-    return Setpoint(roll, pitch, value.yaw_rate, round(thrust))
+    return Mapped(setpoint(roll, pitch, -constants.yaw_gain * yaw, thrust), thrust != wanted)

@@ -1,18 +1,26 @@
-"""The terminal while flying: a few lines, redrawn by a thread of their own so that a slow terminal delays nothing."""
+"""What the person at the laptop sees and presses: terminal display, live view in a browser, keys and signals."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
+import select
+import signal
+import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
 from typing import TextIO
 
 import numpy as np
 
 from mjxball.control import rotations
-from mjxball.fly.contract import View
+from mjxball.errors import InputError
 from mjxball.fly.limits import NAMES, Limits
+from mjxball.fly.protocols import View
 from mjxball.fly.supervisor import ENDED, GUIDED, State
 
 RED, YELLOW, GREEN, PLAIN = "\x1b[1;37;41m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
@@ -77,3 +85,105 @@ class Display:
             self._stream.write(up + "".join(f"\x1b[2K{line}\n" for line in text))
             self._stream.flush()
             self._drawn = len(text)
+
+
+class LiveView:
+    """A running `python -m mjxball.view --live`. A context manager; `line` says where its page is.
+
+    Nothing waits for it while flying: it reads the log and nobody reads what it writes. It ends with this process.
+    """
+
+    def __init__(self, log: Path, port: int = 0, start_limit: float = 30.0):
+        """Start it for the flight log `log`, before the flight. Raises InputError if it does not start."""
+        flags = ["--live", "--attached", "--port", str(port)]
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "mjxball.view", *flags, "--", str(log)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,  # Ctrl-C lands the flight, and that is worth seeing
+            text=True,
+        )
+        assert self._process.stdout is not None
+        readable, _, _ = select.select([self._process.stdout], [], [], start_limit)
+        self.line = self._process.stdout.readline().strip() if readable else ""
+        if not self.line:
+            self.close()
+            raise InputError("the live view did not start; is the port of --view free?")
+
+    def __enter__(self) -> LiveView:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End it, once an open page has the rest of the flight."""
+        try:
+            with contextlib.suppress(OSError, ValueError):
+                self._process.communicate(timeout=5)  # closes its input, which ends it
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate(timeout=5)
+
+
+KILL_KEYS = b" kK"  # the largest key, found without looking
+LAND_KEYS = b"lLq\n"
+
+
+@contextlib.contextmanager
+def listening(land: Callable[[], None], interrupt: Callable[[], None], kill: Callable[[], None]) -> Iterator[None]:
+    """Call `interrupt` on Ctrl-C, `land` on SIGTERM, a closed terminal and the landing keys, `kill` on the kill keys.
+
+    What Ctrl-C pressed twice means is the caller's. Keys work in a terminal only.
+    """
+    done = threading.Event()
+
+    def caught(number: int, frame: FrameType | None) -> None:
+        (interrupt if number == signal.SIGINT else land)()
+
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, caught) for number in numbers}
+    with _raw_terminal() as terminal:
+        if terminal is not None:
+            threading.Thread(target=_read, args=(terminal, done, land, kill), daemon=True).start()
+        try:
+            yield
+        finally:
+            done.set()
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _raw_terminal() -> Iterator[int | None]:
+    """Standard input with single keys readable, None if it is no terminal."""
+    try:
+        import termios
+        import tty
+    except ImportError:  # not on Windows
+        yield None
+        return
+    try:
+        number = sys.stdin.fileno()
+        before = termios.tcgetattr(number)
+    except (OSError, ValueError, AttributeError, termios.error):
+        yield None
+        return
+    tty.setcbreak(number)
+    try:
+        yield number
+    finally:
+        with contextlib.suppress(OSError, termios.error):  # the terminal may have been closed
+            termios.tcsetattr(number, termios.TCSADRAIN, before)
+
+
+def _read(terminal: int, done: threading.Event, land: Callable[[], None], kill: Callable[[], None]) -> None:
+    while not done.is_set():
+        readable, _, _ = select.select([terminal], [], [], 0.1)
+        pressed = os.read(terminal, 32) if readable else b""
+        if readable and not pressed:
+            return
+        if any(key in KILL_KEYS for key in pressed):
+            kill()
+        elif any(key in LAND_KEYS for key in pressed):
+            land()

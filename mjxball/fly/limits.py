@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from mjxball.fly.packets import DroneState
 from mjxball.fly.pair import Rig
 from mjxball.fly.supervisor import Event, Fault
 
+STAND_SPARE = 0.25  # [m] above the goal, the height at which a stand's flight is ended
 NAMES = ("leader", "follower")
 
 
@@ -32,6 +33,13 @@ class Limits:
     saturation_time: float = 1.0  # of thrust at a bound [s]
     missed_deadlines: int = 10  # within a second
     longest_gap: float = 0.1  # between two ticks [s]
+    fresh: float = 0.03  # [s] that states must be fresh before a flight that was held goes on
+    gaps: int = 4  # of the states in one flight, after which it lands
+
+    def on_stand(self, goal_height: float) -> Limits:
+        """Bounds for a stand: a ceiling, and no word about sideways, which its estimators invent."""
+        far = 1e3
+        return replace(self, fence_low=(-far, -far, -0.1), fence_high=(far, far, goal_height + STAND_SPARE))
 
 
 def within_fence(goal: Sequence[float], rig: Rig, limits: Limits) -> bool:

@@ -6,62 +6,41 @@ cflib is imported when a link is opened, so that all else here works without it.
 from __future__ import annotations
 
 import collections
-import functools
-import logging
+import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
-from mjxball.errors import InputError
 from mjxball.fly import packets
+from mjxball.fly.connection import Deadlines, Identity, bounded, connect
 from mjxball.fly.packets import Packet, PacketError
-from mjxball.fly.telemetry import Telemetry
+from mjxball.fly.parameters import PORT, Element, LinkError, Parameters
+from mjxball.fly.telemetry import HealthSample, Telemetry
 
 Note = Callable[..., None]  # note(kind, **fields): into the flight log
 PROTOCOL = 12  # CRTP version with a supervisor port
 LOG_PORT, LOG_DATA = 5, 2
-
-
-@dataclass(frozen=True)
-class Deadlines:
-    """How long the link may take [s]."""
-
-    connect: float = 15.0  # tables and parameters over a radio take several seconds
-    parameter: float = 1.0  # each write with its read back
-    request: float = 2.0  # a packet of ours, before the flight
-    first_state: float = 2.0
-    close: float = 2.0
-
-
-class LinkError(InputError):
-    """A drone that cannot be reached or is not what is needed, in one sentence."""
-
-
-def bounded(action: Callable[[], Any], seconds: float) -> bool:
-    """Run `action` in a thread; false if it has not returned after `seconds`, it is then left behind.
-
-    cflib waits without limit in places, and some of its callbacks can lock each other out.
-    """
-    thread = threading.Thread(target=action, daemon=True)
-    thread.start()
-    thread.join(seconds)
-    return not thread.is_alive()
+DEADLINES = Deadlines()
+QUIET = 0.1  # [s] without anything to send, after which a ping goes out
+REVISION = ("firmware.revision0", "firmware.revision1", "firmware.modified")
 
 
 class Link:
     """One drone: newest state, newest setpoint out, parameters. `send` and `command` never block."""
 
-    def __init__(self, uri: str, name: str, note: Note, deadlines: Deadlines = Deadlines()):
+    def __init__(self, uri: str, name: str, note: Note, deadlines: Deadlines = DEADLINES):
         self.uri, self.name = uri, name
         self.telemetry = Telemetry()
         self.lost: str | None = None  # why, once the link has ended
         self.overwritten = self.sent = 0
-        self.firmware: dict[str, str] = {}
+        self.identity = Identity()
+        self.busy: bool | str = False  # with `write_later`: True while writing, else why it failed
         self._note, self._deadlines = note, deadlines
         self._wake = threading.Condition()
         self._setpoint: Packet | None = None
+        self._pose: Packet | None = None
         self._commands: collections.deque[Packet] = collections.deque()
         self._waiting_since: float | None = None
         self._closing = False
@@ -69,104 +48,99 @@ class Link:
         self._crazyflie: Any = None
         self._driver: Any = None
         self._sender = threading.Thread(target=self._send_all, name=f"sender {name}", daemon=True)
+        self.parameters = Parameters(name, self._element, self._request, deadlines.parameter)
 
     # Before flight; these may block up to their deadlines.
 
-    def open(self) -> None:
-        """Connect, with all tables and parameters. Raises LinkError."""
-        import cflib.crtp
-        from cflib.crazyflie import Crazyflie
-
-        _start_drivers(cflib.crtp)
-        crazyflie, ready = Crazyflie(), threading.Event()
-        failed: list[str] = []
-
-        def refused(_: str, why: str) -> None:
-            failed.append(why)
-            ready.set()
-
-        def lost(uri: str, why: str) -> None:
-            self._end(why)
-            refused(uri, why)
-
-        crazyflie.fully_connected.add_callback(lambda uri: ready.set())
-        crazyflie.connection_failed.add_callback(refused)
-        crazyflie.connection_lost.add_callback(lost)
-        crazyflie.console.receivedChar.add_callback(lambda text: self._note("console", drone=self.name, text=text))
-        self._crazyflie = crazyflie
+    def open(self, progress: Callable[[str], None] = lambda text: None) -> None:
+        """Connect, with both tables of contents, which are cached; `progress` is told how far. Raises LinkError."""
         started = time.monotonic()
-        threading.Thread(target=crazyflie.open_link, args=(self.uri,), daemon=True).start()
-        arrived = ready.wait(self._deadlines.connect)
-        if failed or not arrived:
-            self.close()
-            reason = failed[0].strip().splitlines()[0] if failed else f"no answer within {self._deadlines.connect:g} s"
-            raise LinkError(f"{self.name} at {self.uri} cannot be reached: {reason}")
-        self._driver = crazyflie.link
-        latency = crazyflie.link_statistics.latency.latency
-        # Its pings share a lock with every send, and their thread holds that lock for ever when a link dies.
-        bounded(crazyflie.link_statistics.stop, self._deadlines.close)
-        self._check_version(time.monotonic() - started, latency)
+        self._crazyflie = connect(self.uri, self.name, self._deadlines, progress, self._end, self._console)
+        self._driver = self._crazyflie.link
         self._sender.start()
+        self._crazyflie.add_port_callback(PORT, self.parameters.received)
+        self._identify(time.monotonic() - started)
 
-    def _check_version(self, seconds: float, latency: float) -> None:
-        version = self._crazyflie.platform.get_protocol_version()
-        names = ("firmware.revision0", "firmware.revision1", "firmware.modified")
-        values = self._crazyflie.param.values
-        known = {name: values.get(name.split(".")[0], {}).get(name.split(".")[1], "?") for name in names}
-        self.firmware = {"protocol": str(version), **known}
-        self._note("connected", drone=self.name, uri=self.uri, seconds=seconds, latency_ms=latency, **self.firmware)
-        if version < PROTOCOL:
+    def _console(self, text: str) -> None:
+        self._note("console", drone=self.name, text=text)
+
+    def _identify(self, seconds: float) -> None:
+        """Ask for the firmware's version and the drone's kind. Raises LinkError for a protocol that is too old."""
+        answers: dict[int, str] = {}
+        both = threading.Event()
+
+        def told(packet: Any) -> None:
+            data = bytes(packet.data)
+            if packet.channel == 1 and data[:1] in (b"\x01", b"\x02"):
+                answers[data[0]] = data[1:].split(b"\0")[0].decode("ascii", "replace").strip()
+                if len(answers) == 2:
+                    both.set()
+
+        self._crazyflie.add_port_callback(packets.VERSION.port, told)
+        for request in (packets.VERSION, packets.DEVICE):
+            self._request(request)
+        both.wait(self._deadlines.version)
+        self._crazyflie.remove_port_callback(packets.VERSION.port, told)
+        names = [name for name in REVISION if self.parameters.has(name)]
+        began = time.monotonic()
+        revision = self.parameters.read(names)
+        trip = (time.monotonic() - began) if names else math.nan
+        self.identity = Identity(
+            protocol=self._crazyflie.platform.get_protocol_version(),
+            version=answers.get(1) or "?",
+            device=answers.get(2) or "?",
+            revision="".join(f"{int(value):x}" for value in revision.values()) or "?",
+        )
+        found = dataclasses.asdict(self.identity)
+        self._note("connected", drone=self.name, uri=self.uri, seconds=seconds, latency_ms=1000 * trip, **found)
+        if self.identity.protocol < PROTOCOL:
             self.close()
-            raise LinkError(f"{self.name} speaks protocol {version}, {PROTOCOL} is needed; update its firmware")
+            found_version = self.identity.protocol
+            raise LinkError(f"{self.name} speaks protocol {found_version}, {PROTOCOL} is needed; update its firmware")
+
+    def _element(self, name: str) -> Element | None:
+        found = self._crazyflie.param.toc.get_element_by_complete_name(name)
+        return None if found is None else Element(found.ident, found.pytype, found.access == found.RO_ACCESS)
 
     def start_states(self) -> None:
-        """Have the state sent at 100 Hz, and wait for the first one. Raises LinkError."""
+        """Have the state sent at 100 Hz and health at 20 Hz, and wait for the first state. Raises LinkError."""
         block = self._log_block("state", packets.STATE_VARIABLES, 10)
         self._block = block.id
         self._crazyflie.add_header_callback(self._receive, LOG_PORT, LOG_DATA)
+        health = self._log_block("health", self._health_variables(), 50)
+        health.data_received_cb.add_callback(lambda stamp, values, config: self._take_health(values))
         self._ask(block.start)
+        self._ask(health.start)
         deadline = time.monotonic() + self._deadlines.first_state
-        while self.telemetry.newest is None:
+        while self.telemetry.newest is None or self.telemetry.health is None:
             if time.monotonic() > deadline:
                 raise LinkError(f"the {self.name} sends no state within {self._deadlines.first_state:g} s")
             time.sleep(0.01)
 
-    def write_parameters(self, values: Mapping[str, float]) -> None:
-        """Write each parameter and read it back. Raises LinkError naming the one that differs or is missing."""
+    def _health_variables(self) -> list[tuple[str, str]]:
+        listed = self._crazyflie.log.toc.get_element_by_complete_name
+        motors = next((names for names in packets.MOTORS if all(listed(name) for name, _ in names)), ())
+        thrust = [packets.ACTING_THRUST] if listed(packets.ACTING_THRUST[0]) else []
+        return [*packets.VARIANCES, *motors, *thrust]
+
+    def write_parameters(self, values: Mapping[str, float], check: bool = True) -> None:
+        """Write each parameter and read it back (see `Parameters.write`). Raises LinkError."""
+        self.parameters.write(values, check)
         for name, value in values.items():
-            answer: list[str] = []
-            heard = threading.Event()
-
-            def updated(_: str, text: str, answer: list[str] = answer, heard: threading.Event = heard) -> None:
-                answer.append(text)
-                if len(answer) >= 2:
-                    heard.set()
-
-            group, _, variable = name.partition(".")
-            param = self._crazyflie.param
-            param.add_update_callback(group, variable, updated)
-            refused = self._ask(functools.partial(_write, param, name, value))
-            if refused is not None:
-                raise LinkError(f"parameter {name} of the {self.name} cannot be written: {refused}")
-            in_time = heard.wait(self._deadlines.parameter)
-            param.remove_update_callback(group, variable, updated)
-            if not in_time:
-                raise LinkError(f"the {self.name} did not confirm parameter {name}")
-            if abs(float(answer[-1]) - value) > 1e-6 * max(1.0, abs(value)):
-                raise LinkError(f"parameter {name} of the {self.name} reads {answer[-1]} after {value:g} was written")
             self._note("parameter", drone=self.name, name=name, value=value)
 
-    def stream(self, variables: tuple[str, ...], period_ms: int, take: Callable[[dict[str, float]], None]) -> Any:
-        """Have `take` called with further log variables; returns what `stop_stream` ends. Raises LinkError."""
-        block = self._log_block("extra", [(name, "float") for name in variables], period_ms)
-        block.data_received_cb.add_callback(lambda stamp, data, config: take(data))
-        self._ask(block.start)
-        return block
+    def write_later(self, values: Mapping[str, float]) -> None:
+        """Write parameters in a thread of their own, while flying; `busy` tells how it went."""
 
-    def stop_stream(self, block: Any) -> None:
-        """End a `stream`. Raises LinkError."""
-        self._ask(block.stop)
-        self._ask(block.delete)
+        def write() -> None:
+            try:
+                self.write_parameters(values)
+                self.busy = False
+            except LinkError as error:
+                self.busy = str(error)
+
+        self.busy = True
+        threading.Thread(target=write, daemon=True).start()
 
     def _log_block(self, title: str, variables: Iterable[tuple[str, str]], period_ms: int) -> Any:
         from cflib.crazyflie.log import LogConfig
@@ -217,6 +191,22 @@ class Link:
             self._waiting_since = self._waiting_since or time.monotonic()
             self._wake.notify()
 
+    def pose(self, packet: Packet) -> None:
+        """Put `packet` out as the newest measured pose, once no command and no setpoint waits; an older one is dropped.
+
+        Poses that wait do not count in `stuck_for`: they are the first that a busy radio may lose.
+        """
+        with self._wake:
+            self._pose = packet
+            self._wake.notify()
+
+    def _request(self, packet: Packet) -> None:
+        """Queue `packet` behind the commands that wait; a setpoint that waits stays."""
+        with self._wake:
+            self._commands.append(packet)
+            self._waiting_since = self._waiting_since or time.monotonic()
+            self._wake.notify()
+
     def stuck_for(self, now: float) -> float:
         """How long the sender has been unable to send what waits [s]."""
         since = self._waiting_since
@@ -235,17 +225,18 @@ class Link:
 
         while True:
             with self._wake:
-                while not (self._commands or self._setpoint or self._closing):
-                    self._wake.wait()
+                if not (self._commands or self._setpoint or self._pose or self._closing):
+                    self._wake.wait(QUIET)
                 if self._closing and not self._commands:
                     return
-                packet: Packet | None = None
+                packet: Packet | None = packets.PING  # the firmware stops its logs if it hears nothing for 1 s
                 if self._commands:
                     packet = self._commands.popleft()
-                else:
+                elif self._setpoint:
                     packet, self._setpoint = self._setpoint, None
-            if packet is None:
-                continue
+                elif self._pose:
+                    packet, self._pose = self._pose, None
+            assert packet is not None
             wire = CRTPPacket()
             wire.set_header(packet.port, packet.channel)
             wire.data = packet.data
@@ -254,7 +245,7 @@ class Link:
                 self._driver.send_packet(wire)
             except Exception as error:  # whatever a driver raises, this link is at its end and the loop must hear of it
                 self._end(f"{type(error).__name__}: {error}")
-            self.sent += 1
+            self.sent += packet.port != packets.POSE_PORT
             with self._wake:
                 waiting = self._commands or self._setpoint
                 self._waiting_since = time.monotonic() if waiting else None
@@ -273,25 +264,11 @@ class Link:
         if sample is not None:
             self._note("state", t=arrival, drone=self.name, raw=data.hex())
 
+    def _take_health(self, values: Mapping[str, float]) -> None:
+        arrival, health = time.monotonic(), packets.health_of(values)
+        self.telemetry.health = HealthSample(health, arrival)
+        self._note("health", t=arrival, drone=self.name, **health._asdict())
+
     def _end(self, why: str) -> None:
         self.lost = self.lost or (why.strip().splitlines() or ["link error"])[0]
         self._note("link", drone=self.name, text=self.lost)
-
-
-_drivers = threading.Lock()
-
-
-def _start_drivers(crtp: Any) -> None:
-    """Start cflib's drivers once, and keep its own messages off the terminal."""
-    with _drivers:
-        if not crtp.CLASSES:
-            crtp.init_drivers()
-        logger = logging.getLogger("cflib")
-        if not logger.handlers:
-            logger.addHandler(logging.NullHandler())
-            logger.propagate = False
-
-
-def _write(param: Any, name: str, value: float) -> None:
-    param.set_value(name, value)
-    param.request_param_update(name)  # what the write echoes is not what the firmware holds

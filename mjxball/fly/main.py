@@ -10,22 +10,24 @@ import re
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from mjxball import cli
 from mjxball.cli import run_command
 from mjxball.errors import InputError
-from mjxball.fly import limits, pair
-from mjxball.fly.card import ThrustChoice, command_maps, gains_of, goal_of, times_of
-from mjxball.fly.command import LINEAR, OLDER
-from mjxball.fly.contract import FlightSettings
+from mjxball.fly import limits, mocap, pair
+from mjxball.fly.card import ThrustChoice, drone_of, goal_of, motor_of, times_of, variants
+from mjxball.fly.controller import Controller
+from mjxball.fly.display import LiveView
 from mjxball.fly.limits import Limits
-from mjxball.fly.pilot import Pilot
 from mjxball.fly.preflight import Preflight, read_gains
+from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.rehearse import Rehearsal
-from mjxball.fly.sortie import Crew, fly
-from mjxball.fly.spectator import Spectator
-from mjxball.fly.twin.faults import STRIKES, read_strike
+from mjxball.fly.session import FlightSetup, fly
+from mjxball.fly.thrust import CURVE_NAMES
+from mjxball.fly.twin.faults import FAULT_KINDS, read_fault
+from mjxball.fly.twin.kind import add_twin_options, asked_of_twin, check_twin
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
@@ -37,7 +39,6 @@ WORSE = {  # once the motors turn: cflib connects over a good link only
     "delay": "seconds that each is late",
     "jitter": "seconds more, at random",
 }
-CURVES = {"linear": LINEAR, "older": OLDER}
 
 
 def make_parser() -> cli.Parser:
@@ -53,8 +54,9 @@ def make_parser() -> cli.Parser:
     for name, _, high in LINK[1:]:
         parser.add_argument(f"--{name}", type=float, metavar="X", help=f"--rehearse: {WORSE[name]}, up to {high:g}")
     parser.add_argument(
-        "--fault", action="append", default=[], metavar="KIND:DRONE@S", help=f"--rehearse: {', '.join(STRIKES)}"
+        "--fault", action="append", default=[], metavar="KIND:DRONE@S", help=f"--rehearse: {', '.join(FAULT_KINDS)}"
     )
+    add_twin_options(parser)
     parser.add_argument("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
     parser.add_argument("--dry-run", action="store_true", help="connect, log, and send zeros only")
     parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
@@ -83,8 +85,9 @@ def make_parser() -> cli.Parser:
     )
     parser.add_argument("--thrust", choices=("calibrated", "paper"), help="law from az to thrust (the card's)")
     parser.add_argument("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
-    parser.add_argument("--curve", choices=tuple(CURVES), help="calibrated law: force of a motor (the card's)")
+    parser.add_argument("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
     parser.add_argument("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
+    mocap.add_flags(parser)
     return parser
 
 
@@ -122,14 +125,17 @@ def check_twin_options(options: argparse.Namespace) -> None:
     asked = [name for name in (*WORSE, "fault") if getattr(options, name)]
     if asked and not options.rehearse:
         raise InputError(f"--{asked[0]} is for --rehearse only")
+    if asked_of_twin(options) and not options.rehearse:
+        raise InputError(f"{asked_of_twin(options)[0]} is for --rehearse only")
+    check_twin(options)
     for fault in options.fault:
-        read_strike(fault)
+        read_fault(fault)
 
 
 def twin_options(options: argparse.Namespace) -> list[str]:
     """What the twin is told of the link and of faults."""
     worse = [f"--{name}={getattr(options, name)}" for name in WORSE if getattr(options, name) is not None]
-    return [*worse, *(f"--fault={fault}" for fault in options.fault)]
+    return [*worse, *(f"--fault={fault}" for fault in options.fault), *asked_of_twin(options)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -139,32 +145,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def command() -> int:
         check_options(options)
         check_twin_options(options)
+        capture = mocap.settings_of(options)
         log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
         policy = Policy.load(options.policy)
-        pilot = Pilot(policy)
-        config = pilot.config
-        gains = gains_of(config)
-        if options.gains:
-            leader, follower = ({**own, **new} for own, new in zip(gains, read_gains(options.gains), strict=True))
-            gains = leader, follower
+        controller = Controller(policy)
+        config = controller.config
+        more = read_gains(options.gains) if options.gains else ({}, {})
         rig = pair.Rig.of_card(policy.card)
         period = policy.control_period / math.ceil(policy.control_period * LOOP_RATE - 1e-9)
         bounds = Limits() if options.battery is None else Limits(battery=options.battery)
         goal = tuple(options.goal or goal_of(config))
         if not limits.within_fence(goal, rig, bounds):
             raise InputError(f"--goal {' '.join(f'{value:g}' for value in goal)} puts a drone beyond the fence")
-        settings = FlightSettings(options.seconds, goal, options.dry_run, period, bounds, times_of(config))
-        choice = ThrustChoice(options.thrust, options.hover, CURVES.get(options.curve), options.mass)
-        crew = Crew(pilot, command_maps(config, choice), rig, gains, Preflight())
+        stand = config.plant.stand != "free"
+        bounds = bounds.on_stand(goal[2]) if stand else bounds
+        settings = FlightSettings(
+            options.seconds, goal, options.dry_run, period, motor_of(config), stand, bounds, times_of(config)
+        )
+        choice = ThrustChoice(options.thrust, options.hover, options.curve, options.mass)
+        setup = FlightSetup(
+            controller, variants(config, choice, more), choice.curve or "linear", rig, Preflight(drone=drone_of(config))
+        )
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
             if options.rehearse:
                 ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
                 uris = stack.enter_context(Rehearsal(options.policy, ports, twin_options(options))).uris
+            if capture is not None:
+                setup = replace(setup, mocap=stack.enter_context(mocap.ready(capture, rig.span)))
             if options.view is not None and log is not None:
-                print(stack.enter_context(Spectator(log, options.view)).line, flush=True)  # noqa: T201
+                print(stack.enter_context(LiveView(log, options.view)).line, flush=True)  # noqa: T201
             if log and not options.log:
                 print(f"log: {log}", flush=True)  # noqa: T201
-            return fly(uris, crew, settings, log, list(sys.argv if arguments is None else arguments))
+            return fly(uris, setup, settings, log, list(sys.argv if arguments is None else arguments))
 
     return run_command(command)

@@ -6,8 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from mjxball.fly.command import CommandMap, slewed
+import numpy as np
+
+from mjxball.control import leader
+from mjxball.fly.command import CommandMap
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, Setpoint, setpoint
+
+GRAVITY = 9.81
 
 
 @dataclass(frozen=True)
@@ -16,6 +21,8 @@ class Times:
 
     arm: float = 0.3  # zeros before the motors may turn [s]
     arm_limit: float = 3.0  # [s]
+    spin: float = 0.3  # at a third of hover before the motors are judged [s]
+    spin_limit: float = 4.0  # [s]: gains may have to be written
     ramp: float = 1.5  # thrust from nothing to hover [s]
     land_speed: float = 0.25  # at which the goal sinks [m/s]
     land_spare: float = 6.0  # beyond the time the goal takes to the ground [s]
@@ -23,16 +30,16 @@ class Times:
     descend_limit: float = 4.0  # [s]
     drone_watchdog: float = 2.0  # after which the firmware stops a drone that hears nothing [s]
     stop: float = 0.5  # stops are repeated for this long [s]
+    stop_limit: float = 4.0  # [s]: the firmware counts as flying for 2 s after the last thrust
     settled: float = 0.3  # a landing is believed after this [s]
     near_ground: float = 0.04  # of O above where it stood [m]
     still: float = 0.12  # vertical speed below which it stands [m/s]
 
 
-def ramp(elapsed: float, times: Times, constants: CommandMap, last: Setpoint, period: float) -> Setpoint:
+def ramp(elapsed: float, times: Times, constants: CommandMap) -> Setpoint:
     """Level, thrust rising in a straight line to hover."""
     share = min(elapsed / times.ramp, 1.0)
-    thrust = THRUST_FLOOR + share * (constants.hover_thrust - THRUST_FLOOR)
-    return level(thrust, last, period, constants)
+    return level(THRUST_FLOOR + share * (constants.hover_thrust - THRUST_FLOOR))
 
 
 def sink(trim: float, climb: float | None, elapsed: float, times: Times) -> float:
@@ -45,10 +52,20 @@ def sink(trim: float, climb: float | None, elapsed: float, times: Times) -> floa
     return trim * (1 + min(max(-0.4 * (climb + times.descend_speed), -0.3), 0.1))
 
 
-def level(thrust: float, last: Setpoint, period: float, constants: CommandMap) -> Setpoint:
-    """Level attitude at `thrust`, within bounds and slew limits from `last`."""
+def level(thrust: float, tilt: tuple[float, float] = (0.0, 0.0)) -> Setpoint:
+    """`tilt` (roll, pitch) [rad], level if not given, at `thrust`, within bounds."""
     bounded = min(max(thrust, THRUST_FLOOR), THRUST_CEILING) if math.isfinite(thrust) else THRUST_FLOOR
-    return slewed(setpoint(0.0, 0.0, 0.0, bounded), last, period, constants)
+    return setpoint(*tilt, 0.0, bounded)
+
+
+BRAKE_TILT = math.radians(8)  # of a descent that brakes sideways
+
+
+def brake(velocity: np.ndarray) -> tuple[float, float]:
+    """(roll, pitch) [rad] that brake a horizontal `velocity` (3,) [m/s] with a time constant of 0.7 s."""
+    wanted = leader.command(-velocity / 0.7, 0.0, GRAVITY, BRAKE_TILT, 1.0)
+    roll, pitch = float(wanted[0]), float(wanted[1])
+    return (roll, pitch) if math.isfinite(roll) and math.isfinite(pitch) else (0.0, 0.0)
 
 
 def smoothed(trim: float, thrust: float, period: float, hover: float) -> float:
@@ -60,7 +77,7 @@ def smoothed(trim: float, thrust: float, period: float, hover: float) -> float:
     return min(max(moved, 0.85 * hover), 1.15 * hover)
 
 
-class Glimpse(NamedTuple):
+class LastKnownState(NamedTuple):
     """What is known of the pair at the moment when nothing more will be heard of it."""
 
     trims: tuple[int, int]  # thrust that hovers, leader and follower [thrust units]
@@ -69,13 +86,12 @@ class Glimpse(NamedTuple):
     lift: float  # its vertical acceleration under the setpoints that were sent last [m/s2]
 
 
-GRAVITY = 9.81
 BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
 BLIND_LIMIT = 2.5  # [s] that it lasts at most
 BRISK, GENTLE = 3.0, 0.7  # [m/s2] downward at most: where both drones hear, and where one may not
 
 
-def blind_shares(seen: Glimpse, unheard: float, period: float, hardest: float = BRISK) -> list[float]:
+def blind_shares(seen: LastKnownState, unheard: float, period: float, hardest: float = BRISK) -> list[float]:
     """Shares of the trim for a descent that is flown blind, one per `period` [s], all below 1.
 
     The first `unheard` seconds went by under the last setpoints. From there the pair's height is computed, not

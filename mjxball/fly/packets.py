@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,15 @@ _SETPOINT = struct.Struct("<fffH")
 SETPOINT_SIZE = _SETPOINT.size
 MILLI = 1e-3
 
+# A second log packet of at most 24 bytes tells whether estimator, motors and uplink of a drone are well. The lines are
+# alternatives: the first whose variables the firmware lists is taken, none if there is none.
+VARIANCES = tuple((f"kalman.var{axis}", "float") for axis in "XYZ")  # [m2] (varPX and so on are of the velocity)
+MOTORS = (
+    tuple((f"motor.m{number}", "uint16_t") for number in (1, 2, 3, 4)),  # [PWM]
+    tuple((f"motor.m{number}req", "uint16_t") for number in (1, 2, 3, 4)),  # [PWM], not capped
+)
+ACTING_THRUST = ("controller.cmd_thrust", "float")  # [thrust units] of the setpoint that is in force
+
 CAN_ARM, ARMED, AUTO_ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
 THRUST_FLOOR, THRUST_CEILING = 10001, 60000  # [thrust units] what the firmware's documentation allows
 
@@ -49,6 +59,14 @@ class DroneState(NamedTuple):
     rates: np.ndarray  # (3,) about the body axes [rad/s]
     info: int  # bits of the firmware's supervisor, see `CAN_ARM` and following
     battery: float  # [V]
+
+
+class Health(NamedTuple):
+    """What one drone reports about its estimator, its motors and what it acts on."""
+
+    variance: tuple[float, float, float]  # of the estimated position [m2]
+    motors: tuple[int, int, int, int]  # PWM 0 .. 65535
+    thrust: float  # of the setpoint in force [thrust units]
 
 
 class Setpoint(NamedTuple):
@@ -117,6 +135,15 @@ def unpack_state(data: bytes) -> DroneState:
     return DroneState(position, velocity, decompress_quaternion(compressed), rates, info, MILLI * battery)
 
 
+def health_of(values: Mapping[str, float]) -> Health:
+    """Health from log variables by name; motors that are not among them stand still, an unknown thrust is NaN."""
+    known = next((names for names in MOTORS if names[0][0] in values), ())
+    motors = [int(values[name]) for name, _ in known] or [0] * 4
+    variance = [float(values[name]) for name, _ in VARIANCES]
+    thrust = float(values.get(ACTING_THRUST[0], math.nan))
+    return Health((variance[0], variance[1], variance[2]), (motors[0], motors[1], motors[2], motors[3]), thrust)
+
+
 class Packet(NamedTuple):
     """One CRTP packet for a drone."""
 
@@ -130,9 +157,35 @@ def setpoint_packet(value: Setpoint) -> Packet:
     return Packet(3, 0, pack_setpoint(value))
 
 
+PING = Packet(15, 0, b"\0")
+VERSION, DEVICE = Packet(13, 1, b"\x01"), Packet(13, 1, b"\x02")  # requests, answered on the same channel
 STOP = Packet(7, 0, b"\0")  # motors off, at once, not locked
 EMERGENCY_STOP = Packet(9, 1, b"\x03")  # motors off and locked until reboot
 ARM, DISARM = Packet(9, 1, b"\x01\x01"), Packet(9, 1, b"\x01\x00")
+
+POSE = struct.Struct("<B7f")  # of the localization port: kind of packet, x, y, z [m], quaternion (x, y, z, w)
+POSE_PORT, _EXTERNAL_POSE = 6, 8
+
+
+def pose_packet(position: Sequence[float], quaternion: Sequence[float]) -> Packet:
+    """A pose (3,) [m] and (4,) (w, x, y, z), body -> world, that the drone's estimator takes for a measurement.
+
+    Raises PacketError for a number that is not finite or a quaternion that is not one of unit length.
+    """
+    w, x, y, z = map(float, quaternion)
+    numbers = (*map(float, position), x, y, z, w)
+    if not all(map(math.isfinite, numbers)) or abs(w * w + x * x + y * y + z * z - 1) > 1e-3:
+        raise PacketError("a pose is not finite or its quaternion is not one of unit length")
+    return Packet(POSE_PORT, 1, POSE.pack(_EXTERNAL_POSE, *numbers))
+
+
+def unpack_pose(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) [m] and quaternion (4,) (w, x, y, z) of a pose packet's bytes. Raises PacketError if it is none."""
+    if len(data) != POSE.size or data[0] != _EXTERNAL_POSE:
+        raise PacketError(f"a pose has {POSE.size} bytes, of which the first is {_EXTERNAL_POSE}")
+    _, px, py, pz, x, y, z, w = POSE.unpack(data)
+    return np.array([px, py, pz]), np.array([w, x, y, z])
+
 
 _STEPS = 511  # a component takes 9 bits and a sign
 

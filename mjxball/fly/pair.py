@@ -40,6 +40,11 @@ class Rig:
         return cls(tuple(plant["leader_mount"]), tuple(plant["follower_mount"]))
 
     @property
+    def mounts(self) -> tuple[np.ndarray, np.ndarray]:
+        """(3,) of leader and follower from O [m]."""
+        return np.array(self.leader_mount), np.array(self.follower_mount)
+
+    @property
     def span(self) -> np.ndarray:
         """(3,) leader from follower [m]."""
         return np.array(self.leader_mount) - np.array(self.follower_mount)
@@ -61,6 +66,14 @@ def object_state(states: Sequence[DroneState], rig: Rig) -> ObjectState:
     position = lead * states[0].position + follow * states[1].position
     velocity = lead * states[0].velocity + follow * states[1].velocity
     return ObjectState(position, velocity, states[1].quaternion, states[1].rates)
+
+
+def object_of_one(state: DroneState, mount: np.ndarray) -> ObjectState:
+    """O's state from one drone's alone: p_O = p - R r, with `mount` r (3,) [m]."""
+    matrix = rotations.matrix_from_quaternion(state.quaternion)
+    position = state.position - matrix @ mount
+    velocity = state.velocity - matrix @ np.cross(state.rates, mount)
+    return ObjectState(position, velocity, state.quaternion, state.rates)
 
 
 def yaw_of(state: DroneState) -> float:

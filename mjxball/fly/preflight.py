@@ -14,13 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.control.firmware_gains import Gains, PairGains, read_pair_gains
+from mjxball.control.firmware_gains import PairGains, read_pair_gains
 from mjxball.errors import InputError
 from mjxball.fly import limits, packets, pair
 from mjxball.fly.limits import Limits
-from mjxball.fly.link import Link, LinkError
-
-VARIANCES = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
+from mjxball.fly.link import Link
+from mjxball.fly.mocap import Mocap
+from mjxball.fly.parameters import LinkError
+from mjxball.fly.protocols import Variants
+from mjxball.fly.thrust import CurveName, curve_of_version
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,9 @@ class Preflight:
     converge: float = 10.0  # time the estimators get [s]
     tilt: float = math.radians(8)  # [rad]
     yaw: float = math.radians(15)  # from the world's x axis [rad]
+    rearm: float = 4.0  # time that a firmware gets to settle after a landing [s]
+    reset: float = 0.1  # time between the two writes that reset an estimator [s]
+    drone: str = "2.1"  # which Crazyflie the policy was trained for, a key of `motors.MOTORS`
 
 
 class Check(NamedTuple):
@@ -79,55 +84,118 @@ def together(actions: Sequence[Callable[[], None]]) -> None:
         raise errors[0]
 
 
-def prepare(links: Sequence[Link], gains: PairGains, asked: Preflight) -> None:
-    """Open both links, write each drone's gains, reset the estimators, start the states. Raises LinkError."""
+KALMAN = 2  # of stabilizer.estimator
 
-    def one(link: Link, own: Gains) -> None:
-        link.open()
-        link.write_parameters(own)
-        reset_estimator(link, asked)
+
+def prepare(
+    links: Sequence[Link],
+    variants: Sequence[Variants],
+    asked: Preflight,
+    say: Callable[[str], None],
+    mocap: Mocap | None = None,
+) -> list[CurveName]:
+    """Open both links at once, write each drone's gains, start the states, reset the estimators. Raises LinkError.
+
+    Returns the force curves that the firmwares' versions promise, whose gains were written. With `mocap`, poses go to
+    each drone from before its estimator is reset.
+    """
+    curves: dict[str, CurveName] = {}
+
+    def one(link: Link, own: Variants) -> None:
+        link.open(say)
+        check_kind(link, asked, mocap is not None)
+        curves[link.name] = promised_curve(link, own)
+        link.write_parameters(own[curves[link.name]].gains)
+        if mocap is not None:
+            link.write_parameters(mocap.parameters() | {"stabilizer.estimator": KALMAN})
+            mocap.feed(links.index(link), link)
         link.start_states()
+        reset_estimator(link, asked)
 
-    together([functools.partial(one, *each) for each in zip(links, gains, strict=True)])
+    together([functools.partial(one, *each) for each in zip(links, variants, strict=True)])
+    return [curves[link.name] for link in links]
+
+
+def promised_curve(link: Link, own: Variants) -> CurveName:
+    """The force curve of the drone's firmware by its version. Raises LinkError if there are no gains for it."""
+    known, first = curve_of_version(link.identity.version), next(iter(own))
+    if known is None or known in own:
+        return known or first
+    raise LinkError(
+        f"the firmware {link.identity.version} of the {link.name} has the {known} force curve, "
+        f"and this flight has gains for the {first} one only"
+    )
+
+
+def check_kind(link: Link, asked: Preflight, measured: bool = False) -> None:
+    """The drone is of the kind that the policy was trained for, and knows its position, unless that is `measured` here.
+
+    Raises LinkError.
+    """
+    device, brushless = link.identity.device, "brushless" in link.identity.device.lower()
+    if device.startswith("Crazyflie 2") and brushless != (asked.drone == "brushless"):
+        raise LinkError(f"the {link.name} is a {device}, and the policy was trained for the {asked.drone}")
+    if not measured and link.parameters.read(["stabilizer.estimator"])["stabilizer.estimator"] != KALMAN:
+        raise LinkError(
+            f"the estimator of the {link.name} is not the Kalman filter (stabilizer.estimator is not {KALMAN}): "
+            "it has found no positioning deck"
+        )
 
 
 def reset_estimator(link: Link, asked: Preflight) -> None:
     """Reset the Kalman filter and wait until its position has converged. Raises LinkError."""
-    link.write_parameters({"kalman.resetEstimation": 1.0})
-    link.write_parameters({"kalman.resetEstimation": 0.0})
-    found: list[float] = [math.inf]
-    good = threading.Event()
-    below = [0]
+    link.write_parameters({"kalman.resetEstimation": 1.0}, check=False)  # the firmware clears it by itself
+    time.sleep(asked.reset)
+    link.write_parameters({"kalman.resetEstimation": 0.0}, check=False)
+    started, good, judged, found = time.monotonic(), 0, 0.0, math.inf
+    while good < 5:
+        if time.monotonic() - started > asked.converge:
+            raise LinkError(
+                f"the estimator of the {link.name} has not converged after {asked.converge:g} s: "
+                f"position variance {found:.2g} m2, {asked.variance:g} needed; does it get its position?"
+            )
+        time.sleep(0.01)
+        sample = link.telemetry.health
+        if sample is None or sample.arrival <= max(judged, started):
+            continue
+        judged, found = sample.arrival, max(sample.health.variance)
+        # A filter that does not run reports 0.
+        good = good + 1 if min(sample.health.variance) > 0 and found < asked.variance else 0
 
-    def take(values: dict[str, float]) -> None:
-        found[0] = max(values[name] for name in VARIANCES)
-        below[0] = below[0] + 1 if found[0] < asked.variance else 0
-        if below[0] >= 5:
-            good.set()
 
-    block = link.stream(VARIANCES, 50, take)
-    converged = good.wait(asked.converge)
-    link.stop_stream(block)
-    if not converged:
-        raise LinkError(
-            f"the estimator of the {link.name} has not converged after {asked.converge:g} s: "
-            f"position variance {found[0]:.2g} m2, {asked.variance:g} needed"
-        )
+def _ready(info: int) -> bool:
+    return bool(info & (packets.CAN_ARM | packets.CAN_FLY)) and not info & packets.FLYING
+
+
+def _wait_until_ready(links: Sequence[Link], seconds: float) -> None:
+    """Wait for firmwares that still count as flying, or disarm and arm again, as they do 3 s after a landing."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        newest = [link.telemetry.newest for link in links]
+        if all(
+            sample is None or _ready(sample.state.info) or limits.down_reason(sample.state.info, False)
+            for sample in newest
+        ):
+            return
+        time.sleep(0.02)
 
 
 def check(links: Sequence[Link], rig: pair.Rig, bounds: Limits, asked: Preflight) -> list[Check]:
-    """All checks, with what was found; takes `asked.measure` seconds."""
+    """All checks, with what was found; takes `asked.measure` seconds, more while a firmware re-arms after a landing."""
+    _wait_until_ready(links, asked.rearm)
+    began = time.monotonic()
     before = [link.telemetry.received for link in links]
     time.sleep(asked.measure)
+    _wait_until_ready(links, asked.rearm)
     checks, now = [], time.monotonic()
     states = []
     for link, count in zip(links, before, strict=True):
-        sample, rate = link.telemetry.newest, (link.telemetry.received - count) / asked.measure
+        sample, rate = link.telemetry.newest, (link.telemetry.received - count) / max(now - began, 1e-3)
         assert sample is not None
         state, age = sample.state, link.telemetry.age(now)
         states.append(state)
         refusal = limits.down_reason(state.info, armed=False)
-        can = bool(state.info & (packets.CAN_ARM | packets.CAN_FLY))
+        can = _ready(state.info)
         tilt, yaw = limits.tilt_of(state), pair.yaw_of(state)
         checks += [
             Check(f"{link.name} states", rate >= asked.rate, f"{rate:.0f} Hz, {asked.rate:.0f} needed"),

@@ -9,23 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import crazyflie
-from mjxball.control.firmware_gains import PairGains, read_pair_gains
+from mjxball.control.firmware_gains import PairGains
 from mjxball.errors import InputError
-from mjxball.fly import packets
-from mjxball.fly.card import command_maps
-from mjxball.fly.journal import read
+from mjxball.fly import flight_log
+from mjxball.fly.card import drone_of
+from mjxball.fly.flight_log import FlightLog
+from mjxball.fly.flown import force_curve, one_curve
 from mjxball.fly.limits import NAMES
 from mjxball.fly.packets import DroneState
-from mjxball.fly.pair import Rig, object_state
+from mjxball.fly.pair import ObjectState, Rig, object_state
+from mjxball.fly.thrust import CurveName
 from mjxball.fly.twin.body import PairState
+from mjxball.fly.twin.kind import DroneKind, Surroundings, drone_kind
 from mjxball.fly.twin.pairs import pair_of
 
-STAMP = 4  # bytes of block and time stamp before a state
 LONGEST = 3600.0  # [s] of a flight that is read
-LONGEST_GAP = 5.0  # [s] between two ticks
+OBSERVATION = 18  # numbers of an observation, where the log holds none
 
 
 @dataclass(frozen=True)
@@ -34,7 +35,8 @@ class Recording:
 
     policy: str
     config: Config
-    gains: PairGains  # that were uploaded
+    curves: tuple[CurveName, CurveName]  # of leader's and follower's firmware
+    gains: PairGains  # that they flew with
     time: np.ndarray  # (T,) from 0 [s]
     phase: tuple[str, ...]  # (T,) the supervisor's state
     sent: np.ndarray  # (T, 2, 4) leader, follower: roll, pitch [deg], yaw rate [deg/s], thrust, wire's signs
@@ -48,65 +50,47 @@ class Recording:
     observation: np.ndarray  # (T, 18) NaN where no law was in command
     rotor_force: np.ndarray  # (T, 2, 4) [N]; of a log: what the thrust that was sent gives, without lag and cascade
     cg_offset: np.ndarray  # (T,) [m]; NaN where nobody measured it
+    remarks: tuple[str, ...] = ()  # what a reader of the log should know, a line each
 
 
 def read_recording(path: Path) -> Recording:
     """The flight in the log `path`. Raises InputError with one sentence if there is none."""
-    try:
-        return _arrange(path, list(read(path)))
-    except OSError as error:
-        raise InputError(f"flight log {path} cannot be read: {error.strerror or error}") from None
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
-        raise InputError(f"{path} is not a flight log that this version reads ({type(error).__name__})") from None
-
-
-def _arrange(path: Path, records: Sequence[Mapping[str, Any]]) -> Recording:
-    if not records or records[0]["kind"] != "header" or "config" not in records[0]:
-        raise InputError(f"{path} is not a flight log of this version: it does not begin with a header and its config")
-    header = records[0]
-    config = configs.validate(configs.from_record(header["config"]))
-    rig = Rig(config.plant.leader_mount, config.plant.follower_mount)
-    rows: list[dict[str, Any]] = []
-    newest: list[DroneState | None] = [None, None]
-    for record in sorted(records[1:], key=lambda one: float(one["t"])):
+    log = flight_log.load(path)
+    plant = log.config.plant
+    rig = Rig(plant.leader_mount, plant.follower_mount)
+    ticks: list[Mapping[str, Any]] = []
+    seen: list[ObjectState] = []
+    newest: dict[str, DroneState] = {}
+    for record in log.records:
         if record["kind"] == "state":
-            newest[NAMES.index(record["drone"])] = packets.unpack_state(bytes.fromhex(record["raw"])[STAMP:])
-        seen = [state for state in newest if state is not None]
-        if record["kind"] != "tick" or len(seen) < 2:
-            continue
-        if rows or max(setpoint[3] for setpoint in record["sent"]) > 0:
-            rows.append({**record, "seen": object_state(seen, rig)})
-    if len(rows) < 2:
-        raise InputError(f"flight log {path} holds no flight: no motor was ever told to turn")
-    return _recording(path, header, config, rows)
+            newest[record["drone"]] = record["raw"].state
+        elif len(newest) == len(NAMES):
+            ticks.append(record)
+            seen.append(object_state([newest[name] for name in NAMES], rig))
+    time = np.array([tick["t"] for tick in ticks])
+    if len(time) < 2 or not (np.diff(time) > 0).all() or time[-1] - time[0] > LONGEST:
+        raise InputError(f"flight log {path} holds no flight: fewer than two ticks, or their times do not follow")
+    return _recording(log, ticks, seen)
 
 
-def _recording(path: Path, header: Mapping[str, Any], config: Config, rows: Sequence[Mapping[str, Any]]) -> Recording:
-    nothing = {"leader": [np.nan] * 3, "follower": [np.nan] * 3, "observation": [np.nan] * 18}
+def _recording(log: FlightLog, ticks: Sequence[Mapping[str, Any]], seen: Sequence[ObjectState]) -> Recording:
+    def column(name: str, width: int) -> np.ndarray:
+        return np.array([tick.get(name, np.full(width, np.nan)) for tick in ticks])
 
-    def column(name: str, *shape: int) -> np.ndarray:
-        return np.array([row.get(name, nothing.get(name)) for row in rows], float).reshape(len(rows), *shape)
-
-    time, sent = column("t") - float(rows[0]["t"]), column("sent", 2, 4)
-    steps = np.diff(time)
-    if not (np.isfinite(sent).all() and np.isfinite(time).all() and time[-1] <= LONGEST):
-        raise InputError(f"flight log {path} holds a time or a setpoint that is not sound")
-    if not ((steps > 0) & (steps < LONGEST_GAP)).all():
-        raise InputError(f"flight log {path}: its ticks do not follow each other")
-    seen = [row["seen"] for row in rows]
-    position, velocity, quaternion, rates = (np.array(part, float) for part in zip(*seen, strict=True))
-    force = np.array(
-        [[m.curve.force(s[3]) / 4 for m, s in zip(command_maps(config), row, strict=True)] for row in sent]
-    )
+    position, velocity, quaternion, rates = (np.array(part) for part in zip(*seen, strict=True))
+    curves = [force_curve(log.config, name) for name in log.curves]
+    force = np.array([[c.force(s[3]) / 4 for c, s in zip(curves, tick["sent"], strict=True)] for tick in ticks])
+    lengths = {len(tick["observation"]) for tick in ticks if "observation" in tick} or {OBSERVATION}
+    if len(lengths) > 1:
+        raise InputError(f"flight log {log.path} holds observations of several lengths")
     return Recording(
-        policy=str(header["policy"])[:80],
-        config=config,
-        gains=read_pair_gains(header["gains"]),
-        time=time,
-        phase=tuple(str(row["state"]) for row in rows),
-        sent=sent,
+        policy=log.policy,
+        config=log.config,
+        curves=log.curves,
+        gains=log.gains,
+        time=np.array([tick["t"] for tick in ticks]) - ticks[0]["t"],
+        phase=tuple(tick["state"] for tick in ticks),
+        sent=column("sent", 8),
         goal=column("goal", 3),
         position=position,
         velocity=velocity,
@@ -114,19 +98,30 @@ def _recording(path: Path, header: Mapping[str, Any], config: Config, rows: Sequ
         rates=rates,
         leader=column("leader", 3),
         follower=column("follower", 3),
-        observation=column("observation", 18),
+        observation=column("observation", lengths.pop()),
         rotor_force=np.repeat(force[..., None], 4, axis=-1),
-        cg_offset=np.full(len(rows), np.nan),
+        cg_offset=np.full(len(ticks), np.nan),
+        remarks=tuple(log.told()),
     )
 
 
-def fly_again(recording: Recording) -> Recording:
-    """The recorded setpoints through the twin's physics, from rest where the recorded flight began.
+def twin_of(recording: Recording) -> DroneKind:
+    """The twin's drones whose firmware has the force curve that flew. Raises InputError if both had different ones."""
+    curve = one_curve(recording.curves)
+    if curve is None:
+        told = ", ".join(f"{name} {own}" for name, own in zip(NAMES, recording.curves, strict=True))
+        raise InputError(f"the flight was flown on two force curves ({told}), and the twin's drones have one")
+    return drone_kind(drone_of(recording.config), curve)
 
-    Nobody steers: what both disagree on adds up with time. The object's mass and the CG's motion, which no log knows,
-    are those of a rehearsal (`twin.coupled.Conditions.of`).
+
+def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
+    """The recorded setpoints through the physics of drones of `kind`, from rest where the recorded flight began.
+
+    Without a `kind` they are those that the log tells of (`twin_of`). Nobody steers: what both disagree on adds up
+    with time. The object's mass and the CG's motion, which no log knows, are those of a rehearsal
+    (`twin.coupled.Conditions.of`).
     """
-    pair = pair_of(recording.config)
+    pair = pair_of(recording.config, kind or twin_of(recording), Surroundings(exact=True))
     for drone, gains in enumerate(recording.gains):
         for name, value in gains.items():
             pair.set_parameter(drone, name, value)

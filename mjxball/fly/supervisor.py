@@ -1,4 +1,4 @@
-"""The safety supervisor: a pure state machine. `TRANSITIONS` is all of it; `docs/flying.md` prints the same table.
+"""The safety supervisor: a pure state machine. `TRANSITIONS` is all of it; docs/supervisor.md shows it as a table.
 
 States say what both drones are sent, and always both: any fault on one of them brings both down together.
 """
@@ -15,18 +15,19 @@ class State(Enum):
 
     CHECK = "check"  # zeros, while the checks before flight run
     ARM = "arm"  # zeros, which open the firmware's thrust lock while it arms
+    SPIN = "spin"  # level, a third of hover: what the motors get shows which force curve the firmware has
     RAMP = "ramp"  # level, thrust rising to hover
     FLY = "fly"  # leader PID and follower policy
     LAND = "land"  # the same laws toward a goal that sinks
     DESCEND = "descend"  # level, thrust held to a sinking speed where it is known, else ramped down
     HOLD = "hold"  # a drone is not heard: level, a little less than the trims, until its own watchdog must stop it
-    STOP = "stop"  # zeros and stop setpoints
+    STOP = "stop"  # stop and zero setpoints, until the firmware counts neither drone as flying
     KILL = "kill"  # emergency stop, repeated; the firmware stays locked until reboot
     DONE = "done"  # motors off, disarmed; nothing more is sent
 
     @property
     def severity(self) -> int:
-        """Order in which states may follow each other; aborts never go back."""
+        """Order of precedence when one tick has several events; only HOLD leads back to what it interrupted."""
         return list(State).index(self)
 
 
@@ -36,22 +37,30 @@ class Event(Enum):
     READY = "all checks before flight passed"
     REFUSED = "a check before flight failed"
     ARMED = "both drones armed with the thrust lock open"
+    CURVE_KNOWN = "the force curves of both firmwares are known"
+    CURVE_UNKNOWN = "a firmware's force curve is not one that can be flown"
     HOVERING = "the thrust ramp ended"
     TIME_UP = "the flight time is over"
     INTERRUPT = "Ctrl-C or SIGTERM"
     KEY_KILL = "kill key, or Ctrl-C again"
     STALE = "a drone's state is older than 100 ms by the host's or the firmware's clock"
+    GAPS = "states broke off too often"
+    RESUMED = "fresh states of both drones have come back"
     LINK_LOST = "a link reported its end"
+    UNHEARD = "a drone does not act on what it is sent"
     BAD_STATE = "a state or a command is not finite"
     FENCE = "a drone left the geofence"
     TILT = "a drone tilts beyond the limit"
     STICK = "the two positions contradict the stick: its length or its tilt"
+    ESTIMATOR = "an estimator's position cannot be trusted"
     BATTERY = "a battery is low"
     SATURATED = "thrust has been at its bound for too long"
     DEADLINES = "the loop missed too many deadlines"
     WATCHDOG = "the watchdog process ended"
     DRONE_DOWN = "a drone's firmware is locked, crashed, tumbled or cannot fly"
+    POSE = "the motion capture has had no good pose of a drone for too long"
     TOUCHED_DOWN = "the pair stands on the ground"
+    GROUNDED = "the firmware counts neither drone as flying"
     TIMEOUT = "the state has lasted as long as it may"
 
 
@@ -64,16 +73,23 @@ class Fault(NamedTuple):
 
 S, E = State, Event
 BEFORE_MOTORS = (S.CHECK, S.ARM)
+ON_GROUND = (*BEFORE_MOTORS, S.SPIN)
 GUIDED = (S.FLY, S.LAND)  # leader and follower laws are in command
 AIRBORNE = (S.RAMP, S.FLY, S.LAND, S.DESCEND, S.HOLD)
 ENDED = (S.STOP, S.KILL, S.DONE)
+
+
+# What goes as planned; and after what the pair sinks under control.
+PLANNED = frozenset({E.READY, E.ARMED, E.CURVE_KNOWN, E.HOVERING, E.TIME_UP, E.RESUMED, E.TOUCHED_DOWN, E.GROUNDED})
+_CONTROLLED = (E.BAD_STATE, E.FENCE, E.SATURATED, E.DEADLINES, E.STICK, E.ESTIMATOR, E.POSE)
 
 
 def _planned() -> dict[tuple[State, Event], State]:
     """A flight in which nothing is wrong, and who may end it early."""
     return {
         (S.CHECK, E.READY): S.ARM,
-        (S.ARM, E.ARMED): S.RAMP,
+        (S.ARM, E.ARMED): S.SPIN,
+        (S.SPIN, E.CURVE_KNOWN): S.RAMP,
         (S.RAMP, E.HOVERING): S.FLY,
         (S.FLY, E.TIME_UP): S.LAND,
         (S.FLY, E.TIMEOUT): S.LAND,
@@ -81,27 +97,30 @@ def _planned() -> dict[tuple[State, Event], State]:
         (S.RAMP, E.INTERRUPT): S.DESCEND,
         (S.LAND, E.TOUCHED_DOWN): S.STOP,
         (S.DESCEND, E.TOUCHED_DOWN): S.STOP,
+        (S.HOLD, E.RESUMED): S.FLY,  # or what else was interrupted, see `Supervisor.after`
+        (S.STOP, E.GROUNDED): S.DONE,
         (S.STOP, E.TIMEOUT): S.DONE,
         (S.KILL, E.TIMEOUT): S.DONE,
     }
 
 
 def _on_the_ground() -> dict[tuple[State, Event], State]:
-    """Before the motors turn, whatever is wrong ends it."""
-    harmless = {E.READY, E.ARMED, E.HOVERING, E.TIME_UP, E.TOUCHED_DOWN, E.SATURATED, E.DEADLINES}
-    return {(state, event): S.STOP for state in BEFORE_MOTORS for event in E if event not in harmless}
+    """Before the pair can lift, whatever is wrong ends it."""
+    harmless = PLANNED | {E.SATURATED, E.DEADLINES, E.TIMEOUT, E.INTERRUPT}
+    wrong = {(state, event): S.STOP for state in ON_GROUND for event in E if event not in harmless}
+    return wrong | {(state, event): S.STOP for state in ON_GROUND for event in (E.TIMEOUT, E.INTERRUPT)}
 
 
 def _in_the_air() -> dict[tuple[State, Event], State]:
     """What can still be flown lands or sinks level, what cannot be heard is mirrored, what is lost is cut."""
-    table = {(S.FLY, event): S.LAND for event in (E.BATTERY, E.WATCHDOG)}
-    table |= {(S.RAMP, event): S.DESCEND for event in (E.BATTERY, E.WATCHDOG, E.TIMEOUT)}
+    table = {(S.FLY, event): S.LAND for event in (E.BATTERY, E.WATCHDOG, E.GAPS)}
+    table |= {(S.RAMP, event): S.DESCEND for event in (E.BATTERY, E.WATCHDOG, E.GAPS, E.TIMEOUT)}
     table[S.LAND, E.TIMEOUT] = S.DESCEND
     for state in (S.RAMP, *GUIDED):
-        table |= {(state, event): S.DESCEND for event in (E.BAD_STATE, E.FENCE, E.SATURATED, E.DEADLINES)}
+        table |= {(state, event): S.DESCEND for event in _CONTROLLED}
     for state in AIRBORNE:
-        table |= {(state, event): S.STOP for event in (E.DRONE_DOWN, E.TILT, E.STICK)}
-        table |= {(state, event): S.HOLD for event in (E.STALE, E.LINK_LOST)}
+        table |= {(state, event): S.STOP for event in (E.DRONE_DOWN, E.TILT)}
+        table |= {(state, event): S.HOLD for event in (E.STALE, E.LINK_LOST, E.UNHEARD)}
     table |= {(state, E.TIMEOUT): S.STOP for state in (S.DESCEND, S.HOLD)}
     table[S.DESCEND, E.BAD_STATE] = S.STOP
     return table
@@ -114,9 +133,9 @@ def _table() -> dict[tuple[State, Event], State]:
 
 
 TRANSITIONS = {pair: state for pair, state in _table().items() if pair[0] is not state}
-SHORT = (S.ARM, S.RAMP)  # states whose time limit is only reached if something is wrong
+SHORT = (S.ARM, S.SPIN, S.RAMP)  # states whose time limit is only reached if something is wrong
 # The flight's exit code is 1 after any of these, or after a state of SHORT that lasted too long.
-FAULTS = frozenset(E) - {E.READY, E.ARMED, E.HOVERING, E.TIME_UP, E.INTERRUPT, E.TOUCHED_DOWN, E.TIMEOUT}
+FAULTS = frozenset(E) - PLANNED - {E.INTERRUPT, E.TIMEOUT}
 
 
 @dataclass(frozen=True)
@@ -126,6 +145,7 @@ class Supervisor:
     state: State = State.CHECK
     since: float = 0.0  # [s]
     cause: Fault | None = None  # what began the abort
+    held: tuple[State, float] | None = None  # the state that HOLD interrupted, and when that was entered [s]
 
     def after(self, faults: list[Fault], now: float) -> Supervisor:
         """The supervisor after everything that happened in one tick ending at `now` [s]."""
@@ -139,9 +159,18 @@ class Supervisor:
         best, why = max(asked or led, key=lambda pair: pair[0].severity, default=(self.state, None))
         if why is None:
             return self
+        if why.event is Event.RESUMED:
+            return self._resumed(now)
         unplanned = why.event in FAULTS or (self.state in SHORT and why.event is Event.TIMEOUT)
         first = self.cause or (why if unplanned else None)
-        return Supervisor(best, now, first)
+        held = (self.state, self.since) if best is State.HOLD else None
+        return Supervisor(best, now, first, held)
+
+    def _resumed(self, now: float) -> Supervisor:
+        """Back to what HOLD interrupted; a gap that closed is no cause. A ramp is not taken up again."""
+        state, since = self.held or (State.DESCEND, now)
+        cause = None if self.cause is not None and self.cause.event is Event.STALE else self.cause
+        return Supervisor(state, since, cause) if state in GUIDED else Supervisor(State.DESCEND, now, self.cause)
 
 
 def table_rows() -> list[tuple[str, str, str]]:
@@ -155,6 +184,12 @@ def markdown() -> str:
     states = [state for state in State if state is not State.DONE]
     lines = ["| event | " + " | ".join(state.value for state in states) + " |", "|---" * (len(states) + 1) + "|"]
     for event in Event:
-        cells = [TRANSITIONS[state, event].value if (state, event) in TRANSITIONS else "" for state in states]
+        cells = [_cell(state, event) for state in states]
         lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def _cell(state: State, event: Event) -> str:
+    if event is Event.RESUMED and state is State.HOLD:
+        return "as before"
+    return TRANSITIONS[state, event].value if (state, event) in TRANSITIONS else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from mjxball.fly.packets import DroneState
+from mjxball.fly.packets import DroneState, Health
 
 WRAP = 1 << 24  # [ms] the firmware's time stamps have 24 bits
 LONGEST_STEP = 10_000  # [ms] between two stamps; a larger one means that the drone was restarted
@@ -18,6 +18,13 @@ class Sample(NamedTuple):
     state: DroneState
     arrival: float  # [s] of our monotonic clock
     stamp: float  # [s] of the firmware's clock, unwrapped
+
+
+class HealthSample(NamedTuple):
+    """One health packet as it arrived."""
+
+    health: Health
+    arrival: float  # [s] of our monotonic clock
 
 
 class FirmwareClock:
@@ -60,6 +67,7 @@ class Telemetry:
     def __init__(self) -> None:
         self.clock = FirmwareClock()
         self.newest: Sample | None = None
+        self.health: HealthSample | None = None
         self.received = self.damaged = self.late = 0
 
     def take(self, state: DroneState, stamp: int, arrival: float) -> Sample | None:

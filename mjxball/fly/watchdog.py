@@ -21,21 +21,22 @@ from typing import Any
 
 from mjxball.cli import make_parser
 from mjxball.fly import packets
-from mjxball.fly.maneuver import Glimpse, blind_shares
+from mjxball.fly.maneuver import LastKnownState, blind_shares
 from mjxball.fly.packets import Packet, Setpoint
 
-FRAME = struct.Struct("<BHHfff")  # what is going on, then `Glimpse`
+FRAME = struct.Struct("<BHHfff")  # what is going on, then `LastKnownState`
 IDLE, FLYING, GOODBYE = 0, 1, 2
 SILENCE = 0.3  # [s] without a frame while flying: the firmware levels at 0.5 s and stops at 2 s
 PERIOD = 0.02  # [s] of the setpoints on the way down
 STOPPING = 0.5  # [s] for which stops are repeated
+ZEROS = 2.3  # [s] of zeros after that: a firmware that counts as flying and hears nothing for 2 s locks itself
 OPENING = 2.0  # [s] for which a link is tried: then the firmware has stopped by itself
 
 
-NOTHING = Glimpse((0, 0), 0.0, 0.0, 0.0)
+NOTHING = LastKnownState((0, 0), 0.0, 0.0, 0.0)
 
 
-def packed(state: int, seen: Glimpse) -> bytes:
+def packed(state: int, seen: LastKnownState) -> bytes:
     """One frame."""
     return FRAME.pack(state, *seen.trims, seen.height, seen.climb, seen.lift)
 
@@ -64,7 +65,7 @@ class Watchdog:
         """Of the watchdog process."""
         return self._process.pid
 
-    def beat(self, flying: bool, seen: Glimpse) -> bool:
+    def beat(self, flying: bool, seen: LastKnownState) -> bool:
         """We live, and this is what it would take over; false if the watchdog has ended."""
         return self._write(packed(FLYING if flying else IDLE, seen))
 
@@ -94,10 +95,10 @@ class Watchdog:
         self._process.stdout.close()
 
 
-def watch(pipe: int, runner: int) -> tuple[Glimpse, float] | None:
+def watch(pipe: int, runner: int) -> tuple[LastKnownState, float] | None:
     """Read frames from `pipe` until the runner is gone; None if all is well, else what to take over with.
 
-    That is the last glimpse and how long ago it was taken [s].
+    That is the last last_known and how long ago it was taken [s].
     """
     state, seen, waiting = IDLE, NOTHING, b""
     while True:
@@ -112,12 +113,12 @@ def watch(pipe: int, runner: int) -> tuple[Glimpse, float] | None:
         waiting += received
         while len(waiting) >= FRAME.size:
             state, leader, follower, *rest = FRAME.unpack(waiting[: FRAME.size])
-            seen, waiting = Glimpse((leader, follower), *rest), waiting[FRAME.size :]
+            seen, waiting = LastKnownState((leader, follower), *rest), waiting[FRAME.size :]
             if state == GOODBYE:
                 return None
 
 
-def way_down(number: int, seen: Glimpse, unheard: float) -> list[Packet]:
+def way_down(number: int, seen: LastKnownState, unheard: float) -> list[Packet]:
     """What drone `number` is sent, one packet per period: level and sinking, then stops and zeros.
 
     Both drones' lists are equally long, so that they stay together.
@@ -126,7 +127,7 @@ def way_down(number: int, seen: Glimpse, unheard: float) -> list[Packet]:
     thrusts = [min(round(share * seen.trims[number]), packets.THRUST_CEILING) for share in shares]
     sinking = [packets.setpoint_packet(Setpoint(0.0, 0.0, 0.0, thrust)) for thrust in thrusts]
     ending = [packets.STOP, packets.setpoint_packet(packets.ZERO)] * round(STOPPING / PERIOD / 2)
-    return [*sinking, *ending, packets.STOP]
+    return [*sinking, *ending, *[packets.setpoint_packet(packets.ZERO)] * round(ZEROS / PERIOD)]
 
 
 def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:

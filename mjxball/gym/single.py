@@ -28,8 +28,8 @@ class Laws(NamedTuple):
 
     pair: CoupledPairEnv
     start: Any  # chain -> (chain, State)
-    command: Any  # (State, action (3,)) -> (Orders, Load)
-    arrive: Any  # (State, Orders, PlantState) -> State
+    command: Any  # (State, action (3,)) -> (Applied, Load)
+    after_physics: Any  # (State, Applied, PlantState) -> State
 
 
 @functools.lru_cache(maxsize=8)
@@ -42,7 +42,7 @@ def compiled_laws(config: Config) -> Laws:
         chain, key = worlds.next_world(chain)
         return chain, pair.reset(key)
 
-    return Laws(pair, jax.jit(start), jax.jit(pair.command), jax.jit(pair.arrive))
+    return Laws(pair, jax.jit(start), jax.jit(pair.command), jax.jit(pair.after_physics))
 
 
 def engine_of(config: Config, physics: str | None) -> str:
@@ -107,13 +107,13 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._state is None or self._plant is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         with on_the_host():
-            orders, load = self._laws.command(self._state, np.asarray(action, np.float32))
-        commands = np.stack([orders.led, orders.followed]).astype(float)[None]
+            applied, load = self._laws.command(self._state, np.asarray(action, np.float32))
+        commands = np.stack(applied.commands).astype(float)[None]
         self._load = load
         plant = self._move(self._plant, commands, _batch_of_one(load))
         with on_the_host():
             arrived = plant.each(lambda leaf: leaf[0].astype(np.float32))
-            self._state = self._laws.arrive(self._state, orders, arrived)
+            self._state = self._laws.after_physics(self._state, applied, arrived)
         if not self._state.metrics["diverged"]:
             self._plant = plant
         truncated = bool(self._state.info["truncation"])

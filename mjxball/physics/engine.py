@@ -45,12 +45,14 @@ class Load(NamedTuple):
     cg_phase: Array  # (...) of a sine [rad]
     mass_change: Array  # (..., k) mass added, or dropped if negative [kg]
     mass_change_time: Array  # (..., k) when [s]
-    push: Array | None = None  # (..., 3) force on O in the world, held over a control step [N]; None: none
+    external_force: Array | None = None  # (..., 3) force on O in the world, held over a control step [N]; None: none
     rotor_lag_scale: Array | None = None  # (...) factor on the rotors' time constant; None: 1
     thrust_scale: Array | None = None  # (..., 2) factor on the rotor forces of leader and follower; None: 1
     added_inertia: Array | None = None  # (..., 3) about the body axes through O, without mass [kg m2]; None: none
     cg_path: Array | None = None  # (..., k) places in [-1, 1] that the CG visits instead of a sine, see `motion.visits`
     cg_visits: Array | None = None  # (...) 1 where it does, 0 where it follows the sine
+    supply: Array | None = None  # (...) voltage of both batteries [V]; None: motors follow the curve
+    older: Array | None = None  # (...) 1 where the firmware does not compensate for the battery, else 0
 
 
 class Wrench(NamedTuple):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjxball.config import Config
-from mjxball.control import attitude, crazyflie, mixer, rotations
+from mjxball.control import attitude, crazyflie, mixer, motor_curves, motors, rotations
 from mjxball.control.constants import plant_constants
 from mjxball.physics import motion
 from mjxball.physics.engine import Engine, Load, PlantState, Wrench
@@ -19,6 +19,9 @@ ControlStep = Callable[[PlantState, Array, Load], PlantState]
 Autopilot = Callable[[PlantState, Array, Load], tuple[Any, Array]]
 # repeat(body, count, value): apply `body` to `value` `count` times
 Repeat = Callable[[Callable[[PlantState], PlantState], int, PlantState], PlantState]
+
+
+USUAL_BATTERY = 3.7  # [V] in hover, where none is drawn
 
 
 def python_repeat(body: Callable[[PlantState], PlantState], count: int, value: PlantState) -> PlantState:
@@ -58,7 +61,7 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
         acting = target + mean * (state.rotor_force - target)
         middle = _drift(state, h / 2)
         rotors = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust, plant.layout)
-        wrench = pushed(rotors, middle, load)
+        wrench = with_external_force(rotors, middle, load)
         linear, angular, ball = accelerate(middle, wrench, load)
         kicked = middle._replace(
             velocity=state.velocity + h * linear,
@@ -137,7 +140,15 @@ def make_autopilot(config: Config) -> Autopilot:
             rotor_targets(config, constants, state, commands, load.believed_mass),
         )
 
+    powered = make_powered(config)
+
     def firmware(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
+        if load.supply is not None:
+            return powered(state, commands, load)
+        if config.autopilot.drone and motor_curves.compensates(config.autopilot.motor_curve):
+            # A motor gives more than a thrust command of 65 535 where the battery has it: full PWM is the limit.
+            usual = commands[..., 0, 0] * 0.0
+            return powered(state, commands, load._replace(supply=usual + USUAL_BATTERY, older=usual))
         xp, law, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
         own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
         sent = crazyflie.setpoints(law, commands, own + share * load.believed_mass[..., None], gravity)
@@ -149,6 +160,45 @@ def make_autopilot(config: Config) -> Autopilot:
         return loops, left * crazyflie.motor_force(law.motor_curve, motors)
 
     return firmware
+
+
+def make_powered(config: Config) -> Autopilot:
+    """The firmware's loops with motors that follow the battery, `load.supply`, with or without its compensation.
+
+    Where `load.older`, the firmware is one without compensation, and what it is sent and its gains are converted for
+    its curve (`motor_curves.with_curve`), as the runner does.
+    """
+    constants = plant_constants(config.plant, config.attitude)
+    law, gravity = config.autopilot, config.plant.gravity
+    motor = motors.MOTORS[law.drone or "2.1"]
+    older = motor_curves.with_curve(config, motor_curves.OLDER).autopilot
+    slower = older.roll_rate[0] / law.roll_rate[0]
+    line = motor_curves.compensates(law.motor_curve)
+
+    def powered(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
+        xp = commands.__array_namespace__()
+        own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
+        carried = own + share * load.believed_mass[..., None]
+        is_old: Array = load.older
+        volts: Array = load.supply
+        old, supply = is_old[..., None, None] > 0, volts[..., None, None]
+        sent = xp.where(
+            old,
+            crazyflie.setpoints(older, commands, carried, gravity),
+            crazyflie.setpoints(law, commands, carried, gravity),
+        )
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
+        euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
+        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype)
+        rate_share = 1.0 + (slower - 1.0) * is_old[..., None, None]
+
+        def duty(command: Array) -> Array:
+            return xp.where(old, command, motors.compensated(motor, command, supply)) if line else command
+
+        loops, pwm = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals, duty, rate_share)
+        return loops, motors.force(motor, pwm, supply)
+
+    return powered
 
 
 def total_wrench(
@@ -164,12 +214,12 @@ def total_wrench(
     return Wrench(xp.stack([zero, zero, _total(thrust)], axis=-1), torque + levers)
 
 
-def pushed(wrench: Wrench, state: PlantState, load: Load) -> Wrench:
+def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench:
     """`wrench` with the force on O that the world exerts."""
-    if load.push is None:
+    if load.external_force is None:
         return wrench
     matrix = rotations.matrix_from_quaternion(state.quaternion)
-    return wrench._replace(force=wrench.force + rotations.rotate_back(matrix, load.push))
+    return wrench._replace(force=wrench.force + rotations.rotate_back(matrix, load.external_force))
 
 
 def _total(pair: Array) -> Array:

@@ -2,36 +2,39 @@
 
 from __future__ import annotations
 
+import io
+import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjxball import __version__
 from mjxball.config import Config, config_hash, to_dict
+from mjxball.control.motor_curves import firmware
 from mjxball.control.observation import ACTION, OBSERVATION, commanded
 from mjxball.control.recall import recall_of
-from mjxball.policy.file import FORMAT_VERSION, PolicyFile
+from mjxball.policy.file import FORMAT_VERSION, PolicyFile, write_whole
 
 
-def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any] | None = None) -> PolicyFile:
-    """The policy file of a `train.sac.Learner`: its averaged policy and its observation statistics.
+def policy_file(config: Config, learnt: Any, steps: int, origin: dict[str, Any] | None = None) -> PolicyFile:
+    """The policy file of what has been learnt, see `mjxball.algorithms.base.Policy`.
 
     `origin` (command, seed, commit, ...) is added to the card.
     """
-    layers = learner.average["params"]
-    names = sorted(layers, key=lambda name: int(name.rsplit("_", 1)[1]))
+    weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
     mask = np.array(recall_of(config).mask(follower.ignore_position))
     size = len(mask)  # behind it stands what only the critics were told; the policy's weights for it never moved
-    deviation = np.asarray(learner.normaliser.std, np.float64)[:size]
-    reach = [follower.tilt_limit, follower.vertical_limit]
+    deviation = np.asarray(learnt.deviation, np.float64)[:size]
+    reach = [follower.action_scale_tilt, follower.action_scale_vertical]
     card = {
         "format_version": FORMAT_VERSION,
         "observation": [list(slot) for slot in OBSERVATION],
         "history": follower.history,
         "previous_action": follower.previous_action,
-        "filters": list(follower.filters),
+        "filters": list(follower.observation_averages),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
         "action_reach": reach,
@@ -41,6 +44,7 @@ def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any]
         "gravity": config.plant.gravity,
         "control_period": config.timing.control_period,
         "plant": to_dict(config.plant),
+        **({"firmware": firmware(config)} if config.autopilot.kind == "crazyflie" else {}),
         "preset": config.preset,
         "config": to_dict(config),
         "config_hash": config_hash(config),
@@ -49,19 +53,46 @@ def policy_file(config: Config, learner: Any, steps: int, origin: dict[str, Any]
         "bounds": {name: bound for name, bound in to_dict(config.bounds).items() if bound > 0},
         **(origin or {}),
     }
-    weights = [np.asarray(layers[name]["kernel"], np.float32) for name in names]
-    biases = [np.asarray(layers[name]["bias"], np.float32) for name in names]
     # What the network does not command is 0, the mean of nothing; behind the means stand the deviations.
     keep = np.append(commanded(follower.load_axis_only, config.plant.cg_axis), np.ones(len(ACTION))).astype(np.float32)
     weights[-1], biases[-1] = weights[-1] * keep, biases[-1] * keep
     return PolicyFile(
         weights=(weights[0][:size], *weights[1:]),
         biases=tuple(biases),
-        observation_mean=np.asarray(learner.normaliser.mean, np.float32)[:size],
+        observation_mean=np.asarray(learnt.mean, np.float32)[:size],
         observation_scale=(mask / deviation).astype(np.float32),
         action_scale=np.array([reach[0], reach[0], reach[1]], np.float32),
         card=card,
     )
+
+
+def _layers(learnt: Any) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Weights (n_in, n_out) and biases (n_out,) of all layers, float32."""
+    names = sorted(learnt.layers, key=lambda name: int(name.rsplit("_", 1)[1]))
+    layers = [learnt.layers[name] for name in names]
+    return tuple([np.asarray(layer[part], np.float32) for layer in layers] for part in ("kernel", "bias"))  # type: ignore[return-value]
+
+
+def network_file(path: Path, learnt: Any, steps: int, origin: dict[str, Any]) -> bool:
+    """Write a policy for another environment than ours to `path`; False, and nothing is written, if it is not finite.
+
+    The arrays are those of a policy file (docs/policy-file.md); the card holds `origin` and `training_steps` alone.
+    """
+    weights, biases = _layers(learnt)
+    scale = np.asarray(learnt.mask) / np.asarray(learnt.deviation, np.float64)
+    arrays: dict[str, Any] = {
+        "observation_mean": np.asarray(learnt.mean, np.float32),
+        "observation_scale": scale.astype(np.float32),
+        **{f"weight_{k}": weight for k, weight in enumerate(weights)},
+        **{f"bias_{k}": bias for k, bias in enumerate(biases)},
+    }
+    if not all(np.isfinite(array).all() for array in arrays.values()):
+        return False
+    stream = io.BytesIO()
+    card: dict[str, Any] = {"training_steps": steps, "package_version": __version__, **origin}
+    np.savez(stream, card=np.array(json.dumps(card, sort_keys=True)), **arrays)
+    write_whole(path, stream.getvalue())
+    return True
 
 
 def is_sound(policy: PolicyFile) -> bool:

@@ -75,9 +75,9 @@ class Policy:
 
 
 class NetworkLaw:
-    """A policy as two pure functions of arrays (see `control.baselines.law.Law`), for batches on NumPy or JAX."""
+    """A policy as two pure functions of arrays (see `control.followers.Law`), for batches on NumPy or JAX."""
 
-    needs_truth = False
+    needs_privileged = False
 
     def __init__(self, policy: Policy):
         self.name = policy.name

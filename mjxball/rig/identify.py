@@ -15,13 +15,17 @@ import numpy as np
 
 from mjxball import cli, config
 from mjxball.control import firmware_gains
+from mjxball.control.crazyflie import THRUST_CEILING
 from mjxball.control.firmware_gains import PARAMETERS, PairGains, pair_gains
 from mjxball.control.hover import hover
 from mjxball.errors import InputError
+from mjxball.fly.card import with_curve
+from mjxball.fly.flown import one_curve, own_curve
 from mjxball.fly.preflight import read_gains
+from mjxball.fly.thrust import CurveName
 from mjxball.rig.axis import inertia_about_o
 from mjxball.rig.fit import Found, identify
-from mjxball.rig.log import read_log
+from mjxball.rig.log import Log, read_log
 from mjxball.rig.model import pair_mass
 
 LEAST_INERTIA = 1e-6  # of a drone about its own centre [kg m2]
@@ -35,7 +39,9 @@ def parser() -> cli.Parser:
     result.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="of mjxball.fly --log, or .npz; see docs")
     result.add_argument("--preset", choices=("flight", "stand"), default="flight", help="rig (default flight)")
     result.add_argument("--plant", type=Path, metavar="FILE", help="masses and places as measured, to start from")
-    result.add_argument("--gains", type=Path, metavar="FILE", help="what the drones flew with, if not the preset's")
+    result.add_argument(
+        "--gains", type=Path, metavar="FILE", help="what the drones flew with, if the log does not say (the preset's)"
+    )
     result.add_argument("--out", type=Path, metavar="PLANT.json", help="write a plant file for train, eval, rig.gains")
     return result
 
@@ -51,21 +57,67 @@ def _identify(options: argparse.Namespace) -> int:
         cli.output_file(options.out, ".json")
     known = cli.read_plant(options.plant).settings if options.plant else {}
     settings = cli.apply_plant(config.preset(options.preset), options.plant)
-    if options.gains:
-        settings = with_gains(settings, read_gains(options.gains))
     if settings.plant.cg_axis != "y":
         raise InputError("identification is of the inertia about x; the stick must lie along y")
-    found = [identify(settings, read_log(path)) for path in options.logs]
-    for path, one in zip(options.logs, found, strict=True):
-        print(f"{path.name}: {one.windows} s of flight\n{report(settings, one)}")  # noqa: T201
+    gains = read_gains(options.gains) if options.gains else None
+    logs = [read_log(path) for path in options.logs]
+    flown = [flown_with(settings, log, gains, path) for path, log in zip(options.logs, logs, strict=True)]
+    curve = curve_of_all([own_curve(one) for one in flown])
+    converted = with_curve(settings, curve)
+    found = [identify(one, log) for one, log in zip(flown, logs, strict=True)]
+    for path, log, one in zip(options.logs, logs, found, strict=True):
+        for remark in log.remarks:
+            print(remark, file=sys.stderr)  # noqa: T201
+        print(f"{path.name}: {one.windows} s of flight, {curve} force curve\n{report(converted, one)}")  # noqa: T201
     mean = average(found)
     if len(found) > 1:
-        print(f"all {len(found)} logs\n{report(settings, mean)}")  # noqa: T201
-    values = {**known, **plant_settings(settings, mean)}
+        print(f"all {len(found)} logs\n{report(converted, mean)}")  # noqa: T201
+    values = {**known, **conversion(settings, converted), **plant_settings(converted, mean)}
     if options.out:
         options.out.write_text(json.dumps({"preset": options.preset, **values}, indent=1) + "\n")
     config.validate(config.apply_overrides(settings, values))  # the file is kept: what is wrong is the rig
     return 0
+
+
+def flown_with(settings: config.Config, log: Log, gains: PairGains | None, path: Path) -> config.Config:
+    """`settings` on the force curve that the `log` says was flown, with the `gains` given, else with the log's.
+
+    Raises InputError if the log is of a rig on another stand, or what flew cannot be identified with.
+    """
+    if log.stand not in (None, settings.plant.stand):
+        rig = "flight" if log.stand == "free" else "stand"
+        raise InputError(f"flight log {path} is of the {rig}: say --preset {rig}")
+    if log.curves is not None:
+        curve = one_curve(log.curves)
+        if curve is None:
+            leader, follower = log.curves
+            raise InputError(
+                f"flight log {path} is of a leader with the {leader} and a follower with the {follower} force curve; "
+                "identification takes one of both"
+            )
+        settings = with_curve(settings, curve)
+    gains = gains or log.gains
+    return with_gains(settings, gains) if gains else settings
+
+
+def curve_of_all(curves: Sequence[CurveName]) -> CurveName:
+    """The force curve of all logs. Raises InputError if they have different ones."""
+    if len(set(curves)) > 1:
+        raise InputError(f"the logs are of different force curves ({', '.join(curves)}): identify each curve by itself")
+    return curves[0]
+
+
+def conversion(settings: config.Config, converted: config.Config) -> dict[str, Any]:
+    """Settings by path of the autopilot by which `converted`, on another force curve, differs from `settings`."""
+    pairs = {
+        f"autopilot.{item.name}": (getattr(settings.autopilot, item.name), getattr(converted.autopilot, item.name))
+        for item in dataclasses.fields(converted.autopilot)
+    }
+    return {
+        name: [_rounded(value) for value in new] if isinstance(new, tuple) else _rounded(new)
+        for name, (old, new) in pairs.items()
+        if new != old
+    }
 
 
 def with_gains(settings: config.Config, gains: PairGains) -> config.Config:
@@ -90,14 +142,13 @@ def with_gains(settings: config.Config, gains: PairGains) -> config.Config:
 
 def average(found: Sequence[Found]) -> Found:
     """One result from several logs, each weighted by its own precision."""
-    values = np.array([[one.thrust, one.inertia, one.lag, one.delay] for one in found])
-    spreads = np.array([one.spread for one in found])
-    weights = 1 / spreads**2
-    thrust, inertia, lag, delay = map(float, (weights * values).sum(axis=0) / weights.sum(axis=0))
-    s = np.sqrt(1 / weights.sum(axis=0))
-    spread = (float(s[0]), float(s[1]), float(s[2]), float(s[3]))
+    values = np.array([[one.thrust, one.inertia, one.lag, one.delay, one.uneven] for one in found])
+    weights = 1 / np.array([[*one.spread, one.uneven_spread] for one in found]) ** 2
+    thrust, inertia, lag, delay, uneven = map(float, (weights * values).sum(axis=0) / weights.sum(axis=0))
+    *s, uneven_spread = map(float, np.sqrt(1 / weights.sum(axis=0)))
     misfit = float(np.sqrt(np.mean([one.misfit**2 for one in found])))
-    return Found(thrust, inertia, lag, delay, spread, misfit, sum(one.windows for one in found))
+    windows = sum(one.windows for one in found)
+    return Found(thrust, inertia, lag, delay, (s[0], s[1], s[2], s[3]), misfit, windows, uneven, uneven_spread)
 
 
 def plant_settings(settings: config.Config, found: Found) -> dict[str, Any]:
@@ -119,7 +170,8 @@ def plant_settings(settings: config.Config, found: Found) -> dict[str, Any]:
         "plant.leader_inertia": [_rounded(value) for value in own(plant.leader_inertia)],
         "plant.follower_inertia": [_rounded(value) for value in own(plant.follower_inertia)],
         "autopilot.motor_curve": [_rounded(value) for value in curve],
-        "autopilot.hover_thrust": round(hover(stronger)[0]),
+        # What takes more than there is is a rig that is too weak: `validate` says so.
+        "autopilot.hover_thrust": min(round(hover(stronger)[0]), THRUST_CEILING),
         "scenario.delay": [
             _rounded(max(found.delay - DELAY_EITHER_WAY, 0.0)),
             _rounded(found.delay + DELAY_EITHER_WAY),
@@ -142,6 +194,8 @@ def report(settings: config.Config, found: Found) -> str:
         f"  inertia       {1e3 * found.inertia:.4f} +- {1e3 * found.inertia * inertia:.4f} g m2 across the stick, "
         f"{found.inertia / computed:.2f} of what masses and places give",
         f"  delay         {1e3 * found.delay:.1f} +- {1e3 * delay:.1f} ms",
+        f"  uneven        leader {100 * found.uneven:+.1f} %, follower {-100 * found.uneven:+.1f} %, "
+        f"+- {100 * found.uneven_spread:.1f}",
         f"  misfit        {found.misfit:.2f} of the noise that was assumed",
     ]
     if max(thrust, inertia, lag) > 0.1:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from mjxball.control import rotations
 from mjxball.control.crazyflie import PERIOD
+from mjxball.control.firmware_gains import PairGains
 from mjxball.errors import InputError
-from mjxball.fly import journal, packets
+from mjxball.fly import flight_log
+from mjxball.fly.flight_log import GUIDED, FlightLog, Outage, numbers, outages
+from mjxball.fly.limits import NAMES
+from mjxball.fly.thrust import CurveName
 
 STATE = 13  # numbers of a drone's state in an .npz: position, velocity, quaternion (w, x, y, z), body rates
-FLYING = "fly"  # state of the runner in which both laws fly
-LONGEST_GAP = 0.2  # [s] without a state before a log is refused
+OFF_THE_GROUND = 0.03  # [m] above the start of a flight from which on nothing touches the pair
+LONGEST_HOLD = 0.4  # [s] without a setpoint after which what the firmware does is not what is modelled
 
 
 class Log(NamedTuple):
@@ -24,7 +29,13 @@ class Log(NamedTuple):
     climb: np.ndarray  # (K,) vertical velocity of O [m/s]
     euler: np.ndarray  # (K, 3) of the body, the mean of both drones [rad]
     rates: np.ndarray  # (K, 3) likewise [rad/s]
+    usable: np.ndarray  # (K,) True: guided flight, off the ground, and both drones' states are known
     every: int  # ticks between two measurements
+    remarks: tuple[str, ...] = ()  # what was left out, or should be known, a line each
+    stand: str | None = None  # of the rig that flew, as its log has it
+    gains: PairGains | None = None  # that were flown, likewise
+    curves: tuple[CurveName, CurveName] | None = None  # of leader's and follower's firmware, likewise
+    volts: float | None = None  # of the batteries under load, the median; None: not measured
 
 
 def read_log(path: Path) -> Log:
@@ -32,34 +43,51 @@ def read_log(path: Path) -> Log:
 
     Raises InputError.
     """
+    if path.suffix != ".npz":
+        return _of_flight(flight_log.load(path))
     try:
-        if path.suffix == ".npz":
-            with np.load(path, allow_pickle=False) as data:
-                arrays = [np.asarray(data[name], float) for name in ("time", "setpoints", "states")]
-                return make_log(arrays[0], arrays[1], arrays[0], [arrays[2][:, 0], arrays[2][:, 1]])
-        return _of_journal(path)
+        with np.load(path, allow_pickle=False) as data:
+            arrays = [np.asarray(data[name], float) for name in ("time", "setpoints", "states")]
+        return make_log(arrays[0], arrays[1], arrays[0], [arrays[2][:, 0], arrays[2][:, 1]])
     except OSError as error:
         raise InputError(f"log {path} cannot be read: {error.strerror or error}") from None
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise InputError(f"log {path} is none of mjxball.fly and no .npz of time, setpoints, states: {error}") from None
+        raise InputError(f"log {path} is no .npz of time, setpoints, states: {error}") from None
 
 
-def make_log(sent_at: np.ndarray, setpoints: np.ndarray, seen_at: Any, states: list[np.ndarray]) -> Log:
-    """Bring setpoints (T, 2, 4) at `sent_at` and two drones' `states` (S, 13) at `seen_at` onto the ticks."""
-    times = seen_at if isinstance(seen_at, list) else [seen_at, seen_at]
+def make_log(
+    sent_at: np.ndarray,
+    setpoints: np.ndarray,
+    seen_at: np.ndarray | Sequence[np.ndarray],
+    states: Sequence[np.ndarray],
+    guided: np.ndarray | None = None,
+) -> Log:
+    """Bring setpoints (T, 2, 4) at `sent_at` and two drones' `states` (S, 13) at `seen_at` onto the ticks.
+
+    `guided` (T,) says at which setpoints of a flight, which starts on the ground, the laws were in command; if it is
+    not given, they always were, in the air. Raises ValueError if the arrays are unsound.
+    """
+    times = [seen_at, seen_at] if isinstance(seen_at, np.ndarray) else list(seen_at)
     count = len(sent_at)
     if setpoints.shape != (count, 2, 4) or any(s.shape != (len(t), STATE) for s, t in zip(states, times, strict=True)):
         raise ValueError("shapes do not fit: time (T,), setpoints (T, 2, 4), states (T, 2, 13)")
-    if count < 2 or not all(np.isfinite(part).all() for part in (sent_at, setpoints, *states, *times)):
+    if min(count, *map(len, times)) < 2:
+        raise ValueError("it holds fewer than two rows")
+    if not all(np.isfinite(part).all() for part in (sent_at, setpoints, *states, *times)):
         raise ValueError("numbers are missing or not finite")
-    if any((np.diff(t) <= 0).any() or np.diff(t).max() > LONGEST_GAP for t in (sent_at, *times)):
-        raise ValueError(f"times do not increase, or leave a gap of more than {LONGEST_GAP:g} s")
+    if any((np.diff(t) <= 0).any() for t in (sent_at, *times)):
+        raise ValueError("times do not increase")
     grid = np.arange(max(t[0] for t in (sent_at, *times)), min(t[-1] for t in (sent_at, *times)), PERIOD)
-    held = setpoints[np.searchsorted(sent_at, grid + 1e-9, side="right") - 1]
+    latest = np.searchsorted(sent_at, grid + 1e-9, side="right") - 1
     rows = [_on_grid(grid, t, s) for t, s in zip(times, states, strict=True)]
     climb, euler, rates = (np.mean(parts, axis=0) for parts in zip(*rows, strict=True))
     every = max(1, round(float(np.median(np.diff(times[0]))) / PERIOD))
-    return Log(held, climb, euler, rates, every)
+    usable = grid - sent_at[latest] < LONGEST_HOLD
+    if guided is not None:
+        height = np.mean([np.interp(grid, t, s[:, 2] - s[0, 2]) for t, s in zip(times, states, strict=True)], axis=0)
+        usable &= guided[latest] & (height > OFF_THE_GROUND)
+    found = [gap for name, t, s in zip(NAMES, times, states, strict=True) for gap in outages(name, t, s, t[-1])]
+    return Log(setpoints[latest], climb, euler, rates, usable & ~_within(grid, found), every)
 
 
 def _on_grid(grid: np.ndarray, time: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -72,22 +100,35 @@ def _on_grid(grid: np.ndarray, time: np.ndarray, states: np.ndarray) -> tuple[np
     return np.interp(grid, time, states[:, 5]), interpolated(euler), interpolated(states[:, 10:13])
 
 
-def _of_journal(path: Path) -> Log:
-    """The guided part of a flight."""
-    sent_at, sent = [], []
-    seen: dict[str, tuple[list[float], list[np.ndarray]]] = {"leader": ([], []), "follower": ([], [])}
-    for record in journal.read(path):
-        if record["kind"] == "tick" and record["state"] == FLYING:
-            sent_at.append(float(record["t"]))
-            sent.append(record["sent"])
-        elif record["kind"] == "state":
-            state = packets.unpack_state(bytes.fromhex(record["raw"]))
-            times, states = seen[record["drone"]]
-            times.append(float(record["t"]))
-            states.append(np.concatenate([state.position, state.velocity, state.quaternion, state.rates]))
-    if len(sent) < 2 or not all(times for times, _ in seen.values()):
-        raise ValueError("it holds no guided flight of two drones")
-    both = [(np.array(times), np.array(states)) for times, states in seen.values()]
-    spans = [(t > sent_at[0] - LONGEST_GAP) & (t < sent_at[-1] + LONGEST_GAP) for t, _ in both]
-    guided = [(t[span], s[span]) for (t, s), span in zip(both, spans, strict=True)]
-    return make_log(np.array(sent_at), np.array(sent, float), [t for t, _ in guided], [s for _, s in guided])
+def _within(grid: np.ndarray, gaps: Sequence[Outage]) -> np.ndarray:
+    """(K,) whether each time lies in one of the `gaps`."""
+    inside = np.zeros(len(grid), bool)
+    for gap in gaps:
+        inside |= (grid > gap.begin) & (grid < gap.end)
+    return inside
+
+
+def _of_flight(flown: FlightLog) -> Log:
+    """A flight from where its motors turn, since the integrals that it is flown with begin there."""
+    ticks = [one for one in flown.records if one["kind"] == "tick"]
+    own = [[one for one in flown.records if one["kind"] == "state" and one["drone"] == name] for name in NAMES]
+    guided = np.array([one["state"] == GUIDED for one in ticks])
+    if not guided.any():
+        raise InputError(f"flight log {flown.path} holds no guided flight: its laws were never in command")
+    try:
+        log = make_log(
+            np.array([one["t"] for one in ticks]),
+            np.array([one["sent"] for one in ticks]),
+            [np.array([one["t"] for one in rows]) for rows in own],
+            [np.array([numbers(one["raw"].state) for one in rows]) for rows in own],
+            guided,
+        )
+    except ValueError as error:
+        raise InputError(f"flight log {flown.path} cannot be used: {error}") from None
+    return log._replace(
+        remarks=tuple(flown.told()),
+        stand=flown.config.plant.stand,
+        gains=flown.gains,
+        curves=flown.curves,
+        volts=float(np.median([one["raw"].state.battery for rows in own for one in rows])),
+    )

@@ -16,6 +16,7 @@ import orbax.checkpoint as ocp
 
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.train.extensions import Extensions, is_pair, resolve
 from mjxball.train.members import best_member, read_members
 from mjxball.train.population import Population
 from mjxball.train.processes import is_writer
@@ -156,16 +157,19 @@ def _restore(run: Path, population: Population, discard: bool) -> TrainState | N
 
 
 def restore_policy(run: Path) -> tuple[Config, Any, int, dict[str, Any]]:
-    """Configuration, learner, environment steps and origin of a run's newest checkpoint; of a population the best's."""
+    """Configuration, policy, environment steps and origin of a run's newest checkpoint; of a population the best's."""
     config, origin = read_config(run)
     population, best = _population(config, origin), best_member(read_members(run))
     state = _restore(run, population, discard=False)
     if state is None:
         raise InputError(f"{run} has no complete checkpoint")
-    chosen = population.member(state, best)
+    if not is_pair(population.program.env):
+        raise InputError(f"{run} was trained on an environment of its own; its policy.npz is all there is to export")
     origin = {**origin, "seed": origin["seed"] + best}
-    return population.member_config(best), chosen.learner, int(chosen.steps), origin
+    steps = int(np.ravel(state.steps)[0])
+    return population.member_config(best), population.policy(state, best), steps, origin
 
 
 def _population(config: Config, origin: dict[str, Any]) -> Population:
-    return Population(config, origin["physics"], origin["seeds"], origin["sweep"])
+    extensions = resolve(Extensions(**(origin.get("extensions") or {})))
+    return Population(config, origin["physics"], origin["seeds"], origin["sweep"], extensions=extensions)

@@ -68,11 +68,12 @@ def draw_training(run: Path, config: Config, path: Path) -> None:
         kept = [(int(row["steps"]), float(row[name])) for row in rows if row[name]]
         return np.array([k for k, _ in kept]), np.array([v for _, v in kept])
 
-    below = PANELS[config.reward.kind]
+    known = set(rows[0]) if rows else set()
+    below = tuple(panel for panel in PANELS[config.reward.kind] if {name for name in panel[:2] if name} <= known)
     plt = pyplot()
-    figure, axes = plt.subplots(
-        1 + len(below), 1, sharex=True, figsize=(8, 3 + 2.2 * len(below)), constrained_layout=True
-    )
+    size = (8, 3 + 2.2 * len(below))
+    figure, grid = plt.subplots(1 + len(below), 1, sharex=True, figsize=size, constrained_layout=True, squeeze=False)
+    axes = grid[:, 0]
     for axis, (exploring, evaluated, label) in zip(
         axes, (("episode_return", "eval_return", "return of an episode"), *below), strict=True
     ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +13,7 @@ from mjxball.train.reading import read_rows
 
 LOG = "members.csv"
 POLICIES = "members"
-COLUMNS = (
-    "steps",
-    "seed",
-    "eval_return",
-    "eval_steady_error",
-    "eval_peak",
-    "eval_tilt_error",
-    "eval_vertical_error",
-)
+COLUMNS = ("steps", "seed", "eval_return")  # and what the environment reports of an evaluation
 
 
 class MemberLog:
@@ -30,16 +23,16 @@ class MemberLog:
         self._out, self._seed = out, seed
         self._rows = [row for row in read_members(out) if row["steps"] <= resumed_at] if out else []
 
-    def add(self, steps: int, *columns: np.ndarray) -> None:
-        """Append one evaluation: every array is (members,), in the order of `COLUMNS` after the seed."""
-        for member, values in enumerate(zip(*columns, strict=True)):
-            row = (steps, self._seed + member, *map(float, values))
-            self._rows.append(dict(zip(COLUMNS, row, strict=True)))
+    def add(self, steps: int, found: Mapping[str, np.ndarray]) -> None:
+        """Append one evaluation: every array is (members,)."""
+        for member, values in enumerate(zip(*found.values(), strict=True)):
+            named = dict(zip(found, map(float, values), strict=True))
+            self._rows.append({"steps": steps, "seed": self._seed + member, **named})
         if self._out is None:
             return
         partial = self._out / f".{LOG}.partial"
         with partial.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, COLUMNS)
+            writer = csv.DictWriter(stream, list(self._rows[-1]))
             writer.writeheader()
             writer.writerows(self._rows)
         partial.replace(self._out / LOG)
@@ -64,7 +57,7 @@ def read_members(run: Path) -> list[dict[str, float]]:
     except FileNotFoundError:
         return []
     try:
-        rows = [{name: float(row[name]) for name in COLUMNS} for row in texts]
+        rows = [{name: float(row[name]) for name in {**dict.fromkeys(COLUMNS), **row}} for row in texts]
         return [{**row, "steps": int(row["steps"]), "seed": int(row["seed"])} for row in rows]
     except (KeyError, ValueError, OverflowError):
         raise InputError(f"{run / LOG} holds something else than the numbers of a population") from None

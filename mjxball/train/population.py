@@ -14,12 +14,12 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from mjxball import config as configs
+from mjxball.algorithms.base import Policy, Shards
 from mjxball.config import Config
-from mjxball.errors import InputError
-from mjxball.train.program import Mode, Program, Shards, Tally, TrainState, prefill
+from mjxball.train.environments import Tally, report
+from mjxball.train.extensions import OURS, Extensions
+from mjxball.train.program import Mode, Program, TrainState, warmup
 from mjxball.train.provenance import source_hash, versions
-from mjxball.train.replay import Replay
-from mjxball.train.sac import Losses
 from mjxball.train.sweep import Sweep
 from mjxball.train.traced import Traced
 
@@ -30,15 +30,14 @@ GPU_OPTIONS: dict[str, bool | int | float | str] = {"xla_gpu_autotune_level": 0,
 # One follower's products of layers of 64 are small enough for plain loops, which spare XLA a kernel in Triton for each
 # (2 - 5 s to compile). For many followers at once Triton's are faster (64: by a quarter).
 PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in both matrices
-EVALUATION_DRAW = 20_261_121  # tells the evaluation's worlds from those of any seed
 
 
 class Executables(NamedTuple):
     """A population's compiled functions."""
 
     create: Callable[[Any, Any], TrainState]  # (swept values, keys) -> state
-    advance: Callable[[TrainState, Mode], tuple[TrainState, Tally]]  # gives away the state's memory
-    evaluation_worlds: Callable[[Any, Array], Any]  # (swept values, `_first_key()`) -> worlds
+    advance: Callable[[TrainState, Mode], tuple[TrainState, Tally, Any]]  # gives away the state's memory
+    evaluation_envs: Callable[[Any, Array], Any]  # (swept values, `_first_key()`) -> environments
 
 
 class Population:
@@ -46,7 +45,7 @@ class Population:
 
     Member k has seed `seed + k` and the k-th value of every swept setting. In one process the members are spread
     over all its devices if their number divides evenly, else they share the first. Over several processes (see
-    `processes`) members and, where there are fewer members than devices, each member's worlds are spread over all.
+    `processes`) members and, where there are fewer than devices, each member's environments are spread over all.
     """
 
     def __init__(
@@ -56,25 +55,26 @@ class Population:
         members: int = 1,
         sweep: Sweep | None = None,
         devices: Sequence[Any] | None = None,
+        extensions: Extensions = OURS,
     ):
-        self.config, self.members, self._physics = config, members, physics
+        self.config, self.members, self._physics, self._extensions = config, members, physics, extensions
         self._sweep = dict(sweep or {})
         self._single = members == 1 and not self._sweep
         self._values = {name: np.asarray(values, np.float32) for name, values in self._sweep.items()}
         if devices is None:
             devices = jax.devices() if jax.process_count() > 1 else jax.local_devices()
         groups, parts = grid(members, len(devices), split=jax.process_count() > 1)
-        check_parts(config, parts)
         spread = groups * parts > 1
         self.mesh = _mesh(devices, groups, parts) if spread else None
         self.devices, self.parts = groups * parts, parts
-        self._shards = Shards("worlds", parts) if parts > 1 else Shards()
-        self.program = Program(config, physics, shards=self._shards)
+        self._shards = Shards("envs", parts) if parts > 1 else Shards()
+        self.program = Program(config, physics, shards=self._shards, extensions=extensions)
+        self.program.algorithm.check_parts(parts)
         whole: Any = PartitionSpec() if self._single else PartitionSpec("members")
-        split: Any = PartitionSpec(*whole, "worlds")
+        split: Any = PartitionSpec(*whole, "envs")
         self._whole, self._split = whole, split
-        self._state_spec = TrainState(whole, Replay(rows=split, inserted=whole), split, whole, whole)
-        self._tally_spec = Tally(**{name: split if name == "peak" else whole for name in Tally._fields})
+        self._state_spec = TrainState(self.program.algorithm.partition(whole, split), split, whole, whole)
+        self._tally_spec = Tally(whole, whole, whole, split)
 
     def member_config(self, member: int) -> Config:
         """The configuration of one member."""
@@ -100,13 +100,13 @@ class Population:
         """Shapes of what `create` returns, without computing it."""
         return jax.eval_shape(self._create, self._values, self._keys(0))
 
-    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
+    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally, dict[str, Array]]:
         """See `Program.advance`."""
 
-        def one(program: Program, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
+        def one(program: Program, state: TrainState, mode: Mode) -> tuple[TrainState, Tally, dict[str, Array]]:
             return program.advance(state, mode)
 
-        results = (self._state_spec, self._tally_spec)
+        results = (self._state_spec, self._tally_spec, self._whole)
         return self._on_mesh(one, (self._state_spec, PartitionSpec()), results, (0, None))(self._values, state, mode)
 
     def compile(self, creating: bool) -> Executables:
@@ -127,7 +127,7 @@ class Population:
 
     def _lower_here(self, creating: bool) -> Iterator[Any]:
         """advance, fresh worlds and, if `creating`, create on one device; traced programs come from the cache."""
-        key = {
+        key: dict[str, Any] | None = {
             "config": configs.to_dict(self.config),
             "physics": self._physics,
             "members": self.members,
@@ -136,10 +136,12 @@ class Population:
             "versions": versions(),
         }
         values, keys = jax.tree.map(_shape, self._starts(0))
-        mode, state = jax.tree.map(_shape, prefill(1)), self.template()
-        tally = Tally._make([*[0] * (len(Tally._fields) - 1), Losses._make([0] * len(Losses._fields))])
-        yield Traced("advance", key, self.advance, (state, mode), (state, tally)).lower(donate=0)
-        yield Traced("fresh", key, self._fresh, (values, _shape(_first_key())), state.worlds).lower()
+        if any(self._extensions):
+            key = None  # nobody knows all that they depend on
+        mode, state = jax.tree.map(_shape, warmup(1)), self.template()
+        result = (state, *self._told(state))
+        yield Traced("advance", key, self.advance, (state, mode), result).lower(donate=0)
+        yield Traced("fresh", key, self._fresh, (values, _shape(_first_key())), state.envs).lower()
         if creating:
             yield Traced("create", key, self._create, (values, keys), state).lower()
 
@@ -148,8 +150,8 @@ class Population:
         values, keys = self._starts(0)
         key = self._lent(_first_key(), PartitionSpec())
         state = self._placed_shapes(self.template(), self._state_spec)
-        mode = self.mode(prefill(1))
-        results = self._results(self._state_spec, self._tally_spec)
+        mode = self.mode(warmup(1))
+        results = self._results(self._state_spec, self._tally_spec, self._whole)
         yield jax.jit(self.advance, donate_argnums=0, **results).lower(state, mode)
         yield jax.jit(self._fresh, **self._results(self._split)).lower(values, key)
         if creating:
@@ -159,10 +161,35 @@ class Population:
         """`create(seed)` with a compiled program."""
         return executables.create(*self._starts(seed))
 
-    def evaluation_worlds(self, executables: Executables) -> Any:
-        """Newly reset worlds, the same for every member and every evaluation."""
+    def evaluation_envs(self, executables: Executables) -> Any:
+        """Newly reset environments, the same for every member and every evaluation."""
         values, key = self._lent(self._values, self._whole), self._lent(_first_key(), PartitionSpec())
-        return executables.evaluation_worlds(values, key)
+        return executables.evaluation_envs(values, key)
+
+    def policy(self, state: TrainState, member: int) -> Policy:
+        """The policy of one member of a state of NumPy arrays."""
+        return self.program.policy(self.member(state, member))
+
+    def report(self, tally: Tally, steps: int, evaluation: bool) -> dict[str, np.ndarray]:
+        """What a tally of NumPy arrays over `steps` says of the environment's metrics: {name: (members,)}."""
+        each = lambda values: {name: self.each(value).astype(float) for name, value in values.items()}  # noqa: E731
+        count = steps * self.program.schedule.num_envs
+        return report(self.program.env, each(tally.totals), each(tally.peaks), count, evaluation)
+
+    def metric_names(self) -> tuple[list[str], list[str]]:
+        """Names of what `report` says of training and of evaluation."""
+        tally, _ = self._told(self.template())
+        zeros = Tally(*(jax.tree.map(lambda leaf: np.zeros((self.members, 1)), part) for part in tally))
+        found = [
+            report(self.program.env, {k: v[:, 0] for k, v in zeros.totals.items()}, zeros.peaks, 1, evaluation)
+            for evaluation in (False, True)
+        ]
+        return list(found[0]), list(found[1])
+
+    def _told(self, state: TrainState) -> tuple[Tally, dict[str, int]]:
+        """The structure of a tally and of the algorithm's metrics."""
+        names = dict.fromkeys(state.envs.metrics, 0)
+        return Tally(0, 0, names, names), dict.fromkeys(self.program.algorithm.metrics, 0)
 
     def place_state(self, state: TrainState) -> TrainState:
         """A whole state of NumPy arrays, the same in every process, spread over the devices."""
@@ -205,7 +232,7 @@ class Population:
         )
 
     def _fresh(self, values: Any, key: Array) -> Any:
-        draw = lambda program, key: program.fresh_worlds(jax.random.fold_in(key, EVALUATION_DRAW))  # noqa: E731
+        draw = lambda program, key: program.evaluation_envs(key)  # noqa: E731
         return self._on_mesh(draw, (PartitionSpec(),), self._split, (None,))(values, key)
 
     def _on_mesh(self, one: Callable[..., Any], specs: Any, results: Any, axes: tuple[int | None, ...]) -> Any:
@@ -246,7 +273,9 @@ class Population:
         return jax.tree.map(placed, specs, template, is_leaf=_is_spec)
 
     def _of(self, values: Mapping[str, Array]) -> Program:
-        return Program(self.config, self._physics, values, self._shards) if values else self.program
+        if not values:
+            return self.program
+        return Program(self.config, self._physics, values, self._shards, self._extensions)
 
 
 def _partitioned_by_gspmd(mesh: Mesh | None) -> contextlib.AbstractContextManager[None]:
@@ -279,7 +308,7 @@ def _shape(array: Any) -> jax.ShapeDtypeStruct:
 
 
 def grid(members: int, devices: int, split: bool) -> tuple[int, int]:
-    """(groups of members, parts of each member's worlds) that the devices are arranged in.
+    """(groups of members, parts of each member's environments) that the devices are arranged in.
 
     Without `split` a member stays on one device, and members that do not divide evenly share the first.
     """
@@ -289,17 +318,8 @@ def grid(members: int, devices: int, split: bool) -> tuple[int, int]:
     return (devices, 1) if groups == devices else (1, 1)
 
 
-def check_parts(config: Config, parts: int) -> None:
-    """Raise InputError unless worlds, batch and replay can be cut into `parts`."""
-    for name in ("worlds", "batch", "replay"):
-        size = getattr(config.sac, name)
-        whole = parts * (config.sac.worlds // parts if name == "replay" else 1)
-        if size % whole:
-            raise InputError(f"sac.{name} = {size} cannot be split over {parts} devices evenly; make it a multiple")
-
-
 def _mesh(devices: Sequence[Any], groups: int, parts: int) -> Mesh:
-    return jax.make_mesh((groups, parts), ("members", "worlds"), axis_types=(AxisType.Auto,) * 2, devices=devices)
+    return jax.make_mesh((groups, parts), ("members", "envs"), axis_types=(AxisType.Auto,) * 2, devices=devices)
 
 
 def _is_spec(value: Any) -> bool:

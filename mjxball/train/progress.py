@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import sys
 import time
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from mjxball.quiet import import_tensorboard_writer
 from mjxball.train.reading import read_rows
@@ -15,26 +15,18 @@ from mjxball.train.reading import read_rows
 EVENTS = "tensorboard"  # directory beside metrics.csv
 
 
-@dataclass(frozen=True)
-class Row:
-    """One row of `metrics.csv`. Evaluation columns are empty between evaluations."""
+# steps: environment steps so far; seconds: of training, compilation included, of a resumed run what came before its
+# checkpoint too; rate: environment steps per second of all members together, updates included; episode_return: mean
+# reward x episode steps, exploring. Then what environment and algorithm report, and episodes that ended before their
+# time limit or left the finite range.
+COMMON = ("steps", "seconds", "rate", "episode_return")
+Row = dict[str, Any]  # by column; the columns of an evaluation are absent between evaluations
 
-    steps: int  # environment steps so far
-    seconds: float  # of training, compilation included; of a resumed run what came before its checkpoint too
-    rate: float  # environment steps per second of all members together, updates included
-    episode_return: float  # mean reward x episode steps, exploring policy
-    steady_error: float | None  # mean |e_o| later than 8 s into an episode, exploring policy [m]; None: none so old
-    alpha: float
-    entropy: float  # of the policy [nat]
-    critic_loss: float
-    policy_loss: float
-    terminated: int  # episodes that ended before their time limit
-    diverged: int  # worlds that left the finite range
-    eval_return: float | None = None  # the same for the averaged policy's mean
-    eval_steady_error: float | None = None  # [m]
-    eval_peak: float | None = None  # mean over worlds of the largest steady |e_o| [m]
-    eval_tilt_error: float | None = None  # rms difference of the roll and pitch commands to the leader's [rad]
-    eval_vertical_error: float | None = None  # the same of the vertical accelerations [m/s2]
+
+def columns(exploring: Sequence[str], algorithm: Sequence[str], evaluated: Sequence[str]) -> list[str]:
+    """Columns of `metrics.csv`, from what the environment reports (exploring, evaluated) and the algorithm."""
+    found = [*COMMON, *exploring, *algorithm, "terminated", "diverged", "eval_return"]
+    return [*found, *(f"eval_{name}" for name in evaluated)]
 
 
 class Progress:
@@ -45,9 +37,15 @@ class Progress:
     """
 
     def __init__(
-        self, path: Path | None, total: int, resumed_at: int = 0, members: int = 1, stream: TextIO | None = None
+        self,
+        path: Path | None,
+        names: Sequence[str],
+        total: int,
+        resumed_at: int = 0,
+        members: int = 1,
+        stream: TextIO | None = None,
     ):
-        self._total, self._members = total, members
+        self._names, self._total, self._members = names, total, members
         self._stream = stream or sys.stderr
         self._live = self._stream.isatty()
         self._start = time.monotonic()
@@ -56,9 +54,8 @@ class Progress:
         self._silent = path is None
         if path is None:
             return
-        kept = _rows_until(path, resumed_at)
+        kept = _rows_until(path, names, resumed_at)
         self._before = float(kept[-1]["seconds"]) if kept else 0.0
-        names = [item.name for item in fields(Row)]
         partial = path.with_name(f".{path.name}.partial")
         with partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, names)
@@ -89,22 +86,16 @@ class Progress:
         """Record `row` and show it."""
         if self._silent:
             return
-        self._writer.writerow(asdict(row))
+        self._writer.writerow(row)
         self._file.flush()
-        for name, value in asdict(row).items():
+        for name, value in row.items():
             if value is not None and name != "steps":
-                self._events.add_scalar(name, value, row.steps)
-        left = max(self._total - row.steps, 0) * self._members / max(row.rate, 1e-9)
-        evaluated = row.eval_return is not None
-        metric = (
-            f"steady error {_metres(row.eval_steady_error)}, peak {_metres(row.eval_peak)}"
-            if evaluated
-            else f"steady error {_metres(row.steady_error)} exploring"
-        )
+                self._events.add_scalar(name, value, row["steps"])
+        left = max(self._total - row["steps"], 0) * self._members / max(row["rate"], 1e-9)
+        evaluated = "eval_return" in row
         text = (
-            f"{row.steps:>9,} / {self._total:,} steps  {row.rate / 1e3:6.1f} k/s  "
-            f"{int(left) // 60}:{int(left) % 60:02d} left  return {row.episode_return:9.1f}  {metric}  "
-            f"alpha {row.alpha:.3f}"
+            f"{row['steps']:>9,} / {self._total:,} steps  {row['rate'] / 1e3:6.1f} k/s  "
+            f"{int(left) // 60}:{int(left) % 60:02d} left  {self._told(row, evaluated)}"
         )
         if self._live and not evaluated:
             self._stream.write("\r" + text.ljust(self._width))
@@ -112,6 +103,12 @@ class Progress:
             self._width = len(text)
         else:
             self.say(text)
+
+    def _told(self, row: Row, evaluated: bool) -> str:
+        """The return and the first metrics behind it, of the evaluation or exploring."""
+        chosen = [name for name in self._names if name.startswith("eval_") == evaluated and name not in COMMON]
+        shown = chosen[:3] if evaluated else ["episode_return", *chosen[:2]]
+        return "  ".join(f"{name.replace('_', ' ')} {_number(row.get(name))}" for name in shown)
 
     def close(self) -> None:
         """End the line and close the file."""
@@ -123,13 +120,12 @@ class Progress:
         self._events.close()
 
 
-def _metres(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f} m"
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
 
 
-def _rows_until(path: Path, steps: int) -> list[dict[str, str]]:
+def _rows_until(path: Path, names: Sequence[str], steps: int) -> list[dict[str, str]]:
     if not steps or not path.exists():
         return []
-    names = {item.name for item in fields(Row)}
-    rows = [row for row in read_rows(path) if set(row) == names and row["steps"].isdecimal()]
+    rows = [row for row in read_rows(path) if set(row) == set(names) and row["steps"].isdecimal()]
     return [row for row in rows if len(row["steps"]) < 20 and int(row["steps"]) <= steps]

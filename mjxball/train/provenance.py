@@ -16,14 +16,12 @@ PACKAGE = Path(__file__).parents[1]
 SOURCES = (
     "config",
     "assembly.py",
-    "draws.py",
     "env.py",
-    "nuisance.py",
     "rewards.py",
-    "sensing.py",
-    "wiring.py",
     "control",
     "physics",
+    "sim",
+    "algorithms",
     "train",
 )
 LIBRARIES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")

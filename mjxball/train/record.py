@@ -15,6 +15,7 @@ from mjxball.train.sweep import check_sweep
 
 # What a run directory holds.
 CONFIG_FILE, METRICS, POLICY, CHECKPOINTS = "config.json", "metrics.csv", "policy.npz", "checkpoints"
+EXTENSIONS = ("env", "reward", "algorithm")  # what a run may use of the user's own, by name
 MOST_MEMBERS = 4096
 LARGEST_SEED = 2**31 - 1
 ORIGIN = ("seed", "physics", "seeds", "sweep")  # what it must say beside the configuration
@@ -41,8 +42,9 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
         raise InputError(f"{run} is not a run directory: it has no {CONFIG_FILE}") from None
     if not isinstance(record, dict) or "config" not in record:
         raise InputError(f"{path} holds no configuration")
+    settings = record.pop("config")
     try:
-        config = configs.from_dict(record.pop("config"))
+        config = configs.from_dict(settings)
     except (TypeError, OverflowError) as error:  # a value of another kind than any setting, a number beyond all floats
         raise InputError(f"{path} holds no configuration: {error}") from None
     lost = [name for name in ORIGIN if name not in record]
@@ -52,8 +54,7 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
     if not sound or record["physics"] not in TRAINING_ENGINES:
         raise InputError(f"{path} has no sound seed, seeds or physics")
     if record["sweep"] is not None:
-        check_sweep(record["sweep"], record["seeds"], configs.validate(config), str(path))
-    recorded = record.pop("config_hash", None)
-    if recorded != configs.config_hash(config):
+        record["sweep"] = check_sweep(record["sweep"], record["seeds"], configs.validate(config), str(path))
+    if record.pop("config_hash", None) != configs.config_hash(settings):
         raise InputError(f"the configuration in {path} was changed after the run began; restore it, or start a new run")
     return configs.validate(config), record

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import os
 import resource
@@ -21,19 +20,20 @@ import numpy as np
 from mjxball.config import Config
 from mjxball.errors import TrainingDivergedError
 from mjxball.policy import save_file
-from mjxball.policy.export import is_sound, policy_file
+from mjxball.policy.export import is_sound, network_file, policy_file
 from mjxball.train import processes
 from mjxball.train import program as programs
 from mjxball.train.curves import told_by_the_run
+from mjxball.train.environments import Tally
+from mjxball.train.extensions import Extensions, is_pair, resolve
 from mjxball.train.members import MemberLog
 from mjxball.train.population import Population
-from mjxball.train.program import Mode, Tally, TrainState
-from mjxball.train.progress import Progress, Row
+from mjxball.train.program import Mode, TrainState
+from mjxball.train.progress import Progress, Row, columns
 from mjxball.train.record import CONFIG_FILE, METRICS, POLICY, write_config
 
 CHUNKS = 50  # rows of metrics.csv in a run
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
-EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
 
 
 @dataclass
@@ -78,7 +78,9 @@ class Run:
         `origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name.
         """
         self.config, self.out = config, out
-        self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"])
+        extensions = resolve(Extensions(**(origin.get("extensions") or {})))
+        self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"], extensions=extensions)
+        self._schedule = self.population.program.schedule
         kind = jax.devices()[0].device_kind
         hardware = f"{os.cpu_count()} CPU cores" if kind == "cpu" else f"{self.population.devices} x {kind}"
         self.origin = {**origin, "parts": self.population.parts, "hardware": hardware}
@@ -88,7 +90,11 @@ class Run:
             out.mkdir(parents=True, exist_ok=True)
             if not (out / CONFIG_FILE).exists():
                 write_config(out, config, self.origin)
-        self.progress = Progress(out / METRICS if self._writes else None, config.sac.steps, done, origin["seeds"])
+        exploring, evaluated = self.population.metric_names()
+        names = columns(exploring, self.population.program.algorithm.metrics, evaluated)
+        self.progress = Progress(
+            out / METRICS if self._writes else None, names, self._schedule.total_steps, done, origin["seeds"]
+        )
         self.members = MemberLog(out if self._writes else None, origin["seed"], done)
         self._writer = ThreadPoolExecutor(1)  # writes checkpoints
         self._checkpoints: Future[Any] | None = None
@@ -149,20 +155,18 @@ class Run:
             self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
 
-    def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally]:
-        """See `Program.advance`; the tally comes back whole, as NumPy."""
-        state, tally = self._compiled.advance(state, self.population.mode(mode))
-        return state, processes.gather(tally)
+    def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally, dict[str, Any]]:
+        """See `Program.advance`; tally and metrics come back whole, as NumPy."""
+        state, *told = self._compiled.advance(state, self.population.mode(mode))
+        return state, *processes.gather(told)
 
     def _loop(self, stop: Stop) -> None:
-        sac = self.config.sac
-        total = math.ceil(sac.steps / sac.worlds)
-        # At least one batch and one n-step window must be recorded before the first update.
-        first = max(math.ceil(sac.prefill / sac.worlds), math.ceil(sac.batch / sac.worlds), sac.return_steps)
-        done = self._steps() // sac.worlds
+        total, first = self.population.program.total_rounds, self.population.program.warmup_rounds
+        evaluations = self._schedule.num_evaluations
+        done = self._steps() // self._schedule.num_envs
         (ended,) = processes.any_of((stop.requested,))
         if done < first and not ended:
-            self.state, _ = self._advance(self.state, programs.prefill(first - done))
+            self.state, *_ = self._advance(self.state, programs.warmup(first - done))
             done = first
         chunk = max(1, math.ceil(total / CHUNKS))
         while done < total and not ended:
@@ -173,9 +177,9 @@ class Run:
             late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
             # All processes act on what they agreed on here, whenever a signal reaches one of them.
             ended, late = processes.any_of((stop.requested, late))
-            due = number * sac.evaluations // CHUNKS > (number - 1) * sac.evaluations // CHUNKS
+            due = number * evaluations // CHUNKS > (number - 1) * evaluations // CHUNKS
             if due or done >= total:
-                row = self._evaluated(row)
+                row |= self._evaluated()
             self.progress.show(row)
             if due or late or done >= total:
                 self._save()
@@ -186,55 +190,39 @@ class Run:
 
     def _chunk(self, steps: int) -> Row:
         before = self.progress.elapsed()
-        self.state, tally = self._advance(self.state, programs.train(steps, self.config.sac.updates))
+        self.state, tally, metrics = self._advance(self.state, programs.train(steps))
         after = self.progress.elapsed()
-        worlds = steps * self.config.sac.worlds * self.population.members
-        row = self._row(tally, steps, self.progress.seconds(), worlds / max(after - before, 1e-9))
-        if not all(map(math.isfinite, (row.critic_loss, row.policy_loss, row.alpha))):
-            raise TrainingDivergedError(f"a loss is not finite after {row.steps:,} steps")
-        return row
+        each, members = self.population.each, self.population.members
+        learnt = {name: _middle(each(value)) for name, value in metrics.items()}
+        broken = [name for name, value in learnt.items() if not math.isfinite(value)]
+        if broken:
+            raise TrainingDivergedError(f"{broken[0]} is not finite after {self._steps():,} steps")
+        return {
+            "steps": self._steps(),
+            "seconds": round(self.progress.seconds(), 3),
+            "rate": round(steps * self._schedule.num_envs * members / max(after - before, 1e-9), 1),
+            "episode_return": _middle(each(tally.reward)) / steps * self.config.timing.episode_steps,
+            **{name: _known(values) for name, values in self.population.report(tally, steps, False).items()},
+            **learnt,
+            "terminated": int(each(tally.ended).sum()),
+            "diverged": int(each(tally.totals["diverged"]).sum()) if "diverged" in tally.totals else 0,
+        }
 
-    def _row(self, tally: Tally, steps: int, seconds: float, rate: float) -> Row:
-        each, losses = self.population.each, tally.losses
-        return Row(
-            steps=self._steps(),
-            seconds=round(seconds, 3),
-            rate=round(rate, 1),
-            episode_return=_middle(each(tally.reward)) / steps * self.config.timing.episode_steps,
-            steady_error=_mean(each(tally.steady_error), each(tally.steady)),
-            alpha=_middle(np.exp(each(processes.gather(self.state.learner.log_alpha)))),
-            entropy=_middle(each(losses.entropy)),
-            critic_loss=_middle(each(losses.critic)),
-            policy_loss=_middle(each(losses.policy)),
-            terminated=int(each(tally.ended).sum()),
-            diverged=int(each(tally.diverged).sum()),
-        )
-
-    def _evaluated(self, row: Row) -> Row:
-        """Add the evaluation of the averaged policies, on the same fresh worlds every time."""
-        steps = min(round(EVALUATION_SECONDS / self.config.timing.control_period), self.config.timing.episode_steps)
-        kept = self.state
-        worlds = self.population.evaluation_worlds(self._compiled)
+    def _evaluated(self) -> Row:
+        """Evaluate the policies, on the same fresh environments every time."""
+        population, kept = self.population, self.state
+        steps = population.program.evaluation_steps
         keys = processes.gather(kept.key)
-        lent = kept._replace(worlds=worlds, key=self.population.place_keys(keys))
-        after, tally = self._advance(lent, programs.evaluate(steps))
-        self.state = after._replace(worlds=kept.worlds, key=self.population.place_keys(keys))
-        each = self.population.each
-        returns = each(tally.reward) / steps * self.config.timing.episode_steps
-        peaks = each(tally.peak).mean(axis=-1)
-        errors = each(tally.steady_error) / np.maximum(each(tally.steady), 1)
-        tilts, verticals = (np.sqrt(each(sum_) / steps) for sum_ in (tally.tilt_error, tally.vertical_error))
-        if self.population.members > 1:
-            self.members.add(row.steps, returns, errors, peaks, tilts, verticals)
-        seen = bool(each(tally.steady).any())
-        return dataclasses.replace(
-            row,
-            eval_return=_middle(returns),
-            eval_steady_error=_middle(errors) if seen else None,
-            eval_peak=_middle(peaks) if seen else None,
-            eval_tilt_error=_middle(tilts),
-            eval_vertical_error=_middle(verticals),
-        )
+        envs = population.evaluation_envs(self._compiled)
+        lent = kept._replace(envs=envs, key=population.place_keys(keys))
+        after, tally, _ = self._advance(lent, programs.evaluate(steps))
+        self.state = after._replace(envs=kept.envs, key=population.place_keys(keys))
+        returns = population.each(tally.reward) / steps * self.config.timing.episode_steps
+        found = {"eval_return": returns}
+        found |= {f"eval_{name}": values for name, values in population.report(tally, steps, True).items()}
+        if population.members > 1:
+            self.members.add(self._steps(), found)
+        return {name: _known(values) for name, values in found.items()}
 
     def _save(self) -> None:
         began = self.progress.elapsed()
@@ -262,18 +250,25 @@ class Run:
             return processes.gather(self.state)
         return jax.device_put(self.state, jax.tree.map(lambda leaf: leaf.sharding, self.state), may_alias=False)
 
+    def _network_path(self, member: int) -> Path:
+        return self.members.policy_path(member) if self.population.members > 1 else self.out / POLICY
+
     def _export(self) -> bool:
         """Write the policy file, of a population every member's and the best one's; False if none is sound."""
         steps, exported = self._steps(), False
         best = self.members.best()
-        learners = processes.gather(self.state.learner)
+        state = processes.gather(self.state._replace(envs=()))
         if not self._writes:
             return False
         for member in range(self.population.members):
-            learner = self.population.member(learners, member)
+            learnt = self.population.policy(state, member)
             seed = self.origin["seed"] + member
             origin = {**self.origin, "seed": seed, **told_by_the_run(self.out, seed)}
-            policy = policy_file(self.population.member_config(member), learner, steps, origin)
+            config = self.population.member_config(member)
+            if not is_pair(self.population.program.env):  # no policy file: its observation is another
+                exported |= network_file(self._network_path(member), learnt, steps, origin)
+                continue
+            policy = policy_file(config, learnt, steps, origin)
             if not is_sound(policy):
                 continue
             exported = True
@@ -305,6 +300,7 @@ def _middle(values: np.ndarray) -> float:
     return float(np.median(finite)) if finite.size else math.nan
 
 
-def _mean(total: np.ndarray, count: np.ndarray) -> float | None:
-    """Median over the members of `total` / `count`, None if there was nothing to count."""
-    return _middle(total / np.maximum(count, 1)) if count.any() else None
+def _known(values: np.ndarray) -> float | None:
+    """`_middle`, None if there was nothing to count."""
+    middle = _middle(values)
+    return None if math.isnan(middle) else middle

@@ -11,19 +11,16 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.train.reading import read_json
 
+UNSWEPT = ("sac.curriculum", "sac.max_grad_norm")  # the program branches on whether they are 0
+# Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
 SWEEPABLE = (
-    "sac.learning_rate",
-    "sac.alpha_learning_rate",
-    "sac.learning_rate_end",
-    "sac.discount",
-    "sac.target_rate",
-    "sac.alpha",
-    "sac.target_entropy",
-    "sac.reward_scale",
-    "sac.policy_average",
-    "follower.tilt_limit",
-    "follower.vertical_limit",
-    *(f"reward.{name}" for name in ("error", "error_scale", "velocity", "tilt", "rates", "effort", "smoothness")),
+    *(
+        path
+        for path, value, _ in configs.leaves(Config())
+        if isinstance(value, float) and path.startswith(("sac.", "reward.")) and path not in UNSWEPT
+    ),
+    "follower.action_scale_tilt",
+    "follower.action_scale_vertical",
 )
 Sweep = Mapping[str, Sequence[float]]
 
@@ -34,19 +31,20 @@ def read_sweep(path: Path, members: int, config: Config) -> dict[str, list[float
         sweep = read_json(path, "sweep file")
     except FileNotFoundError:
         raise InputError(f"sweep file {path} does not exist") from None
-    check_sweep(sweep, members, config, f"sweep file {path}")
-    return sweep
+    return check_sweep(sweep, members, config, f"sweep file {path}")
 
 
-def check_sweep(sweep: Any, members: int, config: Config, where: str) -> None:
-    """Raise InputError, which begins with `where`, unless `sweep` fits `members` followers of `config`."""
+def check_sweep(sweep: Any, members: int, config: Config, where: str) -> dict[str, list[float]]:
+    """`sweep` under the settings' present names; InputError that begins with `where` unless it fits the members."""
     if not isinstance(sweep, dict) or not sweep:
         raise InputError(f"{where} must hold an object of settings")
-    for name, values in sweep.items():
+    for given, values in sweep.items():
+        name = configs.current_name(given)
         if name not in SWEEPABLE:
-            raise InputError(f"{where}: {name!r} cannot differ between members; {', '.join(SWEEPABLE)} can")
+            raise InputError(f"{where}: {given!r} cannot differ between members; {', '.join(SWEEPABLE)} can")
         if not isinstance(values, list) or len(values) != members:
             raise InputError(f"{where}: {name} needs {members} numbers, one for each seed")
         for value in values:
             whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53
             configs.validate(configs.replace(config, name, float(value) if whole else value))
+    return {configs.current_name(name): values for name, values in sweep.items()}

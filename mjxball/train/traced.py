@@ -19,10 +19,12 @@ OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionabl
 class Traced:
     """One function of arrays, traced or found in the cache. `lower(donate)` readies it for compilation."""
 
-    def __init__(self, name: str, key: Mapping[str, Any], function: Callable[..., Any], shapes: Any, result: Any):
+    def __init__(
+        self, name: str, key: Mapping[str, Any] | None, function: Callable[..., Any], shapes: Any, result: Any
+    ):
         """`shapes` are the arguments' `ShapeDtypeStruct`s, `result` any tree with the structure of what it returns.
 
-        `key` must hold everything that the traced program depends on.
+        `key` must hold everything that the traced program depends on; None: it is not kept.
         """
         self._name = name
         self._shapes, self._structure = shapes, jax.tree.structure(result)
@@ -48,9 +50,9 @@ class Traced:
         return jax.jit(call, donate_argnums=() if donate is None else donate).lower(*self._shapes)
 
 
-def _path(name: str, key: Mapping[str, Any]) -> Path | None:
+def _path(name: str, key: Mapping[str, Any] | None) -> Path | None:
     place = traced_directory()
-    if place is None:
+    if place is None or key is None:
         return None
     settings = {option: str(getattr(jax.config, option)) for option in OPTIONS}
     text = json.dumps({**key, **settings, "platform": jax.default_backend()}, sort_keys=True)

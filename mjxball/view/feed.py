@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
-from mjxball import config as configs
 from mjxball.control import rotations
-from mjxball.errors import InputError
 from mjxball.fly import packets
-from mjxball.fly.card import command_maps
+from mjxball.fly.card import variants
+from mjxball.fly.flight_log import Tail
+from mjxball.fly.flown import Flown
 from mjxball.fly.limits import NAMES
-from mjxball.fly.packets import DroneState, PacketError
+from mjxball.fly.log_schema import Record
+from mjxball.fly.packets import DroneState
 from mjxball.fly.pair import Rig, object_state
-from mjxball.fly.recording import LONGEST, STAMP
-from mjxball.fly.supervisor import FAULTS, Event, State
+from mjxball.fly.recording import LONGEST
+from mjxball.fly.supervisor import FAULTS, State
 from mjxball.view.page import plant_of
 
 # A row, in this order: name and number of values, in SI units.
@@ -40,6 +39,8 @@ STEP = 0.04  # [s] between two rows at least: nobody sees more while it happens
 CHUNK = 2**20  # bytes read at once
 LONGEST_LINE = 2**20  # bytes
 NO_LAW = (0.0, 0.0, 0.0)
+SEVERITY = {state.value: state.severity for state in State}
+FAULT_NAMES = {event.name for event in FAULTS}
 
 
 class Feed:
@@ -53,84 +54,54 @@ class Feed:
         self.text = f"waiting for {path.name}"
         self.mood = "busy"  # good: the laws are in command; bad: a fault
         self.ended = False
-        self._stream: BinaryIO | None = None
-        self._rest = b""
+        self._tail = Tail(path)
         self._newest: list[DroneState | None] = [None, None]
         self._start: float | None = None
         self._why = ""
 
     def update(self) -> bool:
         """Read what was added, a chunk at most; true if there was something. Raises InputError: no flight log."""
-        try:
-            added = self._read()
-        except OSError as error:
-            raise InputError(f"flight log {self.path} cannot be read: {error.strerror or error}") from None
-        *lines, self._rest = (self._rest + added).split(b"\n")
-        for line in lines:
-            self._take(line)
-        if len(self._rest) > LONGEST_LINE:
-            raise InputError(f"{self.path} is not a flight log: it holds a line of more than {LONGEST_LINE >> 20} MiB")
-        return bool(added)
+        records = self._tail.read()
+        for record in records or ():
+            self._take(record)
+        return records is not None
 
     def close(self) -> None:
         """Close the log."""
-        if self._stream:
-            self._stream.close()
+        self._tail.close()
 
-    def _read(self) -> bytes:
-        if self._stream is None:
-            if not self.path.exists():
-                return b""
-            if not self.path.is_file():  # a pipe or a device would be waited for
-                raise InputError(f"{self.path} is not a flight log: it is no file")
-            self._stream = self.path.open("rb")
-        return self._stream.read(CHUNK)
+    def _take(self, record: Record) -> None:
+        if record["kind"] == "header":
+            self._begin(record)
+        elif record["kind"] == "state":
+            self._newest[NAMES.index(record["drone"])] = record["raw"].state
+        elif record["kind"] == "tick":
+            self._tick(record)
+        else:
+            self._tell(record["kind"], record)
 
-    def _take(self, line: bytes) -> None:
-        try:
-            record = json.loads(line)
-            kind = record["kind"]
-        except (ValueError, TypeError, KeyError, RecursionError):
-            record, kind = {}, ""
-        if self.plant is None:
-            self._begin(record if kind == "header" else {})
-            return
-        try:  # one damaged record must not end the view of a flight
-            if kind == "state":
-                drone = NAMES.index(record["drone"])
-                self._newest[drone] = packets.unpack_state(bytes.fromhex(record["raw"])[STAMP:])
-            elif kind == "tick":
-                self._tick(record)
-            else:
-                self._tell(kind, record)
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError, PacketError):
-            pass
-
-    def _begin(self, header: Mapping[str, Any]) -> None:
-        try:
-            self._config = configs.validate(configs.from_record(header["config"]))
-            self._maps = command_maps(self._config)
-        except (InputError, KeyError, TypeError, ValueError, AttributeError):
-            raise InputError(
-                f"{self.path} is not a flight log of this version: it does not begin with a header"
-            ) from None
+    def _begin(self, header: Record) -> None:
+        self._config, self._flown = header["config"], Flown.of(header)
+        self._curves = self._flown.force_curves(self._config)
         plant = self._config.plant
         self._rig = Rig(plant.leader_mount, plant.follower_mount)
-        strongest = max(one.curve.force(packets.THRUST_CEILING) for one in self._maps)
+        # Of whichever curve: it is known once the motors turn, when the page has its scale.
+        known = [own.map.curve for one in variants(self._config) for own in one.values()]
+        strongest = max(curve.force(packets.THRUST_CEILING) for curve in (*self._curves, *known))
         self.plant = {**plant_of(plant), "thrust": strongest}
         self.text = "connecting and checking"
 
-    def _tick(self, record: Mapping[str, Any]) -> None:
-        self._state(str(record["state"]))
+    def _tick(self, record: Record) -> None:
+        self._state(record["state"])
         seen = [state for state in self._newest if state is not None]
-        now = float(record["t"])
+        now = record["t"]
         self._start = now if self._start is None else self._start
         time = now - self._start
         late_enough = time >= self.rows[-1][0] + STEP - 1e-3 if self.rows else time >= 0.0
         if len(seen) < 2 or not late_enough or time > LONGEST:
             return
         pair = object_state(seen, self._rig)
-        thrust = [one.curve.force(sent[3]) for one, sent in zip(self._maps, record["sent"], strict=True)]
+        thrust = [curve.force(sent[3]) for curve, sent in zip(self._curves, record["sent"], strict=True)]
         values = {
             "time": time,
             "position": pair.position,
@@ -139,14 +110,12 @@ class Feed:
             "leader_command": record.get("leader", NO_LAW),
             "follower_command": record.get("follower", NO_LAW),
             "target": record["goal"],
-            "error": np.array(record["goal"], float) - pair.position,
+            "error": record["goal"] - pair.position,
             "thrust": thrust,
             "battery": [state.battery for state in seen],
-            "late": record["late"],
+            "late": record.get("late", 0.0),
         }
-        row = [float(value) for name in COLUMNS for value in np.ravel(values[name])]
-        if len(row) == sum(COLUMNS.values()) and all(map(math.isfinite, row)):
-            self.rows.append(row)
+        self.rows.append([float(value) for name in COLUMNS for value in np.ravel(values[name])])
 
     def _state(self, name: str) -> None:
         """What the supervisor does, and why once it is on the way down."""
@@ -156,25 +125,28 @@ class Feed:
         if self.mood != "bad":
             self.mood = "good" if name in (State.FLY.value, State.LAND.value) else "busy"
 
-    def _tell(self, kind: str, record: Mapping[str, Any]) -> None:
+    def _tell(self, kind: str, record: Record) -> None:
         """Note anything but states and ticks."""
-        if kind == "check":
+        if kind == "thrust":
+            self._flown = self._flown.after(record, self._config)
+            self._curves = self._flown.force_curves(self._config)
+        elif kind == "check":
             self.text = f"{'good' if record['passed'] else 'BAD'}: {record['name']}: {record['found']}"
         elif kind == "transition":
-            self._turn(str(record["after"]), [str(event) for event in record["events"]])
+            self._turn(record["after"], record["events"])
         elif kind == "refused":
             self.ended, self.mood, self.text = True, "bad", f"refused: {record['text']}"
         elif kind == "end":
             why = f": {self._why}" if self._why else ""
-            self.ended, self.text = True, f"the flight has ended, exit code {int(record['code'])}{why}"
+            self.ended, self.text = True, f"the flight has ended, exit code {record['code']}{why}"
             self.mood = "bad" if record["code"] else "busy"
 
-    def _turn(self, after: str, events: list[str]) -> None:
-        severity = State(after).severity
-        causes = [event for event in events if Event[event.partition(":")[0]] in FAULTS]
+    def _turn(self, after: str, events: Sequence[str]) -> None:
+        severity = SEVERITY.get(after, 0)
+        causes = [event for event in events if event.partition(":")[0] in FAULT_NAMES]
         if causes:
             self.mood = "bad"
-        if causes or (severity > State.FLY.severity and not self._why):
+        if causes or (severity > State.FLY.severity and events):
             self._why = self._why or (causes or events)[0].lower().replace("_", " ")
         self._state(after)
 

@@ -18,7 +18,7 @@ from mjxball.errors import InputError
 from mjxball.policy.file import write_whole
 
 if TYPE_CHECKING:
-    from mjxball.rollout import Trajectory
+    from mjxball.sim.rollout import Trajectory
 
 FORMAT = "mjxball flight 1"
 MAX_BYTES = 256 * 2**20

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.config import Plant
+from mjxball.control import mixer
 from mjxball.view.flight_file import Flight
 
 PARTS = Path(__file__).parent / "parts"
@@ -20,7 +21,7 @@ SCRIPTS = ("space.js", "scene.js", "plots.js", "player.js")
 
 def flight_page(flight: Flight) -> str:
     """The page's text; the flight is inside, as float32."""
-    return _page(flight.title, _contents(flight), "recorded.js")
+    return _page(flight.title, page_contents(flight), "recorded.js")
 
 
 def live_page(title: str, token: str) -> str:
@@ -40,7 +41,8 @@ def _page(title: str, data: Any, start: str) -> str:
     )
 
 
-def _contents(flight: Flight) -> dict[str, Any]:
+def page_contents(flight: Flight) -> dict[str, Any]:
+    """The JSON inside the page of `flight`: title, packed arrays, and the plant that is drawn."""
     thrust = flight["rotor_force"].sum(axis=-1)
     shown = {**flight.arrays, "thrust": thrust, "error": flight["target"] - flight["position"]}
     if not flight["contact_force"].any():  # whatever is carried pushes: these zeros stand for what nobody measured
@@ -54,10 +56,12 @@ def _contents(flight: Flight) -> dict[str, Any]:
 
 
 def plant_of(plant: Plant) -> dict[str, Any]:
-    """What the scene draws of `plant`."""
+    """The numbers of `plant` that the scene draws."""
+    lever = mixer.lever(plant.arm, plant.layout)
     return {
         "size": plant.object_size,
         "arm": plant.arm,
+        "rotors": [[lever * x, lever * y] for x, y in mixer.PLACES[plant.layout]],  # from a drone's centre [m]
         "mounts": [plant.leader_mount, plant.follower_mount],
         "axis": "xy".index(plant.cg_axis),
         "share": plant.moving_fraction,

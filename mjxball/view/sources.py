@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ def read_log(path: Path) -> Flight:
     if path.suffix != ".jsonl":
         raise InputError(f"{path} is no flight (.npz), flight log (.jsonl), policy (.npz) or run directory")
     recording = read_recording(path)
+    for remark in recording.remarks:
+        print(remark, file=sys.stderr)  # noqa: T201
     rows = len(recording.time)
     euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion))
     arrays = {
@@ -62,19 +65,19 @@ def read_log(path: Path) -> Flight:
 
 
 def _flown(source: str, changes: Mapping[str, Any], physics: str) -> Flight:
-    from mjxball.control.followers import LAWS, make_baseline
-    from mjxball.evaluate.cells import REFERENCE, load_policy, standard_scenarios
-    from mjxball.evaluate.homes import own_home
-    from mjxball.rollout import simulate
+    from mjxball.baselines import LAWS, make_baseline
+    from mjxball.evaluate.policies import load_policy, native_config
+    from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
+    from mjxball.sim.rollout import simulate
 
     setup, reference, path = preset("paper"), REFERENCE, Path(source)
     if source in LAWS:
         follower: Any = make_baseline(source, setup)
     else:
         file = _policy_file(path)
-        home = own_home(file)
-        if home is not None:
-            setup, reference = home, standard_scenarios(home)[-1]
+        native = native_config(file)
+        if native is not None:
+            setup, reference = native, standard_scenarios(native)[-1]
         follower = load_policy(file, setup)
         follower.name = path.name if path.is_dir() else follower.name
     tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
@@ -93,6 +96,6 @@ def _policy_file(path: Path) -> Path:
         return path / "policy.npz"
     if path.suffix == ".npz":
         return path
-    from mjxball.control.followers import LAWS
+    from mjxball.baselines import LAWS
 
     raise InputError(f"{path} is no flight, policy file, run directory or one of {', '.join(LAWS)}")

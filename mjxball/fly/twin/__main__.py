@@ -14,7 +14,8 @@ from pathlib import Path
 
 from mjxball.cli import make_parser, run_command
 from mjxball.fly.loop import urgent
-from mjxball.fly.twin.faults import LinkFaults, Strike, read_strike
+from mjxball.fly.twin.faults import Injection, LinkFaults, read_fault
+from mjxball.fly.twin.kind import add_twin_options, drone_kind, surroundings
 from mjxball.fly.twin.pairs import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
 from mjxball.policy import load_file
@@ -27,7 +28,8 @@ def main() -> int:
     parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
     for name in ("loss", "delay", "jitter"):
         parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links, once motors turn")
-    parser.add_argument("--fault", type=read_strike, action="append", default=[], metavar="KIND:DRONE@S")
+    add_twin_options(parser)
+    parser.add_argument("--fault", type=read_fault, action="append", default=[], metavar="KIND:DRONE@S")
     options = parser.parse_args()
     return run_command(lambda: serve(options))
 
@@ -35,11 +37,13 @@ def main() -> int:
 def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` ask for until standard input ends."""
     card = load_file(options.policy).card if options.policy else None
-    with urgent(), Twin(make_pair(card), TwinSettings(ports=tuple(options.ports))) as twin:
+    kind, around = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear"), surroundings(options)
+    settings = TwinSettings(ports=tuple(options.ports), kind=kind, around=around)
+    with urgent(), Twin(make_pair(card, kind, around), settings) as twin:
         worse = LinkFaults(options.loss, options.delay, options.jitter)
-        links = [Strike(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
+        links = [Injection(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
         for one in (*links, *options.fault):
-            threading.Thread(target=strike, args=(twin, one), daemon=True).start()
+            threading.Thread(target=inject_later, args=(twin, one), daemon=True).start()
         print(json.dumps({"uris": twin.uris}), flush=True)  # noqa: T201
         try:
             while sys.stdin.readline():
@@ -49,12 +53,12 @@ def serve(options: argparse.Namespace) -> int:
     return 0
 
 
-def strike(twin: Twin, one: Strike) -> None:
+def inject_later(twin: Twin, one: Injection) -> None:
     """Wait for the first motor to turn, then until the fault is due."""
-    while max(twin.truth.thrust) == 0:
+    while twin.truth.pwm.max() == 0 or max(twin.truth.thrust) == 0:
         time.sleep(0.01)
     time.sleep(one.after)
-    twin.strike(one)
+    twin.inject(one)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""The coupled Crazyflie model behind the twin: both firmwares' cascades, motors and batteries over C MuJoCo.
+"""The coupled Crazyflie model behind the twin: both drones' computers, motors and batteries over C MuJoCo.
 
 MuJoCo steps the model of `mjxball.assembly` every millisecond, with legs and a floor added, so that the pair stands on
-the ground (a stand: on its rest, its lowest place) and takes off and lands by contact. The laws are those of
-`control.crazyflie`; what moves the ball is `physics.motion`, as in simulation.
+the ground (a stand: on its rest, its lowest place) and takes off and lands by contact. The cascade is that of
+`control.crazyflie`, flown on each drone's own estimates; what moves the ball is `physics.motion`, as in simulation.
 """
 
 from __future__ import annotations
@@ -13,27 +13,35 @@ import math
 import mujoco
 import numpy as np
 
-from mjxball.assembly import ASSEMBLY, BALL_JOINT, FOLLOWER, LEADER, build_spec
+from mjxball.assembly import ASSEMBLY, BALL_JOINT
 from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
-from mjxball.control.firmware_gains import PARAMETERS, with_gains, with_stock_gains
-from mjxball.fly.twin.body import PairState
+from mjxball.control.firmware_gains import with_stock_gains
+from mjxball.fly.twin.body import RUNNING, Modes, PairState
 from mjxball.fly.twin.conditions import Conditions
+from mjxball.fly.twin.estimators import matrix_of, skew
+from mjxball.fly.twin.ground import STEP, grounded_model
+from mjxball.fly.twin.kind import DELIVERED, QUIET, DroneKind, Surroundings
+from mjxball.fly.twin.onboard import TICK, Onboard
+from mjxball.fly.twin.power import Power
 from mjxball.physics import motion
 from mjxball.physics.engine import Load, PlantState
 
-STEP = 0.001  # [s] of MuJoCo and the motors; the cascade runs at every second one
-TICK = round(crazyflie.PERIOD / STEP)
-LEG = 0.03  # [m] from a drone's centre down to what it stands on
-REACH = 0.03  # [m] from a drone's centre sideways to each of its legs
-FOOT = 0.003  # [m] radius
+SENSED = 6  # numbers of one drone's accelerometer and gyroscope
 
 
 class CoupledPair:
-    """See `body.Pair`. One instance is one pair; `start` begins anew and keeps the gains."""
+    """See `body.Pair`. One instance is one pair; `start` begins anew and keeps the parameters."""
 
-    def __init__(self, config: Config, conditions: Conditions | None = None):
+    def __init__(
+        self,
+        config: Config,
+        conditions: Conditions | None = None,
+        kind: DroneKind = DELIVERED,
+        around: Surroundings = QUIET,
+    ):
         self.config, self.conditions = config, conditions or Conditions.of(config)
+        self.kind, self.around = kind, around
         plant = dataclasses.replace(config.plant, object_mass=self.conditions.object_mass)
         self.model = grounded_model(config, self.conditions.object_mass)
         self.data = mujoco.MjData(self.model)
@@ -55,22 +63,22 @@ class CoupledPair:
         lag = plant.rotor_lag * self.conditions.rotor_lag
         self._keep = math.exp(-STEP / lag)
         self._mean = lag / STEP * (1 - self._keep)
-        self._strength = np.array(self.conditions.thrust)[:, None]
-        self._autopilots = [with_stock_gains(config.autopilot)] * 2
-        self._alike = True
+        self.onboard = Onboard(kind, around, with_stock_gains(config.autopilot), self._new_power())
         self.start()
+
+    def _new_power(self) -> Power:
+        one, other = (a * b for a, b in zip(self.conditions.thrust, self.around.gains, strict=True))
+        return Power(self.kind, self.conditions.battery, (one, other))
 
     def start(self) -> PairState:
         """See `Pair.start`."""
         mujoco.mj_resetData(self.model, self.data)
-        self._rotors, self._targets, self._motors = np.zeros((2, 4)), np.zeros((2, 4)), np.zeros((2, 4))
-        self._charge = np.full(2, self.conditions.battery.full)
+        self._rotors, self._targets = np.zeros((2, 4)), np.zeros((2, 4))
+        self.power = self.onboard.power = self._new_power()
         self._steps, self._flown = 0, 0.0
         self._left, self._moving = 0.0, False
         self._place_ball()
-        mujoco.mj_forward(self.model, self.data)
-        self._loops = crazyflie.start_loops(*self._seen())
-        return self._state()
+        return self._settle()
 
     def place(self, state: PlantState) -> PairState:
         """Put the pair, motors running, into a simulation's `state` (one world) and return it."""
@@ -82,57 +90,85 @@ class CoupledPair:
             data.qpos[:-1] = [state.position[2], roll][-len(data.qpos) + 1 :]
             data.qvel[:-1] = [state.velocity[2], state.rates[0]][-len(data.qvel) + 1 :]
         data.qpos[self._slide_position], data.qvel[self._slide] = state.ball_offset, state.ball_rate
-        self._rotors, self._loops = np.array(state.rotor_force), np.array(state.loops)
+        self._rotors = np.array(state.rotor_force)
+        data.ctrl[:] = self._rotors.ravel()
         self._moving, self._flown, self._steps = True, float(state.time), 2 * TICK
         self._place_ball()
-        mujoco.mj_forward(self.model, data)
+        placed = self._settle()
+        self.onboard._loops = np.array(state.loops)
+        return placed
+
+    def _settle(self) -> PairState:
+        """Let sensors and estimators know where the pair is."""
+        mujoco.mj_forward(self.model, self.data)
+        position, _, matrix = self._pose()
+        velocity, _ = self._velocity(matrix)
+        self.onboard.imu.settle(self._sensed())
+        self.onboard.start(position, self._quaternion(), velocity)
         return self._state()
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
         """See `Pair.set_parameter`."""
-        if name not in PARAMETERS:
-            return
-        self._autopilots[drone] = with_gains(self._autopilots[drone], {name: value})
-        self._alike = self._autopilots[0] == self._autopilots[1]
+        self.onboard.set_parameter(drone, name, value)
 
-    def advance(self, setpoints: np.ndarray, dt: float) -> PairState:
+    def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
+        """See `Pair.receive_pose`."""
+        self.onboard.receive_pose(drone, position, quaternion)
+
+    def disturb(self, drone: int, what: str, value: float) -> None:
+        """See `Pair.disturb`."""
+        source = self.onboard.positioning[drone]
+        match what:
+            case "frozen":
+                source.frozen = bool(value)
+            case "lost":
+                source.lost = bool(value)
+            case "jump":
+                source.offset = np.array([0.0, 0.0, value])
+            case "battery":
+                self.power.sag_to(drone, value)
+            case "gain":
+                self.power.strength[drone] *= value
+
+    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
         """See `Pair.advance`; `dt` is made of whole milliseconds, what is left over is made good later."""
         self._left += dt
-        self._moving = self._moving or bool((setpoints[:, 3] >= crazyflie.IDLE).any())
+        self.onboard.order(np.asarray(setpoints, float), modes)
         count = round(self._left / STEP)
         self._left -= count * STEP
         for _ in range(count):
-            self._step(setpoints)
-        battery = self.conditions.battery
-        self._charge = self._charge - battery.drain * dt * self._power()
+            self._step()
         return self._state()
 
-    def _step(self, setpoints: np.ndarray) -> None:
+    def _step(self) -> None:
         model, data = self.model, self.data
         mujoco.mj_step1(model, data)
         if self._steps % TICK == 0:
-            self._fly(setpoints)
-        acting = self._targets + self._mean * (self._rotors - self._targets)
-        self._rotors = self._targets + self._keep * (self._rotors - self._targets)
+            self._fly()
+        self._rotors, acting = self._lagged()
         data.ctrl[:] = acting.ravel()
         data.qfrc_applied[self._slide] = self._push_ball()
         mujoco.mj_step2(model, data)
         self._steps += 1
         self._flown += STEP * self._moving
         self._place_ball()
+        if not self.around.exact:
+            self.onboard.sense(self._steps, self._sensed(), self._pose)
 
-    def _fly(self, setpoints: np.ndarray) -> None:
-        """Both cascades, once: what the motors are to give from now on."""
-        seen, law = self._seen(), self._autopilots
-        if self._alike:
-            self._loops, self._motors = crazyflie.cascade(law[0], self._loops, setpoints, *seen)
+    def _lagged(self) -> tuple[np.ndarray, np.ndarray]:
+        """Forces of the motors after one step, and their mean over it."""
+        gap = self._rotors - self._targets
+        return self._targets + self._keep * gap, self._targets + self._mean * gap
+
+    def _fly(self) -> None:
+        """Both cascades, once: what the motors are to give from here on."""
+        if self.around.exact:
+            pwm = self.onboard.control(*self._seen())
         else:
-            rows = [
-                crazyflie.cascade(law[n], self._loops[n], setpoints[n], *(part[n] for part in seen)) for n in range(2)
-            ]
-            self._loops, self._motors = (np.stack(part) for part in zip(*rows, strict=True))
-        left = max(1.0 - law[0].sag * self._flown, 0.0)
-        self._targets = left * self._strength * crazyflie.motor_force(law[0].motor_curve, self._motors)
+            pwm = self.onboard.control()
+        self._moving = self._moving or bool((self.onboard.thrust >= crazyflie.IDLE).any())
+        self.power.drain(pwm, TICK * STEP)
+        self._targets = self.power.force(pwm)
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Euler angles and body rates (2, 3) of both drones, which are the assembly's."""
@@ -187,52 +223,52 @@ class CoupledPair:
         """(2, 4) of leader and follower [N]."""
         return self._rotors.copy()
 
-    # What the firmware is shown.
+    # What the sensors are shown, and the truth.
 
-    def _power(self) -> np.ndarray:
-        return self._motors.mean(axis=1) / crazyflie.FULL
+    def _sensed(self) -> np.ndarray:
+        """(2, 6) specific force [m/s2] and rates [rad/s] of both drones, body axes, one step old."""
+        return self.data.sensordata.reshape(2, SENSED)
+
+    def _quaternion(self) -> np.ndarray:
+        q = self.data.qpos
+        if self._free:
+            return q[3:7].copy()
+        half = q[1 if self._heaves else 0] / 2
+        return np.array([math.cos(half), math.sin(half), 0.0, 0.0])
+
+    def _pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Both drones' positions (2, 3), the quaternion (4,) and the rotation matrix of all."""
+        quaternion, q = self._quaternion(), self.data.qpos
+        matrix = matrix_of(quaternion)
+        if self._free:
+            origin = q[:3]
+        else:
+            origin = np.array([0.0, 0.0, q[0] if self._heaves else 0.0])
+        return origin + self._mounts @ matrix.T, quaternion, matrix
+
+    def _velocity(self, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Velocities (2, 3) of both drones in the world, and the body rates (3,)."""
+        v, rates = self.data.qvel, self._rates()
+        if self._free:
+            origin = v[:3]
+        else:
+            origin = np.array([0.0, 0.0, v[0] if self._heaves else 0.0])
+        return origin - self._mounts @ skew(rates) @ matrix.T, rates
 
     def _state(self) -> PairState:
-        position, quaternion, velocity, acceleration, turning = self._root()
-        rates, matrix = self._rates(), rotations.matrix_from_quaternion(quaternion)
-        swing = rotations.cross(rates, self._mounts)
-        whirl = rotations.cross(turning, self._mounts) + rotations.cross(rates, swing)
-        felt = (acceleration + np.array([0.0, 0.0, self.config.plant.gravity])) @ matrix + whirl
+        position, quaternion, matrix = self._pose()
+        velocity, rates = self._velocity(matrix)
+        both, turning = np.stack([quaternion] * 2), np.stack([rates] * 2)
+        if self.around.exact:
+            report = self.onboard.reported(position, velocity, both, turning, np.full((2, 9), 1e-5))
+        else:
+            report = self.onboard.report()
         return PairState(
-            position=position + self._mounts @ matrix.T,
-            velocity=velocity + swing @ matrix.T,
-            quaternion=np.stack([quaternion] * 2),
-            rates=np.stack([rates] * 2),
-            specific_force=felt,
-            battery=self._charge - self.conditions.battery.sag * self._power(),
+            position=position,
+            velocity=velocity,
+            quaternion=both,
+            rates=turning,
+            specific_force=self._sensed()[:, :3].copy(),
+            battery=self.power.voltage.copy(),
+            report=report,
         )
-
-    def _root(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """O's position, attitude, velocity, acceleration, and the angular acceleration in body axes."""
-        q, v, a = self.data.qpos, self.data.qvel, self.data.qacc
-        if self._free:
-            return q[:3].copy(), q[3:7].copy(), v[:3].copy(), a[:3].copy(), a[3:6].copy()
-        first = 1 if self._heaves else 0
-        rise = np.array([[part[0] if self._heaves else 0.0] for part in (q, v, a)]) * np.array([0.0, 0.0, 1.0])
-        half = q[first] / 2
-        quaternion = np.array([math.cos(half), math.sin(half), 0.0, 0.0])
-        return rise[0], quaternion, rise[1], rise[2], np.array([a[first], 0.0, 0.0])
-
-
-def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
-    """The assembly's model with contact: O is at height 0 while the drones' legs stand on the floor."""
-    plant = dataclasses.replace(config.plant, object_mass=object_mass)
-    spec = build_spec(plant, STEP)
-    disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    spec.option.disableflags &= ~int(disabled)
-    floor = spec.geom("floor")
-    lowest = min(plant.leader_mount[2], plant.follower_mount[2])
-    floor.pos = [0.0, 0.0, lowest - LEG - FOOT if plant.stand != "pivot" else -1.0]
-    floor.contype, floor.conaffinity = 1, 2
-    for name in (LEADER, FOLLOWER):
-        drone = spec.body(name)
-        places = [(x, y, -LEG) for x in (-REACH, REACH) for y in (-REACH, REACH)]
-        for place in (*places, (0.0, 0.0, LEG)):
-            leg = drone.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[FOOT, 0, 0], pos=place, mass=0.0)
-            leg.contype, leg.conaffinity, leg.solref = 2, 1, [0.008, 1.0]
-    return spec.compile()

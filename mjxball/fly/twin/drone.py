@@ -2,104 +2,147 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-
 import numpy as np
 
-from mjxball.control import rotations
-from mjxball.control.firmware_gains import STOCK, gains_of
-from mjxball.fly import packets
-from mjxball.fly.packets import DroneState, Setpoint
 from mjxball.fly.twin import faults, tables
-from mjxball.fly.twin.body import PairState
+from mjxball.fly.twin.body import Modes, Pair, PairState
 from mjxball.fly.twin.faults import Channel, DroneFaults, LinkFaults
-from mjxball.fly.twin.firmware import Firmware, FirmwareTimes
+from mjxball.fly.twin.firmware import Firmware, Motors, Order
+from mjxball.fly.twin.kind import DELIVERED, QUIET, DroneKind, Surroundings
+from mjxball.fly.twin.logs import Readings, Snapshot
 from mjxball.fly.twin.protocol import Peer
 
-CONVERGING = 0.4  # [s] the estimator's variances take about this long after a reset
+GRAVITY = 9.81  # [m/s2]
+# Parameters of the supervisor, each with its field there and the factor to its unit.
+SUPERVISOR = {
+    "supervisor.prefltTimeout": ("preflight_time", 1e-3),
+    "supervisor.landedTimeout": ("landed_time", 1e-3),
+    "supervisor.tmblChckEn": ("tumble_check", 1.0),
+    "stabilizer.stop": ("stopped", 1.0),
+}
 
 
 class TwinDrone:
     """What answers at one address. `receive`, `step` and `send` are called by one thread."""
 
-    def __init__(self, times: FirmwareTimes, seed: int, on_parameter: Callable[[str, float], None]):
-        self.firmware = Firmware(times)
-        self.peer = Peer(self.firmware, self._written)
-        self._on_parameter = on_parameter
+    def __init__(self, pair: Pair, number: int, kind: DroneKind = DELIVERED, around: Surroundings = QUIET):
+        """Drone `number` (0 leader, 1 follower) of `pair`."""
+        self._pair, self.number = pair, number
+        self._random = np.random.default_rng([around.seed, number])
+        self.firmware = Firmware(kind, phase=float(self._random.random()))
+        self._estimator = 2 if around.deck else 1
+        self.peer = self._new_peer()
+        self.delay = around.delay
         self.link, self.faults = LinkFaults(), DroneFaults()
-        self._random = np.random.default_rng(seed)
         self.up, self.down = Channel(self._random), Channel(self._random)
-        self._reset_time = -math.inf
-        self._stamp = 0.0
-        self._readings: dict[str, float] = {name: 0.0 for name, _ in tables.LOG_VARIABLES}
-        self.setpoint = packets.ZERO
+        self._now = self._stamp = self._booted = 0.0  # [s]
+        self._readings: Readings | None = None
+        self._pose = (0.0,) * 7
+
+    def _new_peer(self) -> Peer:
+        return Peer(self.firmware, self._written, self._posed, self._estimator)
 
     def _written(self, name: str, value: float) -> None:
-        if name == "kalman.resetEstimation" and value:
-            self._reset_time = self._stamp
-        self._on_parameter(name, value)
+        if name in SUPERVISOR:
+            field, factor = SUPERVISOR[name]
+            setattr(self.firmware.supervisor, field, value * factor)
+        self._pair.set_parameter(self.number, name, value)
+
+    def _posed(self, position: np.ndarray, quaternion: np.ndarray | None) -> None:
+        turned = self._pose[3:] if quaternion is None else tuple(np.roll(quaternion, -1).tolist())
+        self._pose = (*position.tolist(), *turned)
+        self._pair.receive_pose(self.number, position, quaternion)
 
     def receive(self, datagram: bytes, now: float) -> None:
         """A datagram came from the laptop."""
-        self.up.push(datagram, now, self.link, self.link.silent_up)
+        self.up.push(datagram, now, self.link, self.link.silent_up, self.delay)
 
-    def step(self, state: DroneState, force_z: float, now: float) -> Setpoint:
-        """Handle what has arrived, and return what the firmware makes of it."""
-        for datagram in self.up.due(now):
-            for answer in self.peer.receive(datagram, now):
-                self.down.push(answer, now, self.link, self.link.silent_down)
-        self.setpoint = self.firmware.step(now, force_z, packets.level_share(state.quaternion) > 0)
-        if not self.faults.clock_stopped:
-            self._stamp = now
-        # Every variable is computed only when a packet is due: a twin that is never late needs the time.
-        if not self.faults.frozen and self.peer.is_due(now):
-            self._readings = self._read(state, force_z, now)
-        self._readings["supervisor.info"] = self.firmware.info
-        return self.setpoint
+    @property
+    def next_arrival(self) -> float:
+        """When `answer` has something to do again [s]."""
+        return min(self.up.next, self.down.next)
+
+    def answer(self, now: float) -> None:
+        """Handle what has arrived by `now` [s]."""
+        for due, datagram in self.up.timed(now):
+            if self.faults.stopped or self.firmware.dead or self.firmware.booting:
+                continue
+            for reply in self.peer.receive(datagram, due):
+                self._reply(reply, due)
+
+    def step(self, state: PairState, now: float) -> Order:
+        """Handle what has arrived, and return what the firmware lets through."""
+        self._now = now
+        self.answer(now)
+        report, mine = state.report, self.number
+        wrong = self.faults
+        hung = wrong.stopped or wrong.stabilizer_dead
+        before = self.firmware.supervisor
+        acceleration = (report.acceleration[mine] / GRAVITY).tolist()
+        order = self.firmware.step(now, acceleration, report.pwm[mine].tolist(), hung, wrong.restarts)
+        if self.firmware.supervisor is not before:
+            self._forget(now)
+        if not wrong.clock_stopped:
+            self._stamp = now - self._booted
+        frozen = wrong.frozen or (hung and order.motors is Motors.HELD)
+        if not frozen or self._readings is None:
+            self._readings = Readings(self._snapshot(state))
+        elif not hung:
+            kept = self._readings.snapshot._replace(info=self.firmware.info)
+            self._readings = Readings(kept)
+        return order
+
+    def _snapshot(self, state: PairState) -> Snapshot:
+        position = state.report.position[self.number]
+        if self.faults.offset != (0.0, 0.0, 0.0):
+            position = position + np.array(self.faults.offset)
+        voltage = float(state.battery[self.number]) + self.faults.battery
+        setpoint = self.firmware.order.setpoint
+        return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, self._pose)
 
     def send(self, now: float) -> list[bytes]:
         """Datagrams that leave for the laptop at `now`."""
-        stamped = self.peer.log_data(self._readings, now)
-        if self.faults.clock_stopped:
-            stamp = (int(self._stamp * 1000) & 0xFFFFFF).to_bytes(3, "little")
-            stamped = [datagram[:2] + stamp + datagram[5:] for datagram in stamped]
+        silent = self.faults.stopped or self.firmware.dead or self.firmware.booting
+        if self._readings is not None and not silent and self.peer.logs.is_due(now):
+            for datagram in self.peer.log_data(self._readings, now):
+                stamp = (int(self._stamp * 1000 + 1e-6) & 0xFFFFFF).to_bytes(3, "little")
+                self._reply(datagram[:2] + stamp + datagram[5:], now)
         junk = int(self._random.poisson(self.faults.garbage)) if self.faults.garbage else 0
-        for datagram in (*stamped, *(faults.garbage(self._random) for _ in range(junk))):
-            self.down.push(datagram, now, self.link, self.link.silent_down)
+        for _ in range(junk):
+            self._reply(faults.garbage(self._random), now)
         return self.down.due(now)
+
+    def _reply(self, datagram: bytes, now: float) -> None:
+        self.down.push(datagram, now, self.link, self.link.silent_down, self.delay)
 
     def reboot(self) -> None:
         """Power off and on: log blocks and parameters are forgotten."""
-        self.firmware.reboot()
-        self.peer = Peer(self.firmware, self._written)
-        for name, value in gains_of(STOCK).items():
-            self._on_parameter(name, value)
+        self.firmware.reboot(self._now)
+        self._forget(self._now)
 
-    def _read(self, state: DroneState, force_z: float, now: float) -> dict[str, float]:
-        """Every log variable."""
-        position = state.position + np.array(self.faults.offset)
-        counts = [*1000 * position, *1000 * state.velocity]
-        rates = np.degrees(state.rates)
-        roll, pitch, yaw = np.degrees(rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion)))
-        variance = 1e-5 + math.exp(-(now - self._reset_time) / CONVERGING * 8)
-        voltage = state.battery + self.faults.battery
-        readings = dict(zip((name for name, _ in packets.STATE_VARIABLES), counts, strict=False))
-        readings["stateEstimateZ.quat"] = packets.compress_quaternion(state.quaternion)
-        turning = 1000 * state.rates * np.array([1.0, -1.0, 1.0])
-        readings |= dict(zip([f"stateEstimateZ.rate{axis}" for axis in ("Roll", "Pitch", "Yaw")], turning, strict=True))
-        readings |= {f"kalman.varP{axis}": variance for axis in "XYZ"}
-        readings |= {f"gyro.{axis}": rate for axis, rate in zip("xyz", rates, strict=True)}
-        readings |= {f"stateEstimate.{axis}": value for axis, value in zip("xyz", position, strict=True)}
-        readings |= {"stateEstimate.roll": roll, "stateEstimate.pitch": -pitch, "stateEstimate.yaw": yaw}
-        readings |= {"pm.vbatMV": 1000 * voltage, "pm.vbat": voltage, "acc.z": force_z / 9.81}
-        readings["stabilizer.thrust"] = self.setpoint.thrust
-        return readings
+    def _forget(self, now: float) -> None:
+        self.peer = self._new_peer()
+        self._booted = now
+        self.faults = DroneFaults()
+        for name, value in tables.defaults_of(self.firmware.kind, self._estimator).items():
+            self._pair.set_parameter(self.number, name, value)
+        self._pair.set_parameter(self.number, "kalman.resetEstimation", 1.0)
 
 
-def drone_state(pair: PairState, number: int) -> DroneState:
-    """State of drone `number` of the pair."""
-    position, velocity, quaternion, rates = (
-        leaf[number] for leaf in (pair.position, pair.velocity, pair.quaternion, pair.rates)
+def modes_of(orders: tuple[Order, Order]) -> Modes:
+    """What the physics is told of both drones' orders."""
+    run, held, flying = (
+        (part[0], part[1])
+        for part in (
+            [order.motors is not Motors.OFF for order in orders],
+            [order.motors is Motors.HELD for order in orders],
+            [order.flying for order in orders],
+        )
     )
-    return DroneState(position, velocity, quaternion, rates, 0, float(pair.battery[number]))
+    return Modes(run, held, flying)
+
+
+def advance(pair: Pair, drones: tuple[TwinDrone, TwinDrone], state: PairState, now: float, dt: float) -> PairState:
+    """Step both drones at `now` [s] and the physics `dt` [s] on."""
+    orders = drones[0].step(state, now), drones[1].step(state, now)
+    return pair.advance(np.array([order.setpoint for order in orders], float), dt, modes_of(orders))

@@ -1,136 +1,123 @@
-"""What one drone's firmware does with what it is sent: thrust lock, arming, watchdog, tumble, stops. No clock.
-
-Times and thresholds are those measured on the real firmware (crazyflie.md); the order of the checks is ours.
-"""
+"""What one drone's firmware lets through to its controller: commander and supervisor together, and their faults."""
 
 from __future__ import annotations
 
+import enum
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from typing import NamedTuple
 
-from mjxball.fly import packets
 from mjxball.fly.packets import ZERO, Setpoint
+from mjxball.fly.twin.commander import Commander
+from mjxball.fly.twin.kind import DELIVERED, DroneKind
+from mjxball.fly.twin.supervisor import AIRBORNE, PERIOD, Phase, Supervisor
+
+BOOT_TIME = 1.0  # [s] from power on until the first setpoint can be executed
+LEVEL = (0.0, 0.0, 1.0)  # [g] what the accelerometer shows at rest
+STILL = (0.0, 0.0, 0.0, 0.0)
+WATCHDOG = 0.35  # [s] after which the microcontroller's own watchdog restarts a program that hangs
 
 
-@dataclass(frozen=True)
-class FirmwareTimes:
-    """Behaviour of the firmware."""
+class Motors(enum.Enum):
+    """What drives the motors."""
 
-    auto_arm: bool = True  # 2.1 arms itself, the brushless does not
-    level_after: float = 0.5  # without setpoints, thrust is kept [s]
-    lock_after: float = 2.0  # without setpoints, motors off until reboot [s]
-    tumble_force: float = 0.5 * 9.81  # specific force along body z below which it may be falling [m/s2]
-    tumble_time: float = 1.0  # [s]
-    keepalive_time: float = 1.0  # an emergency stop keepalive that was begun must be repeated within this [s]
-    thrust_floor: int = 1000  # below, motors stand still [thrust units]
-    thrust_ceiling: int = 60000
+    RUN = "run"  # the controller, at idle at least
+    OFF = "off"
+    HELD = "held"  # nothing: their PWM stays as it is
+
+
+class Order(NamedTuple):
+    """What reaches the controller of one drone."""
+
+    setpoint: Setpoint = ZERO
+    motors: Motors = Motors.RUN
+    flying: bool = False  # by the supervisor, for the estimator
 
 
 class Firmware:
-    """Supervisor and commander of one drone. Time comes in, setpoints for the physics come out."""
+    """Time and measurements come in, an order for the controller comes out."""
 
-    def __init__(self, times: FirmwareTimes = FirmwareTimes()):
-        self.times = times
-        self.reboot()
+    def __init__(self, kind: DroneKind = DELIVERED, now: float = 0.0, phase: float = 0.0):
+        """`phase` 0 .. 1 is where in its period of 40 ms the supervisor is at `now` [s]."""
+        self.kind = kind
+        self._next_look = now + (1.0 - phase) * PERIOD
+        self._start(now, booted=True)
 
-    def reboot(self) -> None:
-        """Power on: locked thrust, no memory of crashes."""
-        self.armed = self.times.auto_arm
-        self.locked = self.crashed = self.tumbled = self.dead = False
-        self._thrust_locked = True
-        self._last = ZERO
-        self._last_time: float | None = None
-        self._falling_since: float | None = None
-        self._keepalive: float | None = None
-        self.flying = False
-        self.running = False
+    def _start(self, now: float, booted: bool) -> None:
+        self.supervisor = Supervisor(self.kind, now, booted)
+        self.commander = Commander(now)
+        self.order = Order(ZERO, Motors.RUN if self.supervisor.motors_allowed else Motors.OFF)
+        self.dead = False  # without power
+        self.booting_until = -math.inf
+        self._hung_since: float | None = None
 
-    # What the link delivers.
+    def reboot(self, now: float) -> None:
+        """Power on at `now` [s]: everything is forgotten."""
+        self._start(now, booted=False)
+        self.booting_until = now + BOOT_TIME
+        self._next_look = self.booting_until
 
-    def receive_setpoint(self, value: Setpoint, now: float) -> None:
-        """Port 3: a setpoint of any values; floats that are not finite reach the controller, as they do on a drone."""
-        if value.thrust == 0:
-            self._thrust_locked = False
-        self._last, self._last_time = value, now
+    def step(
+        self,
+        now: float,
+        acceleration: Sequence[float] = LEVEL,
+        pwm: Sequence[float] = STILL,
+        hung: bool = False,
+        restarts: bool = True,
+    ) -> Order:
+        """The order at `now` [s]; measured `acceleration` (3,) [g], `pwm` (4,) of the motors.
 
-    def receive_stop(self) -> None:
-        """Port 7, stop: motors off at once, not locked; the next setpoint counts again, after a zero one."""
-        self._last, self._last_time, self._thrust_locked, self.running = ZERO, None, True, False
-
-    def emergency_stop(self) -> None:
-        """Motors off and locked until reboot."""
-        self.locked = True
-
-    def keep_alive(self, now: float) -> None:
-        """Emergency stop keepalive: once begun it must go on."""
-        self._keepalive = now
-
-    def arm(self, wanted: bool) -> bool:
-        """Arm or disarm; true if done."""
-        if wanted and (self.locked or self.crashed or self.tumbled):
-            return False
-        self.armed = wanted
-        return True
-
-    def recover(self) -> bool:
-        """Leave the crashed state, if upright and not locked."""
-        if self.locked or self.tumbled:
-            return False
-        self.crashed, self._thrust_locked = False, True
-        return True
-
-    # What it does every millisecond.
-
-    def step(self, now: float, force_z: float, upright: bool) -> Setpoint:
-        """The setpoint that reaches the controller; thrust 0 is motors off.
-
-        `force_z` is the accelerometer's body z [m/s2], `upright` whether body z points up.
+        `hung`: the stabilizer does not run. The microcontroller's watchdog ends that, and the program `restarts`.
         """
-        times = self.times
-        age = math.inf if self._last_time is None else now - self._last_time
-        if age > times.lock_after and self.running:
-            self.locked = True
-        if self._keepalive is not None and now - self._keepalive > times.keepalive_time:
-            self.locked = True
-        self._watch_tumble(now, force_z, upright)
-        value = self._last if age <= times.lock_after else ZERO
-        if age > times.level_after:
-            value = Setpoint(0.0, 0.0, 0.0, value.thrust)
-        off = not self.armed or self.locked or self.crashed or self.dead or self._thrust_locked
-        thrust = 0 if off or value.thrust < times.thrust_floor else min(value.thrust, times.thrust_ceiling)
-        self.running = thrust > 0
-        self.flying = self.running and thrust > 20000
-        # The real controller takes a number that is not finite as a kick; the physics gets the largest tilt instead.
-        angles = (part if math.isfinite(part) else 30.0 for part in value[:3])
-        roll, pitch, yaw_rate = (min(max(part, -180.0), 180.0) for part in angles)
-        return Setpoint(roll, pitch, yaw_rate, thrust)
+        if self.dead:
+            return self._give(Order(ZERO, Motors.OFF))
+        if hung:
+            return self._hang(now, restarts)
+        self._hung_since = None
+        if now < self.booting_until:
+            return self._give(Order(ZERO, Motors.OFF))
+        self.commander.poll(now, self.supervisor.can_fly)
+        while now >= self._next_look - 1e-9:
+            self.supervisor.look(now, self.commander.age(now), pwm, acceleration)
+            self._next_look += PERIOD
+        phase = self.supervisor.phase
+        flown = self.commander.setpoint if self.supervisor.can_fly else ZERO
+        if phase is Phase.LEVEL_OUT:
+            flown = Setpoint(0.0, 0.0, 0.0, flown.thrust)
+        motors = Motors.RUN if self.supervisor.motors_allowed else Motors.OFF
+        return self._give(Order(flown, motors, phase in AIRBORNE))
 
-    def _watch_tumble(self, now: float, force_z: float, upright: bool) -> None:
-        self.tumbled = not upright
-        if force_z >= self.times.tumble_force or not (self.running or self._falling_since):
-            self._falling_since = None
-        elif self._falling_since is None:
-            self._falling_since = now
-        elif now - self._falling_since > self.times.tumble_time:
-            self.crashed = True
+    def _hang(self, now: float, restarts: bool) -> Order:
+        if self._hung_since is None:
+            self._hung_since = now
+        if now - self._hung_since < WATCHDOG:
+            return self._give(self.order._replace(motors=Motors.HELD))
+        if restarts:
+            self.reboot(now)
+        else:
+            self.dead = True
+        return self._give(Order(ZERO, Motors.OFF))
 
-    @property
-    def last_thrust(self) -> int:
-        """Of the last setpoint that was received, whatever became of it [thrust units]."""
-        return self._last.thrust
+    def _give(self, order: Order) -> Order:
+        self.order = order
+        return order
 
     @property
     def info(self) -> int:
         """Bits of supervisor.info."""
-        sound = not (self.locked or self.crashed or self.tumbled)
-        bits = {
-            packets.CAN_ARM: sound,
-            packets.ARMED: self.armed,
-            packets.AUTO_ARMED: self.times.auto_arm,
-            packets.CAN_FLY: sound and self.armed,
-            packets.FLYING: self.flying,
-            packets.TUMBLED: self.tumbled,
-            packets.LOCKED: self.locked,
-            packets.CRASHED: self.crashed,
-        }
-        return sum(bit for bit, is_set in bits.items() if is_set)
+        return self.supervisor.info
+
+    @property
+    def armed(self) -> bool:
+        """True if the supervisor has armed it."""
+        return self.supervisor.armed
+
+    @property
+    def locked(self) -> bool:
+        """True until it is rebooted."""
+        return self.supervisor.phase is Phase.LOCKED
+
+    @property
+    def booting(self) -> bool:
+        """True between power on and the first look."""
+        return self.supervisor.phase is Phase.UNKNOWN

@@ -9,15 +9,22 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.fly.card import config_of, is_crazyflie
 from mjxball.fly.twin.body import Pair
+from mjxball.fly.twin.conditions import Conditions
+from mjxball.fly.twin.kind import DELIVERED, QUIET, DroneKind, Surroundings
 from mjxball.fly.twin.standin import StandIn, StandInPlant
 
 
-def make_pair(card: Mapping[str, Any] | None = None) -> Pair:
+def make_pair(card: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, around: Surroundings = QUIET) -> Pair:
     """Physics of the rig that a policy's `card` describes; without one, the stand-in's own rig."""
-    return StandIn() if card is None else pair_of(config_of(card))
+    return StandIn() if card is None else pair_of(config_of(card), kind, around)
 
 
-def pair_of(config: Config) -> Pair:
+def pair_of(
+    config: Config,
+    kind: DroneKind = DELIVERED,
+    around: Surroundings = QUIET,
+    conditions: Conditions | None = None,
+) -> Pair:
     """Physics of the rig of `config`; whatever is heavy is imported here, not above.
 
     Raises InputError if the coupled model is needed and MuJoCo is not installed.
@@ -29,4 +36,4 @@ def pair_of(config: Config) -> Pair:
         from mjxball.fly.twin.coupled import CoupledPair
     except ModuleNotFoundError as error:
         raise InputError(f"the twin of a Crazyflie pair needs {error.name}; pip install 'mjxball[fly]'") from None
-    return CoupledPair(config)
+    return CoupledPair(config, conditions, kind, around)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import select
 import socket
 import threading
@@ -12,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjxball.fly.twin.body import Pair, PairState
-from mjxball.fly.twin.drone import TwinDrone, drone_state
-from mjxball.fly.twin.faults import DroneFaults, LinkFaults, Strike
-from mjxball.fly.twin.firmware import FirmwareTimes
+from mjxball.fly.twin.drone import TwinDrone, advance
+from mjxball.fly.twin.faults import BodyFault, DroneFaults, Injection, LinkFaults
+from mjxball.fly.twin.kind import DELIVERED, QUIET, DroneKind, Surroundings
 
 HOST = "127.0.0.1"
-FIRMWARE = FirmwareTimes()
 MOST_BEHIND = 0.1  # [s] of physics that a twin that was held up makes good; the rest of the time it stands still
 
 
@@ -27,8 +25,8 @@ class TwinSettings:
 
     period: float = 0.005  # of physics, firmware and sockets [s]
     ports: tuple[int, int] = (0, 0)  # of leader and follower, 0: any free one
-    seed: int = 0  # of the link's faults
-    times: FirmwareTimes = FIRMWARE
+    kind: DroneKind | None = None  # None: that of the physics
+    around: Surroundings | None = None
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,8 @@ class Truth:
 
     time: float  # [s] of the twin
     state: PairState
-    thrust: tuple[int, int]  # [thrust units] that reach the motors
+    thrust: tuple[int, int]  # [thrust units] that reach the controllers
+    pwm: np.ndarray  # (2, 4) of all motors
     last_wire_thrust: tuple[int, int]  # [thrust units] of the last setpoint received
     info: tuple[int, int]
 
@@ -48,15 +47,19 @@ class Twin:
     def __init__(self, pair: Pair, settings: TwinSettings = TwinSettings()):
         self._pair, self._settings = pair, settings
         self._state = pair.start()
-        self.drones = tuple(
-            TwinDrone(settings.times, 2 * settings.seed + n, functools.partial(pair.set_parameter, n)) for n in range(2)
-        )
+        kind, around = settings.kind, settings.around
+        if kind is None:
+            kind = getattr(pair, "kind", DELIVERED)
+        if around is None:
+            around = getattr(pair, "around", QUIET)
+        self.drones = TwinDrone(pair, 0, kind, around), TwinDrone(pair, 1, kind, around)
         self._sockets = [self._bound(port) for port in settings.ports]
         self._clients: list[tuple[str, int] | None] = [None, None]
         self.uris = tuple(f"udp://{HOST}:{sock.getsockname()[1]}" for sock in self._sockets)
         self._dead = [False, False]
         self._stop = threading.Event()
         self._lock = threading.Lock()
+        self._begun = time.monotonic()
         self._thread = threading.Thread(target=self._run, name="twin", daemon=True)
         self.truth = self._seen(0.0)
         self.history: list[Truth] = []  # one in ten steps
@@ -87,18 +90,21 @@ class Twin:
         """Replace the `DroneFaults` of a drone."""
         self.drones[drone].faults = faults
 
-    def strike(self, one: Strike) -> None:
+    def inject(self, one: Injection) -> None:
         """Have a fault come to pass now."""
         if isinstance(one.what, LinkFaults):
             self.set_link(one.drone, one.what)
         elif isinstance(one.what, DroneFaults):
             self.set_faults(one.drone, one.what)
+        elif isinstance(one.what, BodyFault):
+            with self._lock:
+                self._pair.disturb(one.drone, one.what.what, one.what.value)
         else:
             getattr(self, one.what)(one.drone)
 
     def crash(self, drone: int) -> None:
         """The firmware of a drone finds that it has crashed: its motors stop."""
-        self.drones[drone].firmware.crashed = True
+        self.drones[drone].firmware.supervisor.crash()
 
     def kill(self, drone: int) -> None:
         """A drone loses its power: its motors stop and its address answers nothing, not even that it is closed."""
@@ -124,17 +130,22 @@ class Twin:
             self.failure = failure
             raise
 
+    def _now(self) -> float:
+        """Time [s] of the twin."""
+        return time.monotonic() - self._begun
+
     def _loop(self) -> None:
-        period, begun = self._settings.period, time.monotonic()
-        step, skipped = 0, 0.0
+        period = self._settings.period
+        self._begun = time.monotonic()
+        step = 0
         while not self._stop.is_set():
-            now = time.monotonic() - begun - skipped
+            now = self._now()
             due = (step + 1) * period
             if now < due:
-                self._wait(due - now)
+                self._wait(min(due, *(drone.next_arrival for drone in self.drones)) - now)
                 continue
             if now - due > MOST_BEHIND:
-                skipped += now - due
+                self._begun += now - due
             step += 1
             with self._lock:
                 self._step(step * period)
@@ -142,18 +153,23 @@ class Twin:
                 self.history.append(self.truth)
 
     def _wait(self, seconds: float) -> None:
-        """Sleep until the next step, or until a datagram comes, which is taken in at once."""
+        """Sleep until something is due, or until a datagram comes; it is handled at once.
+
+        Requests are answered between the steps: a table of contents is a hundred of them, one after the other.
+        """
         alive = [n for n in range(2) if not self._dead[n]]
         try:
-            readable, _, _ = select.select([self._sockets[n] for n in alive], [], [], seconds)
+            readable, _, _ = select.select([self._sockets[n] for n in alive], [], [], max(seconds, 0.0))
         except (OSError, ValueError):
             if not any(self._dead[n] for n in alive):
                 raise
             return  # a port was closed just now
-        for number in alive:
-            if self._sockets[number] in readable:
-                with self._lock:
+        with self._lock:
+            for number in alive:
+                if self._sockets[number] in readable:
                     self._receive(number)
+                self.drones[number].answer(self._now())
+                self._transmit(number, self.drones[number].down.due(self._now()))
 
     def _receive(self, number: int) -> None:
         for _ in range(50):
@@ -164,18 +180,10 @@ class Twin:
             except (BlockingIOError, ConnectionError):
                 return
             self._clients[number] = client
-            drone, now = self.drones[number], self.truth.time
-            drone.receive(datagram, now)
-            # Requests are answered at once: a table of contents is a hundred of them, one after the other.
-            drone.step(drone_state(self._state, number), float(self._state.specific_force[number, 2]), now)
-            self._transmit(number, drone.down.due(now))
+            self.drones[number].receive(datagram, self._now())
 
     def _step(self, now: float) -> None:
-        setpoints = []
-        for number, drone in enumerate(self.drones):
-            state = drone_state(self._state, number)
-            setpoints.append(drone.step(state, float(self._state.specific_force[number, 2]), now))
-        self._state = self._pair.advance(np.array(setpoints, float), self._settings.period)
+        self._state = advance(self._pair, self.drones, self._state, now, self._settings.period)
         self.truth = self._seen(now)
         for number, drone in enumerate(self.drones):
             self._transmit(number, drone.send(now))
@@ -192,6 +200,7 @@ class Twin:
 
     def _seen(self, now: float) -> Truth:
         one, other = self.drones
-        thrust = (one.setpoint.thrust, other.setpoint.thrust)
-        last = (one.firmware.last_thrust, other.firmware.last_thrust)
-        return Truth(now, self._state, thrust, last, (one.firmware.info, other.firmware.info))
+        first, second = one.firmware, other.firmware
+        thrust = first.order.setpoint.thrust, second.order.setpoint.thrust
+        last = first.commander.wire_thrust, second.commander.wire_thrust
+        return Truth(now, self._state, thrust, self._state.report.pwm, last, (first.info, second.info))

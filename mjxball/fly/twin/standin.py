@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjxball.control import rotations
-from mjxball.fly.command import ForceCurve
+from mjxball.control import motors, rotations
 from mjxball.fly.packets import Setpoint, angles
-from mjxball.fly.twin.body import PairState
+from mjxball.fly.thrust import ForceCurve
+from mjxball.fly.twin.body import RUNNING, Modes, PairState, Report
 
 CURVE = ForceCurve()
 FASTEST = 30.0  # [rad/s] bound on the body rates: beyond it the oscillator is no model of anything
@@ -51,14 +51,27 @@ class StandIn:
         self._quaternion, self._rates = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
         self._thrust = np.zeros(2)  # of each drone [N]
         self._charge = np.full(2, self.plant.full)
+        self._commands = np.zeros(2)
         return self._state(np.zeros(3))
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
         """The stand-in has no gains."""
 
-    def advance(self, setpoints: np.ndarray, dt: float) -> PairState:
-        """See `Pair.advance`."""
+    def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
+        """The stand-in has no estimator."""
+
+    def disturb(self, drone: int, what: str, value: float) -> None:
+        """Of the faults, the stand-in knows the battery's."""
+        if what == "battery":
+            self._charge[drone] = value
+
+    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+        """See `Pair.advance`; a drone whose stabilizer hangs keeps its thrust and levels."""
         plant = self.plant
+        held = np.array(modes.held)[:, None]
+        setpoints = np.where(held, np.array([[0.0, 0.0, 0.0, thrust] for thrust in self._commands]), setpoints)
+        setpoints = setpoints * np.array(modes.run)[:, None]
+        self._commands = setpoints[:, 3].copy()
         wanted = np.array([plant.curve.force(float(np.clip(row[3], 0, 60000))) for row in setpoints])
         self._thrust += (wanted - self._thrust) * -np.expm1(-dt / plant.motor_lag)
         self._charge = self._charge - dt * plant.drain * self._thrust / plant.curve.force(65535)
@@ -106,11 +119,18 @@ class StandIn:
         swing = rotations.cross(self._rates, self._mounts) @ matrix.T
         load = self._thrust / plant.curve.force(65535)
         felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        battery = self._charge - plant.sag * load
+        pwm = np.stack([motors.compensated(motors.MOTORS["2.1"], self._commands, battery)] * 4, axis=1)
+        position, velocity = self._position + arms, self._velocity + swing
+        quaternion, rates, force = (np.stack([one] * 2) for one in (self._quaternion, self._rates, felt))
         return PairState(
-            position=self._position + arms,
-            velocity=self._velocity + swing,
-            quaternion=np.stack([self._quaternion] * 2),
-            rates=np.stack([self._rates] * 2),
-            specific_force=np.stack([felt] * 2),
-            battery=self._charge - plant.sag * load,
+            position=position,
+            velocity=velocity,
+            quaternion=quaternion,
+            rates=rates,
+            specific_force=force,
+            battery=battery,
+            report=Report(
+                position, velocity, quaternion, rates, force, np.full((2, 9), 1e-5), (2, 2), pwm, pwm, self._commands
+            ),
         )

@@ -1,12 +1,18 @@
-"""What a Crazyflie lists: log variables and parameters, with the types of the wire (ours, a subset that is flown)."""
+"""What a Crazyflie lists: all log variables and parameters of firmware 2026.08, with the types of the wire.
+
+The names are in `names.csv`, in the order of the firmware's own tables. Defaults that matter are here; others are 0.
+"""
 
 from __future__ import annotations
 
+import csv
 import struct
 import zlib
+from pathlib import Path
 from typing import NamedTuple
 
 from mjxball.control.firmware_gains import STOCK, gains_of
+from mjxball.fly.twin.kind import DroneKind
 
 # Type numbers of the two tables, each with its struct code (crazyflie.md).
 LOG_TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int8_t": (4, "b"), "int16_t": (5, "h")}
@@ -15,6 +21,32 @@ LOG_CODES = dict(LOG_TYPES.values())
 PARAM_TYPES = {"uint8_t": (8, "B"), "uint16_t": (9, "H"), "uint32_t": (10, "I"), "int8_t": (0, "b")}
 PARAM_TYPES |= {"int16_t": (1, "h"), "int32_t": (2, "i"), "float": (6, "f")}
 READ_ONLY, EXTENDED = 0x40, 0x10
+DEFAULTS = {
+    **gains_of(STOCK),
+    "firmware.revision0": float(0x20260800),
+    "kalman.attitudeRev": 0.001,
+    "kalman.mNBaro": 2.0,
+    "kalman.mNGyro_rollpitch": 0.1,
+    "kalman.mNGyro_yaw": 0.1,
+    "kalman.maxPos": 100.0,
+    "kalman.maxVel": 10.0,
+    "kalman.pNAcc_xy": 0.5,
+    "kalman.pNAcc_z": 1.0,
+    "locSrv.extPosStdDev": 0.01,
+    "locSrv.extQuatStdDev": 4.5e-3,
+    "pm.criticalLowVoltage": 3.0,
+    "pm.lowVoltage": 3.2,
+    "stabilizer.controller": 1.0,
+    "stabilizer.estimator": 2.0,
+    "supervisor.landedTimeout": 3000.0,
+    "supervisor.prefltTimeout": 30000.0,
+    "supervisor.spinupTimeout": 2000.0,
+    "supervisor.tmblChckEn": 1.0,
+    "system.selftestPassed": 1.0,
+    "flightmode.stabModeRoll": 1.0,
+    "flightmode.stabModePitch": 1.0,
+    "flightmode.yawMode": 2.0,
+}
 
 
 class Parameter(NamedTuple):
@@ -40,34 +72,29 @@ class Parameter(NamedTuple):
         return float(struct.unpack("<" + PARAM_TYPES[self.kind][1], data)[0])
 
 
-def _gains() -> list[Parameter]:
-    return [Parameter(name, "float", value, persistent=True) for name, value in gains_of(STOCK).items()]
+def _listed(table: str) -> list[dict[str, str]]:
+    with Path(__file__).with_name("names.csv").open(encoding="utf-8", newline="") as file:
+        return [row for row in csv.DictReader(file) if row["table"] == table]
 
 
-PARAMETERS = (
-    Parameter("commander.enHighLevel", "uint8_t", 0),
-    Parameter("firmware.modified", "uint8_t", 0, read_only=True),
-    Parameter("firmware.revision0", "uint32_t", 0x20260800, read_only=True),
-    Parameter("firmware.revision1", "uint16_t", 0, read_only=True),
-    Parameter("kalman.resetEstimation", "uint8_t", 0),
-    Parameter("stabilizer.estimator", "uint8_t", 2),
-    Parameter("stabilizer.controller", "uint8_t", 1),
-    *_gains(),
+PARAMETERS = tuple(
+    Parameter(row["name"], row["type"], DEFAULTS.get(row["name"], 0.0), row["access"] == "r", row["access"] == "p")
+    for row in _listed("param")
 )
+LOG_VARIABLES: tuple[tuple[str, str], ...] = tuple((row["name"], row["type"]) for row in _listed("log"))
 
-_STATE = [f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz")]
-_RATES = [f"stateEstimateZ.{name}" for name in ("rateRoll", "ratePitch", "rateYaw")]
-_PLAIN = ["acc.z", "gyro.x", "gyro.y", "gyro.z", "kalman.varPX", "kalman.varPY", "kalman.varPZ", "pm.vbat"]
-_PLAIN += [f"stateEstimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")]
-LOG_VARIABLES: tuple[tuple[str, str], ...] = (
-    *((name, "float") for name in _PLAIN),
-    ("pm.vbatMV", "uint16_t"),
-    ("stabilizer.thrust", "float"),
-    *((name, "int16_t") for name in _STATE),
-    ("stateEstimateZ.quat", "uint32_t"),
-    *((name, "int16_t") for name in _RATES),
-    ("supervisor.info", "uint16_t"),
-)
+
+def defaults_of(kind: DroneKind, estimator: int) -> dict[str, float]:
+    """Values that the parameters of a drone of a `kind` have after boot; `estimator` is what its decks ask for."""
+    values = {parameter.name: parameter.default for parameter in PARAMETERS}
+    values["stabilizer.estimator"] = float(estimator)
+    values["powerDist.idleThrust"] = float(kind.idle)
+    if kind.motor == "brushless":
+        values["pm.lowVoltage"] = 3.35
+    for axis in ("roll", "pitch"):
+        values[f"pid_rate.{axis}_kp"] = kind.rate_gain
+        values[f"pid_rate.{axis}_ki"] = 2 * kind.rate_gain
+    return values
 
 
 def checksum(entries: list[bytes]) -> int:

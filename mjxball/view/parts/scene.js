@@ -145,15 +145,15 @@ class Scene {
   }
 
   pair(row) {
-    const { flight } = this, { size, mounts, arm } = flight.plant;
+    const { flight } = this, { size, mounts, arm, rotors } = flight.plant;
     const place = flight.at('position', row), turn = flight.at('quaternion', row);
     const world = (point) => add(place, rotate(turn, point));
     this.box(world, [0, 0, 0], size.map((edge) => edge / 2), '#c8b07a', 0.4);
     mounts.forEach((mount, drone) => {
       const colour = drone ? COLOURS.follower : COLOURS.leader, hub = 0.18 * arm, high = 0.028;
       this.box(world, mount, [hub * 1.3, hub * 1.3, 0.022], colour, 1);
-      [[1, 0], [0, 1], [-1, 0], [0, -1]].forEach(([x, y]) => {
-        const tip = add(mount, [arm * x, arm * y, high]);
+      rotors.forEach(([x, y]) => {
+        const tip = add(mount, [x, y, high]);
         this.line([world(add(mount, [hub * x, hub * y, 0])), world(tip)], shaded(colour, 0, 1), 3);
         const disc = [];
         for (let k = 0; k < 20; k++) {

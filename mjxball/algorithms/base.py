@@ -1,0 +1,138 @@
+"""What the trainer asks of a learning algorithm, and what it gives it. Nothing in `train/` knows which one runs."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from mjxball.config import Config
+
+Array = Any
+
+
+class Phase(NamedTuple):
+    """What the environments are stepped for. Traced, so that one compiled program serves all phases."""
+
+    random: Array  # () act uniformly at random and record, before anything is learnt
+    evaluate: Array  # () act with the policy's mean; nothing is recorded or learnt
+
+    @property
+    def recording(self) -> Array:
+        """() whether what happens is remembered."""
+        return jnp.logical_not(self.evaluate)
+
+    @property
+    def learning(self) -> Array:
+        """() whether the algorithm updates what it has learnt."""
+        return jnp.logical_not(jnp.logical_or(self.random, self.evaluate))
+
+
+class Schedule(NamedTuple):
+    """How the trainer runs an algorithm. Counted in environment steps, of all environments together."""
+
+    total_steps: int
+    num_envs: int
+    warmup_steps: int  # with random actions
+    num_evaluations: int
+    curriculum: float  # share of the training over which the environment's difficulty grows to the whole, 0: none
+
+
+class Policy(NamedTuple):
+    """What is exported: a tanh-squashed network of ReLU layers on normalised observations. A pytree of arrays."""
+
+    layers: Any  # Flax's {"hidden_0": {"kernel", "bias"}, ...}; the last gives mean and deviation of the action
+    mean: Array  # (n,) of the observations
+    deviation: Array  # (n,)
+    mask: Array  # (n,) 0 for a slot that the policy does not use, else 1
+
+    def __call__(self, observation: Array) -> Array:
+        """Mean action (..., actions) in [-1, 1] at `observation` (..., n)."""
+        names = sorted(self.layers, key=lambda name: int(name.rsplit("_", 1)[1]))
+        hidden = (observation - self.mean) / self.deviation * self.mask
+        for name in names[:-1]:
+            hidden = jax.nn.relu(hidden @ self.layers[name]["kernel"] + self.layers[name]["bias"])
+        last = hidden @ self.layers[names[-1]]["kernel"] + self.layers[names[-1]]["bias"]
+        return jnp.tanh(last[..., : last.shape[-1] // 2])
+
+
+class Shards(NamedTuple):
+    """One learner's environments, memory and batches cut into `parts` equal parts along a mapped axis."""
+
+    axis: str | None = None
+    parts: int = 1
+
+    def own(self, key: Array) -> Array:
+        """A key of this shard alone, from one that all shards share."""
+        return jax.random.fold_in(key, jax.lax.axis_index(self.axis)) if self.axis else key
+
+    def mean(self, value: Any) -> Any:
+        """Mean over the shards."""
+        return jax.lax.pmean(value, self.axis) if self.axis else value
+
+    def total(self, value: Any) -> Any:
+        """Sum over the shards."""
+        return jax.lax.psum(value, self.axis) if self.axis else value
+
+
+class Transition(NamedTuple):
+    """One step of all environments of a shard, before any of them starts anew."""
+
+    observation: Array  # (envs, n)
+    action: Array  # (envs, actions) in [-1, 1]
+    reward: Array  # (envs,)
+    terminated: Array  # (envs,) 1. if the episode ended other than by the time limit
+    next_observation: Array  # (envs, n)
+    done: Array  # (envs,) 1. if the episode ended
+
+
+class Environments(Protocol):
+    """Environments side by side, as an algorithm sees them (`mjxball.train.environments`)."""
+
+    count: int  # of this shard
+    observation_size: int
+    action_size: int
+    policy_mask: Any  # (n,) 1 for what the policy may use of an observation, else 0
+    critic_mask: Any  # (n,) the same for what is needed in training only
+    shards: Shards
+
+    def step(self, envs: Any, action: Array, key: Array) -> tuple[Any, Transition]:
+        """Step `envs` with `action` (count, actions); those that end start anew, at states drawn with `key`."""
+        ...
+
+
+class Algorithm(Protocol):
+    """A learning algorithm. All its functions are pure, and can be jitted and vmapped."""
+
+    schedule: Schedule
+    metrics: tuple[str, ...]  # names of what `update` reports
+    collect_keys: int  # random keys that `collect` takes
+    update_keys: int  # and that `update` takes
+    steps_per_collect: int  # steps of every environment in one `collect`
+
+    def __init__(self, config: Config, environments: Environments): ...
+
+    def init(self, key: Array) -> Any:
+        """What is known at the start: any pytree of arrays without empty ones."""
+        ...
+
+    def collect(self, state: Any, envs: Any, keys: Any, phase: Phase) -> tuple[Any, Any]:
+        """Step the environments and remember what is to be learnt from: (state, envs)."""
+        ...
+
+    def update(self, state: Any, keys: Any, progress: Array, phase: Phase) -> tuple[Any, dict[str, Array]]:
+        """Learn, if `phase.learning`: (state, `metrics`). `progress` () is the share of training done, 0 to 1."""
+        ...
+
+    def policy(self, state: Any) -> Policy:
+        """The policy to evaluate and export."""
+        ...
+
+    def partition(self, whole: Any, split: Any) -> Any:
+        """What `init` returns (or parts of it) with `split` for arrays cut by environments, `whole` for the others."""
+        ...
+
+    def check_parts(self, parts: int) -> None:
+        """Raise InputError unless the work can be cut into `parts`."""
+        ...

@@ -1,0 +1,346 @@
+"""Soft actor-critic on Brax's networks and losses, or on the paper's with a state value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from mjxball.algorithms import replay
+from mjxball.algorithms.base import Environments, Phase, Policy, Schedule
+from mjxball.algorithms.replay import Replay, Transitions
+from mjxball.config import Config, Sac
+from mjxball.errors import InputError
+from mjxball.quiet import import_brax_training
+
+Array = Any
+brax = import_brax_training()
+ADAM = optax.scale_by_adam()
+
+
+class Learner(NamedTuple):
+    """Everything that an update changes."""
+
+    policy: Any
+    critic: Any
+    value: Any  # of a state, () unless `state_value`
+    target: Any  # slow copy of the critic, or of the value if there is one
+    log_alpha: Array
+    policy_adam: Any
+    critic_adam: Any
+    value_adam: Any
+    alpha_adam: Any
+    normaliser: Any  # running mean and deviation of the observations
+    average: Any  # running average of the policy: what is evaluated and exported
+
+
+class Networks(NamedTuple):
+    """Brax's `SACNetworks` and a state-value network, None unless `state_value`."""
+
+    policy_network: Any
+    q_network: Any
+    value_network: Any
+    parametric_action_distribution: Any
+
+
+class Losses(NamedTuple):
+    """Diagnostics of the last update."""
+
+    critic: Array
+    policy: Array
+    entropy: Array  # of the policy [nat], in [-1, 1] action units
+
+
+def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = None) -> Networks:
+    """Brax's SAC networks: tanh-squashed Gaussian policy and critics, ReLU, on normalised observations.
+
+    `mask` (n,) of 0 and 1 hides slots of the observation from the policy, `critic_mask` from critics and value
+    (None: the same).
+    """
+    distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
+    observation_size = len(mask)
+    normalise, normalise_all = _normaliser(mask), _normaliser(mask if critic_mask is None else critic_mask)
+    value_network = brax.networks.make_value_network(
+        observation_size, preprocess_observations_fn=normalise_all, hidden_layer_sizes=config.critic_layers
+    )
+    return Networks(
+        policy_network=brax.networks.make_policy_network(
+            distribution.param_size,
+            observation_size,
+            preprocess_observations_fn=normalise,
+            hidden_layer_sizes=config.policy_layers,
+            activation=jax.nn.relu,
+        ),
+        q_network=brax.networks.make_q_network(
+            observation_size,
+            action_size,
+            preprocess_observations_fn=normalise_all,
+            hidden_layer_sizes=config.critic_layers,
+            activation=jax.nn.relu,
+            layer_norm=config.critic_layer_norm,
+            n_critics=config.num_critics,
+        ),
+        value_network=value_network if config.state_value else None,
+        parametric_action_distribution=distribution,
+    )
+
+
+def _normaliser(mask: Any) -> Callable[[Array, Any], Array]:
+    """Normalisation of an observation by running statistics, with zeros where `mask` (n,) has them."""
+    shown = np.asarray(mask, np.float32)
+    return lambda seen, statistics: brax.running_statistics.normalize(seen, statistics) * shown
+
+
+def create(networks: Networks, config: Sac, observation_size: int, key: Array) -> Learner:
+    """A fresh learner."""
+    policy_key, critic_key = jax.random.split(key)
+    policy, critic = networks.policy_network.init(policy_key), networks.q_network.init(critic_key)
+    value = networks.value_network.init(jax.random.fold_in(critic_key, 1)) if config.state_value else ()
+    log_alpha = jnp.log(jnp.asarray(config.alpha, jnp.float32))
+    specification = brax.specs.Array((observation_size,), jnp.dtype("float32"))
+    return Learner(
+        policy=policy,
+        critic=critic,
+        value=value,
+        target=value if config.state_value else critic,
+        log_alpha=log_alpha,
+        policy_adam=ADAM.init(policy),
+        critic_adam=ADAM.init(critic),
+        value_adam=ADAM.init(value),
+        alpha_adam=ADAM.init(log_alpha),
+        normaliser=brax.running_statistics.init_state(specification),
+        average=policy,
+    )
+
+
+def make_update(
+    networks: Networks, config: Sac, action_size: int, mean: Callable[[Any], Any] = lambda value: value
+) -> Any:
+    """Return `update(learner, transitions, three keys, rate) -> (learner, losses)`; `rate` scales all learning rates.
+
+    `mean` averages gradients and entropies over learners that share their parameters (data parallel).
+    """
+    _, critic_loss, policy_loss = brax.losses.make_losses(networks, config.reward_scale, config.discount, action_size)
+    value_loss, q_loss = make_value_losses(networks, config)
+    distribution = networks.parametric_action_distribution
+    target_entropy = config.target_entropy * action_size
+
+    def entropy_of(learner: Learner, seen: Array, key: Array) -> Array:
+        parameters = networks.policy_network.apply(learner.normaliser, learner.policy, seen)
+        return -jnp.mean(distribution.log_prob(parameters, distribution.sample_no_postprocessing(parameters, key)))
+
+    def value_step(learner: Learner, batch: Any, key: Array, step: Array) -> tuple[Learner, Array]:
+        """The paper's eqs. 6 and 7: V follows Q and the entropy, Q follows the reward and the slow V."""
+        value_gradient = mean(jax.grad(value_loss)(learner.value, learner, batch, key))
+        loss, gradient = jax.value_and_grad(q_loss)(learner.critic, learner, batch)
+        value, value_adam = _descend(learner.value, _clip(value_gradient, config), learner.value_adam, step)
+        critic, adam = _descend(learner.critic, _clip(mean(gradient), config), learner.critic_adam, step)
+        target = optax.incremental_update(value, learner.target, config.tau)
+        moved = learner._replace(value=value, critic=critic, target=target, value_adam=value_adam, critic_adam=adam)
+        return moved, loss
+
+    def critic_step(learner: Learner, batch: Any, key: Array, step: Array) -> tuple[Learner, Array]:
+        alpha = jnp.exp(learner.log_alpha)
+        value, gradient = jax.value_and_grad(critic_loss)(
+            learner.critic, learner.policy, learner.normaliser, learner.target, alpha, batch, key
+        )
+        critic, adam = _descend(learner.critic, _clip(mean(gradient), config), learner.critic_adam, step)
+        target = optax.incremental_update(critic, learner.target, config.tau)
+        return learner._replace(critic=critic, critic_adam=adam, target=target), value
+
+    def policy_step(before: Learner, learner: Learner, batch: Any, keys: Any, rate: Array) -> tuple[Learner, Losses]:
+        """Policy and temperature move against the critic `before` the batch's own critic step, as in Brax."""
+        alpha_key, policy_key = keys
+        alpha, entropy = jnp.exp(before.log_alpha), mean(entropy_of(before, batch.observation, alpha_key))
+        value, gradient = jax.value_and_grad(policy_loss)(
+            before.policy, before.normaliser, before.critic, alpha, batch, policy_key
+        )
+        step = rate * config.learning_rate
+        policy, policy_adam = _descend(before.policy, _clip(mean(gradient), config), before.policy_adam, step)
+        # d(alpha loss)/d(log alpha) of SAC's eq. 18: alpha (H - target).
+        slope = 0.0 * alpha if config.alpha_fixed else alpha * (entropy - target_entropy)
+        log_alpha, alpha_adam = _descend(before.log_alpha, slope, before.alpha_adam, rate * config.alpha_learning_rate)
+        moved = learner._replace(
+            policy=policy,
+            log_alpha=log_alpha,
+            policy_adam=policy_adam,
+            alpha_adam=alpha_adam,
+            average=optax.incremental_update(policy, learner.average, config.policy_ema_rate),
+        )
+        return moved, Losses(jnp.zeros(()), value, entropy)
+
+    def update(learner: Learner, batch: Transitions, keys: Array, rate: Array) -> tuple[Learner, Losses]:
+        alpha_key, critic_key, policy_key = keys
+        transitions = _brax_transitions(batch)
+        evaluate = value_step if config.state_value else critic_step
+        moved, critic_value = evaluate(learner, transitions, critic_key, rate * config.learning_rate)
+        moved, losses = policy_step(learner, moved, transitions, (alpha_key, policy_key), rate)
+        return moved, losses._replace(critic=critic_value)
+
+    return update
+
+
+def make_value_losses(networks: Networks, config: Sac) -> tuple[Any, Any]:
+    """`(value_loss(value, learner, batch, key), q_loss(critic, learner, batch))`, the paper's eqs. 6 and 7.
+
+    The paper prints them without the temperature; here it stands where Haarnoja et al. (2018) put it:
+    V(s) -> E[min Q(s, a) - alpha log pi(a|s)], Q(s, a) -> r + gamma V'(s'), with V' the slow copy of V.
+    """
+    distribution = networks.parametric_action_distribution
+
+    def value_loss(value: Any, learner: Learner, batch: Any, key: Array) -> Array:
+        parameters = networks.policy_network.apply(learner.normaliser, learner.policy, batch.observation)
+        action = distribution.sample_no_postprocessing(parameters, key)
+        log_probability = distribution.log_prob(parameters, action)
+        chosen = distribution.postprocess(action)
+        q = networks.q_network.apply(learner.normaliser, learner.critic, batch.observation, chosen).min(axis=-1)
+        wanted = q - jnp.exp(learner.log_alpha) * log_probability
+        return 0.5 * jnp.mean(
+            (networks.value_network.apply(learner.normaliser, value, batch.observation) - wanted) ** 2
+        )
+
+    def q_loss(critic: Any, learner: Learner, batch: Any) -> Array:
+        q = networks.q_network.apply(learner.normaliser, critic, batch.observation, batch.action)
+        after = networks.value_network.apply(learner.normaliser, learner.target, batch.next_observation)
+        wanted = batch.reward * config.reward_scale + batch.discount * config.discount * after
+        return 0.5 * jnp.mean((q - wanted[:, None]) ** 2)
+
+    return value_loss, q_loss
+
+
+def _clip(gradient: Any, config: Sac) -> Any:
+    """`gradient` scaled to a global norm of at most `config.max_grad_norm`, 0: untouched."""
+    if not config.max_grad_norm:
+        return gradient
+    return optax.clip_by_global_norm(config.max_grad_norm).update(gradient, optax.EmptyState())[0]
+
+
+def _descend(value: Any, gradient: Any, adam: Any, step: Array) -> tuple[Any, Any]:
+    direction, adam = ADAM.update(gradient, adam)
+    return jax.tree.map(lambda v, d: v - step * d, value, direction), adam
+
+
+def _brax_transitions(batch: Transitions) -> Any:
+    """Brax's container. `truncation` stays 0: a time limit bootstraps from the true last observation instead."""
+    truncation = jnp.zeros_like(batch.reward)
+    return brax.types.Transition(
+        observation=batch.observation,
+        action=batch.action,
+        reward=batch.reward,
+        discount=batch.discount,
+        next_observation=batch.next_observation,
+        extras={"state_extras": {"truncation": truncation}, "policy_extras": {}},
+    )
+
+
+class SacState(NamedTuple):
+    """What SAC knows."""
+
+    learner: Learner
+    replay: Replay
+
+
+class SoftActorCritic:
+    """The algorithm as the trainer sees it (`mjxball.algorithms.base.Algorithm`)."""
+
+    metrics = ("alpha", "entropy", "critic_loss", "policy_loss")
+    collect_keys = 3
+    update_keys = 2
+    steps_per_collect = 1
+
+    def __init__(self, config: Config, environments: Environments):
+        self._config, self._environments, self._shards = config.sac, environments, environments.shards
+        sac = config.sac
+        # At least one batch and one n-step window must be recorded before the first update.
+        first = max(math.ceil(sac.warmup_steps / sac.num_envs), math.ceil(sac.batch_size / sac.num_envs), sac.n_step)
+        self.schedule = Schedule(
+            sac.total_steps, sac.num_envs, first * sac.num_envs, sac.num_evaluations, sac.curriculum
+        )
+        self._sizes = (environments.observation_size, environments.action_size)
+        self._mask = environments.policy_mask
+        self.networks = make_networks(sac, self._mask, self._sizes[1], environments.critic_mask)
+        self._update = make_update(self.networks, sac, self._sizes[1], self._shards.mean)
+
+    def init(self, key: Array) -> SacState:
+        """A fresh learner and an empty replay."""
+        capacity = self._config.replay_size // self._shards.parts
+        return SacState(
+            create(self.networks, self._config, self._sizes[0], key),
+            replay.create(capacity, self._environments.count, *self._sizes),
+        )
+
+    def collect(self, state: SacState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[SacState, Any]:
+        """One step of all environments into the replay and the normaliser."""
+        learner, (*act_keys, reset_key) = state.learner, keys
+        action = self._act(learner, envs.states.obs, act_keys, phase)
+        envs, seen = self._environments.step(envs, action, reset_key)
+        transitions = Transitions(
+            seen.observation, action, seen.reward, 1 - seen.terminated, seen.next_observation, seen.done
+        )
+        normaliser = brax.running_statistics.update(
+            learner.normaliser, seen.observation, pmap_axis_name=self._shards.axis
+        )
+        normaliser = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), normaliser, learner.normaliser)
+        buffer = replay.insert(state.replay, transitions, phase.recording)
+        return SacState(learner._replace(normaliser=normaliser), buffer), envs
+
+    def _act(self, learner: Learner, observation: Array, keys: Sequence[Array], phase: Phase) -> Array:
+        sample_key, random_key = map(self._shards.own, keys)
+        policy = jax.tree.map(lambda mean, new: jnp.where(phase.evaluate, mean, new), learner.average, learner.policy)
+        parameters = self.networks.policy_network.apply(learner.normaliser, policy, observation)
+        distribution = self.networks.parametric_action_distribution
+        sampled = distribution.sample(parameters, sample_key)
+        uniform = jax.random.uniform(random_key, sampled.shape, minval=-1.0, maxval=1.0)
+        chosen = jnp.where(phase.random, uniform, sampled)
+        return jnp.where(phase.evaluate, distribution.mode(parameters), chosen)
+
+    def update(
+        self, state: SacState, keys: Sequence[Array], progress: Array, phase: Phase
+    ) -> tuple[SacState, dict[str, Array]]:
+        """`updates_per_step` gradient steps, each on a batch from the replay."""
+        sac = self._config
+        rate = 1.0 + (sac.learning_rate_end - 1.0) * progress
+        draws_key, update_key = map(self._shards.own, keys)
+        shape = (sac.updates_per_step, sac.batch_size // self._shards.parts)
+        draws = jax.random.bits(draws_key, shape, jnp.uint32)
+        update_keys = jax.random.split(update_key, (sac.updates_per_step, 3))
+
+        def one(number: Array, carry: tuple[Learner, Losses]) -> tuple[Learner, Losses]:
+            batch = replay.sample(
+                state.replay, draws[number], self._environments.count, *self._sizes, sac.n_step, sac.discount
+            )
+            return self._update(carry[0], batch, update_keys[number], rate)
+
+        updates = jnp.where(phase.learning, sac.updates_per_step, 0)
+        zero = jnp.zeros(())
+        learner, losses = jax.lax.fori_loop(0, updates, one, (state.learner, Losses(zero, zero, zero)))
+        report = (jnp.exp(learner.log_alpha), losses.entropy, losses.critic, losses.policy)
+        return state._replace(learner=learner), dict(zip(self.metrics, report, strict=True))
+
+    def policy(self, state: SacState) -> Policy:
+        """The running average of the policy, and what it knows of its observations."""
+        learner = state.learner
+        mask = jnp.asarray(self._mask, jnp.float32)
+        return Policy(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
+
+    def partition(self, whole: Any, split: Any) -> SacState:
+        """The replay's rows are cut, the learner is whole."""
+        return SacState(whole, Replay(rows=split, inserted=whole))
+
+    def check_parts(self, parts: int) -> None:
+        """Raise InputError unless environments, batch and replay can be cut into `parts`."""
+        sac = self._config
+        for name, whole in (
+            ("num_envs", parts),
+            ("batch_size", parts),
+            ("replay_size", parts * max(sac.num_envs // parts, 1)),
+        ):
+            if getattr(sac, name) % whole:
+                raise InputError(
+                    f"sac.{name} = {getattr(sac, name)} cannot be split over {parts} devices evenly; make it a multiple"
+                )

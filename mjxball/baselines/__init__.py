@@ -1,0 +1,59 @@
+"""Classical followers, by name. Their gains follow from the plant; all but `copy` are ours.
+
+The adaptive controller that the paper compares with is not public. This package may use SciPy; `copy` lives in
+`control.followers`, which needs NumPy alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from mjxball.baselines.adaptive import Adaptive
+from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
+from mjxball.baselines.lqg import Lqg, Memoryless, SlowLqg
+from mjxball.baselines.reference import Oracle, Random, Stay
+from mjxball.config import Config
+from mjxball.control.followers import Baseline, Copy, Law
+from mjxball.errors import InputError
+
+__all__ = [
+    "BASELINES",
+    "LAWS",
+    "Adaptive",
+    "Copy",
+    "CrazyflieLqg",
+    "Lqg",
+    "Memoryless",
+    "Oracle",
+    "Random",
+    "SlowLqg",
+    "Stay",
+    "make_baseline",
+    "make_law",
+]
+
+LAWS: dict[str, Callable[[Config], Law]] = {
+    "stay": Stay,
+    "random": Random,
+    "copy": Copy,
+    "adaptive": Adaptive,
+    "adaptive-mass": lambda config: Adaptive(config, adapts_mass=True),
+    "oracle": Oracle,
+    "memoryless": Memoryless,
+    "lqg": lambda config: CrazyflieLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
+    "lqg-slow": SlowLqg,
+}
+# The default list of `eval.py`; benchmark suites fly the two variants as well.
+BASELINES = tuple(name for name in LAWS if name not in ("adaptive-mass", "lqg-slow"))
+
+
+def make_law(name: str, config: Config) -> Law:
+    """The classical follower called `name` with the gains that follow from `config`; InputError if unknown."""
+    if name not in LAWS:
+        raise InputError(f"unknown follower {name!r}; baselines are {', '.join(LAWS)}")
+    return LAWS[name](config)
+
+
+def make_baseline(name: str, config: Config) -> Baseline:
+    """`make_law`, ready to fly."""
+    return Baseline(make_law(name, config), config)

@@ -1,0 +1,164 @@
+"""LQG for two Crazyflies on a stick along y: roll and height by one model of pair, cascades and leader (ours).
+
+Roll and height are designed together, unlike for the paper's pair (`lqg.py`): a difference of thrust turns the stick
+as much as the ball does, the leader's firmware integrates, and the leader finds the hover thrust by an integral.
+
+Tuning: among the best of about forty sets on 100 random rigs of `flight`, drawn as in benchmarks/crazyflie.py with
+seed 11; none crashed on 300 rigs. `LOAD_COST` and `ROLLING_NOISE`: ten sets on 20 random starts of `stand`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjxball.baselines.crazyflie_model import MEASURED, LinearModel, linear_model
+from mjxball.baselines.load_axis import CopiedPid, load_axis
+from mjxball.baselines.lqg import discretise
+from mjxball.config import Config
+from mjxball.control.followers import PrivilegedInfo
+from mjxball.control.observation import ERROR, ERROR_RATE
+from mjxball.errors import InputError
+
+Array = Any
+# What costs 1: states and the follower's commands in their units, and the commands' change in a second.
+COSTS = {"y": 0.1, "vy": 0.5, "height": 0.1, "climb": 0.5, "rate": 3.0}
+LOAD_COST = 1e-2  # of a rolling ball's torque [N m]
+THRUST_DIFFERENCE, TILT = 0.05, 0.5  # thrust difference [N], roll command [rad]
+CHANGES = (2.0, 20.0)  # [rad/s], [m/s3]
+# Intensities of the noise that drives a state, as a deviation after one second.
+PROCESS_NOISE = {"load_rate": 0.2, "load": 1e-3, "lift": 0.02, "rate": 0.1, "vy": 0.1, "climb": 0.1}
+ROLLING_NOISE = 2e-3  # of `load_rate` where a ball that rolls by itself is part of the model
+# Standard deviations of the measurements.
+MEASUREMENT_NOISE = {"y": 3e-3, "vy": 2e-2, "roll": 5e-3, "rate": 2e-2, "height": 3e-3, "climb": 2e-2}
+ERROR_LIMIT = 0.1  # largest error that the feedback acts on [m]
+DELAY = 0.03  # of the sensors, added to the rotors' lag [s]
+
+
+class State(NamedTuple):
+    """State of the controller."""
+
+    estimate: Array  # (..., n) states of the model
+    command: Array  # (..., 2) last roll [rad] and vertical acceleration [m/s2]
+    integral: Any  # (..., 3) see `CopiedPid`
+    started: Array  # (...) 1 after the first step
+
+
+class Design(NamedTuple):
+    """x <- A x + B u, x <- x + L (y - C x), u <- u - K (x, u)."""
+
+    transition: np.ndarray  # (n, n)
+    drive: np.ndarray  # (n, 2)
+    gain: np.ndarray  # (n, m) of the filter
+    feedback: np.ndarray  # (2, n + 2) change of the commands in one control period
+
+
+class CrazyflieLqg:
+    """Kalman filter and LQR of the pair's roll and height; about pitch, which no load turns, the leader is copied."""
+
+    name = "lqg"
+    needs_privileged = False
+
+    def __init__(self, config: Config):
+        if config.plant.cg_axis != "y" or config.plant.stand == "pivot":
+            raise InputError("follower 'lqg' flies two Crazyflies along y, free or on the stand with height free")
+        self._axis = load_axis(config, self.name)
+        self._model = linear_model(config, DELAY)
+        self._design = design(self._model, config.timing.control_period)
+        self._pid = CopiedPid(config)
+        self._measured_rows = [MEASURED.index(name) for name in MEASURED if name in self._model.names]
+        self._limits = config.leader.tilt_limit, config.leader.vertical_limit
+        limits = self._model.rate_integral_limit, self._model.load_limit
+        self._state_bounds = self._bounds(("rate_integral", "load"), limits)
+        self._error_bounds = self._bounds(("y", "height"), ERROR_LIMIT)
+
+    def start(self, observation: Array) -> State:
+        """See `Law.start`."""
+        xp = observation.__array_namespace__()
+        zero = xp.zeros_like(observation[..., 0])
+        measured, names = self._measured(observation), self._model.names
+        rows = self._model.indices(MEASURED)
+        estimate = [measured[..., rows.index(k)] if k in rows else zero for k in range(len(names))]
+        return State(xp.stack(estimate, axis=-1), xp.stack([zero, zero], axis=-1), self._pid.start(observation), zero)
+
+    def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
+        """See `Law.step`."""
+        xp = observation.__array_namespace__()
+        transition, drive, gain, feedback = (xp.asarray(part, dtype=observation.dtype) for part in self._design)
+        predicted = state.estimate @ transition.T + state.command @ drive.T
+        predicted = xp.where(state.started[..., None] > 0, predicted, state.estimate)
+        expected = xp.stack([predicted[..., k] for k in self._model.indices(MEASURED)], axis=-1)
+        estimate = _clip(predicted + (self._measured(observation) - expected) @ gain.T, self._state_bounds)
+        near = _clip(estimate, self._error_bounds)  # the motors have little to spare for a far goal
+        change = -xp.concat([near, state.command], axis=-1) @ feedback.T
+        command = _clip(state.command + change, self._limits)
+        integral, copied = self._pid.step(state.integral, observation)
+        vertical = self._axis.less_extra_lift(command[..., 1], command[..., 0])
+        vertical = _clip(vertical, self._limits[1])
+        sent = xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)
+        return State(estimate, command, integral, xp.ones_like(state.started)), sent
+
+    def _measured(self, observation: Array) -> Array:
+        """What the filter measures, (..., m)."""
+        xp = observation.__array_namespace__()
+        error, error_rate = observation[..., ERROR], observation[..., ERROR_RATE]
+        every: tuple[Array, ...] = (-error[..., 1], -error_rate[..., 1], observation[..., 3], observation[..., 9])
+        every = (*every, -error[..., 2], -error_rate[..., 2])
+        return xp.stack([every[k] for k in self._measured_rows], axis=-1)
+
+    def _bounds(self, names: tuple[str, ...], limits: Any) -> np.ndarray:
+        """(n,) the `limits` of the states `names` that the model has, infinite for the others."""
+        bounds = np.full(len(self._model.names), np.inf)
+        bounds[self._model.indices(names)] = limits
+        return bounds
+
+
+def _clip(array: Array, limit: Any) -> Array:
+    xp = array.__array_namespace__()
+    bound = xp.asarray(limit, dtype=array.dtype)
+    return xp.clip(array, -bound, bound)
+
+
+def design(model: LinearModel, period: float) -> Design:
+    """Filter and feedback for the control period [s]."""
+    n, names = len(model.names), model.names
+    transition, drive = discretise(model.a, model.b, period)
+    rolls = bool(np.isfinite(model.load_limit))
+    deviations = PROCESS_NOISE | ({"load_rate": ROLLING_NOISE} if rolls else {})
+    process_noise = np.diag([deviations.get(name, 0.0) ** 2 * period for name in names])
+    rows = model.indices(MEASURED)
+    measurement_noise = np.diag([MEASUREMENT_NOISE[names[k]] ** 2 for k in rows])
+    measured = np.eye(n)[rows]
+    predicted = riccati(transition.T, measured.T, process_noise, measurement_noise)
+    gain = predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + measurement_noise)
+
+    a, b = np.eye(n + 2), np.zeros((n + 2, 2))
+    a[:n, :n], a[:n, n:] = transition, drive
+    b[:n], b[n:] = a[:n, n:], np.eye(2)
+    unit = np.eye(n + 2)
+    weights = {name: 1 / COSTS[name] for name in names if name in COSTS} | ({"load": 1 / LOAD_COST} if rolls else {})
+    outputs = [weight * unit[names.index(name)] for name, weight in weights.items()]
+    outputs.append((unit[names.index("leader_thrust")] - unit[names.index("follower_thrust")]) / THRUST_DIFFERENCE)
+    outputs.append(unit[n] / TILT)
+    cost = np.array(outputs).T @ np.array(outputs)
+    effort = np.diag([(limit * period) ** -2 for limit in CHANGES])
+    value = riccati(a, b, cost, effort)
+    return Design(transition, drive, gain, np.linalg.solve(effort + b.T @ value @ b, b.T @ value @ a))
+
+
+def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """P (n, n) = A'PA - A'PB (R + B'PB)^-1 B'PA + Q, by structure-preserving doubling.
+
+    Not `scipy.linalg.solve_discrete_are`: on the stand the leader's rate integral and the ball's torque conserve a sum
+    that no command moves (an eigenvalue of 1), so there is no stabilising solution to a solver of eigenvalues. SciPy's
+    feedback is then off by 9e-4, and with a decay of 1e-5 1/s it fails; doubling converges to the least cost.
+    """
+    eye, a, g, h = np.eye(len(a)), a.copy(), b @ np.linalg.solve(r, b.T), q.copy()
+    for _ in range(60):
+        w = np.linalg.inv(eye + g @ h)
+        step = a.T @ h @ w @ a
+        a, g, h = a @ w @ a, g + a @ w @ g @ a.T, h + step
+        if np.abs(step).max() <= 1e-12 * np.abs(h).max():
+            break
+    return 0.5 * (h + h.T)

@@ -1,0 +1,80 @@
+"""Names that settings had in earlier versions. Files and command lines that use them keep their meaning."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mjxball.errors import InputError
+
+# Old dotted path -> new one. Old flags are accepted and hidden in --help.
+RENAMED = {
+    "sac.steps": "sac.total_steps",
+    "sac.worlds": "sac.num_envs",
+    "sac.batch": "sac.batch_size",
+    "sac.updates": "sac.updates_per_step",
+    "sac.prefill": "sac.warmup_steps",
+    "sac.replay": "sac.replay_size",
+    "sac.privileged": "sac.privileged_critic",
+    "sac.critics": "sac.num_critics",
+    "sac.return_steps": "sac.n_step",
+    "sac.gradient_clip": "sac.max_grad_norm",
+    "sac.target_rate": "sac.tau",
+    "sac.evaluations": "sac.num_evaluations",
+    "sac.policy_average": "sac.policy_ema_rate",
+    "scenario.goal_reach": "scenario.goal_range",
+    "scenario.wander": "scenario.estimator_drift",
+    "scenario.wire": "scenario.quantize",
+    "scenario.cg_visits": "scenario.cg_random_visits",
+    "scenario.leader_measured": "scenario.leader_uses_measurements",
+    "scenario.older_firmware": "scenario.uncompensated_share",
+    "follower.tilt_limit": "follower.action_scale_tilt",
+    "follower.vertical_limit": "follower.action_scale_vertical",
+    "follower.filters": "follower.observation_averages",
+    "follower.washout": "follower.washout_time",
+    "reward.standing": "reward.steady_action",
+    "reward.opposition": "reward.tilt_disagreement",
+}
+# Former settings that are constants now, with their value. Files may hold no other.
+CONSTANT: dict[str, Any] = {"sac.policy_delay": 1}
+
+
+def current_name(path: str) -> str:
+    """The present name of the setting at the dotted `path`."""
+    return RENAMED.get(path, path)
+
+
+def old_names(path: str) -> list[str]:
+    """Earlier names of the setting at the dotted `path`."""
+    return [old for old, new in RENAMED.items() if new == path]
+
+
+def with_current_names(data: Any) -> Any:
+    """Nested settings as a file holds them, {part: {name: value}}, with present names; anything else as it is.
+
+    Raises InputError if a setting stands there under two names, or a constant with another value.
+    """
+    if not isinstance(data, dict):
+        return data
+    found = {part: dict(values) if isinstance(values, dict) else values for part, values in data.items()}
+    for old in (*RENAMED, *CONSTANT):
+        part, _, name = old.partition(".")
+        if not isinstance(found.get(part), dict) or name not in found[part]:
+            continue
+        value = found[part].pop(name)
+        if old in CONSTANT:
+            check_constant(old, value)
+            continue
+        new_part, _, new_name = RENAMED[old].partition(".")
+        place = found.setdefault(new_part, {})
+        if new_name in place:
+            raise InputError(f"{RENAMED[old]} is given twice, also under its old name {old}")
+        place[new_name] = value
+    return found
+
+
+def check_constant(path: str, value: Any) -> None:
+    """Raise InputError unless `value` is what the former setting at `path` is fixed to."""
+    wanted = CONSTANT[path]
+    value = tuple(value) if isinstance(value, list) else value
+    if value != wanted:
+        raise InputError(f"{path} is no setting any more: it is {wanted!r}, and cannot be {value!r}")

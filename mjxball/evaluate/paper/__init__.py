@@ -1,1 +1,0 @@
-"""The paper's five figures, drawn from our flights, each with a caption that says what agrees and what does not."""

@@ -1,0 +1,78 @@
+"""Policy files for an evaluation: fit to a plant, bounds of their cards, native plants."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from mjxball import config as configs
+from mjxball.config import Config, Plant, with_current_names
+from mjxball.errors import InputError
+from mjxball.evaluate.metrics import Metrics
+from mjxball.policy import Policy
+
+
+def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy:
+    """Load a policy and refuse one that was made for another plant or rate, or for other control laws."""
+    policy = Policy.load(path)
+    period = config.timing.control_period
+    if abs(policy.control_period - period) > 1e-9:
+        raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
+    expected = dataclasses.asdict(config.plant)
+    made_for = {key: tuple(v) if isinstance(v, list) else v for key, v in policy.card["plant"].items()}
+    for key, value in expected.items():
+        if key != "object_mass" and made_for.setdefault(key, getattr(Plant(), key)) != value:
+            raise InputError(f"{path} was made for another plant: {key} is {made_for[key]!r}, not {value!r}")
+    if compare_laws:
+        _refuse_other_laws(path, policy.card, config)
+    return policy
+
+
+def _refuse_other_laws(path: Path, card: dict[str, Any], config: Config) -> None:
+    """Refuse a policy whose leader or attitude loop was another than the one that it would fly with."""
+    trained = with_current_names(card.get("config"))
+    if not isinstance(trained, dict):
+        return
+    for section in ("leader", "attitude"):
+        for key, value in dataclasses.asdict(getattr(config, section)).items():
+            made_for = (trained.get(section) or {}).get(key, value)
+            made_for = tuple(made_for) if isinstance(made_for, list) else made_for
+            if made_for != value:
+                raise InputError(f"{path} was trained with {section}.{key} {made_for!r}, not {value!r}")
+
+
+def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
+    """What of the card's bounds a policy misses on the reference scenario, one phrase each."""
+    misses = ["the flight failed"] if metrics.failed else []
+    for name, bound in sorted(policy.card["bounds"].items()):
+        value = getattr(metrics, name, None)
+        if value is None or value > bound:
+            misses.append(f"{name} {'never' if value is None else f'{value:.4g}'} > {bound:g}")
+    return misses
+
+
+def native_config(path: Path) -> Config | None:
+    """The configuration in the card of a policy for Crazyflies, None for any other policy."""
+    settings = Policy.load(path).card.get("config")
+    autopilot = settings.get("autopilot") if isinstance(settings, dict) else None
+    if not isinstance(autopilot, dict) or autopilot.get("kind") != "crazyflie":
+        return None
+    return configs.validate(configs.from_record(settings))
+
+
+def group_by_plant(paths: list[Path]) -> tuple[list[Path], list[tuple[Config, list[Path]]]]:
+    """(policies for the paper's plant, [(native configuration, its policies)] of the others)."""
+    paper: list[Path] = []
+    others: list[tuple[Config, list[Path]]] = []
+    for path in paths:
+        native = native_config(path)
+        if native is None:
+            paper.append(path)
+            continue
+        known = next((group for config, group in others if config == native), None)
+        if known is None:
+            others.append((native, [path]))
+        else:
+            known.append(path)
+    return paper, others

@@ -1,0 +1,122 @@
+"""Results of single flights: every follower on every scenario, as a table and as JSON."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mjxball.config import Config
+from mjxball.control.followers import Follower
+from mjxball.evaluate.metrics import Metrics, measure_batch
+from mjxball.sim.rollout import Trajectory, simulate_batch
+from mjxball.sim.scenario import Scenario
+
+RESULTS = "cells.json"  # in the output directory
+# The metrics in `--json`, a fixed format; a benchmark's scores have all of them.
+JSON_METRICS = (
+    *("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak"),
+    *("max_tilt", "action_error", "failed"),
+)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One follower on one scenario."""
+
+    follower: str
+    scenario: Scenario
+    metrics: Metrics
+    flight: Trajectory
+    motion: str = "sine"  # how the CG moved: sine, waveform or rolling
+
+    def record(self) -> dict[str, Any]:
+        """The result as `eval.py --json` writes it (keys: docs/metrics.md).
+
+        Only a motion other than a sine (omega and amplitude are then None) and mass changes add keys.
+        """
+        s = self.scenario
+        believed = s.mass if s.believed_mass is None else s.believed_mass
+        sine = self.motion == "sine"
+        keys: dict[str, Any] = {
+            "omega": s.omega if sine else None,
+            "amplitude": s.amplitude if sine else None,
+            "mass": s.mass,
+            "believed_mass": believed,
+        }
+        if not sine:
+            keys["motion"] = self.motion
+        if s.mass_changes:
+            keys["mass_changes"] = [list(change) for change in s.mass_changes]
+        return {"follower": self.follower, **keys, **{name: getattr(self.metrics, name) for name in JSON_METRICS}}
+
+
+def fly_scenarios(
+    config: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str
+) -> list[Result]:
+    """Fly every follower through every scenario; results are ordered by scenario, then by follower."""
+    flights = simulate_batch(config, [(follower, scenarios) for follower in followers], physics)
+    measured = measure_batch(flights, config.scenario.termination_distance, config.plant.rotor_force_max)
+    results = []
+    for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
+        index = j * len(scenarios) + i
+        results.append(Result(follower.name, scenario, measured[index], flights.world(index), config.motion.kind))
+    return results
+
+
+COLUMNS = (
+    ("rmse", "rmse m", 1.0, 3),
+    ("settling_time", "settle s", 1.0, 2),
+    ("overshoot", "over %", 100.0, 1),
+    ("x_peak", "x-peak m", 1.0, 4),
+    ("y_peak", "y-peak m", 1.0, 4),
+    ("z_peak", "z-peak m", 1.0, 4),
+    ("max_tilt", "tilt deg", 180 / math.pi, 1),
+    ("action_error", "act.err", 1.0, 3),
+)
+
+
+def table(results: Sequence[Result]) -> str:
+    """One line per result; a dash where a metric does not exist."""
+    head = ["omega", "ampl.", "mass", "believed", "follower", *(title for _, title, _, _ in COLUMNS), ""]
+    rows = [head]
+    for result in results:
+        record = result.record()
+        numbers = (record[key] for key in ("omega", "amplitude", "mass", "believed_mass"))
+        row = [*("-" if number is None else f"{number:g}" for number in numbers), result.follower]
+        for name, _, factor, digits in COLUMNS:
+            value = record[name]
+            row.append("-" if value is None else f"{value * factor:.{digits}f}")
+        rows.append([*row, "FAILED" if result.metrics.failed else ""])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
+    return "\n".join("  ".join(text.rjust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+
+
+def to_json(results: Sequence[Result]) -> str:
+    """`{"cells": [...]}`, the fixed format of `eval.py --json`."""
+    return json.dumps({"cells": [result.record() for result in results]}, indent=2, allow_nan=False) + "\n"
+
+
+def scenario_title(result: Result) -> str:
+    """The scenario in words, as a figure's title."""
+    s = result.scenario
+    motion = {
+        "sine": f"{s.amplitude:g} m at {s.omega:g} rad/s",
+        "waveform": "given waveform",
+        "rolling": f"rolling ball from {s.ball_start:g} m",
+    }
+    believed = "" if s.believed_mass is None else f", believed {s.believed_mass:g} kg"
+    changes = "".join(f", {mass:+g} kg at {time:g} s" for time, mass in s.mass_changes)
+    return f"CG: {motion[result.motion]}, object {s.mass:g} kg{believed}{changes}"
+
+
+def scenario_stem(result: Result) -> str:
+    """The scenario as the stem of a file name."""
+    s = result.scenario
+    motion = f"omega{s.omega:g}_amplitude{s.amplitude:g}" if result.motion == "sine" else result.motion
+    believed = "" if s.believed_mass is None else f"_believed{s.believed_mass:g}"
+    changes = "".join(f"_{mass:+g}kg_at{time:g}s" for time, mass in s.mass_changes)
+    return f"{motion}_mass{s.mass:g}{believed}{changes}"

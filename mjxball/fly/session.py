@@ -1,0 +1,173 @@
+"""A flight from the first connection to the last line of the log: where threads, clocks and printing come together."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mjxball import __version__
+from mjxball import config as configs
+from mjxball.control.firmware_gains import to_json
+from mjxball.errors import InputError
+from mjxball.fly import packets, pair
+from mjxball.fly.controller import Controller
+from mjxball.fly.display import Display, listening
+from mjxball.fly.flight import Flight
+from mjxball.fly.flight_log import Journal
+from mjxball.fly.limits import NAMES
+from mjxball.fly.link import Link
+from mjxball.fly.loop import Metronome, Timing, urgent
+from mjxball.fly.mocap import Mocap
+from mjxball.fly.preflight import Check, Preflight, check, prepare
+from mjxball.fly.protocols import FlightSettings, Variants
+from mjxball.fly.supervisor import Event, Fault, State, Supervisor
+from mjxball.fly.thrust import CurveName
+from mjxball.fly.watchdog import NOTHING, Watchdog
+
+BUSY = 0.02  # [s]: ticks that come later than that are no fault of drones or policy
+SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
+
+
+@dataclass(frozen=True)
+class FlightSetup:
+    """Who flies, and what with."""
+
+    controller: Controller
+    variants: Sequence[Variants]  # of leader and follower
+    curve: CurveName  # that the firmwares are taken to have until their motors turn
+    rig: pair.Rig
+    preflight: Preflight
+    mocap: Mocap | None = None  # already found to be ready; whoever made it ends it
+
+
+def fly(
+    uris: Sequence[str], setup: FlightSetup, settings: FlightSettings, log: Path | None, command: Sequence[str] = ()
+) -> int:
+    """Fly once; 0 if nothing went wrong, 1 after a fault. Raises InputError if a drone cannot be had.
+
+    Prints the checks and how it ended. `command` goes into the log's header.
+    """
+    header: dict[str, Any] = {
+        "command": list(command),
+        "version": __version__,
+        "uris": list(uris),
+        "settings": dataclasses.asdict(settings),
+    }
+    header |= {"policy": setup.controller.policy.name, "config_hash": setup.controller.policy.card["config_hash"]}
+    header |= {"mocap": str(setup.mocap.settings)} if setup.mocap else {}
+    gains = (setup.variants[0][setup.curve].gains, setup.variants[1][setup.curve].gains)
+    header |= {"config": configs.to_dict(setup.controller.config), "gains": to_json(gains), "curve": setup.curve}
+    before = sys.getswitchinterval()
+    with Journal(log, **header) as journal:
+        links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]
+        try:
+            sys.setswitchinterval(SWITCH_INTERVAL)
+            with urgent() as priority, Watchdog(uris) as guard:
+                journal.note("priority", granted=priority)
+                if setup.mocap is not None:
+                    setup.mocap.log(journal.note)
+                curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
+                flight = Flight(
+                    links, setup.controller, setup.variants, curves, setup.rig, settings, journal, guard, setup.mocap
+                )
+                flight.ready = _checked(links, setup, settings, journal)
+                flight.refusal = "" if flight.ready else "see the checks"
+                timing = run(flight)
+                return _ended(flight, timing, journal)
+        except KeyboardInterrupt:  # before take-off; afterwards Ctrl-C is the flight's own
+            journal.note("refused", text="interrupted")
+            _say("interrupted before take-off")
+            return 1
+        except (InputError, OSError) as error:
+            journal.note("refused", text=str(error))
+            raise
+        finally:
+            for link in links:
+                link.close()
+            sys.setswitchinterval(before)
+
+
+def run(flight: Flight) -> Timing:
+    """Tick until the flight is done; Ctrl-C, SIGTERM and keys are obeyed. Never raises: a bug lands too."""
+    metronome = Metronome(flight.settings.period)
+
+    def land() -> None:
+        flight.interrupts = max(flight.interrupts, 1)
+
+    def interrupt() -> None:
+        flight.interrupts += 1
+
+    def kill() -> None:
+        flight.kill = True
+
+    with listening(land, interrupt, kill), Display(lambda: flight.view, flight.settings.limits):
+        metronome.start()
+        flight.begin(time.monotonic())
+        going = True
+        while going:
+            now = metronome.wait()
+            try:
+                going = flight.tick(now, metronome.lateness, metronome.missed_lately(now), metronome.gap)
+            except Exception as error:  # nothing in here may leave thrust on
+                flight.notes.note("error", text=f"{type(error).__name__}: {error}")
+                flight.kill = True
+                going = _emergency(flight)
+    return metronome.timing()
+
+
+def _emergency(flight: Flight) -> bool:
+    """A tick failed: stop both drones without the flight's help. Returns false: it is over."""
+    for _ in range(50):
+        if flight.guard is not None:
+            flight.guard.beat(False, NOTHING)  # it has nothing to take over any more
+        for link in flight.links:
+            link.command(packets.EMERGENCY_STOP)
+            link.send(packets.setpoint_packet(packets.ZERO))
+        time.sleep(0.01)
+    flight.supervisor = Supervisor(State.DONE, time.monotonic(), Fault(Event.BAD_STATE, "the runner itself failed"))
+    return False
+
+
+def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings, journal: Journal) -> bool:
+    checks = check(links, setup.rig, settings.limits, setup.preflight)
+    if setup.mocap is not None:
+        checks += [Check(*one) for one in setup.mocap.checks()]
+        setup.mocap.guard()
+    for one in checks:
+        journal.note("check", name=one.name, passed=one.passed, found=one.found)
+        _say(f"{'good' if one.passed else 'BAD '}  {one.name}: {one.found}")
+    return all(one.passed for one in checks)
+
+
+def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
+    supervisor = flight.supervisor
+    cause = supervisor.cause
+    stayed = not (flight.settings.dry_run or flight.interrupts or flight.lifted)
+    code = 0 if cause is None and not stayed else 1
+    sent = [getattr(link, "overwritten", 0) for link in flight.links]
+    journal.note("end", code=code, cause=str(cause) if cause else "", timing=timing, overwritten=sent)
+    if cause is not None:
+        _say(f"ended by {cause.event.name.lower().replace('_', ' ')}{': ' + cause.detail if cause.detail else ''}")
+        if cause.event in (Event.DEADLINES, Event.STALE) and timing.largest > BUSY:
+            _say(f"this computer was too busy: a tick came {1e3 * timing.largest:.0f} ms late")
+    if cause is None and stayed:
+        _say("it did not lift: is the thrust that hovers right for this rig (--thrust, --hover, --mass)?")
+    if flight.settings.dry_run and flight.highest:
+        text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
+        _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
+    late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
+    _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
+    if journal.failure:
+        _say(f"the log is not complete: {journal.failure}")
+    return code
+
+
+def _say(text: str) -> None:
+    with contextlib.suppress(OSError, ValueError):  # a closed terminal must not end a flight
+        print(text, flush=True)  # noqa: T201

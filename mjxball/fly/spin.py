@@ -1,0 +1,86 @@
+"""Which force curve each connected firmware has, found while the motors turn slowly; its gains are then written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from mjxball.control.motors import Motor
+from mjxball.fly import thrust
+from mjxball.fly.limits import NAMES
+from mjxball.fly.packets import THRUST_CEILING
+from mjxball.fly.protocols import DroneLink, Notes, Variant, Variants
+from mjxball.fly.supervisor import Event, Fault
+from mjxball.fly.thrust import CurveName
+
+WANTED = 3  # health packets in a row that agree
+RESERVE = 0.97  # of the largest thrust command, above which nobody hovers
+
+
+class SpinCheck:
+    """Decides for both drones. `update` once a tick in State.SPIN."""
+
+    def __init__(
+        self, links: Sequence[DroneLink], variants: Sequence[Variants], assumed: Sequence[CurveName], motor: Motor
+    ):
+        self._links, self._variants, self._motor = links, variants, motor
+        self.curves: list[CurveName] = list(assumed)
+        self._seen: list[list[CurveName | None]] = [[], []]
+        self._last = [0.0, 0.0]
+        self._decided = [False, False]
+        self._unfit: list[str] = []
+
+    def chosen(self) -> tuple[Variant, Variant]:
+        """How leader and follower are flown, by what is known so far."""
+        leader, follower = (own[curve] for own, curve in zip(self._variants, self.curves, strict=True))
+        return leader, follower
+
+    def update(self, since: float, now: float, notes: Notes) -> list[Fault]:
+        """Judge what came after `since` [s], when the motors had settled; events once both are known."""
+        for number in range(2):
+            if not self._decided[number]:
+                self._look(number, since, now, notes)
+        failed = [link.busy for link in self._links if isinstance(link.busy, str)]
+        if failed or self._unfit:
+            return [Fault(Event.CURVE_UNKNOWN, text) for text in (*failed, *self._unfit)]
+        heavy = [
+            Fault(Event.CURVE_UNKNOWN, _too_heavy(name, curve, variant))
+            for name, curve, variant in zip(NAMES, self.curves, self.chosen(), strict=True)
+            if variant.map.hover_thrust > RESERVE * THRUST_CEILING
+        ]
+        if all(self._decided) and (heavy or not any(link.busy for link in self._links)):
+            return heavy or [Fault(Event.CURVE_KNOWN, ", ".join(self.curves))]
+        return []
+
+    def _look(self, number: int, since: float, now: float, notes: Notes) -> None:
+        sample, link = self._links[number].telemetry.health, self._links[number]
+        state = link.telemetry.newest
+        if sample is None or state is None or sample.arrival <= max(since, self._last[number]):
+            return
+        self._last[number] = sample.arrival
+        seen = self._seen[number]
+        if not any(sample.health.motors) and len(seen) < 2 * WANTED:
+            seen.append(None)  # not listed by this firmware, or not turning yet
+            return
+        found = thrust.recognise(sample.health, state.state.battery, self._motor)
+        seen.append(found)
+        latest = seen[-WANTED:]
+        unknown = len(seen) >= 4 * WANTED  # neither fits: what was assumed stands
+        if len(latest) == WANTED and len(set(latest)) == 1 and (found is not None or unknown):
+            self._decide(number, found or self.curves[number], now, notes, found is not None)
+        elif unknown:
+            self._decide(number, self.curves[number], now, notes, False)
+
+    def _decide(self, number: int, curve: CurveName, now: float, notes: Notes, recognised: bool) -> None:
+        self._decided[number] = True
+        changed = curve != self.curves[number]
+        if curve not in self._variants[number]:
+            self._unfit.append(f"the {NAMES[number]} has the {curve} force curve, which this flight has no gains for")
+        elif changed:
+            self.curves[number] = curve
+            self._links[number].write_later(self._variants[number][curve].gains)
+        notes.note("thrust", now, drone=NAMES[number], curve=curve, recognised=recognised, changed=changed)
+
+
+def _too_heavy(name: str, curve: CurveName, variant: Variant) -> str:
+    hover = variant.map.hover_thrust
+    return f"the {name} would hover at {hover:.0f} of {THRUST_CEILING} thrust units on the {curve} force curve"

@@ -1,0 +1,269 @@
+"""Log variables of one drone, computed when a packet asks for them, and its log blocks with the firmware's limits."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from mjxball.fly import packets
+from mjxball.fly.packets import Setpoint
+from mjxball.fly.twin import tables
+from mjxball.fly.twin.body import Report
+from mjxball.fly.twin.estimators import euler_of, matrix_of
+
+GRAVITY = 9.81  # [m/s2]
+
+
+class Snapshot(NamedTuple):
+    """One drone at one moment."""
+
+    report: Report  # of both drones
+    drone: int
+    setpoint: Setpoint
+    info: int
+    voltage: float  # [V]
+    position: np.ndarray  # (3,) that is reported [m]
+    pose: tuple[float, ...]  # last pose from the laptop: x, y, z, qx, qy, qz, qw
+
+
+Group = Callable[[Snapshot], dict[str, float]]
+
+
+def _named(names: str, values: object) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(names.split(), values, strict=True)}  # type: ignore[call-overload]
+
+
+def _quaternion(one: Snapshot) -> np.ndarray:
+    found: np.ndarray = one.report.quaternion[one.drone]
+    return found
+
+
+def _attitude(one: Snapshot) -> dict[str, float]:
+    roll, pitch, yaw = map(math.degrees, euler_of(_quaternion(one)))
+    return {"roll": roll, "pitch": -pitch, "yaw": yaw}
+
+
+def _world_acceleration(one: Snapshot) -> np.ndarray:
+    """(3,) [g], gravity included."""
+    turned: np.ndarray = matrix_of(_quaternion(one)) @ one.report.acceleration[one.drone] / GRAVITY
+    return turned
+
+
+def _estimate(one: Snapshot) -> dict[str, float]:
+    w, x, y, z = _quaternion(one).tolist()
+    acceleration = _world_acceleration(one) - np.array([0.0, 0.0, 1.0])
+    values = _named("x y z", one.position) | _named("vx vy vz", one.report.velocity[one.drone])
+    values |= _named("ax ay az", acceleration) | {"qw": w, "qx": x, "qy": y, "qz": z}
+    return values | _attitude(one)
+
+
+def _compressed(one: Snapshot) -> dict[str, float]:
+    values = _named("x y z", 1000 * one.position) | _named("vx vy vz", 1000 * one.report.velocity[one.drone])
+    values |= _named("ax ay az", 1000 * GRAVITY * _world_acceleration(one))
+    turning = 1000 * one.report.rates[one.drone] * np.array([1.0, -1.0, 1.0])
+    values |= _named("rateRoll ratePitch rateYaw", turning)
+    return values | {"quat": packets.compress_quaternion(_quaternion(one))}
+
+
+def _kalman(one: Snapshot) -> dict[str, float]:
+    variance = one.report.variance[one.drone]
+    values = _named("varX varY varZ varPX varPY varPZ varD0 varD1 varD2", variance)
+    if one.report.estimator[one.drone] != 2:
+        return values
+    body = matrix_of(_quaternion(one)).T @ one.report.velocity[one.drone]
+    values |= _named("stateX stateY stateZ", one.position) | _named("statePX statePY statePZ", body)
+    return values | _named("q0 q1 q2 q3", _quaternion(one)) | {"rtPred": 100.0, "rtUpdate": 1000.0}
+
+
+def _motors(one: Snapshot) -> dict[str, float]:
+    pwm, requested = one.report.pwm[one.drone], one.report.requested[one.drone]
+    return _named("m1 m2 m3 m4", pwm) | _named("m1req m2req m3req m4req", requested)
+
+
+def _power(one: Snapshot) -> dict[str, float]:
+    low = float(one.voltage < 3.2)
+    return {"vbat": one.voltage, "vbatMV": 1000 * one.voltage, "state": 3 * low, "batteryLevel": 10.0 * (1 - low)}
+
+
+def _stabilizer(one: Snapshot) -> dict[str, float]:
+    return {"thrust": float(one.report.thrust[one.drone]), "rtStab": 1000.0, **_attitude(one)}
+
+
+def _controller(one: Snapshot) -> dict[str, float]:
+    thrust = float(one.report.thrust[one.drone])
+    roll, pitch, yaw = one.report.rates[one.drone].tolist()
+    wanted = {"roll": one.setpoint.roll, "pitch": one.setpoint.pitch}
+    return {"cmd_thrust": thrust, "actuatorThrust": thrust, "r_roll": roll, "r_pitch": -pitch, "r_yaw": yaw, **wanted}
+
+
+def _target(one: Snapshot) -> dict[str, float]:
+    value = one.setpoint
+    return {"roll": value.roll, "pitch": value.pitch, "yaw": -value.yaw_rate, "thrust": value.thrust}
+
+
+def _supervisor(one: Snapshot) -> dict[str, float]:
+    size = float(np.linalg.norm(one.report.acceleration[one.drone])) / GRAVITY
+    return {"info": one.info, "accNorm": size}
+
+
+def _flags(one: Snapshot) -> dict[str, float]:
+    known = {"canfly": packets.CAN_FLY, "isFlying": packets.FLYING, "isTumbled": packets.TUMBLED}
+    return {name: float(bool(one.info & bit)) for name, bit in known.items()}
+
+
+GROUPS: dict[str, Group] = {
+    "stateEstimate": _estimate,
+    "stateEstimateZ": _compressed,
+    "kalman": _kalman,
+    "motor": _motors,
+    "pm": _power,
+    "stabilizer": _stabilizer,
+    "controller": _controller,
+    "ctrltarget": _target,
+    "supervisor": _supervisor,
+    "sys": _flags,
+    "acc": lambda one: _named("x y z", one.report.acceleration[one.drone] / GRAVITY),
+    "gyro": lambda one: _named("x y z", np.degrees(one.report.rates[one.drone])),
+    "ext_pos": lambda one: _named("X Y Z", one.pose[:3]),
+    "locSrv": lambda one: _named("x y z qx qy qz qw", one.pose),
+    "radio": lambda one: {"isConnected": 1.0, "rssi": 40.0},
+}
+
+
+class Readings(Mapping[str, float]):
+    """Log variables of one drone at one moment, by their full names; what the twin does not have is 0."""
+
+    def __init__(self, snapshot: Snapshot):
+        self.snapshot = snapshot
+        self._groups: dict[str, dict[str, float]] = {}
+
+    def __getitem__(self, name: str) -> float:
+        group, _, variable = name.partition(".")
+        if group not in self._groups:
+            make = GROUPS.get(group)
+            self._groups[group] = make(self.snapshot) if make else {}
+        return self._groups[group].get(variable, 0.0)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(GROUPS)
+
+    def __len__(self) -> int:
+        return len(GROUPS)
+
+
+MAX_BLOCKS, MAX_VARIABLES, MAX_BLOCK_BYTES = 16, 128, 26
+EXISTS, UNKNOWN, TOO_BIG, NO_MEMORY, BAD = 17, 2, 7, 12, 8
+DELETE, START, STOP, RESET, CREATE, APPEND, START_MS = 2, 3, 4, 5, 6, 7, 8
+
+
+@dataclass
+class Block:
+    """A log block that was created."""
+
+    variables: list[tuple[str, str]] = field(default_factory=list)  # (name, struct code as fetched)
+    period: float = 0.0  # [s], 0 while stopped
+    due: float = 0.0  # [s]
+    once: bool = False  # send one packet only
+
+    @property
+    def size(self) -> int:
+        """Bytes of its values."""
+        return sum(struct.calcsize("<" + code) for _, code in self.variables)
+
+
+class Blocks:
+    """All blocks of one drone."""
+
+    def __init__(self) -> None:
+        self.by_number: dict[int, Block] = {}
+
+    def is_due(self, now: float) -> bool:
+        """True if `take` has something at `now` [s]."""
+        return any((block.period or block.once) and now >= block.due for block in self.by_number.values())
+
+    def take(self, readings: Mapping[str, float], now: float) -> list[bytes]:
+        """Payloads of all blocks that are due at `now`; their time stamp is `now` in ms."""
+        sent = []
+        for number, block in self.by_number.items():
+            if (block.period or block.once) and now >= block.due:
+                late = now - block.due
+                block.due = now + block.period if late > block.period else block.due + block.period
+                block.once = False
+                stamp = struct.pack("<I", int(now * 1000 + 1e-6) & 0xFFFFFF)[:3]
+                values = b"".join(pack(code, readings[name]) for name, code in block.variables)
+                sent.append(bytes([number]) + stamp + values)
+        return sent
+
+    def control(self, data: bytes, now: float) -> list[bytes]:
+        """Answer to a request on the control channel."""
+        if data[:1] == bytes([RESET]):
+            self.by_number.clear()
+            return [b"\x05\0\0"]
+        if len(data) < 2:
+            return []
+        return [data[:2] + bytes([self._obey(data[0], data[1], data[2:], now)])]
+
+    def _obey(self, command: int, number: int, rest: bytes, now: float) -> int:
+        block = self.by_number.get(number)
+        if command == CREATE:
+            if block is not None:
+                return EXISTS
+            if len(self.by_number) >= MAX_BLOCKS:
+                return NO_MEMORY
+            self.by_number[number] = Block()  # stays, even if what follows is refused
+            return self._append(self.by_number[number], rest)
+        if command not in (APPEND, START, START_MS, STOP, DELETE):
+            return BAD
+        if block is None:
+            return UNKNOWN
+        if command == APPEND:
+            return self._append(block, rest)
+        if command in (START, START_MS):
+            return _start(block, command, rest, now)
+        if command == STOP:
+            block.period, block.once = 0.0, False
+        else:
+            del self.by_number[number]
+        return 0
+
+    def _append(self, block: Block, entries: bytes) -> int:
+        """Add (type, id) entries of 3 bytes; cflib sends one stray byte after the ninth, which is no entry."""
+        for at in range(0, len(entries) - 2, 3):
+            kind, index = entries[at] & 0x0F, struct.unpack("<H", entries[at + 1 : at + 3])[0]
+            if kind not in tables.LOG_CODES:
+                return UNKNOWN
+            code = tables.LOG_CODES[kind]
+            if block.size + struct.calcsize("<" + code) > MAX_BLOCK_BYTES:
+                return TOO_BIG
+            if sum(len(one.variables) for one in self.by_number.values()) >= MAX_VARIABLES:
+                return NO_MEMORY
+            if index >= len(tables.LOG_VARIABLES):
+                return UNKNOWN
+            block.variables.append((tables.LOG_VARIABLES[index][0], code))
+        return 0
+
+
+def _start(block: Block, command: int, rest: bytes, now: float) -> int:
+    size = 2 if command == START_MS else 1
+    if len(rest) < size:
+        return BAD
+    period = int.from_bytes(rest[:size], "little") * (1e-3 if command == START_MS else 1e-2)
+    block.period, block.once, block.due = period, not period, now + period
+    return 0
+
+
+_RANGES = {"B": (0, 2**8 - 1), "H": (0, 2**16 - 1), "I": (0, 2**32 - 1)}
+_RANGES |= {"b": (-(2**7), 2**7 - 1), "h": (-(2**15), 2**15 - 1), "i": (-(2**31), 2**31 - 1)}
+
+
+def pack(code: str, value: float) -> bytes:
+    """`value` as bytes of a struct `code`, within its range."""
+    if code in _RANGES:
+        low, high = _RANGES[code]
+        return struct.pack("<" + code, min(max(int(value), low), high))
+    return struct.pack("<" + code, min(max(value, -6e4), 6e4) if code == "e" else value)

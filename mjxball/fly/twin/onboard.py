@@ -1,0 +1,211 @@
+"""What runs on both drones' own computers a thousand times a second: sensors, estimators, cascade, motor commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mjxball.config import Autopilot
+from mjxball.control import crazyflie
+from mjxball.control.firmware_gains import PARAMETERS, gains_of, with_gains
+from mjxball.fly.twin.body import RUNNING, Modes, Report
+from mjxball.fly.twin.estimators import Complementary, Kalman, euler_of
+from mjxball.fly.twin.kind import DroneKind, Surroundings
+from mjxball.fly.twin.power import Power
+from mjxball.fly.twin.sensors import Imu, Positioning
+
+TICK = 2  # [ms] of the cascade
+PREDICTION = 10  # [ms] of the Kalman filter
+AIR = 4  # [ms] of the complementary filter
+COMPLEMENTARY, KALMAN = 1, 2  # numbers of the parameter stabilizer.estimator
+
+
+class Onboard:
+    """Both drones' sensors, estimators and controllers. Times in whole milliseconds since the start."""
+
+    def __init__(self, kind: DroneKind, around: Surroundings, autopilot: Autopilot, power: Power):
+        self.kind, self.around, self.power = kind, around, power
+        random = np.random.default_rng([around.seed, 7])
+        self.imu = Imu(random, around.noise)
+        self.filters = [Kalman(), Kalman()]
+        self.plain = [Complementary(random), Complementary(random)]
+        self.positioning = [Positioning(around, random, phase) for phase in range(2)]
+        self.estimators = [KALMAN if around.deck else COMPLEMENTARY] * 2
+        self.deviations = [[0.01, 4.5e-3], [0.01, 4.5e-3]]  # of poses [m, rad]: locSrv.extPosStdDev, extQuatStdDev
+        self.idle = [float(kind.idle)] * 2
+        self._autopilots = [autopilot] * 2
+        self._arrange_gains()
+        self.pwm, self.thrust = np.zeros((2, 4)), np.zeros(2)
+        self._setpoints, self._modes = np.zeros((2, 4)), RUNNING
+        self._summed, self._counts = np.zeros((2, 6)), [0, 0]
+        self._resets: set[int] = set()
+        self._euler = np.zeros((2, 3))
+
+    def start(self, positions: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray | None = None) -> None:
+        """Begin at a true pose, `positions` (2, 3), `quaternion` (4,), as after long rest there."""
+        for number, one in enumerate(self.filters):
+            if self.estimators[number] == KALMAN:
+                one.reset(positions[number], quaternion)
+                for _ in range(20):
+                    one.correct(positions[number], quaternion, (0.01, 4.5e-3))
+                if velocity is not None:
+                    one.body_velocity = one.matrix.T @ velocity[number]
+            self.plain[number].quaternion = np.array(quaternion)
+            self._look(number)
+        self._loops = crazyflie.start_loops(self._euler, self.imu.filtered[:, 3:])
+
+    # What the laptop sends.
+
+    def set_parameter(self, drone: int, name: str, value: float) -> None:
+        """A parameter was written; those that do not matter here are ignored."""
+        if name in PARAMETERS:
+            self._autopilots[drone] = with_gains(self._autopilots[drone], {name: value})
+            self._arrange_gains()
+        elif name == "kalman.resetEstimation" and value:
+            self._resets.add(drone)
+        elif name == "stabilizer.estimator":
+            self._switch(drone, int(value))
+        elif name == "powerDist.idleThrust" and not self.kind.auto_arm:
+            self.idle[drone] = value
+        elif name == "locSrv.extPosStdDev":
+            self.deviations[drone][0] = max(value, 1e-6)
+        elif name == "locSrv.extQuatStdDev":
+            self.deviations[drone][1] = max(value, 1e-6)
+
+    def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
+        """A pose from the laptop; only the Kalman filter takes it."""
+        if self.estimators[drone] == KALMAN and not self._modes.held[drone]:
+            std = self.deviations[drone]
+            self.filters[drone].correct(position, quaternion, (std[0], std[1]))
+            self._look(drone)
+
+    def _switch(self, drone: int, kind: int) -> None:
+        kind = {0: KALMAN if self.around.deck else COMPLEMENTARY}.get(kind, kind)
+        if kind in (COMPLEMENTARY, KALMAN) and kind != self.estimators[drone]:
+            self.estimators[drone] = kind
+            if kind == KALMAN:
+                self.filters[drone].reset()
+            self._look(drone)
+
+    def _arrange_gains(self) -> None:
+        """Two drones whose ki differ by one factor are stepped at once, which is what flights ask for."""
+        one, other = (gains_of(law) for law in self._autopilots)
+        integral = [name for name in one if name.endswith("_ki")]
+        shares = {round(other[name] / one[name], 9) for name in integral if one[name]} or {1.0}
+        same = all(one[name] == other[name] for name in one if name not in integral or not one[name])
+        self._alike = same and len(shares) == 1
+        self._shares = np.array([[1.0], [next(iter(shares))]])
+
+    # Every millisecond.
+
+    def order(self, setpoints: np.ndarray, modes: Modes) -> None:
+        """What the supervisors let through from here on: `setpoints` (2, 4)."""
+        self._setpoints, self._modes = setpoints, modes
+
+    def sense(self, step: int, raw: np.ndarray, where: Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]) -> None:
+        """Millisecond `step`: `raw` (2, 6) specific force and rates.
+
+        `where` returns the true positions (2, 3), quaternion (4,) and rotation matrix (3, 3).
+        """
+        held = self._modes.held
+        before = self.imu.filtered
+        seen = self.imu.sample(raw, self.pwm.max(axis=1, keepdims=True) > 0)
+        if held[0] or held[1]:
+            seen = self.imu.filtered = np.where(np.array(held)[:, None], before, seen)
+        self._summed += seen
+        for drone in range(2):
+            if held[drone]:
+                continue
+            self._counts[drone] += 1
+            if drone in self._resets:
+                self._resets.discard(drone)
+                self.filters[drone].reset()
+            if self.estimators[drone] == KALMAN:
+                self._filter(step + drone * PREDICTION // 2, drone)
+                if self.positioning[drone].due(step):
+                    positions, quaternion, _ = where()
+                    self.receive_pose(drone, *self.positioning[drone].measure(positions[drone], quaternion))
+            elif step % AIR == 0:
+                height = float(where()[0][drone, 2])
+                self.plain[drone].update(seen[drone, :3], seen[drone, 3:], height, AIR * 1e-3)
+                self._look(drone)
+
+    def _filter(self, step: int, drone: int) -> None:
+        if step % PREDICTION:
+            return
+        mean = self._summed[drone] / max(self._counts[drone], 1)
+        self._summed[drone], self._counts[drone] = 0.0, 0
+        self.filters[drone].predict(mean[:3], mean[3:], self._modes.flying[drone])
+        self._look(drone)
+
+    def _look(self, drone: int) -> None:
+        self._euler[drone] = euler_of(self._attitude(drone))
+
+    def _attitude(self, drone: int) -> np.ndarray:
+        return (self.filters if self.estimators[drone] == KALMAN else self.plain)[drone].quaternion
+
+    # Every second millisecond.
+
+    def control(self, euler: np.ndarray | None = None, rates: np.ndarray | None = None) -> np.ndarray:
+        """PWM (2, 4) of all motors from here on, by the estimates or by the true attitude and rates, if given."""
+        seen = self._euler if euler is None else euler, self.imu.filtered[:, 3:] if rates is None else rates
+        laws, orders = self._autopilots, self._setpoints
+        if self._alike:
+            loops, pwm = crazyflie.cascade(laws[0], self._loops, orders, *seen, self._shares, self.power.compensate)
+        else:
+            rows = [
+                crazyflie.cascade(
+                    laws[n], self._loops[n], orders[n], seen[0][n], seen[1][n], compensate=self.power.one(n)
+                )
+                for n in range(2)
+            ]
+            loops, pwm = (np.stack(part) for part in zip(*rows, strict=True))
+        run, held, _ = self._modes
+        pwm = np.maximum(np.trunc(pwm), np.array(self.idle)[:, None])
+        thrust = orders[:, 3]
+        if run != (True, True):
+            pwm = np.where(np.array(run)[:, None], pwm, 0.0)
+        if held != (False, False):
+            stuck = np.array(held)
+            pwm, thrust = np.where(stuck[:, None], self.pwm, pwm), np.where(stuck, self.thrust, thrust)
+        self._loops, self.pwm, self.thrust = loops, pwm, thrust
+        return pwm
+
+    def report(self) -> Report:
+        """What the drones log."""
+        position, velocity, attitude = (np.zeros((2, size)) for size in (3, 3, 4))
+        variance = np.zeros((2, 9))
+        for drone, one in enumerate(self.filters):
+            plain = self.plain[drone]
+            attitude[drone] = self._attitude(drone)
+            variance[drone] = one.covariance.ravel()[::10]
+            if self.estimators[drone] == KALMAN:
+                position[drone], velocity[drone] = one.position, one.velocity
+            else:
+                position[drone, 2], velocity[drone, 2] = plain.height, plain.climb
+        return self.reported(position, velocity, attitude, self.imu.filtered[:, 3:], variance)
+
+    def reported(
+        self,
+        position: np.ndarray,
+        velocity: np.ndarray,
+        attitude: np.ndarray,
+        rates: np.ndarray,
+        variance: np.ndarray,
+    ) -> Report:
+        """A report of these estimates."""
+        acceleration = self.imu.filtered[:, :3].copy()
+        known = tuple(self.estimators)
+        power = self.power.requested, self.thrust
+        return Report(
+            position,
+            velocity,
+            attitude,
+            rates.copy(),
+            acceleration,
+            variance,
+            (known[0], known[1]),
+            self.pwm,
+            *power,
+        )

@@ -1,0 +1,242 @@
+"""Flights in virtual time: the runner's `Flight` on the twin's drones, without sockets, processes and clock.
+
+For tests and for benchmarks of hundreds of flights: a second of flight takes about a quarter of a second. What a real
+connection does before a flight, gains, estimator reset and time for it, is done here by packets to the drones' own
+protocol; the link's delay holds for setpoints and states alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjxball.fly import packets
+from mjxball.fly.card import motor_of, times_of, variants
+from mjxball.fly.command import CommandMap
+from mjxball.fly.controller import Controller
+from mjxball.fly.flight import Flight
+from mjxball.fly.limits import NAMES
+from mjxball.fly.pair import Rig
+from mjxball.fly.protocols import FlightSettings, Variant, Variants
+from mjxball.fly.supervisor import State, Supervisor
+from mjxball.fly.telemetry import Telemetry
+from mjxball.fly.thrust import CURVE_NAMES, CurveName
+from mjxball.fly.twin.body import Pair, PairState
+from mjxball.fly.twin.conditions import Conditions
+from mjxball.fly.twin.drone import TwinDrone, advance
+from mjxball.fly.twin.kind import DELIVERED, QUIET, DroneKind, Surroundings
+from mjxball.fly.twin.pairs import pair_of
+from mjxball.fly.twin.supervisor import PERIOD
+from mjxball.fly.twin.virtual_link import Notes, VirtualLink
+from mjxball.policy import Policy
+
+STEP = 0.005  # [s] between two steps of the drones; delays are a whole number of them
+GROUNDED = 3e-3  # [m] above its rest below which the pair has touched down
+
+
+class Moment(NamedTuple):
+    """The truth at one moment."""
+
+    time: float  # [s]
+    state: str  # of the flight's supervisor
+    position: np.ndarray  # (3,) of O [m]
+    velocity: np.ndarray  # (3,) mean of both drones [m/s]
+    tilt: float  # of the pair [rad]
+    roll: float  # of the stick [rad]
+    pwm: np.ndarray  # (2, 4)
+    ball: float  # CG offset from O along the stick [m]
+    battery: float  # the lower one's [V]
+
+
+def fit(info: int) -> bool:
+    """True if a drone whose supervisor says `info` may be flown."""
+    wrong = packets.TUMBLED | packets.LOCKED | packets.CRASHED
+    return not info & wrong and bool(info & (packets.CAN_ARM | packets.CAN_FLY))
+
+
+class World:
+    """A pair, its two drones, and flights of them one after the other."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        settings: FlightSettings | None = None,
+        *,
+        kind: DroneKind = DELIVERED,
+        around: Surroundings = QUIET,
+        conditions: Conditions | None = None,
+        physics: Pair | None = None,
+        maps: Sequence[CommandMap] | None = None,
+        notes: Any = None,
+        step: float = STEP,
+        settle: float = 0.05,
+        record: bool = True,
+        checks: bool = False,
+    ):
+        """Put the pair on the ground and begin a flight, `settle` [s] after the states have started.
+
+        Without `physics` it is that of the policy's card, without `maps` the card's by force curve. With `record` the
+        truth is kept in `track`. With `checks` a
+        drone that cannot fly refuses the flight, as the check before a real one does.
+        """
+        self.policy, self.kind, self.around = policy, kind, around
+        self.rig = Rig.of_card(policy.card)
+        controller = Controller(policy)
+        self.config = controller.config
+        self.pair: Pair = physics or pair_of(self.config, kind, around, conditions)
+        self.state: PairState = self.pair.start()
+        self.rest = float(self.state.position[:, 2].mean())
+        self.now, self.step = 0.0, step
+        self._count = 0
+        self.drones = TwinDrone(self.pair, 0, kind, around), TwinDrone(self.pair, 1, kind, around)
+        self.notes: Any = notes or Notes(record)
+        named = zip(NAMES, self.drones, strict=True)
+        self.links = [VirtualLink(drone, lambda: self.now, name, self.notes) for name, drone in named]
+        self.variants: Sequence[Variants] = variants(self.config)
+        if maps is not None:
+            self.variants = [{name: Variant(one, {}) for name in CURVE_NAMES} for one in maps]
+        self.settings = settings or FlightSettings(
+            seconds=2.0, stand=self.config.plant.stand != "free", times=times_of(self.config)
+        )
+        self.settings = dataclasses.replace(self.settings, motor=motor_of(self.config))
+        self.track: list[Moment] = []
+        self._record, self._checks = record, checks
+        self.flight = self.make_flight(controller)
+        self.prepare(settle)
+        self.begin()
+
+    def make_flight(self, controller: Controller) -> Flight:
+        """The runner's flight over the virtual links."""
+        return Flight(self.links, controller, self.variants, [self.assumed] * 2, self.rig, self.settings, self.notes)
+
+    @property
+    def assumed(self) -> CurveName:
+        """The force curve that firmwares are taken to have until their motors turn."""
+        return "linear" if "linear" in self.variants[0] else "older"
+
+    def prepare(self, settle: float) -> None:
+        """What is done before a flight: gains, estimator reset, states; then `settle` [s] of waiting."""
+        for link, own in zip(self.links, self.variants, strict=True):
+            link.telemetry = Telemetry()
+            link.write_parameters(own[self.assumed].gains)
+            link.write_parameters({"kalman.resetEstimation": 1.0})
+            link.start_states()
+        self.advance(max(settle, 4 * self.step) + 2 * self.around.delay)
+
+    def begin(self) -> None:
+        """Begin the flight as one whose checks have passed, if they would."""
+        unfit = [name for name, drone in zip(NAMES, self.drones, strict=True) if not fit(drone.firmware.info)]
+        self.flight.ready = not (unfit and self._checks)
+        self.flight.refusal = f"{unfit[0]} cannot fly" if unfit else ""
+        self.flight.begin(self.now)
+
+    def start_in_air(self, start: Any) -> None:
+        """Have the flight begin under both laws, from a simulation's `PlantState` of one world, its motors running.
+
+        Only the coupled pair can be put there. Height and position are those above the place where the pair rests.
+        """
+        self.advance(2 * PERIOD)
+        for link in self.links:
+            link.send(packets.setpoint_packet(packets.ZERO))
+        self.advance(self.step + 2 * self.around.delay)
+        hover = [packets.Setpoint(0.0, 0.0, 0.0, round(one.hover_thrust)) for one in self.flight.maps]
+        for link, value in zip(self.links, hover, strict=True):
+            link.send(packets.setpoint_packet(value))
+        self.advance(self.step + 2 * self.around.delay)
+        self.state = getattr(self.pair, "place")(start)  # noqa: B009 - not every pair has it
+        self.advance(max(self.step, 0.02) + 2 * self.around.delay)
+        self.flight.supervisor = Supervisor(State.FLY, self.now)
+
+    def next_flight(self, settings: FlightSettings | None = None, pause: float = 3.0, settle: float = 1.0) -> Flight:
+        """A further flight of the same drones without reboot, `pause` [s] of a silent link after the one before.
+
+        In between the laptop disconnects, connects anew and prepares the drones, which takes `settle` [s].
+        """
+        self.advance(pause)
+        self.settings = settings or self.settings
+        self.flight = self.make_flight(Controller(self.policy))
+        self.prepare(settle)
+        self.begin()
+        return self.flight
+
+    def advance(self, seconds: float) -> None:
+        """Let the twin live on for `seconds`."""
+        for _ in range(round(seconds / self.step)):
+            self._count += 1
+            self.now = self._count * self.step
+            self.state = advance(self.pair, self.drones, self.state, self.now, self.step)
+            for drone, link in zip(self.drones, self.links, strict=True):
+                for datagram in drone.send(self.now):
+                    link.take(datagram, self.now)
+
+    def tick(self) -> bool:
+        """One period of twin and flight; false once the flight is done."""
+        self.advance(self.flight.settings.period)
+        going = self.flight.tick(self.now)
+        if self._record:
+            self.track.append(self.moment())
+        return going
+
+    def run(self, limit: float = 120.0) -> str:
+        """Tick to the end of the flight, at most `limit` [s]; the last state of its supervisor."""
+        end = self.now + limit
+        while self.now < end and self.tick():
+            pass
+        return self.flight.supervisor.state.value
+
+    def fly_until(self, wanted: State, limit: float = 30.0) -> None:
+        """Tick until the supervisor is in `wanted`; AssertionError after `limit` seconds."""
+        end = self.now + limit
+        while self.flight.supervisor.state is not wanted:
+            assert self.now < end, f"still in {self.flight.supervisor} after {limit} s"
+            assert self.tick() or self.flight.supervisor.state is wanted
+
+    def fly_for(self, seconds: float) -> None:
+        """Tick for `seconds`, or until the flight is done."""
+        end = self.now + seconds
+        while self.now < end and self.tick():
+            pass
+
+    # The truth.
+
+    def moment(self) -> Moment:
+        """The truth, now."""
+        state = self.state
+        line = state.position[0] - state.position[1]
+        tilt = math.acos(min(max(packets.level_share(state.quaternion[0]), -1.0), 1.0))
+        origin = state.position.mean(axis=0)
+        ball = float(getattr(self.pair, "cg_offset", 0.0))
+        roll = math.atan2(float(line[2]), float(line[1]))
+        value = self.flight.supervisor.state.value
+        low, pwm = float(state.battery.min()), state.report.pwm
+        return Moment(self.now, value, origin, state.velocity.mean(axis=0), tilt, roll, pwm, ball, low)
+
+    def running(self) -> list[bool]:
+        """Whose motors turn."""
+        return [bool(row.max() > 0) for row in self.state.report.pwm]
+
+    def touchdown_speed(self) -> float:
+        """Downward speed [m/s] at the first contact after the highest point of the recorded track; nan: none."""
+        heights = np.array([moment.position[2] for moment in self.track]) - self.rest
+        if not len(heights) or heights.max() < 0.02:
+            return math.nan
+        top = int(heights.argmax())
+        down = np.nonzero(heights[top:] < GROUNDED)[0]
+        if not len(down):
+            return math.nan
+        contact = top + int(down[0])
+        return float(max(-moment.velocity[2] for moment in self.track[max(contact - 3, 0) : contact + 1]))
+
+    # Faults.
+
+    def spoil(self, number: int, **faults: Any) -> None:
+        """Switch `DroneFaults` of one drone on."""
+        self.drones[number].faults = dataclasses.replace(self.drones[number].faults, **faults)
+
+    def disturb(self, number: int, **faults: Any) -> None:
+        """Switch `LinkFaults` of one drone on."""
+        self.drones[number].link = dataclasses.replace(self.drones[number].link, **faults)

@@ -1,0 +1,275 @@
+"""Disturbances of a flight: sensor noise, estimator drift, quantization, a relayed object error, delay, external force.
+
+`SensorModel` is the one model of the follower's sensors, on NumPy and JAX arrays. What disturbs one control step is a
+`Sample`: drawn beforehand from the seeds of scenarios (`record`; the same in every batch and on every engine), or on
+the fly from a JAX key (`RandomDisturbances`; training, where every world has its own). The leader flies on the truth,
+or on the same measurements with `scenario.leader_uses_measurements`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjxball.config import Config
+from mjxball.control.observation import ERROR, ERROR_RATE, OBSERVATION_SIZE
+from mjxball.errors import InputError
+
+# Standard deviation of each observation slot at noise level 1: motion capture and a small drone's inertial sensors.
+NOISE = np.array([*[0.003] * 3, *[0.005] * 3, *[0.02] * 3, *[0.02] * 3, *[0.003] * 3, *[0.02] * 3])
+GUST_TIME = 1.0  # [s] over which a gust is correlated
+# Slow error of each slot at level 1, a Crazyflie's estimator: position 1 mm, attitude 1 mrad, velocity 4 mm/s.
+DRIFT = np.array([*[1e-3] * 3, *[1e-3] * 3, *[4e-3] * 3, *[0.0] * 3, *[1e-3] * 3, *[4e-3] * 3])
+DRIFT_TIME = 1.0  # [s] over which it is correlated
+# Resolution of each slot in a Crazyflie's compressed state: 1 mm, 1 mm/s, 1 mrad/s, a quaternion in 32 bits.
+RESOLUTION = np.array([*[1e-3] * 3, *[2.8e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3])
+Array = Any
+Vector3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What disturbs one flight. The default is nothing."""
+
+    noise: float = 0.0  # standard deviations of the follower's measurements, in units of `NOISE`
+    delay: float = 0.0  # of the follower's measurements, a multiple of the control period [s]
+    relay_rate: float = 0.0  # e_o and its rate reach the follower this often, held in between; 0: at once [Hz]
+    relay_bias: Vector3 = (0.0, 0.0, 0.0)  # added to the relayed e_o [m]
+    relay_loss: float = 0.0  # share of the relayed messages that is lost
+    gust: float = 0.0  # rms of a random force on O, each axis of the world [N]
+    seed: int = 0
+    estimator_drift: float = 0.0  # slow error of the follower's measurements, in units of `DRIFT`
+    quantize: bool = False  # measurements arrive with the resolution `RESOLUTION`
+
+
+def check_disturbance(disturbance: Disturbance, period: float) -> None:
+    """Raise InputError with one sentence if `disturbance` makes no sense at a control `period` [s]."""
+    names = ("noise", "delay", "relay_rate", "gust", "estimator_drift")
+    levels = [getattr(disturbance, name) for name in names]
+    if not np.isfinite((*levels, *disturbance.relay_bias)).all():
+        raise InputError("every number of a disturbance must be finite")
+    if min(levels) < 0:
+        raise InputError("noise, delay, relay rate, gust and estimator drift must not be negative")
+    if abs(disturbance.delay / period - round(disturbance.delay / period)) > 1e-6:
+        raise InputError(f"delay must be a multiple of the control period {period:g} s, not {disturbance.delay:g} s")
+    if not 0 <= disturbance.relay_loss < 1:
+        raise InputError(f"relay loss must be at least 0 and below 1, not {disturbance.relay_loss:g}")
+
+
+class Sample(NamedTuple):
+    """Disturbances of one control step, or with a leading axis of all steps of a flight. The default is nothing."""
+
+    errors: tuple[Array, ...] = ()  # (..., 18) each, added to what is measured in this order
+    received: Array | None = None  # (...) whether a relayed message arrives; None: always
+    force: Array | None = None  # (..., 3) external force on O in the world until the next step [N]; None: none
+
+    def at(self, number: int | slice) -> Sample:
+        """Step `number` of a flight, or a slice of its steps."""
+        errors = tuple(error[number] for error in self.errors)
+        return Sample(errors, *(None if part is None else part[number] for part in self[1:]))
+
+
+class SensorState(NamedTuple):
+    """What the sensors carry from step to step; () for what is not disturbed."""
+
+    delay: Any = ()  # (...) control steps by which the measurements are late
+    relayed: Any = ()  # (..., 6) object error and its rate as last received
+    past: Any = ()  # (longest delay + 1, ..., 18) measurements, newest first
+
+
+@dataclass(frozen=True, eq=False)
+class SensorModel:
+    """From the true observation to the one that the follower sees. Any batch shape, NumPy and JAX arrays."""
+
+    longest_delay: int = 0  # control steps
+    relay_bias: np.ndarray | None = None  # (..., 3) added to the object error [m]
+    quantized: np.ndarray | bool = False  # (..., 1) whether measurements have the resolution `RESOLUTION`
+
+    def start(self, truth: Array, sample: Sample, delay: Array = 0) -> tuple[SensorState, Array]:
+        """(state, observation) at the first step, where the truth is `truth` (..., 18) and has always been so."""
+        xp = truth.__array_namespace__()
+        measured, relayed = self._measure(truth, sample._replace(received=None), ())
+        relayed = () if sample.received is None else relayed
+        if not self.longest_delay:
+            return SensorState((), relayed, ()), measured
+        past = xp.broadcast_to(measured, (self.longest_delay + 1, *measured.shape))
+        return SensorState(delay, relayed, past), measured
+
+    def step(self, state: SensorState, truth: Array, sample: Sample) -> tuple[SensorState, Array]:
+        """(state, observation) one control step on, where the truth is `truth` (..., 18)."""
+        xp = truth.__array_namespace__()
+        measured, relayed = self._measure(truth, sample, state.relayed)
+        relayed = () if sample.received is None else relayed
+        if not self.longest_delay:
+            return SensorState((), relayed, ()), measured
+        past = xp.concat([measured[None], state.past[:-1]], axis=0)
+        return SensorState(state.delay, relayed, past), past[(state.delay, *np.indices(truth.shape[:-1]))]
+
+    def _measure(self, truth: Array, sample: Sample, held: Any) -> tuple[Array, Array]:
+        """(what is measured now (..., 18), its object part (..., 6) before it is quantized)."""
+        xp = truth.__array_namespace__()
+        for error in sample.errors:
+            truth = truth + error
+        if self.relay_bias is not None:
+            error = truth[..., ERROR] + xp.asarray(self.relay_bias, dtype=truth.dtype)
+            truth = xp.concat([truth[..., : ERROR.start], error, truth[..., ERROR_RATE]], axis=-1)
+        relayed = truth[..., ERROR.start :]
+        if sample.received is not None:
+            relayed = xp.where(sample.received[..., None], relayed, held)
+            truth = xp.concat([truth[..., : ERROR.start], relayed], axis=-1)
+        if np.any(self.quantized):
+            truth = xp.where(xp.asarray(self.quantized), quantize(truth), truth)
+        return truth, relayed
+
+
+def quantize(observation: Array) -> Array:
+    """`observation` (..., 18) rounded to the resolution in which a Crazyflie sends it."""
+    xp = observation.__array_namespace__()
+    steps = xp.asarray(RESOLUTION, dtype=observation.dtype)
+    return xp.round(observation / steps) * steps
+
+
+def sensors_of(disturbances: Sequence[Disturbance], period: float) -> tuple[SensorModel, np.ndarray]:
+    """(sensors of n flights, delay of each (n,) in control steps)."""
+    delays = np.array([round(disturbance.delay / period) for disturbance in disturbances])
+    bias = np.array([disturbance.relay_bias for disturbance in disturbances])
+    quantized = np.array([[disturbance.quantize] for disturbance in disturbances])
+    return SensorModel(int(delays.max()), bias if bias.any() else None, quantized), delays
+
+
+def record(disturbances: Sequence[Disturbance], count: int, period: float) -> Sample:
+    """What disturbs n flights at `count` control steps, (count, n, ...), drawn from their seeds.
+
+    More steps leave the first ones as they are.
+    """
+    errors = _stack([_errors(disturbance, count, period) for disturbance in disturbances])
+    received = _stack([_received(disturbance, count, period) for disturbance in disturbances])
+    force = _stack([_gusts(disturbance, count, period) for disturbance in disturbances])
+    return Sample(() if errors is None else (errors,), received, force)
+
+
+def _stack(tables: list[np.ndarray | None]) -> np.ndarray | None:
+    """Tables of all flights along axis 1, with what 'nothing' means where one has none; None if nobody has one."""
+    given = [table for table in tables if table is not None]
+    if not given:
+        return None
+    nothing = np.ones_like(given[0]) if given[0].dtype == bool else np.zeros_like(given[0])
+    return np.stack([nothing if table is None else table for table in tables], axis=1)
+
+
+def _random(disturbance: Disturbance, stream: int) -> np.random.Generator:
+    return np.random.default_rng([disturbance.seed, stream])
+
+
+def _errors(disturbance: Disturbance, count: int, period: float) -> np.ndarray | None:
+    """Noise and estimator drift (count, 18)."""
+    if not (disturbance.noise or disturbance.estimator_drift):
+        return None
+    drawn = _random(disturbance, 1).standard_normal((count, OBSERVATION_SIZE), np.float32)
+    white = drawn * (disturbance.noise * NOISE).astype(np.float32)
+    if not disturbance.estimator_drift:
+        return white
+    slow = _gauss_markov(_random(disturbance, 4).standard_normal((count, OBSERVATION_SIZE)), period / DRIFT_TIME)
+    return white + (disturbance.estimator_drift * DRIFT * slow).astype(np.float32)
+
+
+def _received(disturbance: Disturbance, count: int, period: float) -> np.ndarray | None:
+    """True at the steps (count,) where a relayed message arrives; the first one always does."""
+    if not disturbance.relay_rate:
+        return None
+    sent = np.floor(np.arange(count) * period * disturbance.relay_rate + 1e-9)
+    arrives = np.diff(sent, prepend=-1.0) > 0
+    arrives &= _random(disturbance, 2).random(count) >= disturbance.relay_loss
+    arrives[0] = True
+    return arrives
+
+
+def _gusts(disturbance: Disturbance, count: int, period: float) -> np.ndarray | None:
+    """A first-order Gauss-Markov force (count, 3) [N] that starts in its steady state."""
+    if not disturbance.gust:
+        return None
+    return disturbance.gust * _gauss_markov(_random(disturbance, 3).standard_normal((count, 3)), period / GUST_TIME)
+
+
+def _gauss_markov(drawn: np.ndarray, share: float) -> np.ndarray:
+    """First-order Gauss-Markov process of deviation 1 from white `drawn` (count, ...); `share` of its time a step."""
+    keep = math.exp(-share)
+    slow = np.empty_like(drawn)
+    slow[0] = drawn[0]
+    for number in range(1, len(drawn)):
+        slow[number] = keep * slow[number - 1] + math.sqrt(1 - keep * keep) * drawn[number]
+    return slow
+
+
+class RandomState(NamedTuple):
+    """What one world's random disturbances carry from step to step."""
+
+    key: Array
+    noise: Array  # () level, in units of `NOISE`
+    delay: Array  # () whole control steps
+    gust: Array  # () rms of each axis of `force` [N]
+    force: Array  # (3,) external force on O in the world, now [N]
+    drift: Any = ()  # (18,) slow error, now; () if there is none
+    drift_level: Any = ()  # () in units of `DRIFT`
+
+
+class RandomDisturbances:
+    """Disturbances of one world of training, levels drawn from the ranges of `config.scenario` at its reset. JAX."""
+
+    def __init__(self, config: Config):
+        scenario, self._period = config.scenario, config.timing.control_period
+        self._ranges = (scenario.noise, scenario.delay, scenario.gust)
+        self._drift = scenario.estimator_drift
+        self.present = any(high > 0 for _, high in (*self._ranges, self._drift)) or scenario.quantize
+        self.sensors = SensorModel(math.floor(scenario.delay[1] / self._period + 0.5), None, scenario.quantize)
+        self._keep = math.exp(-self._period / GUST_TIME)
+        self._keep_drift = math.exp(-self._period / DRIFT_TIME)
+
+    def start(self, key: Array) -> tuple[Any, Sample]:
+        """(state, sample of the first step) of a world that is reset; state () if nothing is disturbed."""
+        from jax import numpy as jnp
+        from jax import random
+
+        if not self.present:
+            return (), Sample()
+        draw_key, key = random.split(key)
+        share = random.uniform(draw_key, (3,))
+        noise, delay, gust = (low + (high - low) * u for (low, high), u in zip(self._ranges, share, strict=True))
+        key, noise_key, force_key = random.split(key, 3)
+        drift: Any = ()
+        level: Any = ()
+        if self._drift[1] > 0:
+            low, high = self._drift
+            level = low + (high - low) * random.uniform(random.fold_in(noise_key, 2))
+            drift = level * jnp.asarray(DRIFT) * random.normal(random.fold_in(noise_key, 3), (OBSERVATION_SIZE,))
+        steps = jnp.round(delay / self._period).astype(jnp.int32)
+        state = RandomState(key, noise, steps, gust, gust * random.normal(force_key, (3,)), drift, level)
+        return state, self._sample(state, noise_key)
+
+    def step(self, state: Any) -> tuple[Any, Sample]:
+        """(state, sample) one control period on."""
+        from jax import random
+
+        if not self.present:
+            return (), Sample()
+        key, noise_key, force_key = random.split(state.key, 3)
+        drift = state.drift
+        if self._drift[1] > 0:
+            fresh = random.normal(random.fold_in(noise_key, 1), (OBSERVATION_SIZE,))
+            spread = math.sqrt(1 - self._keep_drift**2)
+            drift = self._keep_drift * drift + state.drift_level * spread * fresh * DRIFT
+        fresh = random.normal(force_key, (3,))
+        force = self._keep * state.force + state.gust * math.sqrt(1 - self._keep**2) * fresh
+        state = state._replace(key=key, force=force, drift=drift)
+        return state, self._sample(state, noise_key)
+
+    def _sample(self, state: RandomState, key: Array) -> Sample:
+        from jax import numpy as jnp
+        from jax import random
+
+        white = state.noise * jnp.asarray(NOISE, state.noise.dtype) * random.normal(key, (OBSERVATION_SIZE,))
+        return Sample((white, state.drift) if self._drift[1] > 0 else (white,), None, state.force)

@@ -1,0 +1,300 @@
+"""`simulate`: fly one follower, or a batch of them, through scenarios and return everything that happened."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjxball.config import Config, Plant, preset, validate
+from mjxball.control import rotations
+from mjxball.control.constants import plant_constants
+from mjxball.control.followers import Baseline, Follower, PrivilegedInfo
+from mjxball.errors import InputError
+from mjxball.physics import newton_euler
+from mjxball.physics.contact import contact_wrenches
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.motion import make_prescribed, object_mass
+from mjxball.physics.step import make_accelerations, make_cg_offset, start_state, total_wrench, with_external_force
+from mjxball.physics.stepper import make_stepper
+from mjxball.sim.closed_loop import ClosedLoop
+from mjxball.sim.disturbances import record, sensors_of
+from mjxball.sim.scenario import Scenario, check_scenario
+
+Array = Any
+Act = Callable[[np.ndarray, PrivilegedInfo], np.ndarray]  # observations (n, 18), what is known -> commands (n, 3)
+
+Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with the scenarios that it flies
+
+
+class Tick(NamedTuple):
+    """One control step of n flights: what `Trajectory` holds for every step, without the contact wrenches."""
+
+    time: float  # [s]
+    position: np.ndarray  # (n, 3) of O in the world [m]
+    target: np.ndarray  # (n, 3) goal of O [m]
+    euler: np.ndarray  # (n, 3) roll, pitch, yaw [rad]
+    rotor_force: np.ndarray  # (n, 2, 4) leader, follower [N]
+    leader_command: np.ndarray  # (n, 3) roll, pitch [rad], vertical acceleration [m/s2]
+    follower_command: np.ndarray  # (n, 3) likewise
+    diverged: np.ndarray  # (n,) bool
+    state: PlantState | None = None
+    observation: np.ndarray | None = None  # (n, 18)
+    cg_offset: np.ndarray | None = None  # (n,) [m]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A flight, or a batch of flights with the batch axis second. NumPy float64, one row per control step.
+
+    T = round(seconds / control period) + 1 rows; row 0 is the start. A flight that diverges (|e_o| or a body
+    rate beyond any bound, or a value that is not finite) is frozen there and marked in `diverged`.
+    """
+
+    time: np.ndarray  # (T,) [s]
+    position: np.ndarray  # (T, ..., 3) of O in the world [m]
+    velocity: np.ndarray  # (T, ..., 3) of O in the world [m/s]
+    euler: np.ndarray  # (T, ..., 3) roll, pitch, yaw [rad]
+    rates: np.ndarray  # (T, ..., 3) body rates [rad/s]
+    quaternion: np.ndarray  # (T, ..., 4) body -> world (w, x, y, z)
+    rotor_force: np.ndarray  # (T, ..., 2, 4) leader, follower [N]
+    leader_command: np.ndarray  # (T, ..., 3) roll, pitch [rad], vertical acceleration [m/s2]
+    follower_command: np.ndarray  # (T, ..., 3) likewise
+    observation: np.ndarray  # (T, ..., 18) what the follower saw
+    cg_offset: np.ndarray  # (T, ...) along the CG axis from O [m]
+    object_mass: np.ndarray  # (T, ...) [kg]
+    contact_force: np.ndarray  # (T, ..., 2, 3) of leader, follower on the object, body axes [N]
+    contact_torque: np.ndarray  # (T, ..., 2, 3) likewise, about each drone's centre [N m]
+    goal: np.ndarray  # (..., 3) of O, the last one of a sequence of waypoints [m]
+    target: np.ndarray  # (T, ..., 3) goal of O at every step [m]
+    diverged: np.ndarray  # (...) bool
+
+    @property
+    def error(self) -> np.ndarray:
+        """e_o = target - position (T, ..., 3) [m]."""
+        return self.target - self.position
+
+    def tick(self, number: int) -> Tick:
+        """Control step `number` of a batch."""
+        names = ("position", "target", "euler", "rotor_force", "leader_command", "follower_command")
+        values = {name: getattr(self, name)[number] for name in names}
+        return Tick(float(self.time[number]), **values, diverged=self.diverged)
+
+    def copied(self) -> Trajectory:
+        """The same with memory of its own: `world` shares that of its whole batch."""
+        return Trajectory(**{item.name: np.array(getattr(self, item.name)) for item in dataclasses.fields(self)})
+
+    def batched(self) -> Trajectory:
+        """A single flight as a batch of one."""
+        parts = {}
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            per_flight = item.name in ("goal", "diverged")
+            parts[item.name] = value if item.name == "time" else np.expand_dims(value, 0 if per_flight else 1)
+        return Trajectory(**parts)
+
+    def world(self, index: int) -> Trajectory:
+        """Flight `index` of a batch."""
+        parts = {}
+        for item in dataclasses.fields(self):
+            value = getattr(self, item.name)
+            per_flight = item.name in ("goal", "diverged")
+            parts[item.name] = value if item.name == "time" else value[index] if per_flight else value[:, index]
+        return Trajectory(**parts)
+
+
+def simulate(
+    plant: Plant | Config, follower: Follower, scenario: Scenario | None = None, physics: str = "mjx"
+) -> Trajectory:
+    """Fly `follower` through `scenario` on `plant` (or on a whole `Config`: gains, limits and rates too).
+
+    `physics` is mjx, newton-euler or mujoco. Raises InputError for an unsound scenario or a policy of another rate.
+    """
+    config = plant if isinstance(plant, Config) else dataclasses.replace(preset("paper"), plant=plant)
+    period = config.timing.control_period
+    wanted = getattr(follower, "control_period", period)
+    if abs(wanted - period) > 1e-9:
+        raise InputError(f"{follower.name} was made for a control period of {wanted:g} s, not {period:g} s")
+    return simulate_batch(config, [(follower, [scenario or Scenario()])], physics).world(0)
+
+
+def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Trajectory:
+    """Fly every (follower, scenarios) pair at once; the batch axis runs over all scenarios in order.
+
+    All scenarios must last equally long. Each follower is called once per control step for its own part.
+    """
+    scenarios, act = _together(config, flights)
+    return _record(config, scenarios, act, physics, shares_of(flights))
+
+
+def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
+    """All scenarios in order, checked, and the followers' laws, each for its own part of the batch."""
+    validate(config)
+    scenarios = [scenario for _, part in flights for scenario in part]
+    for scenario in scenarios:
+        check_scenario(config, scenario)
+    if len({scenario.seconds for scenario in scenarios}) != 1:
+        raise InputError("scenarios of one batch must last equally long")
+    ends = np.cumsum([len(part) for _, part in flights])
+    parts = [slice(end - len(part), end) for end, (_, part) in zip(ends, flights, strict=True)]
+    followers = [follower for follower, _ in flights]
+    for follower in followers:
+        follower.reset()
+
+    def act(seen: np.ndarray, brief: PrivilegedInfo) -> np.ndarray:
+        commands = []
+        for follower, part in zip(followers, parts, strict=True):
+            if isinstance(follower, Baseline):
+                follower.privileged = PrivilegedInfo(*(leaf[part] for leaf in brief))
+            commands.append(np.asarray(follower(seen[part]), float))
+        return np.concatenate(commands)
+
+    return scenarios, act
+
+
+def shares_of(flights: Flights) -> np.ndarray:
+    """(n,) 1.0 for every flight whose follower's base is the leader's whole PID law: a policy, not a baseline."""
+    return np.array([0.0 if isinstance(follower, Baseline) else 1.0 for follower, part in flights for _ in part])
+
+
+def fly(
+    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, shares: np.ndarray | None = None
+) -> Iterator[Tick]:
+    """Every control step of all scenarios at once, the start first; `act` is the followers' laws.
+
+    `shares` (n,) as from `shares_of`; None: all of them policies.
+    """
+    shares = np.ones(len(scenarios)) if shares is None else shares
+    cg_offset, brief, period = make_cg_offset(config), make_brief(config), config.timing.control_period
+    count = round(scenarios[0].seconds / period)
+    load, target = load_of(scenarios), targets(scenarios, count + 1, period)
+    disturbances = [scenario.disturbance for scenario in scenarios]
+    samples = record(disturbances, count + 2, period)
+    sensors, delays = sensors_of(disturbances, period)
+    loop = ClosedLoop(config, make_stepper(config, physics), sensors)
+    state, seen = loop.start(start_of(config, scenarios), target[0], samples.at(0), delays)
+    for number in range(count + 1):
+        plant, goals = state.plant, (target[number], target[number + 1])
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
+        commands = loop.commands(state, seen, act(seen, brief(plant, load)), goals[0], shares)
+        # The time is exact, so that a mass change falls on the same row for every engine.
+        flown = (plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)
+        yield Tick(number * period, *flown, plant, seen, cg_offset(plant, load))
+        if number < count:
+            acting = load._replace(external_force=samples.at(number).force)
+            moved = loop.physics(plant, loop.stack(commands), acting)
+            state, seen = loop.after_physics(state, seen, commands, moved, goals, samples.at(number + 1), shares)
+
+
+def _record(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, shares: np.ndarray) -> Trajectory:
+    ticks = list(fly(config, scenarios, act, physics, shares))
+    grid = np.array([tick.time for tick in ticks])
+    load, count = load_of(scenarios), len(ticks)
+    force = record([s.disturbance for s in scenarios], count, config.timing.control_period).force
+    target, euler, led, followed, seen, offset = (
+        np.stack([getattr(tick, name) for tick in ticks])
+        for name in ("target", "euler", "leader_command", "follower_command", "observation", "cg_offset")
+    )
+    diverged = ticks[-1].diverged
+    states = [tick.state for tick in ticks if tick.state is not None]
+    flown = states[0].each(lambda *leaves: np.stack(leaves), *states[1:])
+    flown = flown._replace(time=np.broadcast_to(grid[:, None], flown.time.shape))
+    load = load._replace(external_force=force)
+    force, torque = flown_contact_wrenches(config, flown, load, physics)
+    return Trajectory(
+        time=grid,
+        position=flown.position,
+        velocity=flown.velocity,
+        euler=euler,
+        rates=flown.rates,
+        quaternion=flown.quaternion,
+        rotor_force=flown.rotor_force,
+        leader_command=led,
+        follower_command=followed,
+        observation=seen,
+        cg_offset=offset,
+        object_mass=object_mass(flown.time, load),
+        contact_force=force,
+        contact_torque=torque,
+        goal=target[-1],
+        target=target,
+        diverged=diverged,
+    )
+
+
+def make_brief(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
+    """Return `brief(state, load)`: what a classical follower is told, the truth half a step and a rotor lag ahead.
+
+    Of a rolling ball nobody can know the future: the oracle is told where it is.
+    """
+    plant = config.plant
+    ahead = 0.5 * config.timing.control_period + plant.rotor_lag
+    drones = plant.leader_mass + plant.follower_mass
+    prescribed = None if config.motion.kind == "rolling" else make_prescribed(config)
+
+    def brief(state: PlantState, load: Load) -> PrivilegedInfo:
+        xp = state.time.__array_namespace__()
+        mass = object_mass(state.time, load)
+        if prescribed is None:
+            offset, acceleration = plant.moving_fraction * state.ball_offset, xp.zeros_like(state.ball_offset)
+        else:
+            offset, _, acceleration = prescribed(state.time + ahead, load)
+        return PrivilegedInfo(load.believed_mass, mass * offset, mass * acceleration, drones + mass)
+
+    return brief
+
+
+def flown_contact_wrenches(
+    config: Config, flown: PlantState, load: Load, physics: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Contact forces and torques (T, n, 2, 3) of recorded states (T, n, ...), see `physics.contact`.
+
+    `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with a push, share the closed form.
+    """
+    if physics == "mujoco" and load.external_force is None:
+        from mjxball.physics.mujoco import flown_contact_wrenches as measured
+
+        return measured(config, flown, load)
+    constants = plant_constants(config.plant, config.attitude)
+    accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
+    wrench = total_wrench(
+        np, flown.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust, config.plant.layout
+    )
+    linear, angular, _ = accelerate(flown, with_external_force(wrench, flown, load), load)
+    return contact_wrenches(config.plant, constants, flown, linear, angular)
+
+
+def targets(scenarios: Sequence[Scenario], count: int, period: float) -> np.ndarray:
+    """Goal of O (count + 1, n, 3) before the first control step and after each of `count`."""
+    time = np.arange(count + 1) * period
+    target = np.empty((count + 1, len(scenarios), 3))
+    for number, scenario in enumerate(scenarios):
+        target[:, number] = scenario.goal
+        for when, goal in scenario.waypoints:
+            target[time >= when - 1e-9, number] = goal
+    return target
+
+
+def start_of(config: Config, scenarios: Sequence[Scenario]) -> PlantState:
+    """The state in which the scenarios begin."""
+    believed = load_of(scenarios).believed_mass
+    position = np.array([scenario.start_position for scenario in scenarios], float)
+    velocity = np.array([scenario.start_velocity for scenario in scenarios], float)
+    tilt = np.array([(*scenario.start_tilt, 0.0) for scenario in scenarios])
+    ball = np.array([scenario.ball_start for scenario in scenarios], float)
+    return start_state(config, position, tilt, velocity, believed, ball)
+
+
+def load_of(scenarios: Sequence[Scenario]) -> Load:
+    """Masses and CG motions of the scenarios, one world each."""
+    mass = np.array([scenario.mass for scenario in scenarios], float)
+    believed = [s.mass if s.believed_mass is None else s.believed_mass for s in scenarios]
+    names = ("amplitude", "omega", "phase")
+    amplitude, omega, phase = (np.array([getattr(s, name) for s in scenarios], float) for name in names)
+    most = max(len(scenario.mass_changes) for scenario in scenarios)
+    padded = [[*s.mass_changes, *[(np.inf, 0.0)] * (most - len(s.mass_changes))] for s in scenarios]
+    changes = np.array(padded, float).reshape(len(scenarios), most, 2)
+    return Load(mass, np.array(believed, float), amplitude, omega, phase, changes[..., 1], changes[..., 0])

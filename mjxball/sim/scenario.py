@@ -1,0 +1,85 @@
+"""`Scenario`: one flight to be flown, and what makes it unsound."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mjxball.config import Config, ball_reach, cg_reach
+from mjxball.errors import InputError
+from mjxball.sim.disturbances import Disturbance, Vector3, check_disturbance
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal.
+
+    How the CG moves (sine, waveform, rolling ball) is the configuration's `motion`; a sine's numbers are here.
+    """
+
+    omega: float = 0.31  # angular speed of the CG's sine [rad/s]
+    amplitude: float = 0.05  # of the CG's sine [m]
+    mass: float = 0.2  # true mass of the object [kg]
+    believed_mass: float | None = None  # mass that the hover thrust assumes, None: the true one [kg]
+    goal: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of O [m]
+    seconds: float = 45.0
+    phase: float = 0.0  # of the CG's sine [rad]
+    mass_changes: tuple[tuple[float, float], ...] = ()  # (time [s], mass added or, if negative, dropped [kg])
+    ball_start: float = 0.0  # of a rolling ball from O along the CG axis [m]
+    start_position: Vector3 = (0.0, 0.0, 0.0)  # of O [m]
+    start_velocity: Vector3 = (0.0, 0.0, 0.0)  # of O [m/s]
+    start_tilt: tuple[float, float] = (0.0, 0.0)  # roll, pitch [rad]
+    waypoints: tuple[tuple[float, Vector3], ...] = ()  # (time [s], next goal of O [m]), in order
+    disturbance: Disturbance = field(default_factory=Disturbance)
+
+
+def check_scenario(config: Config, scenario: Scenario) -> None:
+    """Raise InputError with one sentence if `scenario` makes no sense on `config`'s plant."""
+    if len(scenario.goal) != 3:
+        raise InputError(f"goal takes 3 numbers, not {len(scenario.goal)}")
+    if not np.isfinite(_numbers(astuple(scenario))).all():
+        raise InputError("every number of a scenario must be finite")
+    if scenario.mass <= 0:
+        raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
+    if scenario.believed_mass is not None and scenario.believed_mass < 0:
+        raise InputError(f"believed mass must not be negative, but is {scenario.believed_mass:g} kg")
+    if scenario.omega < 0 or scenario.amplitude < 0:
+        raise InputError("omega and amplitude must not be negative")
+    left = scenario.mass + np.cumsum([mass for _, mass in sorted(scenario.mass_changes)])
+    if (left <= 0).any():
+        raise InputError(f"the mass changes would leave {left.min():.3g} kg of object; it must stay positive")
+    if any(time < 0 for time, _ in scenario.mass_changes):
+        raise InputError("the time of a mass change must not be negative")
+    check_disturbance(scenario.disturbance, config.timing.control_period)
+    reach = cg_reach(config.plant)
+    if config.motion.kind == "sine" and scenario.amplitude > reach + 1e-12:
+        raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object: the CG reaches {reach:.4g} m")
+    if abs(scenario.ball_start) > ball_reach(config.plant) + 1e-12:
+        raise InputError(
+            f"ball start {scenario.ball_start:g} m lies beyond the end stop at {ball_reach(config.plant):.4g} m"
+        )
+    _check_goals(config, scenario)
+    if scenario.seconds < config.timing.control_period or scenario.seconds > 86_400:
+        raise InputError(f"seconds must be between one control period and a day, not {scenario.seconds:g}")
+
+
+def _check_goals(config: Config, scenario: Scenario) -> None:
+    limit = config.scenario.termination_distance
+    before = scenario.start_position
+    for goal in (scenario.goal, *(place for _, place in scenario.waypoints)):
+        far = np.linalg.norm(np.subtract(goal, before))
+        if far > limit:
+            raise InputError(f"goal {goal} is {far:.3g} m away, beyond d_term = {limit:g} m")
+        before = goal
+    times = [time for time, _ in scenario.waypoints]
+    if times != sorted(times) or any(time <= 0 for time in times):
+        raise InputError("waypoints must come in order of time, after the start")
+
+
+def _numbers(value: Any) -> list[float]:
+    """Every number in nested tuples; None counts for nothing."""
+    if isinstance(value, tuple):
+        return [number for part in value for number in _numbers(part)]
+    return [] if value is None else [float(value)]

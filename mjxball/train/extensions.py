@@ -1,0 +1,196 @@
+"""Environments, rewards and algorithms of the user's own: found by name, checked before anything is trained."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from mjxball.config import Config
+from mjxball.env import CoupledPairEnv
+from mjxball.errors import InputError
+from mjxball.quiet import import_brax_env
+
+
+class Extensions(NamedTuple):
+    """What a run uses in place of ours; None: ours. Objects, or names such as "package.module:Class"."""
+
+    env: Any = None  # class or function that makes a Brax environment, or one that is made
+    reward: Any = None  # function (state, action, next state) -> reward
+    algorithm: Any = None  # class, see `mjxball.algorithms.base.Algorithm`
+
+
+OURS = Extensions()
+
+
+def find(name: str, flag: str) -> Any:
+    """The object that "package.module:Name" names; also modules in the current directory are found."""
+    module, _, attribute = name.partition(":")
+    if not module or not attribute:
+        raise InputError(f"{flag} takes package.module:Name, not {name!r}")
+    if str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{flag} {name}: there is no module {error.name} here or among the installed packages; "
+            "install it or run from its directory"
+        ) from None
+    except Exception as error:
+        raise InputError(f"{flag} {name}: importing {module} raised {_said(error)}; mend that module") from None
+    if not hasattr(found, attribute):
+        raise InputError(f"{flag} {name}: {module} has no {attribute}; check the name behind the colon")
+    return getattr(found, attribute)
+
+
+def resolve(extensions: Extensions) -> Extensions:
+    """`extensions` with objects in the place of names. Raises InputError if one cannot be found."""
+    found = {
+        field: find(value, f"--{field}") if isinstance(value, str) else value
+        for field, value in extensions._asdict().items()
+    }
+    return Extensions(**found)
+
+
+def digest(names: Mapping[str, str | None]) -> str | None:
+    """Hash of the files that the named objects come from, None if there are none."""
+    files = sorted(
+        {
+            inspect.getsourcefile(inspect.getmodule(find(name, f"--{flag}")) or object) or ""
+            for flag, name in names.items()
+            if name
+        }
+    )
+    if not files:
+        return None
+    return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()[:16]
+
+
+def make_env(extensions: Extensions, config: Config, physics: str) -> Any:
+    """The environment to train on: checked, with its reward, and with a time limit if it keeps none itself."""
+    kind = extensions.env
+    if kind is None:
+        env: Any = CoupledPairEnv(config, physics)
+    else:
+        env = _made(kind, config, physics)
+        _check_env(env, name_of(extensions.env))
+        if "truncation" not in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).info:
+            import_brax_env()
+            from brax.envs.wrappers.training import EpisodeWrapper
+
+            env = EpisodeWrapper(env, config.timing.episode_steps, 1)
+    if extensions.reward is not None:
+        env = Rewarded(env, extensions.reward)
+    return env
+
+
+def is_pair(env: Any) -> bool:
+    """Whether `env` is the coupled pair, whose policies are policy files."""
+    return isinstance(getattr(env, "unwrapped", env), CoupledPairEnv)
+
+
+class Rewarded:
+    """An environment with another reward."""
+
+    def __init__(self, env: Any, reward: Callable[[Any, Any, Any], Any]):
+        self.env, self._reward = env, reward
+        _check_reward(env, reward)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def reset(self, rng: Any, *difficulty: Any) -> Any:
+        """See the environment's own."""
+        graded = len(inspect.signature(self.env.reset).parameters) > 1
+        return self.env.reset(rng, *difficulty) if graded else self.env.reset(rng)
+
+    def step(self, state: Any, action: Any) -> Any:
+        """The environment's own, but for the reward."""
+        after = self.env.step(state, action)
+        return after.replace(reward=self._reward(state, action, after))
+
+
+def name_of(extension: Any) -> str:
+    """What an error calls the object."""
+    found = extension if inspect.isclass(extension) or inspect.isroutine(extension) else type(extension)
+    return f"{found.__module__}:{found.__qualname__}"
+
+
+def _made(kind: Any, config: Config, physics: str) -> Any:
+    if not inspect.isclass(kind) and not inspect.isroutine(kind):
+        return kind
+    flag, given = f"--env {name_of(kind)}", {"config": config, "physics": physics}
+    try:
+        parameters = inspect.signature(kind).parameters.values()
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{flag} cannot be called: {error}") from None
+    fixed = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    lost = [p.name for p in fixed if p.default is p.empty and p.name not in given]
+    if lost:
+        raise InputError(f"{flag} needs {', '.join(lost)}: give a default; only config and physics are passed, by name")
+    try:
+        return kind(**{p.name: given[p.name] for p in fixed if p.name in given})
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{flag} could not be made: {_said(error)}; mend its constructor") from None
+
+
+def _check_env(env: Any, name: str) -> None:
+    flag = f"--env {name}"
+    lost = [part for part in ("reset", "step", "observation_size", "action_size") if not hasattr(env, part)]
+    if lost:
+        raise InputError(f"{flag} is no Brax environment: it lacks {', '.join(lost)}; derive it from brax.envs.Env")
+    sizes = env.observation_size, env.action_size
+    if not all(isinstance(size, int) and size > 0 for size in sizes):
+        raise InputError(f"{flag}: observation_size and action_size must be whole numbers, not {sizes}; flatten them")
+    first = _traced(flag, "reset", env.reset, jax.random.PRNGKey(0))
+    after = _traced(flag, "step", env.step, first, jax.ShapeDtypeStruct((sizes[1],), "float32"))
+    for part, state in (("reset", first), ("step", after)):
+        for field, wanted in (("obs", (sizes[0],)), ("reward", ()), ("done", ())):
+            shape = getattr(getattr(state, field, None), "shape", None)
+            if shape != wanted:
+                raise InputError(f"{flag}: {part} must return {field} of shape {wanted}, not {shape}")
+    if jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), first) != jax.tree.map(
+        lambda leaf: (leaf.shape, leaf.dtype), after
+    ):
+        raise InputError(f"{flag}: step must return a state of the same fields, shapes and types as reset")
+    for mask in ("input_mask", "critic_mask"):
+        if len(getattr(env, mask, None) or [0] * sizes[0]) != sizes[0]:
+            raise InputError(f"{flag}: {mask} must hold observation_size = {sizes[0]} numbers")
+
+
+def _check_reward(env: Any, reward: Any) -> None:
+    flag = f"--reward {name_of(reward)}"
+    if not callable(reward):
+        raise InputError(f"{flag} is no function of (state, action, next state)")
+    try:
+        inspect.signature(reward).bind(None, None, None)
+    except (TypeError, ValueError):
+        raise InputError(f"{flag} must take (state, action, next state)") from None
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+    action = jax.ShapeDtypeStruct((env.action_size,), "float32")
+    found = _traced(flag, "the function", lambda s, a: reward(s, a, env.step(s, a)), state, action)
+    shape, kind = getattr(found, "shape", None), str(getattr(found, "dtype", type(found).__name__))
+    if shape != () or not kind.startswith("float"):
+        raise InputError(f"{flag} must return one number, not shape {shape} of {kind}; sum it and use floats")
+
+
+def _traced(flag: str, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return jax.eval_shape(function, *arguments)
+    except Exception as error:
+        raise InputError(f"{flag}: {what} raised {_said(error)}; it must be made of JAX operations") from None
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"

@@ -1,0 +1,124 @@
+"""Disturbances do what they say, are the same in every batch, and are refused when they make no sense."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from plants import copying
+
+from mjxball.config import preset
+from mjxball.errors import InputError
+from mjxball.sim import rollout
+from mjxball.sim.disturbances import NOISE, Disturbance, Sample, record, sensors_of
+from mjxball.sim.rollout import simulate, simulate_batch
+from mjxball.sim.scenario import Scenario, check_scenario
+
+CONFIG, PERIOD = preset("paper"), 0.02
+SEEN = np.arange(18.0)[None]
+
+
+def seen_by(disturbance: Disturbance, steps: int) -> np.ndarray:
+    """Observations (steps + 1, 18) of a truth that counts: at step k every slot holds k."""
+    sensors, delays = sensors_of([disturbance], PERIOD)
+    samples = record([disturbance], steps + 1, PERIOD)
+    state, first = sensors.start(np.zeros((1, 18)), samples.at(0), delays)
+    seen = [first[0]]
+    for k in range(1, steps + 1):
+        state, observed = sensors.step(state, np.full((1, 18), float(k)), samples.at(k))
+        seen.append(observed[0])
+    return np.array(seen)
+
+
+def test_nothing_is_disturbed_by_default() -> None:
+    np.testing.assert_array_equal(seen_by(Disturbance(), 5), np.arange(6.0)[:, None] * np.ones(18))
+
+
+def test_noise_has_its_deviation() -> None:
+    errors = seen_by(Disturbance(noise=2.0, seed=3), 20_000) - np.arange(20_001.0)[:, None]
+    np.testing.assert_allclose(errors.std(axis=0), 2 * NOISE, rtol=0.03)  # 5 deviations of a deviation of 20 000
+    assert np.abs(errors.mean(axis=0) / NOISE).max() < 0.1
+
+
+def test_delay_shows_the_past() -> None:
+    np.testing.assert_array_equal(seen_by(Disturbance(delay=0.06), 5)[:, 0], [0, 0, 0, 0, 1, 2])
+
+
+def test_relay_holds_the_objects_error_and_nothing_else() -> None:
+    seen = seen_by(Disturbance(relay_rate=10.0, relay_bias=(0.5, 0.0, 0.0)), 11)
+    np.testing.assert_array_equal(seen[:, 0], np.arange(12))
+    np.testing.assert_array_equal(seen[:, 12], 0.5 + np.array([0, 0, 0, 0, 0, 5, 5, 5, 5, 5, 10, 10]))
+    np.testing.assert_array_equal(seen[:, 17], [0, 0, 0, 0, 0, 5, 5, 5, 5, 5, 10, 10])
+
+
+def test_lost_messages_are_lost_at_their_share() -> None:
+    seen = seen_by(Disturbance(relay_rate=50.0, relay_loss=0.3, seed=1), 20_000)
+    assert np.mean(np.diff(seen[:, 12]) == 0) == pytest.approx(0.3, abs=0.02)
+
+
+def test_gusts_have_their_size_and_correlation() -> None:
+    force = record([Disturbance(gust=0.4, seed=2)], 200_000, PERIOD).force[:, 0]
+    # 4000 s of a process that forgets in 1 s: 2000 independent values, deviations within 5 %.
+    np.testing.assert_allclose(force.std(axis=0), 0.4, rtol=0.08)
+    after = round(1.0 / PERIOD)
+    for k in range(3):
+        assert np.corrcoef(force[:-after, k], force[after:, k])[0, 1] == pytest.approx(np.exp(-1), abs=0.08)
+
+
+def test_a_steady_force_shifts_the_pair_as_statics_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a held force F the PD leader and its copy rest where M kp e = F: e = F / (M kp) along y and z."""
+    force = np.array([0.0, 0.11, -0.22])
+    monkeypatch.setattr(rollout, "record", lambda _, count, period: Sample(force=np.broadcast_to(force, (count, 1, 3))))
+    flight = simulate(CONFIG, copying(CONFIG), Scenario(amplitude=0.0, goal=(0, 0, 0), seconds=60), "newton-euler")
+    # Thrust along body z makes the same force as commanded acceleration; 2.2 kg, kp 0.5; tilt's second order is 1e-4.
+    np.testing.assert_allclose(flight.error[-1, 1:], -force[1:] / (2.2 * 0.5), atol=2e-3)
+
+
+def test_scenarios_are_the_same_alone_and_in_a_batch() -> None:
+    noisy = Scenario(seconds=3, disturbance=Disturbance(noise=1.0, gust=0.3, relay_rate=10, delay=0.04, seed=5))
+    other = dataclasses.replace(noisy, disturbance=Disturbance(noise=2.0, seed=6))
+    alone = simulate(CONFIG, copying(CONFIG), noisy, "newton-euler")
+    batch = simulate_batch(CONFIG, [(copying(CONFIG), [Scenario(seconds=3), other, noisy])], "newton-euler").world(2)
+    np.testing.assert_allclose(batch.position, alone.position, atol=1e-12)
+
+
+def test_engines_agree_on_a_gusty_flight() -> None:
+    scenario = Scenario(seconds=4, disturbance=Disturbance(gust=0.5, seed=1), start_tilt=(0.1, 0.1))
+    flights = [simulate(CONFIG, copying(CONFIG), scenario, engine) for engine in ("newton-euler", "mjx", "mujoco")]
+    for flight in flights[1:]:
+        np.testing.assert_allclose(flight.position, flights[0].position, atol=1e-6)
+
+
+def test_waypoints_become_the_goal_at_their_time() -> None:
+    scenario = Scenario(goal=(1, 0, 1), waypoints=((2.0, (0.0, 0.0, 1.0)),), seconds=4)
+    flight = simulate(CONFIG, copying(CONFIG), scenario, "newton-euler")
+    np.testing.assert_array_equal(flight.target[99], (1, 0, 1))
+    np.testing.assert_array_equal(flight.target[100], (0, 0, 1))
+    np.testing.assert_array_equal(flight.goal, (0, 0, 1))
+    np.testing.assert_allclose(flight.observation[100, 12:15], flight.error[100])
+
+
+def test_start_errors_are_where_the_flight_begins() -> None:
+    start = {"start_position": (0.1, 0.2, 0.3), "start_velocity": (0.4, 0.5, 0.6), "start_tilt": (0.1, -0.2)}
+    flight = simulate(CONFIG, copying(CONFIG), Scenario(seconds=0.1, **start), "newton-euler")
+    np.testing.assert_allclose(flight.position[0], start["start_position"])
+    np.testing.assert_allclose(flight.velocity[0], start["start_velocity"])
+    np.testing.assert_allclose(flight.euler[0], (0.1, -0.2, 0.0), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"disturbance": Disturbance(delay=0.03)}, "multiple of the control period"),
+        ({"disturbance": Disturbance(noise=-1.0)}, "negative"),
+        ({"disturbance": Disturbance(gust=float("nan"))}, "finite"),
+        ({"disturbance": Disturbance(relay_rate=5.0, relay_loss=1.0)}, "relay loss"),
+        ({"waypoints": ((5.0, (1.0, 1.0, 1.0)), (2.0, (0.0, 0.0, 0.0)))}, "order of time"),
+        ({"waypoints": ((5.0, (9.0, 1.0, 1.0)),)}, "beyond d_term"),
+        ({"start_position": (5.0, 0.0, 0.0)}, "beyond d_term"),
+    ],
+)
+def test_unsound_disturbances_are_refused(change, word) -> None:
+    with pytest.raises(InputError, match=word):
+        check_scenario(CONFIG, dataclasses.replace(Scenario(), **change))

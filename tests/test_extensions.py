@@ -1,0 +1,128 @@
+"""A user's own environment, reward and algorithm: trained, refused in one sentence; training as a pure function."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import toys
+from conftest import with_settings
+
+from mjxball.algorithms.sac import SoftActorCritic
+from mjxball.commands.train import main
+from mjxball.config import Config, preset
+from mjxball.env import CoupledPairEnv
+from mjxball.train import program as programs
+from mjxball.train import train
+from mjxball.train.extensions import Extensions, make_env
+from mjxball.train.population import Population
+
+SMALL = {
+    "total_steps": 6000, "num_envs": 16, "replay_size": 6400, "batch_size": 64, "warmup_steps": 400,
+    "policy_layers": (16, 16), "critic_layers": (16, 16), "updates_per_step": 4, "num_evaluations": 3,
+    "learning_rate": 5e-3,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def small(transport: Config) -> Config:
+    return with_settings(transport, sac=SMALL, timing={"episode_steps": 60})
+
+
+@pytest.mark.slow
+def test_any_brax_environment_trains(small: Config) -> None:
+    """From pushing at random to standing at 0: the return of 60 steps is about -1.5 for the optimal law."""
+    policy, metrics = jax.jit(lambda key: train(small, key, env=toys.DoubleIntegrator))(jax.random.PRNGKey(0))
+    assert metrics["eval_return"].shape == metrics["alpha"].shape == (3,)
+    assert metrics["eval_return"][-1] > -8.0
+    assert metrics["eval_distance"][-1] < 0.3
+    assert policy(np.array([1.0, 0.0]))[0] < 0 < policy(np.array([-1.0, 0.0]))[0]
+
+
+@pytest.mark.slow
+def test_runs_side_by_side_are_the_runs_alone(small: Config) -> None:
+    """vmap over keys and over a numeric setting."""
+    keys, rates = jax.random.split(jax.random.PRNGKey(1), 2), np.array([1e-3, 5e-3], np.float32)
+    tiny = with_settings(small, sac={**SMALL, "total_steps": 800})
+
+    def one(key, rate):
+        return train(tiny, key, env=toys.DoubleIntegrator, overrides={"sac.learning_rate": rate})
+
+    together = jax.vmap(one)(keys, rates)
+    for member in range(2):
+        alone = jax.jit(one)(keys[member], rates[member])
+        for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(a[member], b, rtol=2e-3, atol=2e-3)  # batched products round differently
+
+
+@pytest.mark.slow
+def test_the_pure_function_is_the_run(small: Config) -> None:
+    """Same steps, same keys: the same policy as `train.py --seed 5`, evaluations left out."""
+    tiny = with_settings(small, sac={**SMALL, "total_steps": 800})
+    population = Population(tiny, "newton-euler", extensions=Extensions(toys.DoubleIntegrator))
+    program, advance = population.program, jax.jit(population.advance)
+    state, *_ = advance(population.create(5), programs.warmup(program.warmup_rounds))
+    state, *_ = advance(state, programs.train(program.total_rounds - program.warmup_rounds))
+    policy, _ = jax.jit(lambda key: train(tiny, key, env=toys.DoubleIntegrator))(jax.random.PRNGKey(5))
+    for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(population.policy(state, 0)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)  # two programs: XLA may fuse them differently
+
+
+def test_a_reward_of_the_users_own_replaces_ours() -> None:
+    config = preset("transport")
+    env = make_env(Extensions(reward=toys.effort), config, "newton-euler")
+    state = env.reset(jax.random.PRNGKey(0))
+    action = np.array([0.5, 0.0, 0.0], np.float32)
+    after = env.step(state, action)
+    assert float(after.reward) == pytest.approx(-float(after.metrics["error"]) - 0.25, rel=1e-6)
+    assert (env.input_mask, env.observation_size) == (env.env.input_mask, env.env.observation_size)
+
+
+def test_a_run_on_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    flags = [word for name, value in SMALL.items() for word in (f"--sac.{name}", str(value).strip("() "))]
+    flags = [word.replace(" ", "") for word in flags]
+    flags += ["--timing.episode_steps", "60", "--sac.total_steps", "1600"]
+    assert main(["--env", "toys:DoubleIntegrator", *flags, "--out", "run"]) == 0
+    with np.load("run/policy.npz", allow_pickle=False) as policy:
+        assert (policy["weight_0"].shape, policy["bias_2"].shape) == ((2, 16), (2,))
+        assert json.loads(str(policy["card"]))["extensions"] == {"env": "toys:DoubleIntegrator"}
+    columns = Path("run/metrics.csv").read_text().splitlines()[0].split(",")
+    assert columns[4:6] == ["distance", "alpha"]
+    assert columns[-1] == "eval_distance"
+
+
+@pytest.mark.parametrize(
+    ("flag", "name", "word"),
+    [
+        ("--env", "toys", "package.module:Name"),
+        ("--env", "nowhere:Env", "no module nowhere"),
+        ("--env", "toys:Nothing", "has no Nothing"),
+        ("--env", "toys:Needy", "needs mass"),
+        ("--env", "toys:Wide", "obs of shape (3,), not (2,)"),
+        ("--env", "toys:Broken", "no such wheel"),
+        ("--env", "toys:effort", "needs state"),
+        ("--reward", "toys:vector", "one number"),
+        ("--reward", "toys:binary", "(state, action, next state)"),
+        ("--algorithm", "toys:Wide", "lacks init"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    flag: str, name: str, word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["transport", "--physics", "newton-euler", flag, name]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert flag in line
+    assert word in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_our_environment_and_algorithm_need_no_exception() -> None:
+    """The defaults go the same way as a user's own."""
+    env = make_env(Extensions(env=CoupledPairEnv), preset("transport"), "newton-euler")
+    assert isinstance(env, CoupledPairEnv)
+    assert {"init", "collect", "update", "policy"} <= set(vars(SoftActorCritic))

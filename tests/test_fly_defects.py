@@ -1,0 +1,196 @@
+"""What went wrong on the real firmware, each on the twin that behaves like it: flights in virtual time."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+
+from mjxball.control.rotations import roll_of_quaternion
+from mjxball.fly.card import goal_of, times_of
+from mjxball.fly.controller import Controller
+from mjxball.fly.limits import Limits
+from mjxball.fly.packets import FLYING, LOCKED
+from mjxball.fly.protocols import FlightSettings
+from mjxball.fly.supervisor import Event, State
+from mjxball.fly.thrust import curve_of_version
+from mjxball.fly.twin.conditions import Conditions
+from mjxball.fly.twin.kind import DRONES, Surroundings, drone_kind
+from mjxball.fly.twin.virtual import World
+from mjxball.fly.twin.virtual_link import Notes
+from mjxball.policy import Policy
+from mjxball.policy.shipped import shipped_policy
+
+pytest.importorskip("mujoco")
+
+
+def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, **around) -> World:
+    policy = Policy.load(shipped_policy(name))
+    config = Controller(policy).config
+    goal, stand = goal_of(config), config.plant.stand != "free"
+    limits = Limits().on_stand(goal[2]) if stand else Limits()
+    settings = FlightSettings(seconds, goal, stand=stand, limits=limits, times=times_of(config))
+    return World(
+        policy,
+        settings,
+        kind=drone_kind(curve=curve),
+        around=Surroundings(**around),
+        conditions=conditions,
+        notes=Notes(),
+        settle=1.0,
+    )
+
+
+def error_of(world: World, after: float) -> np.ndarray:
+    """(T, 3) of O from its goal, from `after` [s] of the flight on [m]."""
+    flown = [moment for moment in world.track if moment.state == "fly"]
+    late = np.array([moment.position for moment in flown if moment.time - flown[0].time >= after])
+    return late - (world.flight._origin + np.array(world.settings.goal))
+
+
+def test_two_flights_in_a_row_need_no_reboot() -> None:
+    """Defect 2: silence while the firmware counts as flying locks it. Zeros go on until it does not."""
+    world = world_of("flight", 2.0)
+    for number in range(2):
+        if number:
+            world.track.clear()
+            world.next_flight()
+        world.run(60.0)
+        assert world.flight.supervisor.cause is None
+        assert world.flight.lifted
+        assert world.touchdown_speed() < 0.5
+        assert not any(drone.firmware.info & (FLYING | LOCKED) for drone in world.drones)
+        world.advance(3.0)
+        assert not any(drone.firmware.info & LOCKED for drone in world.drones)
+
+
+@pytest.mark.parametrize(
+    "curve", ["older", *(pytest.param(curve, marks=pytest.mark.slow) for curve in ("linear", "cubic"))]
+)
+def test_either_firmware_is_recognised_and_flown_alike(curve: str) -> None:
+    """Defects 3, 4: a card for one force curve crashed on the other. 20 mm is what the issue asks of either."""
+    world = world_of("flight", 9.0, curve, delay=0.005)
+    world.run(60.0)
+    assert world.flight.supervisor.cause is None
+    assert world.flight.spin.curves == ["linear" if curve == "linear" else "older"] * 2
+    assert np.sqrt((error_of(world, 5.0) ** 2).sum(axis=1).mean()) < 0.020
+    assert max(moment.tilt for moment in world.track) < np.radians(10)
+
+
+def pushed(world: World, monkeypatch: pytest.MonkeyPatch, *vertical: float) -> None:
+    """Have both laws ask for `vertical` accelerations [m/s2] by turns."""
+    flight, turns = world.flight, itertools.cycle(vertical)
+    step = flight.controller.step
+
+    def ask(state, goal):
+        command, asked = np.array([0.0, 0.0, next(turns)]), step(state, goal)
+        return asked._replace(leader=command, follower=command)
+
+    monkeypatch.setattr(flight.controller, "step", ask)
+
+
+def test_thrust_moves_as_fast_as_the_law_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Defect 4: a slew limit of 1200 units a tick, which training does not have, took 0.4 of the roll authority."""
+    world = world_of("flight", 2.0)
+    world.fly_until(State.FLY)
+    pushed(world, monkeypatch, -1.0, 1.0)
+    world.fly_for(0.2)
+    ticks = [record["sent"][0].thrust for record in world.notes.records if record["kind"] == "tick"]
+    hover = world.flight.maps[0].hover_thrust
+    assert np.abs(np.diff(ticks[-10:])).min() == pytest.approx(2 / 9.81 * hover, rel=0.05)
+
+
+def test_a_stand_has_a_ceiling_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Defect 5: O rose to 0.8 - 1.4 m before anything ended the flight."""
+    world = world_of("stand", 10.0)
+    world.fly_until(State.FLY)
+    pushed(world, monkeypatch, 0.5)
+    world.run(30.0)
+    assert world.flight.supervisor.cause.event is Event.FENCE
+    # 25 cm above the goal of 8 cm; it goes on at 0.5 m/s2 for the 0.1 s of braking.
+    assert max(moment.position[2] for moment in world.track) - world.rest < 0.08 + 0.25 + 0.15
+
+
+def test_versions_promise_a_curve() -> None:
+    found = {version: curve_of_version(version) for version in ("2025.02", "2025.09", "2025.12.1", "2026.08", "?", "")}
+    assert list(found.values()) == ["older", "older", "linear", "linear", None, None]
+
+
+def test_a_pair_too_heavy_for_its_firmware_is_refused_before_the_ramp() -> None:
+    """Defect 3: `stand` never lifted and exited 0."""
+    world = world_of("flight", 2.0)
+    heavy = [{name: one._replace(map=dataclasses.replace(one.map, carried_mass=0.046)) for name, one in own.items()}
+             for own in world.variants]  # fmt: skip
+    world.flight.spin._variants = heavy
+    world.run(30.0)
+    assert world.flight.supervisor.cause.event is Event.CURVE_UNKNOWN
+    assert "ramp" not in world.notes.transitions()
+    assert not world.flight.lifted
+
+
+@pytest.mark.slow
+def test_the_stand_keeps_its_ball_under_the_estimators_sideways_motion() -> None:
+    """Defect 5: fed sideways positions that do not exist, both laws lost the ball from 4 cm."""
+    policy = Policy.load(shipped_policy("stand"))
+    conditions = dataclasses.replace(Conditions.of(Controller(policy).config), ball=0.03)
+    world = world_of("stand", 15.0, conditions=conditions)
+    world.run(60.0)
+    assert world.flight.supervisor.cause is None
+    share = world.config.plant.moving_fraction
+    assert max(abs(moment.ball) for moment in world.track) / share < world.config.plant.ball_stop
+    seen = world.links[0].telemetry.newest.state
+    assert abs(roll_of_quaternion(seen.quaternion)) < 0.1
+
+
+@pytest.mark.parametrize(("kind", "drones"), [("lost", (0,)), ("lost", (0, 1)), ("jump", (1,)), ("frozen", (0,))])
+def test_an_estimator_that_loses_its_pose_brings_the_pair_down_gently(kind: str, drones: tuple[int, ...]) -> None:
+    """Defect 6: lost poses were not noticed, frozen ones cut the motors at 0.2 m, a jump at 0.4 m (2.7 m/s)."""
+    world = world_of("flight", 4.0)
+    world.fly_until(State.FLY)
+    world.fly_for(3.0)
+    for drone in drones:
+        world.pair.disturb(drone, kind, 0.4 if kind == "jump" else 1.0)
+    world.run(30.0)
+    assert world.flight.supervisor.cause.event in (Event.ESTIMATOR, Event.STICK)
+    assert world.touchdown_speed() < 0.7
+    assert not any(world.running())
+
+
+def test_a_gap_in_the_states_costs_nothing() -> None:
+    """Defect 8: 110 ms without states gave 1.9 s of blind flight and 0.25 to 0.48 m of drift."""
+    world = world_of("flight", 8.0)
+    world.fly_until(State.FLY)
+    world.fly_for(5.0)
+    before = world.state.position.mean(axis=0)
+    for silent in (True, False):
+        for number in range(2):
+            world.disturb(number, silent_down=silent)
+        world.fly_for(0.13)
+    assert world.flight.supervisor.state is State.FLY
+    world.fly_for(1.0)
+    assert np.linalg.norm(world.state.position.mean(axis=0) - before) < 0.03
+    world.run(30.0)
+    assert world.flight.supervisor.cause is None
+
+
+@pytest.mark.slow
+def test_delay_is_borne() -> None:
+    """Defect 10: 20 ms each way gave 185 mm and 22 degrees. 40 mm is what the issue asks."""
+    world = world_of("flight", 9.0, delay=0.02)
+    world.run(60.0)
+    assert world.flight.supervisor.cause is None
+    assert np.sqrt((error_of(world, 5.0) ** 2).sum(axis=1).mean()) < 0.040
+    assert max(moment.tilt for moment in world.track) < np.radians(10)
+
+
+@pytest.mark.slow
+def test_other_drones_have_gains_for_their_own_firmware_alone() -> None:
+    for name, drone in (("flight-upgrade", "thrust-upgrade"), ("flight-brushless", "brushless")):
+        policy = Policy.load(shipped_policy(name))
+        world = World(policy, FlightSettings(2.0), kind=DRONES[drone], settle=1.0)
+        assert [list(own) for own in world.variants] == [["linear"], ["linear"]]
+        world.run(60.0)
+        assert world.flight.supervisor.cause is None, (name, world.flight.supervisor)
+        assert world.flight.lifted

@@ -1,0 +1,166 @@
+"""One firmware's thrust commands in another's units, and the motors that follow the battery in training."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxball.config import RIGS, Config, apply_overrides, preset, validate
+from mjxball.control import crazyflie, motors
+from mjxball.control.hover import drone_loop, hover
+from mjxball.control.motor_curves import OLDER, compensates, firmware, with_curve
+from mjxball.env import CoupledPairEnv
+from mjxball.physics.engine import Load
+from mjxball.physics.step import make_powered, start_state
+from mjxball.sim.randomization import LIFT, ResetDistribution
+
+NEWER = (0.0, 0.12)
+
+
+class TestConversion:
+    @pytest.mark.parametrize("name", ["flight", "stand"])
+    def test_the_loop_about_hover_stays(self, name: str) -> None:
+        """Stiffness and damping of roll and pitch: equal to rounding, and back again are the gains that there were."""
+        config = preset(name)
+        other = validate(with_curve(config, OLDER))
+        assert other.autopilot.roll_rate[0] < 0.7 * config.autopilot.roll_rate[0]  # its curve is 1.63 times as steep
+        for axis in (0, 1):
+            mine, theirs = drone_loop(config, axis), drone_loop(other, axis)
+            for part in ("kp", "kd", "kdd", "slow"):
+                assert getattr(theirs, part) == pytest.approx(getattr(mine, part), rel=1e-6)
+        back = with_curve(other, NEWER)
+        for axis in ("roll_rate", "pitch_rate", "yaw_rate"):
+            assert getattr(back.autopilot, axis) == pytest.approx(getattr(config.autopilot, axis), rel=1e-9)
+
+    def test_the_papers_law_keeps_force_and_slope(self) -> None:
+        """46 000 and 1000 units on the older curve; a unit more per acceleration gives the same force on both."""
+        config = preset("stand")
+        older = with_curve(config, OLDER)
+        assert older.autopilot.hover_thrust == pytest.approx(46000, abs=50)
+        assert older.autopilot.thrust_per_acceleration == pytest.approx(1000, rel=2e-3)
+        for vertical in (-0.1, 0.0, 0.1):
+            forces = [
+                crazyflie.motor_force(
+                    law.motor_curve, np.float64(law.hover_thrust + law.thrust_per_acceleration * vertical)
+                )
+                for law in (config.autopilot, older.autopilot)
+            ]
+            # 100 units off hover the older curve bends by 3e-7 N of 0.09 N.
+            assert forces[0] == pytest.approx(forces[1], rel=1e-5)
+
+    def test_the_same_curve_changes_nothing(self) -> None:
+        assert with_curve(preset("flight"), NEWER) is preset("flight")
+
+    def test_delivered_pair_hovers_at_50562_units(self) -> None:
+        assert hover(preset("flight"))[0] == pytest.approx(50562, abs=1)
+
+    def test_cards_name_the_firmware(self) -> None:
+        assert firmware(preset("flight")) == {"drone": "2.1", "curve": "linear", "converts": ["older"]}
+        assert firmware(with_curve(preset("flight"), OLDER))["curve"] == "older"
+        for name, drone in (("crazyflie-brushless", "brushless"), ("crazyflie-thrust-upgrade", "thrust-upgrade")):
+            assert firmware(apply_overrides(preset("flight"), RIGS[name])) == {
+                "drone": drone,
+                "curve": "linear",
+                "converts": [],
+            }
+        assert compensates(NEWER)
+        assert not compensates(OLDER)
+
+
+def powered_load(volts: float, older: float, scale: tuple[float, float] = (1.0, 1.0)) -> Load:
+    mass, zero, none = np.array(0.0175), np.array(0.0), np.zeros(0)
+    return Load(mass, mass, zero, zero, zero, none, none, thrust_scale=np.array(scale), supply=np.array(volts),
+                older=np.array(older))  # fmt: skip
+
+
+def asked(config: Config, volts: float, older: float, vertical: float) -> np.ndarray:
+    """Rotor forces (2, 4) that a level pair at rest is given for a vertical command."""
+    still = np.zeros(3)
+    state = start_state(config, still, still, still, np.array(0.0175), np.array(0.0))
+    return make_powered(config)(state, np.array([[0.0, 0.0, vertical]] * 2), powered_load(volts, older))[1]
+
+
+class TestBattery:
+    def test_compensated_force_is_the_commands_until_the_battery_has_no_more(self) -> None:
+        config = preset("flight")
+        weight = 0.03775 * 9.81 / 4
+        for volts in (4.2, 3.7, 3.2):
+            # Whole units of command: 1e-5 of hover.
+            assert asked(config, volts, 0.0, 0.0) == pytest.approx(np.full((2, 4), weight), rel=2e-5)
+        empty = asked(config, 2.7, 0.0, 0.0)
+        most = float(motors.force(motors.MOTORS["2.1"], np.array(65535.0), np.array(2.7)))
+        assert empty == pytest.approx(np.full((2, 4), most), rel=1e-9)
+        assert most < weight
+
+    def test_without_compensation_force_falls_with_the_battery(self) -> None:
+        config = preset("flight")
+        forces = [float(asked(config, volts, 1.0, 0.0).mean()) for volts in (4.2, 3.7, 3.2)]
+        command = round(hover(with_curve(config, OLDER))[0])
+        for volts, force in zip((4.2, 3.7, 3.2), forces, strict=True):
+            assert force == pytest.approx(
+                float(motors.force(motors.MOTORS["2.1"], np.array(float(command)), np.array(volts))), rel=1e-4
+            )
+        assert forces[0] / forces[2] > 1.4
+
+    def test_an_integral_that_hovers_a_drawn_world_hovers_it(self) -> None:
+        """`missing` commanded to both drones gives each its share of the weight, whatever battery and firmware."""
+        config, resets = preset("flight"), ResetDistribution(preset("flight"))
+        for volts, older, scale in ((3.3, 1.0, (0.95, 1.05)), (4.1, 1.0, (1.0, 0.9)), (3.7, 0.0, (0.97, 1.1))):
+            parts = (jnp.array([volts]), jnp.array([older]), jnp.array([scale]))
+            told = np.asarray(resets.missing(jnp.array(0.0175), *parts))[0]
+            still = np.zeros(3)
+            state = start_state(config, still, still, still, np.array(0.0175), np.array(0.0))
+            commands = np.array([[0.0, 0.0, one] for one in told])
+            force = make_powered(config)(state, commands, powered_load(volts, older))[1] * np.array(scale)[:, None]
+            # float32 and whole units of command
+            assert force == pytest.approx(np.full((2, 4), 0.03775 * 9.81 / 4), rel=1e-4)
+
+
+class TestDrawnWorlds:
+    def test_every_world_can_be_flown(self) -> None:
+        config = preset("flight")
+        env = CoupledPairEnv(config, "newton-euler")
+        state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(3), 512))
+        load = state.pipeline_state.load
+        assert 0.4 < float(load.older.mean()) < 0.65  # half, and some of the others' candidates are refused
+        assert float(load.supply.min()) >= 3.2
+        assert float(load.supply.max()) <= 4.2
+        resets = ResetDistribution(config)
+        good = jax.vmap(
+            lambda one: resets.flyable(one.object_mass, one.supply[None], one.older[None], one.thrust_scale[None])[0]
+        )(load)
+        assert bool(good.all())
+
+    def test_a_drone_too_weak_for_its_share_is_refused(self) -> None:
+        resets = ResetDistribution(preset("flight"))
+        cap = 0.12 * 60000 / 65535
+        need = (1 + LIFT) * 0.03775 * 9.81 / 4 / cap  # factor on the force with which it just can
+        for factor, fine in ((need + 0.002, True), (need - 0.002, False)):
+            scale = jnp.array([[1.0, factor]])
+            told = resets.flyable(jnp.array(0.0175), jnp.array([4.0]), jnp.array([0.0]), scale)
+            assert bool(told[0]) is fine
+
+    def test_other_presets_draw_no_battery(self) -> None:
+        env = CoupledPairEnv(preset("robust"), "newton-euler")
+        load = env.reset(jax.random.PRNGKey(0)).pipeline_state.load
+        assert load.supply is None
+        assert load.older is None
+
+
+def test_rate_share_is_a_factor_on_all_rate_gains() -> None:
+    law = preset("flight").autopilot
+    halved = dataclasses.replace(
+        law,
+        **{name: tuple(0.5 * gain for gain in getattr(law, name)) for name in ("roll_rate", "pitch_rate", "yaw_rate")},
+    )
+    euler, rates = np.array([0.02, -0.03, 0.1]), np.array([0.1, 0.2, -0.1])
+    loops = crazyflie.start_loops(euler, rates)
+    setpoint = np.array([3.0, -2.0, 0.0, 45000.0])
+    mine = crazyflie.cascade(law, loops, setpoint, euler, rates, rate_share=np.array([0.5]))
+    theirs = crazyflie.cascade(halved, loops, setpoint, euler, rates)
+    for one, other in zip(mine, theirs, strict=True):
+        np.testing.assert_allclose(one, other, atol=1.0)  # truncation to whole units

@@ -1,0 +1,59 @@
+"""A Brax-style environment, rewards and mistakes of a user's own, found by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjxball.quiet import import_brax_env
+
+Env, State = import_brax_env()
+
+
+class DoubleIntegrator(Env):
+    """A point on a line, pushed by the action towards 0. It keeps no time and knows nothing of mjxball."""
+
+    observation_size, action_size, backend = 2, 1, "none"
+
+    def reset(self, rng: Any) -> Any:
+        obs = jax.random.uniform(rng, (2,), minval=-1.0)
+        zero = jnp.zeros(())
+        return State(None, obs, zero, zero, {"distance": zero}, {})
+
+    def step(self, state: Any, action: Any) -> Any:
+        position, speed = state.obs
+        speed = speed + 0.2 * action[0]
+        position = position + 0.2 * speed
+        lost = (jnp.abs(position) > 3.0).astype(jnp.float32)
+        reward = -(position**2) - 0.1 * speed**2 - 10.0 * lost
+        obs = jnp.stack([position, speed])
+        return state.replace(obs=obs, reward=reward, done=lost, metrics={"distance": jnp.abs(position)})
+
+
+class Needy(DoubleIntegrator):
+    def __init__(self, mass: float):
+        self.mass = mass
+
+
+class Wide(DoubleIntegrator):
+    observation_size = 3
+
+
+class Broken(DoubleIntegrator):
+    def step(self, state: Any, action: Any) -> Any:
+        raise ValueError("no such wheel")
+
+
+def effort(state: Any, action: Any, after: Any) -> Any:
+    """The pair's error and the action, squared."""
+    return -after.metrics["error"] - (action**2).sum()
+
+
+def vector(state: Any, action: Any, after: Any) -> Any:
+    return action
+
+
+def binary(state: Any, action: Any) -> Any:
+    return 0.0
