@@ -3,7 +3,7 @@
 `python benchmarks/fly_faults.py [--policy FILE] [--trials 200] [--jobs 2] [--seed 0] [--json FILE] [--only KIND ...]`
 
 The twin's own truth judges: safe means that both drones' motors are off and stay off for two seconds, beyond the
-firmware's own watchdog. The physics are the twin's (`mjxball/fly/twin/pairs.py`); no radio is involved.
+firmware's own watchdog. The physics are the twin's (`mjxball/fly/twin/physics.py`); no radio is involved.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ import numpy as np
 
 from mjxball.fly import flight_log, packets
 from mjxball.fly.loop import urgent
-from mjxball.fly.twin.faults import FAULT_KINDS, Injection, LinkFaults
-from mjxball.fly.twin.pairs import make_pair
+from mjxball.fly.twin.conditions import FAULT_KINDS, Injection, LinkFaults
+from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Truth, Twin
 from mjxball.policy import load_file
 

@@ -35,11 +35,16 @@ from mjxball.fly.controller import Controller
 from mjxball.fly.limits import Limits
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import Conditions
-from mjxball.fly.twin.faults import FAULT_KINDS, BodyFault, DroneFaults, LinkFaults
-from mjxball.fly.twin.kind import Surroundings, drone_kind
-from mjxball.fly.twin.virtual import Moment, World
-from mjxball.fly.twin.virtual_link import Notes
+from mjxball.fly.twin.conditions import (
+    FAULT_KINDS,
+    BodyFault,
+    Conditions,
+    DroneFaults,
+    LinkFaults,
+    Surroundings,
+    drone_kind,
+)
+from mjxball.fly.twin.virtual import Moment, Notes, World
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policy

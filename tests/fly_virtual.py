@@ -14,10 +14,9 @@ from mjxball.fly.command import CommandMap
 from mjxball.fly.pair import Rig
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.twin import virtual
-from mjxball.fly.twin.body import Pair
-from mjxball.fly.twin.kind import DELIVERED, QUIET, DroneKind, Surroundings
-from mjxball.fly.twin.standin import StandIn, StandInPlant
-from mjxball.fly.twin.virtual_link import Notes, VirtualLink
+from mjxball.fly.twin.conditions import DELIVERED, QUIET, DroneKind, Surroundings
+from mjxball.fly.twin.physics import Pair, StandIn, StandInPlant
+from mjxball.fly.twin.virtual import Notes, VirtualLink
 from mjxball.policy import Policy, PolicyFile
 
 __all__ = ["ARMED_BY_HAND", "MASS", "Notes", "VirtualLink", "World", "log_header", "thrusts"]

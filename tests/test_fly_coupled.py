@@ -12,10 +12,9 @@ from mjxball.config import Config
 from mjxball.control import crazyflie, motor_curves, rotations
 from mjxball.control.constants import plant_constants
 from mjxball.control.firmware_gains import PARAMETERS, STOCK, gains_of, pair_gains, with_gains
-from mjxball.fly.twin.body import PairState
-from mjxball.fly.twin.conditions import Conditions
+from mjxball.fly.twin.conditions import Conditions, DroneKind, Surroundings, drone_kind
 from mjxball.fly.twin.coupled import CoupledPair
-from mjxball.fly.twin.kind import DroneKind, Surroundings, drone_kind
+from mjxball.fly.twin.physics import PairState
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_control_step, start_state

@@ -18,8 +18,7 @@ from mjxball.fly.command import to_setpoint
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.fly.thrust import ForceCurve
-from mjxball.fly.twin.pairs import make_pair
-from mjxball.fly.twin.standin import StandIn
+from mjxball.fly.twin.physics import StandIn, make_pair
 from mjxball.policy import load_file
 from mjxball.policy.shipped import shipped_policy
 

@@ -16,10 +16,8 @@ from mjxball.fly.packets import FLYING, LOCKED
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import Event, State
 from mjxball.fly.thrust import curve_of_version
-from mjxball.fly.twin.conditions import Conditions
-from mjxball.fly.twin.kind import DRONES, Surroundings, drone_kind
-from mjxball.fly.twin.virtual import World
-from mjxball.fly.twin.virtual_link import Notes
+from mjxball.fly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
+from mjxball.fly.twin.virtual import Notes, World
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policy
 

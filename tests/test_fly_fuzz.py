@@ -17,14 +17,15 @@ from mjxball.fly import packets
 from mjxball.fly.connection import Deadlines
 from mjxball.fly.link import Link
 from mjxball.fly.parameters import LinkError
-from mjxball.fly.twin import tables
-from mjxball.fly.twin.faults import DroneFaults, garbage
+from mjxball.fly.twin import logs
+from mjxball.fly.twin.conditions import DroneFaults
+from mjxball.fly.twin.drone import garbage
 from mjxball.fly.twin.firmware import BOOT_TIME, Firmware
+from mjxball.fly.twin.physics import StandIn
 from mjxball.fly.twin.protocol import MAX_DATA, Peer
 from mjxball.fly.twin.server import HOST, Twin
-from mjxball.fly.twin.standin import StandIn
 
-READINGS = {name: 1e12 for name, _ in tables.LOG_VARIABLES}
+READINGS = {name: 1e12 for name, _ in logs.LOG_VARIABLES}
 ports = st.sampled_from(
     [
         0x2C,

@@ -20,9 +20,9 @@ from mjxball.fly.packets import Setpoint
 from mjxball.fly.parameters import LinkError
 from mjxball.fly.preflight import Preflight, reset_estimator
 from mjxball.fly.telemetry import WRAP, FirmwareClock
-from mjxball.fly.twin.faults import DroneFaults, LinkFaults
+from mjxball.fly.twin.conditions import DroneFaults, LinkFaults
+from mjxball.fly.twin.physics import StandIn
 from mjxball.fly.twin.server import HOST, Twin
-from mjxball.fly.twin.standin import StandIn
 
 pytest.importorskip("cflib")
 pytestmark = pytest.mark.alone  # by the clock

@@ -32,8 +32,8 @@ from mjxball.fly.packets import Setpoint
 from mjxball.fly.pair import Rig
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import Event, State
-from mjxball.fly.twin.kind import QUIET, Surroundings
-from mjxball.fly.twin.pairs import make_pair
+from mjxball.fly.twin.conditions import QUIET, Surroundings
+from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
 from mjxball.policy import load_file
 from mjxball.policy.shipped import shipped_policy

@@ -20,9 +20,8 @@ from mjxball.fly.flight_log import Journal
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.recording import Recording, fly_again, read_recording
 from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import Conditions
-from mjxball.fly.twin.kind import Surroundings, drone_kind
-from mjxball.fly.twin.pairs import make_pair
+from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind
+from mjxball.fly.twin.physics import make_pair
 from mjxball.policy import Policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario

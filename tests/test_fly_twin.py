@@ -14,10 +14,9 @@ from mjxball.control import rotations
 from mjxball.fly import packets
 from mjxball.fly.mocap_source import wait_until
 from mjxball.fly.packets import Setpoint
-from mjxball.fly.twin import tables
-from mjxball.fly.twin.body import RUNNING, Modes, PairState
+from mjxball.fly.twin import logs, protocol
+from mjxball.fly.twin.physics import RUNNING, Modes, PairState, StandIn
 from mjxball.fly.twin.server import HOST, Twin
-from mjxball.fly.twin.standin import StandIn
 
 cflib = pytest.importorskip("cflib")
 pytestmark = pytest.mark.alone  # by the clock
@@ -62,9 +61,9 @@ def flown() -> Iterator[tuple[Twin, Told, Any]]:
 def test_cflib_finds_every_table_entry(flown: tuple[Twin, Told, Any]) -> None:
     crazyflie = flown[2]
     assert crazyflie.platform.get_protocol_version() == 12
-    for name, kind in tables.LOG_VARIABLES:
+    for name, kind in logs.LOG_VARIABLES:
         assert crazyflie.log.toc.get_element_by_complete_name(name).ctype == kind
-    for parameter in tables.PARAMETERS:
+    for parameter in protocol.PARAMETERS:
         element = crazyflie.param.toc.get_element_by_complete_name(parameter.name)
         assert element.ctype == parameter.kind
         assert element.is_persistent() == parameter.persistent

@@ -17,7 +17,7 @@ from tables import rows
 from mjxball.fly import flight_log, packets, watchdog
 from mjxball.fly.loop import urgent
 from mjxball.fly.maneuver import LastKnownState, blind_shares
-from mjxball.fly.twin.pairs import make_pair
+from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin
 from mjxball.fly.watchdog import FLYING, GOODBYE, IDLE, NOTHING, packed
 from mjxball.policy import load_file

@@ -20,7 +20,7 @@ from mjxball.fly.limits import NAMES
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.fly.thrust import CurveName
-from mjxball.fly.twin import kind as kinds
+from mjxball.fly.twin import conditions as kinds
 from mjxball.fly.twin.conditions import Conditions
 from mjxball.fly.twin.coupled import CoupledPair
 from mjxball.fly.twin.virtual import STEP

@@ -14,17 +14,26 @@ from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.firmware_gains import pair_gains
 from mjxball.fly import packets
 from mjxball.fly.packets import ARMED, AUTO_ARMED, CAN_ARM, CAN_FLY, CRASHED, FLYING, LOCKED, TUMBLED, ZERO, Setpoint
-from mjxball.fly.twin import tables
-from mjxball.fly.twin.body import Modes, PairState
-from mjxball.fly.twin.conditions import Battery, Conditions
+from mjxball.fly.twin import logs, protocol
+from mjxball.fly.twin.conditions import (
+    DELIVERED,
+    DRONES,
+    FAULT_KINDS,
+    Battery,
+    BodyFault,
+    Conditions,
+    DroneFaults,
+    DroneKind,
+    LinkFaults,
+    Surroundings,
+    drone_kind,
+)
 from mjxball.fly.twin.coupled import CoupledPair
 from mjxball.fly.twin.drone import TwinDrone, advance
-from mjxball.fly.twin.faults import FAULT_KINDS, BodyFault, DroneFaults, LinkFaults
+from mjxball.fly.twin.estimators import Imu
 from mjxball.fly.twin.firmware import BOOT_TIME, Firmware, Motors, Order
-from mjxball.fly.twin.kind import DELIVERED, DRONES, DroneKind, Surroundings, drone_kind
+from mjxball.fly.twin.physics import Modes, PairState, StandIn
 from mjxball.fly.twin.protocol import Peer, header
-from mjxball.fly.twin.sensors import Imu
-from mjxball.fly.twin.standin import StandIn
 from mjxball.fly.twin.supervisor import PERIOD, Phase
 
 BRUSHLESS = DRONES["brushless"]
@@ -84,13 +93,13 @@ class Bench:
 
 def written(peer: Peer, name: str, value: float, now: float) -> float:
     """What a parameter reads 2 ms after `value` was written at `now`."""
-    names = [parameter.name for parameter in tables.PARAMETERS]
+    names = [parameter.name for parameter in protocol.PARAMETERS]
     number = names.index(name)
-    packed = tables.PARAMETERS[number].pack(value)
+    packed = protocol.PARAMETERS[number].pack(value)
     echo = peer.receive(bytes([header(2, 2), *number.to_bytes(2, "little")]) + packed, now)
     assert echo[0][3:] == packed  # the echo is what was written
     [answer] = peer.receive(bytes([header(2, 1), *number.to_bytes(2, "little")]), now + 0.002)
-    return tables.PARAMETERS[number].unpack(answer[4:])
+    return protocol.PARAMETERS[number].unpack(answer[4:])
 
 
 def test_row_reset_estimation_clears_itself() -> None:
@@ -584,7 +593,7 @@ def flown(kind: DroneKind = DELIVERED) -> tuple[StandIn, tuple[TwinDrone, TwinDr
 def test_row_a_dead_stabilizer_logs_on_with_frozen_values() -> None:
     pair, drones, _ = flown()
     state, leader = pair.start(), drones[0]
-    names = [name for name, _ in tables.LOG_VARIABLES]
+    names = [name for name, _ in logs.LOG_VARIABLES]
     entry = bytes([7]) + names.index("stateEstimate.z").to_bytes(2, "little")
     for request in (bytes([6, 1]) + entry, bytes([3, 1, 1])):
         leader.receive(bytes([header(5, 1)]) + request, 0.0)
@@ -646,14 +655,14 @@ def test_a_stabilizer_that_hangs_holds_pwm_and_estimate() -> None:
 
 
 def test_row_tables_have_the_real_size() -> None:
-    assert (len(tables.PARAMETERS), len(tables.LOG_VARIABLES)) == (240, 355)
-    for items in (tables.PARAM_ITEMS, tables.LOG_ITEMS):
+    assert (len(protocol.PARAMETERS), len(logs.LOG_VARIABLES)) == (240, 355)
+    for items in (protocol.PARAM_ITEMS, logs.LOG_ITEMS):
         assert len(set(items)) == len(items)
         assert max(map(len, items)) + 3 <= 30  # one packet each
-    by_name = {parameter.name: parameter for parameter in tables.PARAMETERS}
+    by_name = {parameter.name: parameter for parameter in protocol.PARAMETERS}
     for name, kind in (("stabilizer.estimator", "uint8_t"), ("powerDist.idleThrust", "uint32_t")):
         assert by_name[name].kind == kind
-    logged = dict(tables.LOG_VARIABLES)
+    logged = dict(logs.LOG_VARIABLES)
     for name, kind in (*packets.STATE_VARIABLES, ("motor.m1", "uint16_t"), ("motor.m1req", "int32_t")):
         assert logged[name] == kind
     assert dict.fromkeys(logged) != {}
@@ -693,7 +702,7 @@ def test_limits_of_the_log() -> None:
 
 def test_parameters_that_cannot_be_written() -> None:
     peer = Peer(Firmware())
-    names = [parameter.name for parameter in tables.PARAMETERS]
+    names = [parameter.name for parameter in protocol.PARAMETERS]
     fixed = names.index("firmware.revision0").to_bytes(2, "little")
     assert ask(peer, 2, 2, fixed + b"\0\0\0\0") == []  # read-only: no answer
     assert ask(peer, 2, 2, b"\xff\xff\0") == [b"\xff\xff\x02"]

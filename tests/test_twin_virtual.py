@@ -14,8 +14,7 @@ from mjxball.fly.card import goal_of, variants
 from mjxball.fly.controller import Controller
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import Conditions
-from mjxball.fly.twin.kind import Surroundings, drone_kind
+from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind
 from mjxball.fly.twin.virtual import World
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy

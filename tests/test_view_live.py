@@ -29,7 +29,7 @@ from mjxball.fly.main import main as fly
 from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.recording import read_recording
 from mjxball.fly.supervisor import State
-from mjxball.fly.twin.pairs import make_pair
+from mjxball.fly.twin.physics import make_pair
 from mjxball.view.command import main
 from mjxball.view.feed import COLUMNS, STEP, Feed, columns
 from mjxball.view.live import Board, Server

@@ -26,8 +26,7 @@ from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.rehearse import Rehearsal
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.thrust import CURVE_NAMES
-from mjxball.fly.twin.faults import FAULT_KINDS, read_fault
-from mjxball.fly.twin.kind import add_twin_options, asked_of_twin, check_twin
+from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, asked_of_twin, check_twin, read_fault
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")

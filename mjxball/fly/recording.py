@@ -21,9 +21,8 @@ from mjxball.fly.limits import NAMES
 from mjxball.fly.packets import DroneState
 from mjxball.fly.pair import ObjectState, Rig, object_state
 from mjxball.fly.thrust import CurveName
-from mjxball.fly.twin.body import PairState
-from mjxball.fly.twin.kind import DroneKind, Surroundings, drone_kind
-from mjxball.fly.twin.pairs import pair_of
+from mjxball.fly.twin.conditions import DroneKind, Surroundings, drone_kind
+from mjxball.fly.twin.physics import PairState, pair_of
 
 LONGEST = 3600.0  # [s] of a flight that is read
 OBSERVATION = 18  # numbers of an observation, where the log holds none

@@ -1,6 +1,6 @@
 """Software twin of the pair: two CRTP peers over UDP on loopback that the unmodified cflib opens.
 
-`tables` (what a drone lists), `protocol` (bytes in, bytes out), `firmware` (what it does in trouble), `body` (the
-interface of the physics), `coupled` (the Crazyflie model), `conditions` (what it meets), `standin` (simple physics),
-`pairs` (which of the two), `faults` (of the link), `server` (sockets and clock).
+`conditions` (which drones, what they meet, which faults), `protocol` and `logs` (bytes in, bytes out), `supervisor`,
+`firmware` and `drone` (what a drone makes of them), `physics` (its interface, a simple stand-in), `coupled`, `onboard`
+and `estimators` (the Crazyflie model), `server` (sockets and clock), `virtual` (flights without either).
 """

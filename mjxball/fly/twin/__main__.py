@@ -14,9 +14,8 @@ from pathlib import Path
 
 from mjxball.cli import make_parser, run_command
 from mjxball.fly.loop import urgent
-from mjxball.fly.twin.faults import Injection, LinkFaults, read_fault
-from mjxball.fly.twin.kind import add_twin_options, drone_kind, surroundings
-from mjxball.fly.twin.pairs import make_pair
+from mjxball.fly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
+from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
 from mjxball.policy import load_file
 

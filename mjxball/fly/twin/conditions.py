@@ -1,10 +1,127 @@
-"""What a rehearsal on the coupled model meets, and the laptop is not told."""
+"""What a rehearsal meets: which drones, what surrounds them, which faults come; and the flags that ask for it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import argparse
+import math
+import re
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from mjxball.config import Config
+from mjxball.control import motor_curves
+from mjxball.control.motors import MOTORS, Motor
+from mjxball.errors import InputError
+
+OLDER_FORCE = motor_curves.OLDER  # [N] shares of p^2 and p, p = PWM / 65535: a fit that ignores the voltage
+
+
+@dataclass(frozen=True)
+class DroneKind:
+    """A Crazyflie and the build of its firmware. The default is a 2.1 as delivered, with firmware 2026.08."""
+
+    device: str = "Crazyflie 2.1"  # what it calls itself
+    version: str = "2026.08"  # of its firmware
+    motor: str = "2.1"  # of `control.motors.MOTORS`
+    compensated: bool = True  # thrust is converted to PWM by the battery's voltage; else thrust is PWM
+    older_force: bool = False  # the true force is `OLDER_FORCE`, whatever the voltage
+    auto_arm: bool = True  # arms itself as soon as its checks pass
+    idle: int = 0  # PWM of every motor while armed, where arming is required
+    rate_gain: float = 250.0  # default of pid_rate.roll_kp; the ki is twice that
+
+    @property
+    def constants(self) -> Motor:
+        """Its motor's."""
+        return MOTORS[self.motor]
+
+
+DRONES = {
+    "2.1": DroneKind(),
+    "thrust-upgrade": DroneKind(motor="thrust-upgrade"),
+    "brushless": DroneKind(
+        device="Crazyflie 2.1 Brushless", motor="brushless", auto_arm=False, idle=7000, rate_gain=200.0
+    ),
+}
+CURVES = {
+    "linear": {},  # as delivered: thrust is linear in force, compensated for the battery
+    "older": {"compensated": False, "older_force": True, "version": "2025.02"},
+    "cubic": {"compensated": False},  # today's firmware built without compensation, on the motors as measured
+}
+
+
+def drone_kind(drone: str = "2.1", curve: str = "linear") -> DroneKind:
+    """The kind of drone by the names of `DRONES` and `CURVES`."""
+    return replace(DRONES[drone], **CURVES[curve])  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a rehearsal meets around the drones and the laptop is not told."""
+
+    noise: float = 1.0  # factor on the noise of IMU and pose
+    pose_hz: float = 100.0  # poses of the positioning system [Hz]
+    deck: bool = True  # each drone has its own positioning; else poses come from the laptop, or none do
+    delay: float = 0.0  # of every datagram each way, from the first one on [s]
+    gains: tuple[float, float] = (1.0, 1.0)  # factors on the motor forces of leader and follower
+    exact: bool = False  # the estimates are the truth: for comparisons with the simulation
+    seed: int = 0
+
+
+DELIVERED = DroneKind()
+QUIET = Surroundings()
+
+
+FLAGS = ("drone", "curve", "noise", "pose_hz", "deck", "delay", "gains", "seed")
+# Numbers with least and most.
+RANGES = {"noise": (0.0, 100.0), "pose_hz": (1.0, 1000.0), "delay": (0.0, 0.5)}
+
+
+def add_twin_options(parser: argparse.ArgumentParser) -> None:
+    """Add --twin-drone and the others to `parser`; None where nothing is asked for."""
+    about = "--rehearse: "
+    add = parser.add_argument
+    add("--twin-drone", choices=tuple(DRONES), help=f"{about}what drones the twin is (2.1)")
+    add("--twin-curve", choices=tuple(CURVES), help=f"{about}linear: compensated for the battery; older, cubic: not")
+    add("--twin-noise", type=float, metavar="X", help=f"{about}factor on the noise of its sensors (1)")
+    add("--twin-pose-hz", type=float, metavar="HZ", help=f"{about}poses of its positioning system (100)")
+    add("--twin-deck", choices=("yes", "no"), help=f"{about}its positioning; no: poses must come from here (yes)")
+    add("--twin-delay", type=float, metavar="S", help=f"{about}of each datagram, from the first one on (0)")
+    add("--twin-gains", type=float, nargs=2, metavar=("L", "F"), help=f"{about}factors on the motor forces (1 1)")
+    add("--twin-seed", type=int, metavar="N", help=f"{about}of its noise (0)")
+
+
+def check_twin(options: argparse.Namespace) -> None:
+    """Raise InputError for what no twin can be."""
+    for name, (low, high) in RANGES.items():
+        value = getattr(options, f"twin_{name}")
+        if value is not None and not low <= value <= high:
+            raise InputError(f"--twin-{name.replace('_', '-')} must be {low:g} to {high:g}, not {value:g}")
+    for value in options.twin_gains or ():
+        if not 0.1 <= value <= 3.0:
+            raise InputError(f"--twin-gains must be two numbers of 0.1 to 3, not {value:g}")
+    if options.twin_seed is not None and options.twin_seed < 0:
+        raise InputError(f"--twin-seed must not be negative, not {options.twin_seed}")
+
+
+def asked_of_twin(options: argparse.Namespace) -> list[str]:
+    """The flags that were given, as the twin's process takes them."""
+    flags = []
+    for name in FLAGS:
+        value = getattr(options, f"twin_{name}")
+        if value is not None:
+            values = value if isinstance(value, list) else [value]
+            flags += [f"--twin-{name.replace('_', '-')}", *map(str, values)]
+    return flags
+
+
+def surroundings(options: argparse.Namespace) -> Surroundings:
+    """The `Surroundings` that were asked for. Raises InputError."""
+    check_twin(options)
+    given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed")}
+    given = {name: value for name, value in given.items() if value is not None and math.isfinite(value)}
+    if options.twin_gains is not None:
+        given["gains"] = tuple(options.twin_gains)
+    return Surroundings(deck=options.twin_deck != "no", **given)
 
 
 @dataclass(frozen=True)
@@ -34,3 +151,81 @@ class Conditions:
         ranges = config.scenario
         amplitude, speed = (sum(pair) / 2 for pair in (ranges.cg_amplitude, ranges.cg_speed))
         return cls(sum(ranges.object_mass) / 2, amplitude, speed, ranges.ball_start / 2)
+
+
+@dataclass(frozen=True)
+class LinkFaults:
+    """What happens to datagrams of one drone. The default is a perfect link."""
+
+    loss: float = 0.0  # share of datagrams that vanish, each way
+    delay: float = 0.0  # of every datagram [s]
+    jitter: float = 0.0  # added delay, uniform from 0 to this [s]: datagrams may overtake each other
+    silent_up: bool = False  # nothing reaches the drone
+    silent_down: bool = False  # nothing comes from the drone
+
+
+@dataclass(frozen=True)
+class DroneFaults:
+    """What one drone gets wrong. The default is nothing."""
+
+    frozen: bool = False  # the estimator repeats its last state, the clock goes on
+    clock_stopped: bool = False  # time stamps stand still
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # added to the reported position [m]
+    battery: float = 0.0  # added to the reported voltage [V]
+    garbage: float = 0.0  # datagrams of random bytes sent for each step
+    stabilizer_dead: bool = False  # its task hangs: the log goes on with fresh stamps and frozen values, PWM stays
+    stopped: bool = False  # the program hangs: nothing is answered, PWM stays
+    restarts: bool = True  # the microcontroller's watchdog restarts what hangs; else its motors stay off
+
+
+class BodyFault(NamedTuple):
+    """What happens to the body of a drone, see `body.Pair.disturb`."""
+
+    what: str  # "frozen", "lost", "jump": of its poses; "battery", "gain"
+    value: float
+
+
+# What `--fault KIND:DRONE@S` can be: faults of the link, of a drone, or what the twin does to it.
+What = LinkFaults | DroneFaults | BodyFault | str
+FAULT_KINDS: dict[str, What] = {
+    "silent": LinkFaults(silent_up=True, silent_down=True),
+    "silent-up": LinkFaults(silent_up=True),
+    "silent-down": LinkFaults(silent_down=True),
+    "loss": LinkFaults(loss=0.3),
+    "frozen": DroneFaults(frozen=True),
+    "clock": DroneFaults(clock_stopped=True),
+    "jump": DroneFaults(offset=(0.0, 0.0, 0.4)),
+    "battery": DroneFaults(battery=-1.2),
+    "garbage": DroneFaults(garbage=3.0),
+    "crash": "crash",
+    "power": "kill",
+    "port": "close_port",
+    "reboot": "reboot",
+    "stabilizer": DroneFaults(stabilizer_dead=True),
+    "imu": DroneFaults(stabilizer_dead=True),  # the stabilizer waits for it
+    "stopped": DroneFaults(stopped=True),
+    "killed": DroneFaults(stopped=True, restarts=False),
+    "pose-frozen": BodyFault("frozen", 1.0),
+    "pose-lost": BodyFault("lost", 1.0),
+    "pose-jump": BodyFault("jump", 0.4),
+    "sag": BodyFault("battery", 3.0),
+    "weak": BodyFault("gain", 0.9),
+}
+
+
+class Injection(NamedTuple):
+    """A fault that comes during a rehearsal."""
+
+    what: What
+    drone: int  # 0 leader, 1 follower
+    after: float  # the first motor has turned [s]
+
+
+def read_fault(text: str) -> Injection:
+    """The fault of `KIND:DRONE@S`, such as `frozen:follower@3`. Raises InputError."""
+    match = re.fullmatch(r"([\w-]+):(leader|follower)@(\d{1,4}(?:\.\d+)?)", text)
+    if match is None or match[1] not in FAULT_KINDS:
+        raise InputError(
+            f"--fault {text} is no KIND:DRONE@S such as frozen:follower@3; kinds: {', '.join(FAULT_KINDS)}"
+        )
+    return Injection(FAULT_KINDS[match[1]], ("leader", "follower").index(match[2]), float(match[3]))

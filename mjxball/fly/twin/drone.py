@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
+import math
+
 import numpy as np
 
-from mjxball.fly.twin import faults, tables
-from mjxball.fly.twin.body import Modes, Pair, PairState
-from mjxball.fly.twin.faults import Channel, DroneFaults, LinkFaults
+from mjxball.fly.twin import protocol
+from mjxball.fly.twin.conditions import DELIVERED, QUIET, DroneFaults, DroneKind, LinkFaults, Surroundings
 from mjxball.fly.twin.firmware import Firmware, Motors, Order
-from mjxball.fly.twin.kind import DELIVERED, QUIET, DroneKind, Surroundings
 from mjxball.fly.twin.logs import Readings, Snapshot
+from mjxball.fly.twin.physics import Modes, Pair, PairState
 from mjxball.fly.twin.protocol import Peer
 
 GRAVITY = 9.81  # [m/s2]
@@ -109,7 +112,7 @@ class TwinDrone:
                 self._reply(datagram[:2] + stamp + datagram[5:], now)
         junk = int(self._random.poisson(self.faults.garbage)) if self.faults.garbage else 0
         for _ in range(junk):
-            self._reply(faults.garbage(self._random), now)
+            self._reply(garbage(self._random), now)
         return self.down.due(now)
 
     def _reply(self, datagram: bytes, now: float) -> None:
@@ -124,9 +127,54 @@ class TwinDrone:
         self.peer = self._new_peer()
         self._booted = now
         self.faults = DroneFaults()
-        for name, value in tables.defaults_of(self.firmware.kind, self._estimator).items():
+        for name, value in protocol.defaults_of(self.firmware.kind, self._estimator).items():
             self._pair.set_parameter(self.number, name, value)
         self._pair.set_parameter(self.number, "kalman.resetEstimation", 1.0)
+
+
+class Channel:
+    """One way of a link: datagrams go in, and come out late, or never."""
+
+    def __init__(self, random: np.random.Generator):
+        self._random = random
+        self._waiting: list[tuple[float, int, bytes]] = []
+        self._count = itertools.count()
+
+    def push(self, datagram: bytes, now: float, faults: LinkFaults, silent: bool, delay: float = 0.0) -> None:
+        """Take a datagram in at time `now` [s]; `delay` [s] is added to that of `faults`."""
+        if silent or (faults.loss and self._random.random() < faults.loss):
+            return
+        due = now + faults.delay + delay
+        if faults.jitter:
+            due += faults.jitter * self._random.random()
+        heapq.heappush(self._waiting, (due, next(self._count), datagram))
+
+    def due(self, now: float) -> list[bytes]:
+        """Datagrams that come out by `now` [s], in order."""
+        return [datagram for _, datagram in self.timed(now)]
+
+    def timed(self, now: float) -> list[tuple[float, bytes]]:
+        """The same, each with its time [s]."""
+        out = []
+        while self._waiting and self._waiting[0][0] <= now + 1e-9:
+            due, _, datagram = heapq.heappop(self._waiting)
+            out.append((due, datagram))
+        return out
+
+    @property
+    def next(self) -> float:
+        """When the next datagram comes out [s]."""
+        return self._waiting[0][0] if self._waiting else math.inf
+
+
+def garbage(random: np.random.Generator) -> bytes:
+    """A datagram of random bytes; half of them begin with a port that is in use."""
+    size = int(random.integers(0, 40))
+    data = bytearray(random.integers(0, 256, size, dtype=np.uint8).tobytes())
+    if size and random.random() < 0.5:
+        port, channel = random.choice([0, 2, 3, 4, 5, 7, 9, 13, 15]), random.integers(0, 4)
+        data[0] = int(port) << 4 | 0x0C | int(channel)
+    return bytes(data)
 
 
 def modes_of(orders: tuple[Order, Order]) -> Modes:

@@ -2,21 +2,42 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from mjxball.fly import packets
 from mjxball.fly.packets import Setpoint
-from mjxball.fly.twin import tables
-from mjxball.fly.twin.body import Report
 from mjxball.fly.twin.estimators import euler_of, matrix_of
+from mjxball.fly.twin.physics import Report
 
 GRAVITY = 9.81  # [m/s2]
+# Type numbers of log variables, each with its struct code (crazyflie.md).
+LOG_TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int8_t": (4, "b"), "int16_t": (5, "h")}
+LOG_TYPES |= {"int32_t": (6, "i"), "float": (7, "f"), "FP16": (8, "e")}
+LOG_CODES = dict(LOG_TYPES.values())
+
+
+def listed(table: str) -> list[dict[str, str]]:
+    """Rows of `names.csv`, in the order of the firmware's own table, "log" or "param"."""
+    with Path(__file__).with_name("names.csv").open(encoding="utf-8", newline="") as file:
+        return [row for row in csv.DictReader(file) if row["table"] == table]
+
+
+def item(type_byte: int, name: str) -> bytes:
+    """Type, group, name of one entry as the table of contents sends them."""
+    group, _, variable = name.partition(".")
+    return bytes([type_byte]) + group.encode() + b"\0" + variable.encode() + b"\0"
+
+
+LOG_VARIABLES: tuple[tuple[str, str], ...] = tuple((row["name"], row["type"]) for row in listed("log"))
+LOG_ITEMS = [item(LOG_TYPES[kind][0], name) for name, kind in LOG_VARIABLES]
 
 
 class Snapshot(NamedTuple):
@@ -235,16 +256,16 @@ class Blocks:
         """Add (type, id) entries of 3 bytes; cflib sends one stray byte after the ninth, which is no entry."""
         for at in range(0, len(entries) - 2, 3):
             kind, index = entries[at] & 0x0F, struct.unpack("<H", entries[at + 1 : at + 3])[0]
-            if kind not in tables.LOG_CODES:
+            if kind not in LOG_CODES:
                 return UNKNOWN
-            code = tables.LOG_CODES[kind]
+            code = LOG_CODES[kind]
             if block.size + struct.calcsize("<" + code) > MAX_BLOCK_BYTES:
                 return TOO_BIG
             if sum(len(one.variables) for one in self.by_number.values()) >= MAX_VARIABLES:
                 return NO_MEMORY
-            if index >= len(tables.LOG_VARIABLES):
+            if index >= len(LOG_VARIABLES):
                 return UNKNOWN
-            block.variables.append((tables.LOG_VARIABLES[index][0], code))
+            block.variables.append((LOG_VARIABLES[index][0], code))
         return 0
 
 

@@ -6,15 +6,18 @@ Any bytes may come in; what makes no sense is dropped, as the firmware drops it.
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
+from mjxball.control.firmware_gains import STOCK, gains_of
 from mjxball.fly import packets
 from mjxball.fly.packets import PacketError
-from mjxball.fly.twin import tables
+from mjxball.fly.twin.conditions import DroneKind
 from mjxball.fly.twin.firmware import Firmware
-from mjxball.fly.twin.logs import MAX_BLOCKS, MAX_VARIABLES, UNKNOWN, Blocks
+from mjxball.fly.twin.logs import LOG_ITEMS, MAX_BLOCKS, MAX_VARIABLES, UNKNOWN, Blocks, item, listed
 
 VERSION = 12
 MAX_DATA = 30
@@ -27,6 +30,80 @@ CLEARED = {"kalman.resetEstimation", "supervisor.infdmp", "syslink.probe", "syst
 CLEARED |= {"health.startPropTest", "health.startBatTest"}
 EMERGENCY, KEEPALIVE, POSE, POSES = 3, 4, 8, 9  # kinds of generic localization packets
 Pose = Callable[[np.ndarray, "np.ndarray | None"], None]
+
+
+PARAM_TYPES = {"uint8_t": (8, "B"), "uint16_t": (9, "H"), "uint32_t": (10, "I"), "int8_t": (0, "b")}
+PARAM_TYPES |= {"int16_t": (1, "h"), "int32_t": (2, "i"), "float": (6, "f")}
+READ_ONLY, EXTENDED = 0x40, 0x10
+DEFAULTS = {
+    **gains_of(STOCK),
+    "firmware.revision0": float(0x20260800),
+    "kalman.attitudeRev": 0.001,
+    "kalman.mNBaro": 2.0,
+    "kalman.mNGyro_rollpitch": 0.1,
+    "kalman.mNGyro_yaw": 0.1,
+    "kalman.maxPos": 100.0,
+    "kalman.maxVel": 10.0,
+    "kalman.pNAcc_xy": 0.5,
+    "kalman.pNAcc_z": 1.0,
+    "locSrv.extPosStdDev": 0.01,
+    "locSrv.extQuatStdDev": 4.5e-3,
+    "pm.criticalLowVoltage": 3.0,
+    "pm.lowVoltage": 3.2,
+    "stabilizer.controller": 1.0,
+    "stabilizer.estimator": 2.0,
+    "supervisor.landedTimeout": 3000.0,
+    "supervisor.prefltTimeout": 30000.0,
+    "supervisor.spinupTimeout": 2000.0,
+    "supervisor.tmblChckEn": 1.0,
+    "system.selftestPassed": 1.0,
+    "flightmode.stabModeRoll": 1.0,
+    "flightmode.stabModePitch": 1.0,
+    "flightmode.yawMode": 2.0,
+}
+
+
+class Parameter(NamedTuple):
+    """One parameter of the firmware."""
+
+    name: str  # "group.name"
+    kind: str  # a key of PARAM_TYPES
+    default: float
+    read_only: bool = False
+    persistent: bool = False
+
+    @property
+    def type_byte(self) -> int:
+        """The byte that describes it in the table of contents."""
+        return PARAM_TYPES[self.kind][0] | READ_ONLY * self.read_only | EXTENDED * self.persistent
+
+    def pack(self, value: float) -> bytes:
+        """`value` as bytes of its type."""
+        return struct.pack("<" + PARAM_TYPES[self.kind][1], value if self.kind == "float" else int(value))
+
+    def unpack(self, data: bytes) -> float:
+        """Value in `data`; raises struct.error for a wrong length."""
+        return float(struct.unpack("<" + PARAM_TYPES[self.kind][1], data)[0])
+
+
+PARAMETERS = tuple(
+    Parameter(row["name"], row["type"], DEFAULTS.get(row["name"], 0.0), row["access"] == "r", row["access"] == "p")
+    for row in listed("param")
+)
+PARAM_ITEMS = [item(parameter.type_byte, parameter.name) for parameter in PARAMETERS]
+
+
+def defaults_of(kind: DroneKind, estimator: int) -> dict[str, float]:
+    """Values that the parameters of a drone of a `kind` have after boot; `estimator` is what its decks ask for."""
+    values = {parameter.name: parameter.default for parameter in PARAMETERS}
+    values["stabilizer.estimator"] = float(estimator)
+    values["powerDist.idleThrust"] = float(kind.idle)
+    if kind.motor == "brushless":
+        values["pm.lowVoltage"] = 3.35
+    for axis in ("roll", "pitch"):
+        values[f"pid_rate.{axis}_kp"] = kind.rate_gain
+        values[f"pid_rate.{axis}_ki"] = 2 * kind.rate_gain
+    return values
 
 
 def header(port: int, channel: int) -> int:
@@ -46,7 +123,7 @@ class Peer:
     ):
         """`estimator` is what the drone's decks ask for: 1 complementary, 2 Kalman."""
         self.firmware = firmware
-        self.values = tables.defaults_of(firmware.kind, estimator)
+        self.values = defaults_of(firmware.kind, estimator)
         self.logs = Blocks()
         self._estimator = estimator
         self._on_parameter, self._on_pose = on_parameter, on_pose
@@ -55,11 +132,11 @@ class Peer:
             (LINK, 1): lambda data, now: [GREETING] if data[:1] == b"\0" else [],
             (PLATFORM, 0): self._platform,
             (PLATFORM, 1): self._version,
-            (PARAM, 0): lambda data, now: self._contents(data, tables.PARAM_ITEMS, b""),
+            (PARAM, 0): lambda data, now: self._contents(data, PARAM_ITEMS, b""),
             (PARAM, 1): self._read_parameter,
             (PARAM, 2): self._write_parameter,
             (PARAM, 3): self._parameter_extra,
-            (LOG, 0): lambda data, now: self._contents(data, tables.LOG_ITEMS, bytes([MAX_BLOCKS, MAX_VARIABLES])),
+            (LOG, 0): lambda data, now: self._contents(data, LOG_ITEMS, bytes([MAX_BLOCKS, MAX_VARIABLES])),
             (LOG, 1): self.logs.control,
             (MEMORY, 0): lambda data, now: [b"\x01\x00"] if data[:1] == b"\x01" else [],
             (COMMANDER, 0): self._setpoint,
@@ -112,17 +189,17 @@ class Peer:
 
     def _contents(self, data: bytes, items: list[bytes], tail: bytes) -> list[bytes]:
         if data[:1] == b"\x03":
-            return [b"\x03" + struct.pack("<HI", len(items), tables.checksum(items)) + tail]
+            return [b"\x03" + struct.pack("<HI", len(items), zlib.crc32(b"".join(items))) + tail]
         if data[:1] == b"\x02" and len(data) >= 3:
             index = struct.unpack("<H", data[1:3])[0]
             return [data[:3] + items[index]] if index < len(items) else [data[:1]]
         return []
 
-    def _parameter(self, data: bytes) -> tables.Parameter | None:
+    def _parameter(self, data: bytes) -> Parameter | None:
         if len(data) < 2:
             return None
         index = struct.unpack("<H", data[:2])[0]
-        return tables.PARAMETERS[index] if index < len(tables.PARAMETERS) else None
+        return PARAMETERS[index] if index < len(PARAMETERS) else None
 
     def _read_parameter(self, data: bytes, now: float) -> list[bytes]:
         known = self._parameter(data)
@@ -152,7 +229,7 @@ class Peer:
             return [data[:3] + bytes([UNKNOWN])] if len(data) >= 3 else []
         if data[0] == 0x07:
             return [data[:3] + bytes([0, int(known.persistent)])]
-        default = tables.defaults_of(self.firmware.kind, self._estimator)[known.name]
+        default = defaults_of(self.firmware.kind, self._estimator)[known.name]
         return [data[:3] + b"\0" + known.pack(default)] if data[0] == 0x08 else []
 
     def _setpoint(self, data: bytes, now: float) -> list[bytes]:

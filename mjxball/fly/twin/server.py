@@ -10,10 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjxball.fly.twin.body import Pair, PairState
+from mjxball.fly.twin.conditions import (
+    DELIVERED,
+    QUIET,
+    BodyFault,
+    DroneFaults,
+    DroneKind,
+    Injection,
+    LinkFaults,
+    Surroundings,
+)
 from mjxball.fly.twin.drone import TwinDrone, advance
-from mjxball.fly.twin.faults import BodyFault, DroneFaults, Injection, LinkFaults
-from mjxball.fly.twin.kind import DELIVERED, QUIET, DroneKind, Surroundings
+from mjxball.fly.twin.physics import Pair, PairState
 
 HOST = "127.0.0.1"
 MOST_BEHIND = 0.1  # [s] of physics that a twin that was held up makes good; the rest of the time it stands still

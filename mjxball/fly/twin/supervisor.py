@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from mjxball.fly import packets
-from mjxball.fly.twin.kind import DroneKind
+from mjxball.fly.twin.conditions import DroneKind
 
 PERIOD = 0.04  # [s] between two looks at the conditions
 FLYING_KEPT = 2.0  # [s] it counts as flying after a motor was last above idle

@@ -1,19 +1,87 @@
-"""A stand-in for the coupled pair: one rigid stick whose attitude follows the commands as a damped oscillator.
-
-It is not a Crazyflie: no motors apart, no cascade, no rolling ball. It exists so that protocol, safety and loop can be
-tested without MuJoCo; numbers flown on it say nothing about a real pair.
-"""
+"""Physics of two drones and what they carry: the interface, a stand-in without MuJoCo, and which one a policy needs."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from mjxball.config import Config
 from mjxball.control import motors, rotations
+from mjxball.errors import InputError
+from mjxball.fly.card import config_of, is_crazyflie
 from mjxball.fly.packets import Setpoint, angles
 from mjxball.fly.thrust import ForceCurve
-from mjxball.fly.twin.body import RUNNING, Modes, PairState, Report
+from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
+
+
+class Report(NamedTuple):
+    """What both drones' own computers hold, leader first: what they log, not the truth. SI units."""
+
+    position: np.ndarray  # (2, 3) [m]
+    velocity: np.ndarray  # (2, 3) in the world [m/s]
+    quaternion: np.ndarray  # (2, 4) body -> world (w, x, y, z)
+    rates: np.ndarray  # (2, 3) filtered gyroscopes [rad/s]
+    acceleration: np.ndarray  # (2, 3) filtered accelerometers [m/s2]
+    variance: np.ndarray  # (2, 9) of the Kalman filter: position, velocity, attitude; 0 if it never ran
+    estimator: tuple[int, int]  # 1 complementary, 2 Kalman
+    pwm: np.ndarray  # (2, 4) of the motors
+    requested: np.ndarray  # (2, 4) the same before its bounds
+    thrust: np.ndarray  # (2,) command of the controller [thrust units]
+
+
+class PairState(NamedTuple):
+    """Both drones, leader first. World axes X forward, Y left, Z up; SI units."""
+
+    position: np.ndarray  # (2, 3) of each drone's centre [m]
+    velocity: np.ndarray  # (2, 3) [m/s]
+    quaternion: np.ndarray  # (2, 4) body -> world (w, x, y, z)
+    rates: np.ndarray  # (2, 3) about the body axes [rad/s]
+    specific_force: np.ndarray  # (2, 3) what each accelerometer would read without noise, body axes [m/s2]
+    battery: np.ndarray  # (2,) [V]
+    report: Report  # what the drones make of it
+
+
+class Modes(NamedTuple):
+    """What the supervisors say of leader and follower."""
+
+    run: tuple[bool, bool] = (True, True)  # motors turn, if only at idle; else their PWM is 0
+    held: tuple[bool, bool] = (False, False)  # the stabilizer hangs: PWM and estimate stay as they are
+    flying: tuple[bool, bool] = (True, True)
+
+
+RUNNING = Modes()
+
+
+class Pair(Protocol):
+    """Physics of two drones and what they carry, with motors and each firmware's estimator and cascade.
+
+    The firmware's supervisor is not part of it: setpoints come after thrust lock, watchdog and stops.
+    """
+
+    def start(self) -> PairState:
+        """Put everything back to rest on the ground (stand: at its lowest) and return that state."""
+        ...
+
+    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+        """Move `dt` [s] on, under `setpoints` (2, 4), and return the new state.
+
+        A row is (roll [deg], pitch [deg], yaw rate [deg/s], thrust 0 .. 65535) as decoded from the wire: negative
+        pitch moves toward +x, positive yaw rate turns clockwise from above. Thrust 0 means motors off, or at idle.
+        """
+        ...
+
+    def set_parameter(self, drone: int, name: str, value: float) -> None:
+        """Parameter `name`, "pid_attitude.roll_kp", of `drone` (0 leader, 1 follower) was written; ignore others."""
+
+    def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
+        """The laptop sent `drone` its pose: `position` (3,) [m] and, if known, `quaternion` (4,) (w, x, y, z)."""
+
+    def disturb(self, drone: int, what: str, value: float) -> None:
+        """A fault of the body of `drone`: "pose" frozen, lost or jumping, "battery", "gain"; see `faults.BODY`."""
+
 
 CURVE = ForceCurve()
 FASTEST = 30.0  # [rad/s] bound on the body rates: beyond it the oscillator is no model of anything
@@ -134,3 +202,28 @@ class StandIn:
                 position, velocity, quaternion, rates, force, np.full((2, 9), 1e-5), (2, 2), pwm, pwm, self._commands
             ),
         )
+
+
+def make_pair(card: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, around: Surroundings = QUIET) -> Pair:
+    """Physics of the rig that a policy's `card` describes; without one, the stand-in's own rig."""
+    return StandIn() if card is None else pair_of(config_of(card), kind, around)
+
+
+def pair_of(
+    config: Config,
+    kind: DroneKind = DELIVERED,
+    around: Surroundings = QUIET,
+    conditions: Conditions | None = None,
+) -> Pair:
+    """Physics of the rig of `config`; whatever is heavy is imported here, not above.
+
+    Raises InputError if the coupled model is needed and MuJoCo is not installed.
+    """
+    if not is_crazyflie(config):
+        plant = config.plant
+        return StandIn(StandInPlant(mounts=(plant.leader_mount, plant.follower_mount)))
+    try:
+        from mjxball.fly.twin.coupled import CoupledPair
+    except ModuleNotFoundError as error:
+        raise InputError(f"the twin of a Crazyflie pair needs {error.name}; pip install 'mjxball[fly]'") from None
+    return CoupledPair(config, conditions, kind, around)
