@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import json
 import os
+import re
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,9 +24,24 @@ EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that a
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one sentence on stderr and exit code 2."""
 
+    def parse_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        """As `argparse` does, and a list may begin with a negative number: `--scenario.mass_change -0.1,0.2`."""
+        words: list[str] = []
+        for word in sys.argv[1:] if args is None else args:
+            if words and re.fullmatch(r"--[^=]+", words[-1]) and re.match(r"-\.?\d[^,]*,", word):
+                words[-1] += f"={word}"  # else Python before 3.14 takes the list for a flag
+            else:
+                words.append(word)
+        return super().parse_args(words, namespace)
+
     def error(self, message: str) -> None:  # type: ignore[override]
-        """Print `message` and exit with code 2."""
-        self.exit(2, f"{self.prog}: {message}\n")
+        """Print `message`, with the flag that is most like an unknown one, and exit with code 2."""
+        unknown = re.match(r"unrecognized arguments: (--[^ =]+)", message)
+        known = re.findall(r"--[\w.-]+", self.format_help()) if unknown else []
+        similar = difflib.get_close_matches(unknown[1], known, 1, cutoff=0.8) if unknown else []
+        self.exit(2, f"{self.prog}: {message}{f'; did you mean {similar[0]}?' if similar else ''}\n")
 
 
 def make_parser(program: str, description: str, usage: str | None = None, epilog: str | None = None) -> Parser:

@@ -29,9 +29,9 @@ from command_line import (
 )
 from tables import rows
 
+from mjxball import cli, export
 from mjxball import config as configs
-from mjxball import export
-from mjxball.commands.train import main
+from mjxball.commands.train import main, parser
 from mjxball.policy import Policy
 
 WORLDS = 32
@@ -285,6 +285,24 @@ BAD_EXPORTS = {
 def test_bad_export_is_refused(here: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     (here / "old.npz").write_bytes(b"old")
     assert_refused(export.main, arguments, here, capsys)
+
+
+def test_a_list_may_begin_with_a_negative_number() -> None:
+    """As every flag with a value, after a space or after `=`."""
+    asked = (["--scenario.mass_change", "-0.05,0.1"], ["--scenario.mass_change=-0.05,0.1"])
+    for arguments in asked:
+        found = cli.apply_config_flags(configs.preset("transport"), parser().parse_args(arguments))
+        assert found.scenario.mass_change == (-0.05, 0.1)
+
+
+def test_the_number_of_seeds_has_two_names() -> None:
+    assert [parser().parse_args([flag, "3"]).num_seeds for flag in ("--num-seeds", "--seeds")] == [3, 3]
+
+
+def test_a_misspelt_flag_is_answered_with_the_right_one(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for wrong, right in (("--sac.total_stesp", "--sac.total_steps"), ("--num_seeds", "--num-seeds")):
+        assert right in assert_refused(main, [wrong, 5], here, capsys)
+    assert "--frobnicate\n" in assert_refused(main, ["--frobnicate"], here, capsys)  # like none
 
 
 def test_refusal_of_a_real_process(here: Path) -> None:

@@ -33,8 +33,8 @@ def parser() -> cli.Parser:
     """The argument parser; configuration flags are generated from `mjxball.config`."""
     result = cli.make_parser(
         "train.py",
-        usage="%(prog)s [PRESET] [--seed N] [--seeds K] [--sweep FILE] [--out DIR] [--resume DIR] [--physics ENGINE]\n"
-        "                [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
+        usage="%(prog)s [PRESET] [--seed N] [--num-seeds K] [--sweep FILE] [--out DIR] [--resume DIR]\n"
+        "                [--physics ENGINE] [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
         "                [--<config path> VALUE ...]",
         description="Train a follower with soft actor-critic, export it to NumPy and judge it against `copy`.",
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
@@ -42,7 +42,9 @@ def parser() -> cli.Parser:
     names = ", ".join(config.PRESETS)
     result.add_argument("preset", nargs="?", metavar="PRESET", help=f"one of {names} (default transport)")
     result.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default 0)")
-    result.add_argument("--seeds", type=int, metavar="K", help="train K followers at once, seeds N, N + 1, ...")
+    result.add_argument(
+        "--num-seeds", "--seeds", type=int, metavar="K", help="train K followers at once, seeds N, N + 1 ..."
+    )
     result.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
@@ -144,9 +146,9 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
     out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)
-    members = 1 if options.seeds is None else options.seeds
+    members = 1 if options.num_seeds is None else options.num_seeds
     if not 1 <= members <= MOST_MEMBERS:
-        raise InputError(f"--seeds must be between 1 and {MOST_MEMBERS}, not {members}")
+        raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
     extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
     origin: dict[str, Any] = {
         "command": command,
@@ -234,8 +236,8 @@ def _seed_of(path: Path) -> int:
 
 def _refuse_with_resume(options: argparse.Namespace) -> None:
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    own = ("out", "seed", "seeds", "sweep", "physics", "plant", *EXTENSIONS)
-    given += [f"--{name}" for name in own if getattr(options, name) is not None]
+    own = ("out", "seed", "num_seeds", "sweep", "physics", "plant", *EXTENSIONS)
+    given += [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
     given += [options.preset] if options.preset else []
     if given:
         raise InputError(f"--resume continues with the run's own configuration; drop {', '.join(given)}")

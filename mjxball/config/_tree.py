@@ -76,8 +76,8 @@ def _parse(path: str, text: str, example: Any) -> Any:
             return tuple(kind(part) for part in text.split(",")) if text else ()
         return type(example)(text)
     except (ValueError, KeyError):
-        wanted = "comma-separated numbers" if isinstance(example, tuple) else type(example).__name__
-        raise InputError(f"--{path} takes {wanted}, not {text!r}") from None
+        wanted = {bool: "true or false", int: "a whole number", float: "a number", tuple: "comma-separated numbers"}
+        raise InputError(f"--{path} takes {wanted[type(example)]}, not {text!r}") from None
 
 
 def to_dict(config: Any) -> dict[str, Any]:
