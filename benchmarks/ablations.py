@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from cells import WANTED, feasible, fly, wanted, wins_of
-
 from mjxball import __version__
 from mjxball import config as configs
 from mjxball.baselines import make_baseline

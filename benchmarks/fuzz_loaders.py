@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mutations import ANY, CSV, JSON, POLICY, WITNESS
 
 from mjxball import config as configs
 from mjxball.control.observation import OBSERVATION_SIZE
@@ -39,6 +38,7 @@ from mjxball.policy import Policy, shipped_policies
 from mjxball.train.curves import told_by_the_run
 from mjxball.train.members import read_members
 from mjxball.train.record import read_config
+from mutations import ANY, CSV, JSON, POLICY, WITNESS
 
 TRAIN = Path(__file__).parents[1] / "train.py"
 MEMORY = 256 * 2**20  # [B] that reading one file may take: a few times the largest file that is read

@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from cells import feasible
-from rivals import fly
-
 from mjxball.baselines.lqg import SLOW, Lqg, Tuning
 from mjxball.config import preset
 from mjxball.control.followers import Baseline
+from rivals import fly
 
 SHOWN = ("settling", "peak", "overshoot", "rmse", "smoothness")
 TUNINGS = (

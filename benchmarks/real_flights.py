@@ -16,8 +16,8 @@ from pathlib import Path
 
 from mjxball import cli
 from mjxball.errors import InputError
-from mjxball.rig import flight_report, real_flights
 from mjxball.train.provenance import commit
+from nanobench import report, study
 
 FIGURES = (".svg", ".png")
 
@@ -26,7 +26,7 @@ def parser() -> cli.Parser:
     """The flags."""
     result = cli.make_parser("python benchmarks/real_flights.py", "Hold real flights against the simulated drone.")
     result.add_argument("directory", type=Path, metavar="DIR", help="with the flights' .csv or .csv.gz files")
-    result.add_argument("--fit", nargs="+", default=real_flights.FITTED, metavar="NAME", help="flights to fit to")
+    result.add_argument("--fit", nargs="+", default=study.FITTED, metavar="NAME", help="flights to fit to")
     result.add_argument("--json", type=Path, metavar="FILE")
     result.add_argument("--figure", type=Path, metavar="FILE", help="of suffix .svg or .png")
     return result
@@ -42,17 +42,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for path in (options.json, options.figure):
             if path and not path.absolute().parent.is_dir():
                 raise InputError(f"directory {path.absolute().parent} does not exist")
-        found = real_flights.study(options.directory, tuple(options.fit))
-        data = real_flights.to_json(found)
-        print(flight_report.tables(data))
+        found = study.study(options.directory, tuple(options.fit))
+        data = study.to_json(found)
+        print(report.tables(data))
         if options.json:
             command = "python benchmarks/real_flights.py DIR"
-            if tuple(options.fit) != real_flights.FITTED:
+            if tuple(options.fit) != study.FITTED:
                 command += f" --fit {' '.join(options.fit)}"
             data = {"command": command, "commit": commit(), **data}
             options.json.write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
         if options.figure:
-            flight_report.draw(found, options.figure)
+            report.draw(found, options.figure)
         return 0
 
     return cli.run_command(run)

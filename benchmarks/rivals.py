@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from cells import WANTED, feasible, numbers_of
-
 from mjxball.baselines import make_baseline
 from mjxball.config import preset
 from mjxball.control.followers import Follower

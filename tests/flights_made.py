@@ -11,8 +11,8 @@ import numpy as np
 from mjxball.config import Autopilot
 from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.motors import FULL
-from mjxball.rig.flight_fit import MOTOR, SIGNS
-from mjxball.rig.flights import GRAVITY, GROUPS
+from nanobench.flights import GRAVITY, GROUPS
+from nanobench.rotation import MOTOR, SIGNS
 
 COLUMNS = [name for group in GROUPS.values() for name in group]
 PERIOD = crazyflie.PERIOD

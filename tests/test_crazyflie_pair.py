@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mjxball.config import Autopilot, Config, preset
-from mjxball.control import rotations
+from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
@@ -19,7 +19,8 @@ from mjxball.physics.step import hover_rotor_force, make_autopilot, make_control
 from mjxball.physics.stepper import make_stepper
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policy
-from mjxball.rig.response import Trial, rise_and_overshoot, turn_alone
+from mjxball.rig.attitude import Body, Trial
+from mjxball.rig.attitude import simulate as simulate_attitude
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
@@ -36,8 +37,13 @@ class TestSingleDrone:
     @pytest.fixture(scope="class")
     def steps(self) -> dict[int, tuple[float, float]]:
         scales = (1, 15, 30, 45, 60)
-        angle = turn_alone(DELIVERED, [Trial((10, 0, 0), inertia=scale) for scale in scales], INERTIA, MASS, 6.0)
-        peaks = {scale: rise_and_overshoot(angle[:, n, 0], 10.0) for n, scale in enumerate(scales)}
+        hover = float(crazyflie.motor_command(DELIVERED.motor_curve, np.array(MASS * 9.81 / 4)))
+        drone = Body(np.array(INERTIA), hover, arm=0.046, yaw_per_thrust=0.006, drones=1)
+        angle = simulate_attitude(drone, DELIVERED, [Trial((10, 0, 0), inertia=scale) for scale in scales], 6.0)
+        share = angle[..., 0] / 10
+        rise = np.argmax(share >= 0.632, axis=0) * crazyflie.PERIOD
+        overshoot = 100 * (share.max(axis=0) - 1)
+        peaks = {scale: (float(rise[n]), float(overshoot[n])) for n, scale in enumerate(scales)}
         self.__class__.angle = angle
         return peaks
 

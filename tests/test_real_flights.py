@@ -18,10 +18,10 @@ from flights_made import COLUMNS, Truth, fly, write
 
 from mjxball.control.crazyflie import PERIOD
 from mjxball.errors import InputError
-from mjxball.rig import flight_cascade, flight_thrust
-from mjxball.rig.flight_fit import fit_rotation, track_of
-from mjxball.rig.flights import Flight, find_flights, read_flight
-from mjxball.rig.real_flights import FITTED, Study, study, to_json
+from nanobench import cascade, lift
+from nanobench.flights import Flight, find_flights, read_flight
+from nanobench.rotation import fit_rotation, track_of
+from nanobench.study import FITTED, Study, study, to_json
 
 TRUTH = Truth()
 SCRIPT = REPOSITORY / "benchmarks" / "real_flights.py"
@@ -72,26 +72,26 @@ def test_the_fit_recovers_the_simulated_drone(flights: list[Flight]) -> None:
 
 
 def test_force_over_mass_and_its_exponents(flights: list[Flight]) -> None:
-    lifts = {flight.name: flight_thrust.lift_of(flight, TRUTH.lag, TRUTH.delay * PERIOD) for flight in flights}
-    models = flight_thrust.compare(lifts, {})
-    factor = flight_thrust.nominal_factor(models)
+    lifts = {flight.name: lift.lift_of(flight, TRUTH.lag, TRUTH.delay * PERIOD) for flight in flights}
+    models = lift.compare(lifts, {})
+    factor = lift.nominal_factor(models)
     assert factor == pytest.approx(TRUTH.force_over_mass, rel=0.005)  # exact but for rows every 10 ms
     worse = {name: np.abs(fit.left[flights[0].name]).mean() for name, fit in models.items()}
     assert min(worse, key=worse.__getitem__) == "factor x cubic 2.1"
-    exponents = flight_thrust.elasticities(list(lifts.values()))
+    exponents = lift.elasticities(list(lifts.values()))
     # A force of command times voltage alone has one exponent for both, and compensation leaves none.
     assert exponents["command"][0] == pytest.approx(exponents["voltage"][0], abs=0.1)
     assert exponents["voltage, compensated"][0] == pytest.approx(0.0, abs=0.05)
 
 
 def test_the_cascade_repeats_its_own_commands(flights: list[Flight]) -> None:
-    replayed = flight_cascade.replay(flights[0])
-    errors, sizes = flight_cascade.errors(replayed), flight_cascade.sizes(replayed)
+    replayed = cascade.replay(flights[0])
+    errors, sizes = cascade.errors(replayed), cascade.sizes(replayed)
     # Derivative terms of a signal known every 10 ms instead of 2 ms; the integrals' levels are taken out.
     for part in ("roll", "pitch"):
         assert np.median(errors[part]) < 0.4 * np.median(sizes[part])
     assert np.median(errors["collective"]) < 20  # of 65535: linear interpolation of thrust and voltage
-    offsets = flight_cascade.compensation(flights[0])
+    offsets = cascade.compensation(flights[0])
     assert abs(offsets["2.1"]) < 20 < abs(offsets["2.1-legacy"])
 
 

@@ -16,10 +16,8 @@ from mjxball.config._crazyflie import autopilot, rig
 from mjxball.errors import InputError
 from mjxball.fly.preflight import read_gains
 from mjxball.rig import gains as command
-from mjxball.rig.axis import axes
-from mjxball.rig.design import ASKED, design, gains_of, stock, worst_margins
-from mjxball.rig.loop import Gains, is_stable, margins
-from mjxball.rig.response import Trial, turn
+from mjxball.rig.attitude import Trial, axes, pair, simulate
+from mjxball.rig.design import REQUIREMENTS, Gains, delivered_gains, design, gains_of, is_stable, margins, worst_margins
 
 PAIR = preset("flight")
 ROLL, PITCH, YAW = axes(PAIR)
@@ -72,27 +70,27 @@ class TestMargins:
         found, lag = one.nominal, PAIR.plant.rotor_lag
         for factor in (found.gain_up, 1 / found.gain_down):
             inside, outside = (one.axis.gain * factor**power for power in (0.95, 1.05))
-            assert is_stable(one.gains, inside, lag, ASKED.delay)
-            assert not is_stable(one.gains, outside, lag, ASKED.delay)
-        assert is_stable(one.gains, one.axis.gain, lag, ASKED.delay + 0.95 * found.delay)
-        assert not is_stable(one.gains, one.axis.gain, lag, ASKED.delay + 1.05 * found.delay)
+            assert is_stable(one.gains, inside, lag, REQUIREMENTS.delay)
+            assert not is_stable(one.gains, outside, lag, REQUIREMENTS.delay)
+        assert is_stable(one.gains, one.axis.gain, lag, REQUIREMENTS.delay + 0.95 * found.delay)
+        assert not is_stable(one.gains, one.axis.gain, lag, REQUIREMENTS.delay + 1.05 * found.delay)
 
     def test_delivered_gains_have_none_left(self) -> None:
-        assert margins(stock(ROLL), ROLL.gain, 0.05, 0.01).phase < 3
-        assert worst_margins(stock(ROLL), ROLL).phase == 0
-        assert worst_margins(stock(YAW), YAW).phase == 0
+        assert margins(delivered_gains(ROLL), ROLL.gain, 0.05, 0.01).phase < 3
+        assert worst_margins(delivered_gains(ROLL), ROLL).phase == 0
+        assert worst_margins(delivered_gains(YAW), YAW).phase == 0
 
 
 class TestDesign:
     def test_margins_are_kept(self, designs) -> None:
         for one in designs:
             if one.axis.name == "pitch":
-                assert one.gains == stock(one.axis)
+                assert one.gains == delivered_gains(one.axis)
                 continue
-            assert one.nominal.phase >= ASKED.phase
-            assert min(one.nominal.gain_up, one.nominal.gain_down) >= ASKED.gain
-            assert one.worst.phase >= ASKED.worst_phase
-            assert min(one.worst.gain_up, one.worst.gain_down) >= ASKED.worst_gain
+            assert one.nominal.phase >= REQUIREMENTS.phase
+            assert min(one.nominal.gain_up, one.nominal.gain_down) >= REQUIREMENTS.gain
+            assert one.worst.phase >= REQUIREMENTS.worst_phase
+            assert min(one.worst.gain_up, one.worst.gain_down) >= REQUIREMENTS.worst_gain
 
     @pytest.mark.parametrize("drone", ["2.1-older", "thrust-upgrade", "brushless"])
     def test_presets_fly_them(self, drone: str) -> None:
@@ -113,7 +111,7 @@ class TestResponse:
     def test_delivered_gains_diverge_and_these_do_not(self) -> None:
         trials = [Trial((8, 0, 0), lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
         stocked, designed = (
-            turn(PAIR, law, trials)[..., 0]
+            simulate(pair(PAIR), law, trials)[..., 0]
             for law in (Autopilot(kind="crazyflie", motor_curve=PAIR.autopilot.motor_curve), PAIR.autopilot)
         )
         nominal = self.CORNERS.index((0.05, 1.0))
@@ -129,7 +127,7 @@ class TestResponse:
         moment = (0.5 * 0.0075 * 9.81 * 0.08, 0.0, 0.0)
         steps = [Trial((8, 0, 0), lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
         loads = [Trial(torque=moment, lag=lag, inertia=inertia, delay=0.01) for lag, inertia in self.CORNERS]
-        before, now = (turn(PAIR, law, steps + loads)[..., 0] for law in (INTERIM, PAIR.autopilot))
+        before, now = (simulate(pair(PAIR), law, steps + loads)[..., 0] for law in (INTERIM, PAIR.autopilot))
         count = len(self.CORNERS)
         assert (now[:, :count].max(axis=0) <= before[:, :count].max(axis=0) + 0.01).all()
         assert (now[:, count:].max(axis=0) < 0.75 * before[:, count:].max(axis=0)).all()

@@ -21,8 +21,8 @@ from mjxball.physics.engine import Load
 from mjxball.physics.step import start_state
 from mjxball.physics.stepper import make_stepper
 from mjxball.rig import identify as command
-from mjxball.rig.axis import inertia_about_o
-from mjxball.rig.fit import Found, identify
+from mjxball.rig.attitude import inertia_about_o
+from mjxball.rig.fit import Estimate, identify
 from mjxball.rig.gains import parameter_file
 from mjxball.rig.log import make_log, read_log
 
@@ -85,7 +85,7 @@ def logs() -> dict[str, dict[str, np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
-def found(logs) -> dict[str, Found]:
+def found(logs) -> dict[str, Estimate]:
     return {
         name: identify(
             PAIR, make_log(log["time"], log["setpoints"], log["time"], [log["states"][:, 0], log["states"][:, 1]])
@@ -136,11 +136,11 @@ def test_too_short_a_flight_is_refused(logs) -> None:
         identify(PAIR, short)
 
 
-SOME = Found(1.05, COMPUTED + 4e-4, 0.06, 0.02, (0.001, 0.01, 0.02, 0.001), 0.8, 19)
+SOME = Estimate(1.05, COMPUTED + 4e-4, 0.06, 0.02, (0.001, 0.01, 0.02, 0.001), 0.8, 19)
 
 
 class TestPlantFile:
-    def write(self, place: Path, found: Found = SOME) -> Path:
+    def write(self, place: Path, found: Estimate = SOME) -> Path:
         path = place / "plant.json"
         path.write_text(json.dumps({"preset": "flight", **command.plant_settings(PAIR, found)}))
         return path

@@ -27,8 +27,8 @@ from mjxball.fly.twin.virtual import STEP
 from mjxball.policy import load_file
 from mjxball.policy.shipped import shipped_policy
 from mjxball.rig import identify as command
-from mjxball.rig.axis import inertia_about_o
-from mjxball.rig.fit import Found, identify
+from mjxball.rig.attitude import inertia_about_o
+from mjxball.rig.fit import Estimate, identify
 from mjxball.rig.log import Log, read_log
 
 CONTENTS = load_file(shipped_policy("flight"))
@@ -90,7 +90,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
-def identified(path: Path) -> Found:
+def identified(path: Path) -> Estimate:
     """What is found in the log `path`, by what it says that flew."""
     log = read_log(path)
     return identify(command.flown_with(CONFIG, log, None, path), log)
@@ -125,7 +125,7 @@ def test_the_twins_own_numbers_are_found(name: str, logs: dict[str, Path]) -> No
     assert -0.002 < found.lag + found.delay - wanted[2] - wanted[3] < (0.005 if case.exact else 0.015)
 
 
-def assert_near(found: Found, case: Case) -> None:
+def assert_near(found: Estimate, case: Case) -> None:
     """Each number of `found` within three deviations and the model's error of the truth."""
     wanted, spread = truth(case), np.array([*found.spread, found.uneven_spread])
     errors = np.array([found.thrust, found.inertia, found.lag, found.delay, found.uneven]) - wanted

@@ -23,10 +23,9 @@ from mjxball.fly.card import with_curve
 from mjxball.fly.flown import one_curve, own_curve
 from mjxball.fly.preflight import read_gains
 from mjxball.fly.thrust import CurveName
-from mjxball.rig.axis import inertia_about_o
-from mjxball.rig.fit import Found, identify
+from mjxball.rig.attitude import inertia_about_o
+from mjxball.rig.fit import Estimate, identify, pair_mass
 from mjxball.rig.log import Log, read_log
-from mjxball.rig.model import pair_mass
 
 LEAST_INERTIA = 1e-6  # of a drone about its own centre [kg m2]
 DELAY_EITHER_WAY = 0.01  # [s] by which training varies the delay that was found
@@ -140,7 +139,7 @@ def with_gains(settings: config.Config, gains: PairGains) -> config.Config:
     return dataclasses.replace(settings, autopilot=law)
 
 
-def average(found: Sequence[Found]) -> Found:
+def average(found: Sequence[Estimate]) -> Estimate:
     """One result from several logs, each weighted by its own precision."""
     values = np.array([[one.thrust, one.inertia, one.lag, one.delay, one.uneven] for one in found])
     weights = 1 / np.array([[*one.spread, one.uneven_spread] for one in found]) ** 2
@@ -148,10 +147,10 @@ def average(found: Sequence[Found]) -> Found:
     *s, uneven_spread = map(float, np.sqrt(1 / weights.sum(axis=0)))
     misfit = float(np.sqrt(np.mean([one.misfit**2 for one in found])))
     windows = sum(one.windows for one in found)
-    return Found(thrust, inertia, lag, delay, (s[0], s[1], s[2], s[3]), misfit, windows, uneven, uneven_spread)
+    return Estimate(thrust, inertia, lag, delay, (s[0], s[1], s[2], s[3]), misfit, windows, uneven, uneven_spread)
 
 
-def plant_settings(settings: config.Config, found: Found) -> dict[str, Any]:
+def plant_settings(settings: config.Config, found: Estimate) -> dict[str, Any]:
     """Settings by path that make `settings` the plant that was found.
 
     Inertia beyond what masses and places explain is given to the drones, half to each, about roll and yaw.
@@ -179,7 +178,7 @@ def plant_settings(settings: config.Config, found: Found) -> dict[str, Any]:
     }
 
 
-def report(settings: config.Config, found: Found) -> str:
+def report(settings: config.Config, found: Estimate) -> str:
     """What was found with one standard deviation by the fit's own account, a line each."""
     a, b = settings.autopilot.motor_curve
     stronger = config.apply_overrides(settings, {"autopilot.motor_curve": (found.thrust * a, found.thrust * b)})

@@ -25,7 +25,7 @@ from scipy.signal import lfilter
 from mjxball.control import motors, rotations
 from mjxball.control.mixer import PLACES, SPIN
 from mjxball.control.motors import MOTORS
-from mjxball.rig.flights import ROW, Array, Flight
+from nanobench.flights import ROW, Array, Flight
 
 MOTOR = MOTORS["2.1"]  # nominal curve: the one whose compensation the flights' firmware computed
 TICK = 0.002  # [s] of the grid that forces are filtered on

@@ -12,8 +12,8 @@ import numpy as np
 from mjxball.config import Autopilot
 from mjxball.control import crazyflie, motors
 from mjxball.control.motors import MOTORS
-from mjxball.rig.flight_fit import MOTOR, SIGNS
-from mjxball.rig.flights import ROW, Array, Flight
+from nanobench.flights import ROW, Array, Flight
+from nanobench.rotation import MOTOR, SIGNS
 
 WINDOW = 0.5  # [s] whose rms is one sample of an error
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.signal import lfilter
 
 from mjxball.control import rotations
-from mjxball.rig.flight_fit import Rotation, Track, lagged
-from mjxball.rig.flights import GRAVITY, ROW, Array, Flight
+from nanobench.flights import GRAVITY, ROW, Array, Flight
+from nanobench.rotation import Rotation, Track, lagged
 
 HORIZONS = (0.1, 0.25, 0.5)  # [s]
 HORIZON_ROWS = [round(horizon / ROW) for horizon in HORIZONS]

@@ -10,10 +10,10 @@ import numpy as np
 from mjxball import config
 from mjxball.control.mixer import lever
 from mjxball.errors import InputError
-from mjxball.rig import flight_cascade, flight_thrust
-from mjxball.rig.flight_fit import AXES, POLE, POLES, Rotation, fit_rotation, track_of
-from mjxball.rig.flight_forecast import HORIZON_ROWS, HORIZONS, Forecast, Memory, choose_memory, forecast
-from mjxball.rig.flights import Array, Flight, find_flights, read_flight
+from nanobench import cascade, lift
+from nanobench.flights import Array, Flight, find_flights, read_flight
+from nanobench.forecast import HORIZON_ROWS, HORIZONS, Forecast, Memory, choose_memory, forecast
+from nanobench.rotation import AXES, POLE, POLES, Rotation, fit_rotation, track_of
 
 FITTED = ("B3_figure8_slow_rep2", "B10_lissajous_slow_rep1")
 QUANTILES = (0.5, 0.9, 0.99)
@@ -32,9 +32,9 @@ class Study(NamedTuple):
     memory: Memory
     unbalanced: Memory
     forecasts: dict[str, Forecast]
-    cascades: dict[str, flight_cascade.Replayed]
-    lifts: dict[str, flight_thrust.Lift]
-    thrust: dict[str, flight_thrust.Fit]
+    cascades: dict[str, cascade.Replayed]
+    lifts: dict[str, lift.Lift]
+    thrust: dict[str, lift.Fit]
 
 
 def study(directory: Path, fitted: tuple[str, ...] = FITTED) -> Study:
@@ -53,7 +53,7 @@ def study(directory: Path, fitted: tuple[str, ...] = FITTED) -> Study:
     others = {f"filter pole {pole:g}": fit_rotation(mine, pole) for pole in POLES}
     others["held-out flights alone"] = fit_rotation(theirs)
     memory, unbalanced = choose_memory([flights[name] for name in fitted], mine, fit)
-    lifts = {name: flight_thrust.lift_of(flight, fit.lag, fit.delay) for name, flight in flights.items()}
+    lifts = {name: lift.lift_of(flight, fit.lag, fit.delay) for name, flight in flights.items()}
     return Study(
         flights=flights,
         fitted=list(fitted),
@@ -63,9 +63,9 @@ def study(directory: Path, fitted: tuple[str, ...] = FITTED) -> Study:
         memory=memory,
         unbalanced=unbalanced,
         forecasts={name: forecast(flights[name], tracks[name], fit, memory, unbalanced) for name in flights},
-        cascades={name: flight_cascade.replay(flight) for name, flight in flights.items() if flight.has_cascade},
+        cascades={name: cascade.replay(flight) for name, flight in flights.items() if flight.has_cascade},
         lifts=lifts,
-        thrust=flight_thrust.compare({n: lifts[n] for n in fitted}, {n: lifts[n] for n in held_out}),
+        thrust=lift.compare({n: lifts[n] for n in fitted}, {n: lifts[n] for n in held_out}),
     )
 
 
@@ -89,7 +89,7 @@ def inertia_over_mass(found: Study, fit: Rotation) -> Array:
     """(2,) moment of inertia about x and y over mass [m2], from torque over inertia and force over mass."""
     plant = config.preset("flight").plant
     side = lever(plant.arm, plant.layout)
-    return side * flight_thrust.nominal_factor(found.thrust) / fit.gain[:2]
+    return side * lift.nominal_factor(found.thrust) / fit.gain[:2]
 
 
 def plant_inertia_over_mass() -> Array:
@@ -102,7 +102,7 @@ def ranges(found: Study) -> dict[str, Any]:
     """What training should draw: from the least to the largest of all fits with one standard error."""
     fits = [found.fit, *found.others.values()]
     share = EMPTY_BATTERY / FULL_BATTERY
-    both = [flight_thrust.elasticities([found.lifts[n] for n in names]) for names in (found.fitted, found.held_out)]
+    both = [lift.elasticities([found.lifts[n] for n in names]) for names in (found.fitted, found.held_out)]
 
     def loss(name: str) -> list[float]:
         return sorted(1 - share ** side[name][0] for side in both if name in side)
@@ -167,16 +167,16 @@ def _cascade(found: Study, name: str) -> dict[str, Any]:
         return {part: np.quantile(values, QUANTILES).tolist() for part, values in errors.items()}
 
     return {
-        "windows": len(flight_cascade.errors(replayed)["m1"]),
-        "errors_pwm": table(flight_cascade.errors(replayed)),
-        "errors_with_integrals_of_the_whole_flight_pwm": table(flight_cascade.errors(replayed, level=False)),
-        "commands_pwm": table(flight_cascade.sizes(replayed)),
-        "mean_pwm_if_compensated_for": flight_cascade.compensation(found.flights[name]),
+        "windows": len(cascade.errors(replayed)["m1"]),
+        "errors_pwm": table(cascade.errors(replayed)),
+        "errors_with_integrals_of_the_whole_flight_pwm": table(cascade.errors(replayed, level=False)),
+        "commands_pwm": table(cascade.sizes(replayed)),
+        "mean_pwm_if_compensated_for": cascade.compensation(found.flights[name]),
     }
 
 
 def _thrust(found: Study) -> dict[str, Any]:
-    def left(fit: flight_thrust.Fit) -> dict[str, dict[str, Any]]:
+    def left(fit: lift.Fit) -> dict[str, dict[str, Any]]:
         return {
             name: {"mean": float(rest.mean()), "quantiles": np.quantile(np.abs(rest), QUANTILES).tolist()}
             for name, rest in fit.left.items()
@@ -188,7 +188,5 @@ def _thrust(found: Study) -> dict[str, Any]:
             model: {"coefficients": fit.coefficients.tolist(), "errors": fit.errors.tolist(), "left_m_s2": left(fit)}
             for model, fit in found.thrust.items()
         },
-        "exponents": {
-            key: flight_thrust.elasticities([found.lifts[n] for n in names]) for key, names in groups.items()
-        },
+        "exponents": {key: lift.elasticities([found.lifts[n] for n in names]) for key, names in groups.items()},
     }

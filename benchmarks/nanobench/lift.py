@@ -8,8 +8,8 @@ import numpy as np
 
 from mjxball.control import motor_curves, motors
 from mjxball.control.motors import FULL, MOTORS
-from mjxball.rig.flight_fit import TICK, lagged
-from mjxball.rig.flights import ROW, Array, Flight
+from nanobench.flights import ROW, Array, Flight
+from nanobench.rotation import TICK, lagged
 
 OLDER = motor_curves.OLDER  # [N] a p^2 + b p without voltage, `Autopilot.motor_curve`
 LINEAR = 0.12  # [N] at full command

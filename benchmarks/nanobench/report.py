@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from mjxball.plotting import pyplot
-from mjxball.rig.flight_fit import AXES
-from mjxball.rig.flight_forecast import HORIZON_ROWS
-from mjxball.rig.flights import ROW, Array
-from mjxball.rig.real_flights import Study
+from nanobench.flights import ROW, Array
+from nanobench.forecast import HORIZON_ROWS
+from nanobench.rotation import AXES
+from nanobench.study import Study
 
 LABELS = {"model": "model", "constant rate": "constant rate", "model, no balance": "no balance"}
 COLOURS = {"measured": "#222222", "model": "#2f5fa8", "constant rate": "#b3382c", "model, no balance": "#8a8a8a"}
@@ -21,7 +21,7 @@ SHOWN = (HORIZON_ROWS[0], HORIZON_ROWS[1])  # rows ahead at which rates and atti
 
 
 def tables(data: dict[str, Any]) -> str:
-    """What `real_flights.to_json` holds, for the terminal."""
+    """What `study.to_json` holds, for the terminal."""
     parts = [_fit_lines(data), _forecast_lines(data), _cascade_lines(data), _thrust_lines(data), _range_lines(data)]
     return "\n\n".join("\n".join(part) for part in parts)
 

@@ -1,0 +1,1 @@
+"""The comparison with real flights of NanoBench; `benchmarks/real_flights.py` runs it."""
