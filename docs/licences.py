@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
-"""Write docs/licences.md: the licence of every package in constraints.txt, from the metadata of what is installed.
+"""Write docs/licences.csv: the licence of every package in constraints.txt, from the metadata of what is installed.
 
 `python docs/licences.py`, in an environment with the extras `dev` and `fly`. It fails if one is not installed.
 """
 
 from __future__ import annotations
 
+import csv
 import re
 import sys
 import tomllib
@@ -16,19 +17,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 REPOSITORY = Path(__file__).parents[1]
-PAGE = REPOSITORY / "docs" / "licences.md"
-HEAD = """# Licences of what mjxball installs
-
-mjxball itself is Apache-2.0. `python docs/licences.py` writes this page from the metadata of the packages that
-`constraints.txt` pins; `tests/test_licences.py` compares the two.
-
-**cflib is under the GPL**, so it is an extra (`fly`) that must be asked for, and only the code that opens a radio
-imports it. The GPL applies to distributions of mjxball together with cflib. docutils, which only builds these pages, is
-in the public domain or under BSD licences, except for an Emacs mode under the GPL that is not installed.
-
-| package | licence | installed by |
-|---|---|---|
-"""
+LIST = REPOSITORY / "docs" / "licences.csv"
 
 
 def plain(name: str) -> str:
@@ -82,16 +71,16 @@ def installers() -> dict[str, set[str]]:
     return {"base": closure(project["dependencies"]), **{name: closure(texts) for name, texts in extras.items()}}
 
 
-def page() -> str:
-    """The page's text."""
+def listed() -> list[tuple[str, str, str]]:
+    """Every pinned package, its licence, and what installs it."""
     by = installers()
-    lines = []
-    for name in pinned():
-        asked = [extra for extra, packages in by.items() if plain(name) in packages]
-        lines.append(f"| {name} | {licence(name)} | {', '.join(asked)} |")
-    return HEAD + "\n".join(lines) + "\n"
+    return [
+        (name, licence(name), ", ".join(extra for extra, packages in by.items() if plain(name) in packages))
+        for name in pinned()
+    ]
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page())
-    sys.stdout.write(f"{PAGE}\n")
+    with LIST.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([("package", "licence", "installed by"), *listed()])
+    sys.stdout.write(f"{LIST}\n")

@@ -1,7 +1,8 @@
-"""docs/licences.md names the licence of every pinned package; the GPL stays out of what installs unasked."""
+"""docs/licences.csv names the licence of every pinned package; the GPL stays out of what installs unasked."""
 
 from __future__ import annotations
 
+import csv
 import importlib.util
 from importlib import metadata
 from types import ModuleType
@@ -22,16 +23,16 @@ def licences() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def listed(licences: ModuleType) -> dict[str, tuple[str, str]]:
-    """Package -> (licence, who installs it), as the page says."""
-    rows = [line.strip("| ").split(" | ") for line in licences.PAGE.read_text().splitlines() if line.startswith("| ")]
-    return {name: (licence, asked) for name, licence, asked in rows[1:]}
+    """Package -> (licence, who installs it), as the list says."""
+    with licences.LIST.open(encoding="utf-8", newline="") as file:
+        return {name: (licence, asked) for name, licence, asked in list(csv.reader(file))[1:]}
 
 
 def test_every_pinned_package_is_listed_and_no_other(licences: ModuleType, listed: dict[str, tuple[str, str]]) -> None:
     assert list(listed) == licences.pinned()
 
 
-def test_the_page_says_what_the_installed_packages_say(
+def test_the_list_says_what_the_installed_packages_say(
     licences: ModuleType, listed: dict[str, tuple[str, str]]
 ) -> None:
     """Of the same version: later ones may word it otherwise."""
