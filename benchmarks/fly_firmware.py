@@ -30,10 +30,8 @@ from typing import Any
 import numpy as np
 
 from mjxball.config import preset
-from mjxball.fly.card import goal_of, times_of
-from mjxball.fly.controller import Controller
-from mjxball.fly.limits import Limits
-from mjxball.fly.protocols import FlightSettings
+from mjxball.fly.card import Controller, goal_of, times_of
+from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import (
     FAULT_KINDS,
@@ -44,7 +42,7 @@ from mjxball.fly.twin.conditions import (
     Surroundings,
     drone_kind,
 )
-from mjxball.fly.twin.virtual import Moment, Notes, World
+from mjxball.fly.twin.virtual import MemoryLog, Moment, World
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policy
@@ -68,7 +66,7 @@ def world_of(path: Path, seconds: float, curve: str = "linear", record: bool = T
     drone = drone_kind("2.1", curve)
     surroundings = Surroundings(**around)
     return World(
-        policy, settings_of(policy, seconds), kind=drone, around=surroundings, notes=Notes(record), settle=SETTLE
+        policy, settings_of(policy, seconds), kind=drone, around=surroundings, log=MemoryLog(record), settle=SETTLE
     )
 
 
@@ -133,7 +131,7 @@ def hover(path: Path, name: str, around: dict[str, Any], seed: int) -> list[Row]
     late = [moment for moment in flown if moment.time - flown[0].time >= SETTLED]
     goal = world.flight._origin + np.array(world.settings.goal)
     error = np.array([moment.position for moment in late]) - goal
-    ticks = [r for r in world.notes.records if r["kind"] == "tick" and r["state"] == "fly"]
+    ticks = [r for r in world.log.records if r["kind"] == "tick" and r["state"] == "fly"]
     sent = np.array([[one[:2] for one in record["sent"]] for record in ticks if record["t"] >= late[0].time])
     attitude = np.degrees([moment.roll for moment in late]).mean()
     steady = np.abs(sent.mean(axis=0) - np.array([attitude, 0.0]))
@@ -165,7 +163,7 @@ def stand_start(path: Path, number: int) -> list[Row]:
         settings_of(policy, 60.0),
         conditions=conditions,
         around=Surroundings(seed=number),
-        notes=Notes(False),
+        log=MemoryLog(False),
         settle=SETTLE,
     )
     place = [np.array(part) for part in ([0.0, 0.0, world.settings.goal[2] + height], [0.0] * 3, [roll, 0.0, 0.0])]
@@ -238,7 +236,7 @@ def gap(seconds: float) -> Injection:
     def inject(world: World, drone: int) -> None:
         for number in range(2):
             world.disturb(number, silent_down=True)
-        world.flight.notes.note("gap", world.now)
+        world.flight.note("gap", world.now)
         world.later = (world.now + seconds, lambda: [world.disturb(n, silent_down=False) for n in range(2)])  # type: ignore[attr-defined]
 
     return inject

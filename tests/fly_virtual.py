@@ -11,15 +11,15 @@ from mjxball import config as configs
 from mjxball.control.firmware_gains import to_json
 from mjxball.fly import card, packets
 from mjxball.fly.command import CommandMap
-from mjxball.fly.pair import Rig
-from mjxball.fly.protocols import FlightSettings
+from mjxball.fly.limits import FlightSettings
+from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin import virtual
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, DroneKind, Surroundings
 from mjxball.fly.twin.physics import Pair, StandIn, StandInPlant
-from mjxball.fly.twin.virtual import Notes, VirtualLink
+from mjxball.fly.twin.virtual import MemoryLog, VirtualLink
 from mjxball.policy import Policy, PolicyFile
 
-__all__ = ["ARMED_BY_HAND", "MASS", "Notes", "VirtualLink", "World", "log_header", "thrusts"]
+__all__ = ["ARMED_BY_HAND", "MASS", "MemoryLog", "VirtualLink", "World", "log_header", "thrusts"]
 MASS = 0.07
 ARMED_BY_HAND = dataclasses.replace(DELIVERED, auto_arm=False)
 
@@ -33,7 +33,7 @@ class World(virtual.World):
         kind: DroneKind = DELIVERED,
         contents: PolicyFile | None = None,
         physics: Pair | None = None,
-        notes: Any = None,
+        log: Any = None,
         around: Surroundings = QUIET,
     ):
         policy = Policy(contents, "given") if contents else Policy.load(TRANSPORT)
@@ -42,7 +42,7 @@ class World(virtual.World):
         maps = None if contents else (CommandMap(carried_mass=MASS / 2),) * 2
         settings = settings or FlightSettings(seconds=2.0)
         super().__init__(
-            policy, settings, kind=kind, around=around, physics=physics or StandIn(plant), maps=maps, notes=notes
+            policy, settings, kind=kind, around=around, physics=physics or StandIn(plant), maps=maps, log=log
         )
 
 

@@ -17,8 +17,7 @@ from mjxball.config._crazyflie import DRONES, autopilot, rig
 from mjxball.control import crazyflie, mixer
 from mjxball.errors import InputError
 from mjxball.fly import packets
-from mjxball.fly.command import CommandMap, to_setpoint
-from mjxball.fly.thrust import ForceCurve
+from mjxball.fly.command import CommandMap, ForceCurve, to_setpoint
 
 STOCK = Autopilot(kind="crazyflie")
 LEVEL, STILL = np.zeros(3), np.zeros(3)

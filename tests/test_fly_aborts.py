@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from fly_virtual import World, thrusts
 
-from mjxball.fly.maneuver import Times
+from mjxball.fly.limits import FlightSettings, Times
 from mjxball.fly.packets import THRUST_CEILING
-from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import Event, State
 
 
@@ -120,7 +119,7 @@ def test_any_fault_brings_both_down(fault: Callable[[World, int], None], number:
     fault(world, number)
     world.fly_for(SECONDS + SAFE_WITHIN)
     assert world.flight.supervisor.state is State.DONE
-    assert world.notes.transitions()[4] == first
+    assert world.log.transitions()[4] == first
     cause = world.flight.supervisor.cause
     assert (cause.event if cause else None) is event
     world.advance(2.5)  # beyond the firmware's own watchdog
@@ -161,7 +160,7 @@ def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> No
     world.fly_until(State.STOP)
     # It cannot be told from one that only is not heard, but for the stick that tips: 100 ms to miss it, then its fall.
     assert world.now - began < 0.6
-    assert world.notes.transitions()[4:6] == ["hold", "stop"]
+    assert world.log.transitions()[4:6] == ["hold", "stop"]
     world.fly_until(State.DONE)
     assert world.running() == [False, False]
 
@@ -194,7 +193,7 @@ def test_a_gap_in_the_states_is_flown_through(seconds: float) -> None:
     for number in range(2):
         world.disturb(number, silent_down=False)
     world.fly_until(State.DONE)
-    assert world.notes.transitions() == ["arm", "spin", "ramp", "fly", "hold", "fly", "land", "stop", "done"]
+    assert world.log.transitions() == ["arm", "spin", "ramp", "fly", "hold", "fly", "land", "stop", "done"]
     assert world.flight.supervisor.cause is None
     assert world.flight.lifted
 

@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjxball.fly import command
-from mjxball.fly.command import CommandMap
+from mjxball.fly.command import LINEAR, OLDER, CommandMap, ForceCurve
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, PacketError
-from mjxball.fly.thrust import LINEAR, OLDER, ForceCurve
 
 PAPER = CommandMap(law="paper")
 CALIBRATED = CommandMap()

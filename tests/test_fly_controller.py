@@ -11,12 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjxball.control import observation, rotations
-from mjxball.fly import loop, pair
-from mjxball.fly.card import config_of
-from mjxball.fly.controller import Controller
+from mjxball.fly import loop
+from mjxball.fly.card import Controller, config_of
 from mjxball.fly.loop import Metronome
 from mjxball.fly.packets import DroneState, pack_state, unpack_state
-from mjxball.fly.pair import Rig
+from mjxball.fly.telemetry import Rig, object_state
 from mjxball.physics.engine import PlantState
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.sim.closed_loop import ClosedLoop
@@ -44,7 +43,7 @@ def test_the_objects_state_is_found_from_both_drones(
 ) -> None:
     rig = Rig((0.4 * share, 0.0, 0.0), (-0.4 * (1 - share), 0.0, 0.0))
     truth = [np.array(part) for part in (position, euler, velocity, rates)]
-    found = pair.object_state(drones(rig, *truth), rig)
+    found = object_state(drones(rig, *truth), rig)
     np.testing.assert_allclose(found.position, position, atol=1e-12)
     np.testing.assert_allclose(found.velocity, velocity, atol=1e-12)
     np.testing.assert_allclose(rotations.euler_from_matrix(found.matrix), euler, atol=1e-12)
@@ -67,7 +66,7 @@ def test_a_flight_of_the_pilot_is_a_flight_of_the_simulation() -> None:
     follower.reset()
     for _ in range(20):
         position, euler, velocity, rates = (0.3 * random.normal(size=3) for _ in range(4))
-        state = pair.object_state(drones(pilot_rig(contents), position, euler, velocity, rates), pilot_rig(contents))
+        state = object_state(drones(pilot_rig(contents), position, euler, velocity, rates), pilot_rig(contents))
         flown = controller.step(state, goal)
         matrix = rotations.matrix_from_euler(euler)
         seen = observation.observe(position, matrix, velocity, rates, goal, mount)
@@ -96,7 +95,7 @@ def test_the_wire_costs_little_of_the_observation() -> None:
         wired = [unpack_state(pack_state(state)) for state in exact]
         seen = []
         for states in (exact, wired):
-            now = pair.object_state(states, rig)
+            now = object_state(states, rig)
             seen.append(observation.observe(now.position, now.matrix, now.velocity, now.rates, np.ones(3), mount))
         # 3 mrad of attitude resolution, times the 0.17 m mount and the body rates, is the largest of all.
         assert np.abs(seen[1] - seen[0]).max() < 6e-3
@@ -105,7 +104,7 @@ def test_the_wire_costs_little_of_the_observation() -> None:
 def test_forgetting_starts_anew() -> None:
     contents = load_file(TRANSPORT)
     controller, rig = Controller(Policy(contents, "a")), pilot_rig(contents)
-    state = pair.object_state(drones(rig, *np.full((4, 3), 0.1)), rig)
+    state = object_state(drones(rig, *np.full((4, 3), 0.1)), rig)
     first = controller.step(state, np.ones(3))
     controller.step(state, np.zeros(3))
     controller.reset()

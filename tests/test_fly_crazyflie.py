@@ -14,10 +14,9 @@ from mjxball.control import crazyflie, rotations
 from mjxball.control.constants import plant_constants
 from mjxball.errors import InputError
 from mjxball.fly import card
-from mjxball.fly.command import to_setpoint
-from mjxball.fly.protocols import FlightSettings
+from mjxball.fly.command import ForceCurve, to_setpoint
+from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
-from mjxball.fly.thrust import ForceCurve
 from mjxball.fly.twin.physics import StandIn, make_pair
 from mjxball.policy import load_file
 from mjxball.policy.shipped import shipped_policy
@@ -44,7 +43,7 @@ def test_a_free_flight_rises_stays_and_lands() -> None:
         heights.append(world.state.position[:, 2].mean())
         tilts.append(np.abs(rotations.euler_from_matrix(rotations.matrix_from_quaternion(world.state.quaternion[0]))))
     world.fly_until(State.DONE)
-    assert world.notes.transitions() == ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
+    assert world.log.transitions() == ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
     assert world.flight.supervisor.cause is None
     assert min(heights) > 0.3
     assert max(heights) < 0.55  # copying leaves what the CG does, but holds
@@ -62,7 +61,7 @@ def test_the_papers_stand_lifts_off_rolls_and_comes_down() -> None:
     assert (there[:, :1] == 0).all()
     assert there[:, 2].mean() > 0.005  # the paper's gains and its thrust scale let height drift
     world.fly_until(State.DONE, 40.0)
-    assert world.notes.transitions()[-2:] == ["stop", "done"]
+    assert world.log.transitions()[-2:] == ["stop", "done"]
     assert world.flight.supervisor.cause is None
     world.advance(1.0)
     assert np.abs(world.state.position[:, 2]).max() < 1e-3

@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 
 from mjxball.control.rotations import roll_of_quaternion
-from mjxball.fly.card import goal_of, times_of
-from mjxball.fly.controller import Controller
-from mjxball.fly.limits import Limits
+from mjxball.fly.card import Controller, goal_of, times_of
+from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.packets import FLYING, LOCKED
-from mjxball.fly.protocols import FlightSettings
+from mjxball.fly.spin import curve_of_version
 from mjxball.fly.supervisor import Event, State
-from mjxball.fly.thrust import curve_of_version
 from mjxball.fly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
-from mjxball.fly.twin.virtual import Notes, World
+from mjxball.fly.twin.virtual import MemoryLog, World
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policy
 
@@ -36,7 +34,7 @@ def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, 
         kind=drone_kind(curve=curve),
         around=Surroundings(**around),
         conditions=conditions,
-        notes=Notes(),
+        log=MemoryLog(),
         settle=1.0,
     )
 
@@ -95,7 +93,7 @@ def test_thrust_moves_as_fast_as_the_law_asks(monkeypatch: pytest.MonkeyPatch) -
     world.fly_until(State.FLY)
     pushed(world, monkeypatch, -1.0, 1.0)
     world.fly_for(0.2)
-    ticks = [record["sent"][0].thrust for record in world.notes.records if record["kind"] == "tick"]
+    ticks = [record["sent"][0].thrust for record in world.log.records if record["kind"] == "tick"]
     hover = world.flight.maps[0].hover_thrust
     assert np.abs(np.diff(ticks[-10:])).min() == pytest.approx(2 / 9.81 * hover, rel=0.05)
 
@@ -124,7 +122,7 @@ def test_a_pair_too_heavy_for_its_firmware_is_refused_before_the_ramp() -> None:
     world.flight.spin._variants = heavy
     world.run(30.0)
     assert world.flight.supervisor.cause.event is Event.CURVE_UNKNOWN
-    assert "ramp" not in world.notes.transitions()
+    assert "ramp" not in world.log.transitions()
     assert not world.flight.lifted
 
 

@@ -16,9 +16,9 @@ import pytest
 from command_line import environment
 
 from mjxball.fly.display import RED, Display, lines
+from mjxball.fly.flight import View
 from mjxball.fly.limits import Limits
 from mjxball.fly.packets import ZERO, DroneState
-from mjxball.fly.protocols import View
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 
 pytestmark = pytest.mark.alone  # keys and pictures by the clock

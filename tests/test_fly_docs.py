@@ -7,11 +7,10 @@ import math
 
 from command_line import REPOSITORY
 
-from mjxball.fly import maneuver
+from mjxball.fly import command
 from mjxball.fly.command import CommandMap
-from mjxball.fly.limits import STAND_SPARE, Limits
+from mjxball.fly.limits import STAND_SPARE, Limits, Times
 from mjxball.fly.main import make_parser
-from mjxball.fly.maneuver import Times
 from mjxball.fly.mocap_supervision import MocapLimits
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR
 from mjxball.fly.supervisor import State
@@ -56,7 +55,7 @@ def test_bounds_are_those_of_the_code() -> None:
         "landing speed of the goal": f"{times.land_speed:g} m/s",
         "descent": f"{times.descend_speed:g} m/s for at most {times.descend_limit:g} s",
         "*hold* ends after the last word of a drone by": f"{times.drone_watchdog:g} s",
-        "thrust in *hold* below hover": f"up to {100 * maneuver.GENTLE / maneuver.GRAVITY:.0f} %",
+        "thrust in *hold* below hover": f"up to {100 * command.GENTLE / command.GRAVITY:.0f} %",
         "no good pose of a drone (motion capture)": f"{MocapLimits().lost:g} s",
     }
     rows = [tuple(line.strip("| ").split(" | ")) for line in SUPERVISOR.splitlines() if line.startswith("| ")]

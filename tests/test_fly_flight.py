@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjxball.fly import packets, session
-from mjxball.fly.maneuver import LastKnownState, Times
-from mjxball.fly.protocols import FlightSettings, Variant
+from mjxball.fly.command import LastKnownState, Variant
+from mjxball.fly.limits import FlightSettings, Times
 from mjxball.fly.supervisor import AIRBORNE, Event, Fault, State, Supervisor
 
 NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
@@ -28,7 +28,7 @@ def test_a_flight_from_start_to_end() -> None:
     # The policy's card promises to settle within 2.8 s, but for another plant; 5 cm shows that signs are right.
     np.testing.assert_allclose(there, [0.2, -0.1, 0.5], atol=0.05)
     world.fly_until(State.DONE)
-    assert world.notes.transitions() == NORMAL
+    assert world.log.transitions() == NORMAL
     assert world.flight.supervisor.cause is None
     world.advance(0.05)
     assert world.running() == [False, False]
@@ -44,7 +44,7 @@ def test_a_brushless_pair_is_armed_under_zeros() -> None:
     assert all(drone.firmware.armed for drone in world.drones)
     assert {thrust for _, thrust in thrusts(world, 0)[:-1]} == {0}  # the last one is the first that turns
     world.fly_until(State.DONE)
-    assert world.notes.transitions() == NORMAL
+    assert world.log.transitions() == NORMAL
 
 
 def test_a_dry_run_sends_zeros_and_never_arms() -> None:
@@ -96,7 +96,7 @@ def test_failed_checks_never_turn_a_motor() -> None:
     world = World()
     world.flight.ready, world.flight.refusal = False, "battery"
     world.fly_until(State.DONE)
-    assert world.notes.transitions() == ["stop", "done"]
+    assert world.log.transitions() == ["stop", "done"]
     assert {thrust for _, thrust in thrusts(world, 0)} == {0}
     assert world.flight.supervisor.cause.event is Event.REFUSED
 
@@ -111,7 +111,7 @@ def test_a_watchdog_that_dies_ends_the_flight() -> None:
             beats.append((flying, seen))
             return alive[0]
 
-    world.flight.guard = Guard()
+    world.flight.watchdog = Guard()
     world.fly_until(State.FLY)
     world.fly_for(2.0)
     flying, (trims, height, climb, _) = beats[-1]
@@ -158,7 +158,7 @@ def test_a_bug_in_the_runner_stops_both(monkeypatch: pytest.MonkeyPatch) -> None
             beats.append(flying)
             return True
 
-    world.flight.guard = Listening()
+    world.flight.watchdog = Listening()
     monkeypatch.setattr(world.flight, "tick", broken)
     session.run(world.flight)
     assert len(beats) > 20  # the watchdog is told throughout, or it would end us and send thrust again
@@ -167,7 +167,7 @@ def test_a_bug_in_the_runner_stops_both(monkeypatch: pytest.MonkeyPatch) -> None
     assert world.running() == [False, False]
     assert world.flight.supervisor.state is State.DONE
     assert world.flight.supervisor.cause is not None
-    assert any("RuntimeError: a bug" in record.get("text", "") for record in world.notes.records)
+    assert any("RuntimeError: a bug" in record.get("text", "") for record in world.log.records)
 
 
 def test_asking_twice_to_land_is_no_kill_but_ctrl_c_twice_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,9 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjxball.fly import packets
-from mjxball.fly.connection import Deadlines
+from mjxball.fly.connection import Deadlines, LinkError
 from mjxball.fly.link import Link
-from mjxball.fly.parameters import LinkError
 from mjxball.fly.twin import logs
 from mjxball.fly.twin.conditions import DroneFaults
 from mjxball.fly.twin.drone import garbage

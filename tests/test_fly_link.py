@@ -14,10 +14,9 @@ import pytest
 
 from mjxball.errors import InputError
 from mjxball.fly import packets
-from mjxball.fly.connection import Deadlines
+from mjxball.fly.connection import Deadlines, LinkError
 from mjxball.fly.link import Link
 from mjxball.fly.packets import Setpoint
-from mjxball.fly.parameters import LinkError
 from mjxball.fly.preflight import Preflight, reset_estimator
 from mjxball.fly.telemetry import WRAP, FirmwareClock
 from mjxball.fly.twin.conditions import DroneFaults, LinkFaults

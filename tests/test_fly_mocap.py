@@ -22,16 +22,15 @@ from vrpn_server import Poses, VrpnServer
 
 from mjxball.fly import mocap_source, packets
 from mjxball.fly.flight_log import read
-from mjxball.fly.limits import NAMES
+from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.main import main
 from mjxball.fly.mocap import Mocap, MocapError, MocapSettings, default_rate, ready
 from mjxball.fly.mocap_child import Decimation
 from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose
 from mjxball.fly.packets import Setpoint
-from mjxball.fly.pair import Rig
-from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.supervisor import Event, State
+from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import QUIET, Surroundings
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
@@ -268,11 +267,11 @@ class Seen:
         self.mocap = Mocap(MocapSettings("mock", "", BODIES), self.world.rig.span)
         self.heard: list[list[tuple[np.ndarray, np.ndarray]]] = [[], []]
         self._noise, self._spoil, self._begin = np.random.default_rng(0), spoil, 0.0
-        self.mocap.log(self.world.notes.note)
+        self.mocap.log(self.world.log.note)
         for number, link in enumerate(self.world.links):
             link.pose = lambda packet, number=number: self.heard[number].append(packets.unpack_pose(packet.data))
             self.mocap.feed(number, link)
-        self.world.flight._poses = self
+        self.world.flight._mocap = self
         self.mocap.take(self._frame(), self.world.now)
 
     def _frame(self) -> Frame:
@@ -306,7 +305,7 @@ def moved(pose: Pose | None, far: float) -> Pose | None:
 def test_what_the_drones_get_is_where_they_are() -> None:
     seen = Seen()
     assert seen.fly() == ""
-    assert seen.world.notes.transitions() == ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
+    assert seen.world.log.transitions() == ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
     last = seen.world.state
     for number in range(2):
         position, quaternion = seen.heard[number][-1]
@@ -314,7 +313,7 @@ def test_what_the_drones_get_is_where_they_are() -> None:
         np.testing.assert_allclose(position, last.position[number], atol=1e-3)
         np.testing.assert_allclose(quaternion, last.quaternion[number], atol=1e-3)
         assert len(seen.heard[number]) > 95 * seen.world.now  # 100 Hz
-    poses = [record for record in seen.world.notes.records if record["kind"] == "pose"]
+    poses = [record for record in seen.world.log.records if record["kind"] == "pose"]
     assert {record["drone"] for record in poses} == {"leader", "follower"}
     assert len(poses) <= 2 * (50 * seen.world.now + 1)
     assert all(0 <= record["age"] < 0.02 for record in poses)
@@ -337,14 +336,14 @@ def test_bad_poses_bring_both_down_gently_and_are_never_sent(spoil: Spoil, cause
     found = seen.fly()
     assert found.startswith(cause)
     assert bool(found) is bool(cause)
-    states = seen.world.notes.transitions()
+    states = seen.world.log.transitions()
     assert states[4:] == (["descend", "stop", "done"] if cause else ["land", "stop", "done"])
     assert seen.world.running() == [False, False]
     assert seen.world.state.position[:, 2].max() < 0.01
     for number, heard in enumerate(seen.heard):
         x = np.array([position[0] for position, _ in heard]) - seen.world.rig.span[0] * (number == 0)
         assert np.abs(np.diff(x)).max() < 0.05  # no wrong pose among them: 5 m/s at most
-    gaps = [record for record in seen.world.notes.records if record["kind"] == "gap"]
+    gaps = [record for record in seen.world.log.records if record["kind"] == "gap"]
     assert bool(gaps) is (spoil is not IN_FLIGHT[0][1])
 
 

@@ -17,7 +17,7 @@ from mjxball.commands import evaluate
 from mjxball.control import rotations
 from mjxball.fly import card
 from mjxball.fly.flight_log import Journal
-from mjxball.fly.protocols import FlightSettings
+from mjxball.fly.limits import FlightSettings
 from mjxball.fly.recording import Recording, fly_again, read_recording
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind

@@ -9,13 +9,12 @@ import pytest
 
 from mjxball.control import motors, rotations
 from mjxball.control.motors import MOTORS
-from mjxball.fly import thrust
+from mjxball.fly import command, spin
+from mjxball.fly.limits import EstimatorWatch, UplinkWatch, WatchLimits
 from mjxball.fly.packets import MOTORS as MOTOR_VARIABLES
 from mjxball.fly.packets import VARIANCES, DroneState, Health, health_of
-from mjxball.fly.pair import Rig, object_of_one, object_state
 from mjxball.fly.supervisor import Event
-from mjxball.fly.telemetry import Sample
-from mjxball.fly.watch import EstimatorWatch, UplinkWatch, WatchLimits
+from mjxball.fly.telemetry import Rig, Sample, object_of_one, object_state
 
 RIG = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
 LIMITS = WatchLimits()
@@ -129,16 +128,16 @@ def test_a_drone_that_stopped_listening_is_found_within_the_firmwares_half_secon
 @pytest.mark.parametrize("name", ["2.1", "thrust-upgrade", "brushless"])
 @pytest.mark.parametrize("battery", [3.3, 3.7, 4.2])
 def test_both_firmwares_are_told_apart_by_their_pwm(name: str, battery: float) -> None:
-    motor, sent = MOTORS[name], float(thrust.SPIN_THRUST)
+    motor, sent = MOTORS[name], float(command.SPIN_THRUST)
     pwm = float(motors.compensated(motor, np.float64(sent), np.float64(battery)))
     turned = np.array([1.0, -1.0, 1.0, -1.0]) * 800  # yaw and roll at work do not matter
     compensates = Health((0, 0, 0), tuple((pwm + turned).astype(int)), sent)
     plain = Health((0, 0, 0), tuple((sent + turned).astype(int)), sent)
-    assert thrust.recognise(compensates, battery, motor) == "linear"
-    assert thrust.recognise(plain, battery, motor) == "older"
+    assert spin.recognise(compensates, battery, motor) == "linear"
+    assert spin.recognise(plain, battery, motor) == "older"
     # A voltmeter that is 3 % off changes nothing.
-    assert thrust.recognise(compensates, 1.03 * battery, motor) == "linear"
-    assert thrust.recognise(Health((0, 0, 0), (0, 0, 0, 0), sent), battery, motor) is None
+    assert spin.recognise(compensates, 1.03 * battery, motor) == "linear"
+    assert spin.recognise(Health((0, 0, 0), (0, 0, 0, 0), sent), battery, motor) is None
 
 
 def test_health_is_read_from_whichever_variables_there_are() -> None:

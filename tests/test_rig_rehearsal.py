@@ -15,11 +15,10 @@ from fly_virtual import World, log_header
 from mjxball import cli
 from mjxball import config as configs
 from mjxball.fly import card
+from mjxball.fly.command import CurveName
 from mjxball.fly.flight_log import Journal, read
-from mjxball.fly.limits import NAMES
-from mjxball.fly.protocols import FlightSettings
+from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.supervisor import State
-from mjxball.fly.thrust import CurveName
 from mjxball.fly.twin import conditions as kinds
 from mjxball.fly.twin.conditions import Conditions
 from mjxball.fly.twin.coupled import CoupledPair

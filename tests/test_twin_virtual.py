@@ -10,9 +10,8 @@ from fly_policies import untrained
 
 from mjxball import config as configs
 from mjxball.fly import packets
-from mjxball.fly.card import goal_of, variants
-from mjxball.fly.controller import Controller
-from mjxball.fly.protocols import FlightSettings
+from mjxball.fly.card import Controller, goal_of, variants
+from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind
 from mjxball.fly.twin.virtual import World
@@ -43,7 +42,7 @@ def test_setpoints_and_states_are_late_by_the_links_delay(delay: float) -> None:
     policy = policy_of("flight")
     world = World(policy, around=Surroundings(delay=delay))
     world.advance(0.2)
-    states = [record for record in world.notes.records if record["kind"] == "state"]
+    states = [record for record in world.log.records if record["kind"] == "state"]
     stamps = [int.from_bytes(bytes.fromhex(record["raw"])[1:4], "little") / 1000 for record in states]
     ages = np.array([record["t"] for record in states]) - stamps
     np.testing.assert_allclose(ages, delay, atol=1.1e-3)  # stamps have whole milliseconds
@@ -76,7 +75,7 @@ def test_a_pair_that_locked_itself_is_refused() -> None:
     assert all(drone.firmware.locked for drone in world.drones)
     world.next_flight(pause=0.0, settle=0.5)
     assert world.run() == "done"
-    assert "arm" not in world.notes.transitions()[3:]
+    assert "arm" not in world.log.transitions()[3:]
 
 
 def test_maps_convert_a_cards_hover_to_the_drones_curve() -> None:

@@ -25,8 +25,8 @@ from fly_virtual import World, log_header
 from mjxball.errors import InputError
 from mjxball.fly.display import LiveView
 from mjxball.fly.flight_log import Journal
+from mjxball.fly.limits import FlightSettings
 from mjxball.fly.main import main as fly
-from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.recording import read_recording
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.physics import make_pair
@@ -43,7 +43,7 @@ def lines(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
     with Journal(path, **log_header(contents)) as notes:
         settings = FlightSettings(seconds=2.0, goal=(0.1, 0.0, 0.4))
-        world = World(settings, contents=contents, physics=make_pair(contents.card), notes=notes)
+        world = World(settings, contents=contents, physics=make_pair(contents.card), log=notes)
         world.fly_until(State.DONE)
         notes.note("end", code=0)
     return path.read_bytes().splitlines(keepends=True)

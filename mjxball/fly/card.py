@@ -1,21 +1,23 @@
-"""What a policy's card says about how it is to be flown: its configuration, gains, command maps and goal. Pure."""
+"""What a policy's card says about how it is flown: configuration, gains, command maps, goal; and its two laws. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import firmware_gains, motor_curves
 from mjxball.control.firmware_gains import PairGains
 from mjxball.control.motors import MOTORS, Motor
-from mjxball.fly.command import CommandMap
-from mjxball.fly.maneuver import Times
-from mjxball.fly.pair import Rig
-from mjxball.fly.protocols import Variant, Variants
-from mjxball.fly.thrust import CURVE_NAMES, OLDER, CurveName, ForceCurve
+from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
+from mjxball.fly.limits import Times
+from mjxball.fly.telemetry import ObjectState, Rig
+from mjxball.policy import Policy
+from mjxball.sim.closed_loop import ClosedLoop
 
 GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
 STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
@@ -125,3 +127,34 @@ def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple
     per_acceleration = autopilot.thrust_per_acceleration
     leader, follower = (CommandMap(law, hover, per_acceleration, mass, plant.gravity, curve) for mass in carried)
     return leader, follower
+
+
+class Commands(NamedTuple):
+    """What both laws want at one tick."""
+
+    leader: np.ndarray  # (3,) roll, pitch [rad], vertical acceleration [m/s2]
+    follower: np.ndarray  # (3,) likewise
+    observation: np.ndarray  # (18,) what the follower saw
+
+
+class Controller:
+    """Leader and follower at the policy's own rate, by the loop, gains and limits in the policy's card."""
+
+    def __init__(self, policy: Policy):
+        config = config_of(policy.card)
+        self.policy, self.config, self.period = policy, config, policy.control_period
+        self._loop = ClosedLoop(config)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin a flight: no integral, no memory."""
+        self._integral = self._loop.zero_integral(np.zeros(3))
+        self.policy.reset()
+
+    def step(self, state: ObjectState, goal: np.ndarray) -> Commands:
+        """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
+        seen = self._loop.observe(state, goal)
+        led = self._loop.leader_command(state, goal, self._integral)
+        followed = self._loop.follower_command(np.asarray(self.policy(seen), float), self._integral)
+        self._integral = self._loop.integrate(self._integral, state, goal, self.period, followed=followed)
+        return Commands(led, followed, seen)

@@ -1,13 +1,43 @@
-"""The command map: (roll, pitch, vertical acceleration) of a control law -> setpoint of one drone. Pure."""
+"""From a law's command to thrust units, and what both drones are sent in states in which no law is in command. Pure."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
+from mjxball.control import crazyflie, leader, motor_curves
+from mjxball.control.firmware_gains import Gains
+from mjxball.fly.limits import Times
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, Setpoint, setpoint
-from mjxball.fly.thrust import LINEAR, ForceCurve
+
+CurveName = Literal["linear", "older"]
+CURVE_NAMES: tuple[CurveName, ...] = ("linear", "older")
+SPIN_THRUST = 16000  # [thrust units] a third of hover: the motors turn, the pair does not lift
+
+
+@dataclass(frozen=True)
+class ForceCurve:
+    """Force of one motor from p = thrust units / 65535: `quadratic` p^2 + `linear` p [N] (crazyflie.md)."""
+
+    quadratic: float = 0.0  # [N]
+    linear: float = 0.12  # [N] Crazyflie 2.1+ with battery compensation
+
+    def force(self, thrust: float) -> float:
+        """Force of the four motors of one drone [N] at `thrust` units."""
+        return 4 * float(crazyflie.motor_force((self.quadratic, self.linear), thrust))
+
+    def thrust(self, force: float) -> float:
+        """Thrust units at which four motors give `force` [N]; not bounded above, 0 for none."""
+        return float(crazyflie.motor_command((self.quadratic, self.linear), np.float64(force / 4)))
+
+
+LINEAR = ForceCurve()
+OLDER = ForceCurve(*motor_curves.OLDER)  # firmware without battery compensation, 2.1 motors
+
 
 Array = Any
 
@@ -64,3 +94,90 @@ def to_setpoint(command: Array, yaw: float, constants: CommandMap) -> Mapped:
     wanted = raw_thrust((roll, pitch, vertical), constants)
     thrust = min(max(wanted, THRUST_FLOOR), THRUST_CEILING)
     return Mapped(setpoint(roll, pitch, -constants.yaw_gain * yaw, thrust), thrust != wanted)
+
+
+class Variant(NamedTuple):
+    """How one drone is flown if its firmware has a certain force curve."""
+
+    map: CommandMap
+    gains: Gains
+
+
+Variants = Mapping[CurveName, Variant]  # of one drone, by the curve of its firmware
+
+
+GRAVITY = 9.81
+
+
+def ramp(elapsed: float, times: Times, constants: CommandMap) -> Setpoint:
+    """Level, thrust rising in a straight line to hover."""
+    share = min(elapsed / times.ramp, 1.0)
+    return level(THRUST_FLOOR + share * (constants.hover_thrust - THRUST_FLOOR))
+
+
+def sink(trim: float, climb: float | None, elapsed: float, times: Times) -> float:
+    """Thrust [units] that lets a drone sink, from the `trim` that hovered; `climb` is its vertical speed [m/s].
+
+    With a known speed it is held; without one (None) thrust falls from 95 to 70 % of the trim.
+    """
+    if climb is None:
+        return trim * (0.95 - 0.25 * min(elapsed / times.descend_limit, 1.0))
+    return trim * (1 + min(max(-0.4 * (climb + times.descend_speed), -0.3), 0.1))
+
+
+def level(thrust: float, tilt: tuple[float, float] = (0.0, 0.0)) -> Setpoint:
+    """`tilt` (roll, pitch) [rad], level if not given, at `thrust`, within bounds."""
+    bounded = min(max(thrust, THRUST_FLOOR), THRUST_CEILING) if math.isfinite(thrust) else THRUST_FLOOR
+    return setpoint(*tilt, 0.0, bounded)
+
+
+BRAKE_TILT = math.radians(8)  # of a descent that brakes sideways
+
+
+def brake(velocity: np.ndarray) -> tuple[float, float]:
+    """(roll, pitch) [rad] that brake a horizontal `velocity` (3,) [m/s] with a time constant of 0.7 s."""
+    wanted = leader.command(-velocity / 0.7, 0.0, GRAVITY, BRAKE_TILT, 1.0)
+    roll, pitch = float(wanted[0]), float(wanted[1])
+    return (roll, pitch) if math.isfinite(roll) and math.isfinite(pitch) else (0.0, 0.0)
+
+
+def smoothed(trim: float, thrust: float, period: float, hover: float) -> float:
+    """Running average over a second of the thrust that hovers, no further than 15 % from what the rig should need.
+
+    A climb that has just begun must not pass for hovering: the bound keeps what is flown blind near the truth.
+    """
+    moved = trim - math.expm1(-period) * (thrust - trim)
+    return min(max(moved, 0.85 * hover), 1.15 * hover)
+
+
+class LastKnownState(NamedTuple):
+    """What is known of the pair at the moment when nothing more will be heard of it."""
+
+    trims: tuple[int, int]  # thrust that hovers, leader and follower [thrust units]
+    height: float  # of O above where it stood [m]
+    climb: float  # its vertical speed [m/s]
+    lift: float  # its vertical acceleration under the setpoints that were sent last [m/s2]
+
+
+BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
+BLIND_LIMIT = 2.5  # [s] that it lasts at most
+BRISK, GENTLE = 3.0, 0.7  # [m/s2] downward at most: where both drones hear, and where one may not
+
+
+def blind_shares(seen: LastKnownState, unheard: float, period: float, hardest: float = BRISK) -> list[float]:
+    """Shares of the trim for a descent that is flown blind, one per `period` [s], all below 1.
+
+    The first `unheard` seconds went by under the last setpoints. From there the pair's height is computed, not
+    measured: sink at `BLIND_SPEED`, gained with at most `hardest` [m/s2], until it must stand, and 0.1 s more.
+    """
+    known = [value if math.isfinite(value) else 0.0 for value in (seen.height, seen.climb, seen.lift)]
+    lift = min(max(known[2], -3.0), 3.0)
+    height = known[0] + known[1] * unheard + 0.5 * lift * unheard**2
+    climb = known[1] + lift * unheard
+    shares: list[float] = []
+    while height > 0 and len(shares) * period < BLIND_LIMIT:
+        wanted = min(max(3 * (-BLIND_SPEED - climb), -hardest), -0.15)
+        shares.append(1 + wanted / GRAVITY)
+        climb += wanted * period
+        height += climb * period
+    return shares + [1 - hardest / GRAVITY] * round(0.1 / period)

@@ -19,8 +19,8 @@ import numpy as np
 
 from mjxball.control import rotations
 from mjxball.errors import InputError
+from mjxball.fly.flight import View
 from mjxball.fly.limits import NAMES, Limits
-from mjxball.fly.protocols import View
 from mjxball.fly.supervisor import ENDED, GUIDED, State
 
 RED, YELLOW, GREEN, PLAIN = "\x1b[1;37;41m", "\x1b[33m", "\x1b[32m", "\x1b[0m"

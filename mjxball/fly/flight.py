@@ -5,24 +5,35 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.fly import command, limits, maneuver, packets, pair
-from mjxball.fly.command import CommandMap, Mapped
-from mjxball.fly.controller import Commands, Controller
-from mjxball.fly.limits import NAMES, Sustained
-from mjxball.fly.maneuver import LastKnownState
+from mjxball.fly import command, limits, packets
+from mjxball.fly.card import Commands, Controller
+from mjxball.fly.command import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
+from mjxball.fly.limits import NAMES, EstimatorWatch, FlightSettings, Sustained, UplinkWatch
+from mjxball.fly.mocap import Mocap
 from mjxball.fly.packets import ZERO, DroneState, Health, PacketError, Setpoint
-from mjxball.fly.pair import ObjectState
-from mjxball.fly.protocols import DroneLink, FlightSettings, Guard, Notes, Poses, Variants, View
 from mjxball.fly.spin import SpinCheck
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State, Supervisor
-from mjxball.fly.telemetry import Sample
-from mjxball.fly.thrust import SPIN_THRUST, CurveName
-from mjxball.fly.watch import EstimatorWatch, UplinkWatch
+from mjxball.fly.telemetry import DroneLink, Note, ObjectState, Rig, Sample, object_state, yaw_of
+from mjxball.fly.watchdog import Watchdog
 
 LIFTED = 0.05  # [m], or half of the goal's height if that is less, from which on a pair counts as having flown
+
+
+class View(NamedTuple):
+    """What a display may show; replaced as a whole at every tick."""
+
+    time: float  # [s] since the start
+    supervisor: Supervisor
+    states: list[DroneState]
+    ages: list[float]
+    goal: np.ndarray
+    wanted: tuple[Setpoint, Setpoint]
+    late: float  # [s]
+    missed: int
 
 
 class Flight:
@@ -34,16 +45,16 @@ class Flight:
         controller: Controller,
         variants: Sequence[Variants],
         assumed: Sequence[CurveName],
-        rig: pair.Rig,
+        rig: Rig,
         settings: FlightSettings,
-        notes: Notes,
-        guard: Guard | None = None,
-        poses: Poses | None = None,
+        note: Note,
+        watchdog: Watchdog | None = None,
+        mocap: Mocap | None = None,
     ):
         """`variants` of leader and follower by force curve; `assumed` are the curves whose gains were uploaded."""
         self.links, self.controller, self.rig = links, controller, rig
-        self.settings, self.notes, self.guard = settings, notes, guard
-        self._poses = poses
+        self.settings, self.note, self.watchdog = settings, note, watchdog
+        self._mocap = mocap
         self.supervisor = Supervisor()
         self.interrupts = 0
         self.kill = False
@@ -88,7 +99,7 @@ class Flight:
     def begin(self, now: float) -> None:
         """Where the pair stands now is where it starts; both links must have a state."""
         self._start = now
-        self._origin = pair.object_state(self._states(), self.rig).position
+        self._origin = object_state(self._states(), self.rig).position
         self.supervisor = Supervisor(State.CHECK, now)
 
     def tick(self, now: float, late: float = 0.0, missed: int = 0, gap: float = 0.0) -> bool:
@@ -139,25 +150,25 @@ class Flight:
             faults.append(Fault(Event.GAPS, f"{self._holds} times"))
         if missed > bounds.missed_deadlines or gap > bounds.longest_gap:
             faults.append(Fault(Event.DEADLINES, f"{missed} missed in a second, longest gap {1000 * gap:.0f} ms"))
-        if self._poses is not None:
-            faults += self._poses.faults(now)
+        if self._mocap is not None:
+            faults += self._mocap.faults(now)
         if not self._beat():
             faults.append(Fault(Event.WATCHDOG))
         return faults
 
     def _beat(self) -> bool:
         """Tell the watchdog what it would take over; false if there is none any more."""
-        if self.guard is None:
+        if self.watchdog is None:
             return True
-        return self.guard.beat(
+        return self.watchdog.beat(
             self.supervisor.state in AIRBORNE and not self.settings.dry_run, self._last_known_state()
         )
 
     def _last_known_state(self) -> LastKnownState:
         """What is known of how the pair moves."""
-        seen = self._last or pair.object_state(self._states(), self.rig)
+        seen = self._last or object_state(self._states(), self.rig)
         trim = sum(self._trims)
-        lift = maneuver.GRAVITY * (sum(sent.thrust for sent in self._sent) / trim - 1) if trim else 0.0
+        lift = command.GRAVITY * (sum(sent.thrust for sent in self._sent) / trim - 1) if trim else 0.0
         trims = (round(self._trims[0]), round(self._trims[1]))
         return LastKnownState(trims, float(seen.position[2] - self._origin[2]), float(seen.velocity[2]), lift)
 
@@ -189,12 +200,12 @@ class Flight:
         if self.supervisor.state not in GUIDED:
             return None, []
         try:
-            seen = pair.object_state(states, self.rig)
+            seen = object_state(states, self.rig)
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(now))
             laws = (self._commands.leader, self._commands.follower)
             mapped = [
-                command.to_setpoint(law, pair.yaw_of(state), constants)
+                command.to_setpoint(law, yaw_of(state), constants)
                 for law, state, constants in zip(laws, states, self.maps, strict=True)
             ]
         except (PacketError, ValueError, FloatingPointError) as error:
@@ -226,7 +237,7 @@ class Flight:
             events.append(Fault(Event.ARMED))
         if state is State.SPIN and elapsed >= times.spin:
             known = [Fault(Event.CURVE_KNOWN, "dry run")] if self.settings.dry_run else None
-            events += known or self.spin.update(self.supervisor.since + times.spin / 2, now, self.notes)
+            events += known or self.spin.update(self.supervisor.since + times.spin / 2, now, self.note)
         if state is State.RAMP and elapsed >= times.ramp:
             events.append(Fault(Event.HOVERING))
         if state is State.FLY and elapsed >= self.settings.seconds:
@@ -282,15 +293,15 @@ class Flight:
             return
         entered = self.supervisor.state
         names = [f"{fault.event.name}: {fault.detail}" if fault.detail else fault.event.name for fault in faults]
-        self.notes.note("transition", now, before=before.state.value, after=entered.value, events=names)
+        self.note("transition", now, before=before.state.value, after=entered.value, events=names)
         if entered is State.FLY and before.state is State.RAMP:
             self.controller.reset()
             self._commands = None
         if entered is State.LAND and before.state is not State.HOLD:
-            seen = self._last or pair.object_state(self._states(), self.rig)
+            seen = self._last or object_state(self._states(), self.rig)
             self._land_height = float(seen.position[2] - self._origin[2])
         if entered is State.DESCEND:
-            self._shares = maneuver.blind_shares(self._last_known_state(), 0.0, self.settings.period)
+            self._shares = command.blind_shares(self._last_known_state(), 0.0, self.settings.period)
         if entered is State.HOLD:
             self._holds += 1
             self._back = Sustained(self.settings.limits.fresh)
@@ -303,7 +314,7 @@ class Flight:
             age = now - min(watch.heard for watch in self._uplinks if math.isfinite(watch.heard))
         self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
         # Gently: a drone that does not hear keeps its thrust, and the other must not sink away from it.
-        self._shares = maneuver.blind_shares(self._last_known_state(), age, self.settings.period, maneuver.GENTLE)
+        self._shares = command.blind_shares(self._last_known_state(), age, self.settings.period, command.GENTLE)
 
     # What is sent.
 
@@ -312,9 +323,9 @@ class Flight:
         if state in GUIDED:
             return [one.setpoint for one in mapped] if mapped else list(self._sent)
         if state is State.SPIN:
-            return [maneuver.level(SPIN_THRUST)] * 2
+            return [command.level(SPIN_THRUST)] * 2
         if state is State.RAMP:
-            return [maneuver.ramp(elapsed, self.settings.times, constants) for constants in self.maps]
+            return [command.ramp(elapsed, self.settings.times, constants) for constants in self.maps]
         if state in (State.DESCEND, State.HOLD):
             return self._sinking(elapsed)
         return [ZERO, ZERO]
@@ -325,12 +336,12 @@ class Flight:
         known = seen is not None and any(self._estimators.trusted)
         tilt = (0.0, 0.0)
         if seen is not None and known and not (self.settings.stand or self._estimators.contradiction):
-            tilt = maneuver.brake(seen.velocity)
+            tilt = command.brake(seen.velocity)
         if seen is not None and known and descends:
-            share = maneuver.sink(1.0, float(seen.velocity[2]), elapsed, self.settings.times)
+            share = command.sink(1.0, float(seen.velocity[2]), elapsed, self.settings.times)
         else:
             share = self._shares[min(int(elapsed / self.settings.period), len(self._shares) - 1)]
-        return [maneuver.level(share * trim, tilt) for trim in self._trims]
+        return [command.level(share * trim, tilt) for trim in self._trims]
 
     def _transmit(self, wanted: list[Setpoint], now: float) -> None:
         state, elapsed, dry = self.supervisor.state, now - self.supervisor.since, self.settings.dry_run
@@ -339,7 +350,7 @@ class Flight:
         elif state in GUIDED:
             parts = zip(self._trims, wanted, self.maps, strict=True)
             period = self.settings.period
-            self._trims = [maneuver.smoothed(trim, s.thrust, period, c.hover_thrust) for trim, s, c in parts]
+            self._trims = [command.smoothed(trim, s.thrust, period, c.hover_thrust) for trim, s, c in parts]
         self._sent = wanted
         self.highest = [max(most, value.thrust) for most, value in zip(self.highest, wanted, strict=True)]
         sometimes = self._count % 10 == 0 and not dry
@@ -361,7 +372,5 @@ class Flight:
         goal = self.goal(now)
         laws = self._commands if self.supervisor.state in GUIDED else None
         fields = {} if laws is None else laws._asdict()
-        self.notes.note(
-            "tick", now, state=self.supervisor.state.value, goal=goal, sent=sent, ages=ages, late=late, **fields
-        )
+        self.note("tick", now, state=self.supervisor.state.value, goal=goal, sent=sent, ages=ages, late=late, **fields)
         self.view = View(now - self._start, self.supervisor, states, ages, goal, (sent[0], sent[1]), late, missed)

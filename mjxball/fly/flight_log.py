@@ -22,11 +22,11 @@ import numpy as np
 from mjxball.config import Config
 from mjxball.control.firmware_gains import PairGains
 from mjxball.errors import InputError
+from mjxball.fly.command import CURVE_NAMES, CurveName
 from mjxball.fly.flown import RECORDS, Flown
 from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import SCHEMA, Record, decode
 from mjxball.fly.packets import DroneState
-from mjxball.fly.thrust import CURVE_NAMES, CurveName
 
 SYNC_PERIOD = 1.0  # [s] between two fsyncs: a killed process loses nothing that was flushed, a power cut this much
 CHUNK = 2**20  # bytes read at once

@@ -8,9 +8,9 @@ from typing import NamedTuple
 from mjxball.config import Config
 from mjxball.control.firmware_gains import PARAMETERS, Gains, PairGains
 from mjxball.fly.card import ThrustChoice, command_maps, gains_of, with_curve
+from mjxball.fly.command import CURVE_NAMES, CurveName, ForceCurve
 from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import Record
-from mjxball.fly.thrust import CURVE_NAMES, CurveName, ForceCurve
 
 RECORDS = ("thrust", "parameter")  # kinds that `Flown.after` takes
 SAME = 1e-5  # of two gains of which one was sent as a 32-bit float

@@ -14,12 +14,10 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from mjxball.fly import packets
-from mjxball.fly.connection import Deadlines, Identity, bounded, connect
+from mjxball.fly.connection import PORT, Deadlines, Element, Identity, LinkError, Parameters, bounded, connect
 from mjxball.fly.packets import Packet, PacketError
-from mjxball.fly.parameters import PORT, Element, LinkError, Parameters
-from mjxball.fly.telemetry import HealthSample, Telemetry
+from mjxball.fly.telemetry import HealthSample, Note, Telemetry
 
-Note = Callable[..., None]  # note(kind, **fields): into the flight log
 PROTOCOL = 12  # CRTP version with a supervisor port
 LOG_PORT, LOG_DATA = 5, 2
 DEADLINES = Deadlines()

@@ -16,16 +16,15 @@ from pathlib import Path
 from mjxball import cli
 from mjxball.cli import run_command
 from mjxball.errors import InputError
-from mjxball.fly import limits, mocap, pair
-from mjxball.fly.card import ThrustChoice, drone_of, goal_of, motor_of, times_of, variants
-from mjxball.fly.controller import Controller
+from mjxball.fly import limits, mocap
+from mjxball.fly.card import Controller, ThrustChoice, drone_of, goal_of, motor_of, times_of, variants
+from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.display import LiveView
-from mjxball.fly.limits import Limits
+from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.preflight import Preflight, read_gains
-from mjxball.fly.protocols import FlightSettings
 from mjxball.fly.rehearse import Rehearsal
 from mjxball.fly.session import FlightSetup, fly
-from mjxball.fly.thrust import CURVE_NAMES
+from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, asked_of_twin, check_twin, read_fault
 from mjxball.policy import Policy
 
@@ -150,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         controller = Controller(policy)
         config = controller.config
         more = read_gains(options.gains) if options.gains else ({}, {})
-        rig = pair.Rig.of_card(policy.card)
+        rig = Rig.of_card(policy.card)
         period = policy.control_period / math.ceil(policy.control_period * LOOP_RATE - 1e-9)
         bounds = Limits() if options.battery is None else Limits(battery=options.battery)
         goal = tuple(options.goal or goal_of(config))

@@ -16,13 +16,14 @@ import numpy as np
 
 from mjxball.control.firmware_gains import PairGains, read_pair_gains
 from mjxball.errors import InputError
-from mjxball.fly import limits, packets, pair
+from mjxball.fly import limits, packets
+from mjxball.fly.command import CurveName, Variants
+from mjxball.fly.connection import LinkError
 from mjxball.fly.limits import Limits
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
-from mjxball.fly.parameters import LinkError
-from mjxball.fly.protocols import Variants
-from mjxball.fly.thrust import CurveName, curve_of_version
+from mjxball.fly.spin import curve_of_version
+from mjxball.fly.telemetry import Rig, yaw_of
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ def _wait_until_ready(links: Sequence[Link], seconds: float) -> None:
         time.sleep(0.02)
 
 
-def check(links: Sequence[Link], rig: pair.Rig, bounds: Limits, asked: Preflight) -> list[Check]:
+def check(links: Sequence[Link], rig: Rig, bounds: Limits, asked: Preflight) -> list[Check]:
     """All checks, with what was found; takes `asked.measure` seconds, more while a firmware re-arms after a landing."""
     _wait_until_ready(links, asked.rearm)
     began = time.monotonic()
@@ -196,7 +197,7 @@ def check(links: Sequence[Link], rig: pair.Rig, bounds: Limits, asked: Preflight
         states.append(state)
         refusal = limits.down_reason(state.info, armed=False)
         can = _ready(state.info)
-        tilt, yaw = limits.tilt_of(state), pair.yaw_of(state)
+        tilt, yaw = limits.tilt_of(state), yaw_of(state)
         checks += [
             Check(f"{link.name} states", rate >= asked.rate, f"{rate:.0f} Hz, {asked.rate:.0f} needed"),
             Check(f"{link.name} state age", age <= bounds.state_age, f"{1000 * age:.0f} ms"),

@@ -15,12 +15,12 @@ from mjxball.control.firmware_gains import PairGains
 from mjxball.errors import InputError
 from mjxball.fly import flight_log
 from mjxball.fly.card import drone_of
+from mjxball.fly.command import CurveName
 from mjxball.fly.flight_log import FlightLog
 from mjxball.fly.flown import force_curve, one_curve
 from mjxball.fly.limits import NAMES
 from mjxball.fly.packets import DroneState
-from mjxball.fly.pair import ObjectState, Rig, object_state
-from mjxball.fly.thrust import CurveName
+from mjxball.fly.telemetry import ObjectState, Rig, object_state
 from mjxball.fly.twin.conditions import DroneKind, Surroundings, drone_kind
 from mjxball.fly.twin.physics import PairState, pair_of
 

@@ -15,19 +15,19 @@ from mjxball import __version__
 from mjxball import config as configs
 from mjxball.control.firmware_gains import to_json
 from mjxball.errors import InputError
-from mjxball.fly import packets, pair
-from mjxball.fly.controller import Controller
+from mjxball.fly import packets
+from mjxball.fly.card import Controller
+from mjxball.fly.command import CurveName, Variants
 from mjxball.fly.display import Display, listening
 from mjxball.fly.flight import Flight
 from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import NAMES
+from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.loop import Metronome, Timing, urgent
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.preflight import Check, Preflight, check, prepare
-from mjxball.fly.protocols import FlightSettings, Variants
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
-from mjxball.fly.thrust import CurveName
+from mjxball.fly.telemetry import Rig
 from mjxball.fly.watchdog import NOTHING, Watchdog
 
 BUSY = 0.02  # [s]: ticks that come later than that are no fault of drones or policy
@@ -41,7 +41,7 @@ class FlightSetup:
     controller: Controller
     variants: Sequence[Variants]  # of leader and follower
     curve: CurveName  # that the firmwares are taken to have until their motors turn
-    rig: pair.Rig
+    rig: Rig
     preflight: Preflight
     mocap: Mocap | None = None  # already found to be ready; whoever made it ends it
 
@@ -68,13 +68,21 @@ def fly(
         links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]
         try:
             sys.setswitchinterval(SWITCH_INTERVAL)
-            with urgent() as priority, Watchdog(uris) as guard:
+            with urgent() as priority, Watchdog(uris) as watchdog:
                 journal.note("priority", granted=priority)
                 if setup.mocap is not None:
                     setup.mocap.log(journal.note)
                 curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
                 flight = Flight(
-                    links, setup.controller, setup.variants, curves, setup.rig, settings, journal, guard, setup.mocap
+                    links,
+                    setup.controller,
+                    setup.variants,
+                    curves,
+                    setup.rig,
+                    settings,
+                    journal.note,
+                    watchdog,
+                    setup.mocap,
                 )
                 flight.ready = _checked(links, setup, settings, journal)
                 flight.refusal = "" if flight.ready else "see the checks"
@@ -115,7 +123,7 @@ def run(flight: Flight) -> Timing:
             try:
                 going = flight.tick(now, metronome.lateness, metronome.missed_lately(now), metronome.gap)
             except Exception as error:  # nothing in here may leave thrust on
-                flight.notes.note("error", text=f"{type(error).__name__}: {error}")
+                flight.note("error", text=f"{type(error).__name__}: {error}")
                 flight.kill = True
                 going = _emergency(flight)
     return metronome.timing()
@@ -124,8 +132,8 @@ def run(flight: Flight) -> Timing:
 def _emergency(flight: Flight) -> bool:
     """A tick failed: stop both drones without the flight's help. Returns false: it is over."""
     for _ in range(50):
-        if flight.guard is not None:
-            flight.guard.beat(False, NOTHING)  # it has nothing to take over any more
+        if flight.watchdog is not None:
+            flight.watchdog.beat(False, NOTHING)  # it has nothing to take over any more
         for link in flight.links:
             link.command(packets.EMERGENCY_STOP)
             link.send(packets.setpoint_packet(packets.ZERO))

@@ -2,18 +2,53 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Sequence
 
-from mjxball.control.motors import Motor
-from mjxball.fly import thrust
-from mjxball.fly.limits import NAMES
-from mjxball.fly.packets import THRUST_CEILING
-from mjxball.fly.protocols import DroneLink, Notes, Variant, Variants
-from mjxball.fly.supervisor import Event, Fault
-from mjxball.fly.thrust import CurveName
+import numpy as np
 
+from mjxball.control import motors
+from mjxball.control.motors import Motor
+from mjxball.fly.command import CURVE_NAMES, CurveName, Variant, Variants
+from mjxball.fly.limits import NAMES
+from mjxball.fly.packets import THRUST_CEILING, Health
+from mjxball.fly.supervisor import Event, Fault
+from mjxball.fly.telemetry import DroneLink, Note
+
+COMPENSATES_SINCE = (2025, 12)  # version of the firmware, as delivered
+LIKELY = 0.12  # of ln(PWM / expected PWM): half of what lies between the two firmwares at a full battery
 WANTED = 3  # health packets in a row that agree
 RESERVE = 0.97  # of the largest thrust command, above which nobody hovers
+
+
+def curve_of_version(version: str) -> CurveName | None:
+    """What a firmware of this `version`, such as 2026.08, has as delivered; None if it does not say."""
+    found = re.match(r"(20\d\d)\.(\d\d)", version)
+    if found is None:
+        return None
+    return "linear" if (int(found[1]), int(found[2])) >= COMPENSATES_SINCE else "older"
+
+
+def expected_pwm(name: CurveName, motor: Motor, thrust: float, battery: float) -> float:
+    """PWM of every motor at `thrust` units on level ground, by a firmware of this kind at `battery` [V]."""
+    if name == "older":
+        return thrust
+    return float(motors.compensated(motor, np.float64(thrust), np.float64(battery)))
+
+
+def recognise(seen: Health, battery: float, motor: Motor) -> CurveName | None:
+    """Which firmware makes the PWM that was `seen` of the thrust that it reports; None if neither does.
+
+    The mean of the four motors counts, in which roll, pitch and yaw cancel.
+    """
+    pwm, thrust = float(np.mean(seen.motors)), seen.thrust
+    if not (pwm > 0 and thrust > 0 and battery > 0):
+        return None
+    expected = {name: expected_pwm(name, motor, thrust, battery) for name in CURVE_NAMES}
+    off = {name: abs(math.log(pwm / value)) if value > 0 else math.inf for name, value in expected.items()}
+    best = min(CURVE_NAMES, key=lambda name: off[name])
+    return best if off[best] < LIKELY else None
 
 
 class SpinCheck:
@@ -34,11 +69,11 @@ class SpinCheck:
         leader, follower = (own[curve] for own, curve in zip(self._variants, self.curves, strict=True))
         return leader, follower
 
-    def update(self, since: float, now: float, notes: Notes) -> list[Fault]:
+    def update(self, since: float, now: float, note: Note) -> list[Fault]:
         """Judge what came after `since` [s], when the motors had settled; events once both are known."""
         for number in range(2):
             if not self._decided[number]:
-                self._look(number, since, now, notes)
+                self._look(number, since, now, note)
         failed = [link.busy for link in self._links if isinstance(link.busy, str)]
         if failed or self._unfit:
             return [Fault(Event.CURVE_UNKNOWN, text) for text in (*failed, *self._unfit)]
@@ -51,7 +86,7 @@ class SpinCheck:
             return heavy or [Fault(Event.CURVE_KNOWN, ", ".join(self.curves))]
         return []
 
-    def _look(self, number: int, since: float, now: float, notes: Notes) -> None:
+    def _look(self, number: int, since: float, now: float, note: Note) -> None:
         sample, link = self._links[number].telemetry.health, self._links[number]
         state = link.telemetry.newest
         if sample is None or state is None or sample.arrival <= max(since, self._last[number]):
@@ -61,16 +96,16 @@ class SpinCheck:
         if not any(sample.health.motors) and len(seen) < 2 * WANTED:
             seen.append(None)  # not listed by this firmware, or not turning yet
             return
-        found = thrust.recognise(sample.health, state.state.battery, self._motor)
+        found = recognise(sample.health, state.state.battery, self._motor)
         seen.append(found)
         latest = seen[-WANTED:]
         unknown = len(seen) >= 4 * WANTED  # neither fits: what was assumed stands
         if len(latest) == WANTED and len(set(latest)) == 1 and (found is not None or unknown):
-            self._decide(number, found or self.curves[number], now, notes, found is not None)
+            self._decide(number, found or self.curves[number], now, note, found is not None)
         elif unknown:
-            self._decide(number, self.curves[number], now, notes, False)
+            self._decide(number, self.curves[number], now, note, False)
 
-    def _decide(self, number: int, curve: CurveName, now: float, notes: Notes, recognised: bool) -> None:
+    def _decide(self, number: int, curve: CurveName, now: float, note: Note, recognised: bool) -> None:
         self._decided[number] = True
         changed = curve != self.curves[number]
         if curve not in self._variants[number]:
@@ -78,7 +113,7 @@ class SpinCheck:
         elif changed:
             self.curves[number] = curve
             self._links[number].write_later(self._variants[number][curve].gains)
-        notes.note("thrust", now, drone=NAMES[number], curve=curve, recognised=recognised, changed=changed)
+        note("thrust", now, drone=NAMES[number], curve=curve, recognised=recognised, changed=changed)
 
 
 def _too_heavy(name: str, curve: CurveName, variant: Variant) -> str:

@@ -21,7 +21,7 @@ from typing import Any
 
 from mjxball.cli import make_parser
 from mjxball.fly import packets
-from mjxball.fly.maneuver import LastKnownState, blind_shares
+from mjxball.fly.command import LastKnownState, blind_shares
 from mjxball.fly.packets import Packet, Setpoint
 
 FRAME = struct.Struct("<BHHfff")  # what is going on, then `LastKnownState`

@@ -20,9 +20,9 @@ from mjxball.control.firmware_gains import PARAMETERS, PairGains, pair_gains
 from mjxball.control.hover import hover
 from mjxball.errors import InputError
 from mjxball.fly.card import with_curve
+from mjxball.fly.command import CurveName
 from mjxball.fly.flown import one_curve, own_curve
 from mjxball.fly.preflight import read_gains
-from mjxball.fly.thrust import CurveName
 from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify, pair_mass
 from mjxball.rig.log import Log, read_log

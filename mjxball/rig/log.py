@@ -13,9 +13,9 @@ from mjxball.control.crazyflie import PERIOD
 from mjxball.control.firmware_gains import PairGains
 from mjxball.errors import InputError
 from mjxball.fly import flight_log
+from mjxball.fly.command import CurveName
 from mjxball.fly.flight_log import GUIDED, FlightLog, Outage, numbers, outages
 from mjxball.fly.limits import NAMES
-from mjxball.fly.thrust import CurveName
 
 STATE = 13  # numbers of a drone's state in an .npz: position, velocity, quaternion (w, x, y, z), body rates
 OFF_THE_GROUND = 0.03  # [m] above the start of a flight from which on nothing touches the pair

@@ -16,9 +16,9 @@ from mjxball.fly.flown import Flown
 from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
-from mjxball.fly.pair import Rig, object_state
 from mjxball.fly.recording import LONGEST
 from mjxball.fly.supervisor import FAULTS, State
+from mjxball.fly.telemetry import Rig, object_state
 from mjxball.view.page import plant_of
 
 # A row, in this order: name and number of values, in SI units.

@@ -17,17 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.fly import packets
-from mjxball.fly.card import motor_of, times_of, variants
-from mjxball.fly.command import CommandMap
-from mjxball.fly.controller import Controller
+from mjxball.fly.card import Controller, motor_of, times_of, variants
+from mjxball.fly.command import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
 from mjxball.fly.flight import Flight
-from mjxball.fly.limits import NAMES
+from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.packets import Packet
-from mjxball.fly.pair import Rig
-from mjxball.fly.protocols import FlightSettings, Variant, Variants
 from mjxball.fly.supervisor import State, Supervisor
-from mjxball.fly.telemetry import HealthSample, Telemetry
-from mjxball.fly.thrust import CURVE_NAMES, CurveName
+from mjxball.fly.telemetry import HealthSample, Note, Rig, Telemetry
 from mjxball.fly.twin import logs, protocol
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.drone import TwinDrone, advance
@@ -44,9 +40,9 @@ _HEALTH = struct.Struct("<3f4Hf")
 class VirtualLink:
     """In the place of `link.Link`: packets go straight to a drone of the twin."""
 
-    def __init__(self, drone: TwinDrone, clock: Callable[[], float], name: str, notes: Any):
+    def __init__(self, drone: TwinDrone, clock: Callable[[], float], name: str, note: Note):
         self.drone, self._clock = drone, clock
-        self.name, self._notes = name, notes
+        self.name, self._note = name, note
         self.telemetry: Telemetry = Telemetry()
         self.lost: str | None = None
         self.stuck = 0.0
@@ -104,11 +100,11 @@ class VirtualLink:
             except packets.PacketError:
                 self.telemetry.damaged += 1
                 return
-            self._notes.note("state", t=now, drone=self.name, raw=datagram[1:].hex())
+            self._note("state", t=now, drone=self.name, raw=datagram[1:].hex())
             self.telemetry.take(state, int.from_bytes(datagram[2:5], "little"), now)
 
 
-class Notes:
+class MemoryLog:
     """In the place of the flight log; `keep` says whether ticks and states are kept as well."""
 
     def __init__(self, keep: bool = True) -> None:
@@ -162,7 +158,7 @@ class World:
         conditions: Conditions | None = None,
         physics: Pair | None = None,
         maps: Sequence[CommandMap] | None = None,
-        notes: Any = None,
+        log: Any = None,
         step: float = STEP,
         settle: float = 0.05,
         record: bool = True,
@@ -184,9 +180,9 @@ class World:
         self.now, self.step = 0.0, step
         self._count = 0
         self.drones = TwinDrone(self.pair, 0, kind, around), TwinDrone(self.pair, 1, kind, around)
-        self.notes: Any = notes or Notes(record)
+        self.log: Any = log or MemoryLog(record)
         named = zip(NAMES, self.drones, strict=True)
-        self.links = [VirtualLink(drone, lambda: self.now, name, self.notes) for name, drone in named]
+        self.links = [VirtualLink(drone, lambda: self.now, name, self.log.note) for name, drone in named]
         self.variants: Sequence[Variants] = variants(self.config)
         if maps is not None:
             self.variants = [{name: Variant(one, {}) for name in CURVE_NAMES} for one in maps]
@@ -202,7 +198,7 @@ class World:
 
     def make_flight(self, controller: Controller) -> Flight:
         """The runner's flight over the virtual links."""
-        return Flight(self.links, controller, self.variants, [self.assumed] * 2, self.rig, self.settings, self.notes)
+        return Flight(self.links, controller, self.variants, [self.assumed] * 2, self.rig, self.settings, self.log.note)
 
     @property
     def assumed(self) -> CurveName:
