@@ -55,7 +55,7 @@ def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
                 name=f"{name}_{sensed}", type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{name}_imu"
             )
     model = spec.compile()
-    model.actuator_ctrllimited[:] = False  # what a motor can give is `twin.power`'s to say, which knows the battery
+    model.actuator_ctrllimited[:] = False  # what a motor can give is `Power`'s to say, which knows the battery
     return model
 
 
