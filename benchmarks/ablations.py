@@ -75,8 +75,8 @@ def settings_of(row: str, steps: int) -> Config:
 
 def train(out: Path, rows: list[str], steps: int, seeds: int, physics: str) -> None:
     """Train the members of every row that is not there yet."""
-    from mjxball.train.provenance import commit, source_hash, versions
     from mjxball.train.run import Run
+    from mjxball.train.run_directory import commit, source_hash, versions
 
     for row in rows:
         if (out / row).exists():

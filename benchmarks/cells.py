@@ -15,7 +15,7 @@ distribution is printed as well. Wanted, of medians over the phases; who fails i
 LQG (`--told lqg`, or `lqg-slow` with the better filter) is always told the plant. Delay makes `lqg` limit-cycle, so
 that settling and rmse are held against undisturbed flights everywhere. Cells in which one drone's pitch torque,
 2 (5.5 - T / 4) L, does not hold the object's weight at the CG's largest offset with 15 % left are infeasible, for every
-follower. Where the mass is unknown that of the follower must also hold what it lifts alone (`trim_reach`): those cells
+follower. Where the mass is unknown that of the follower must also hold what it lifts alone (`trim_limit`): those cells
 are counted apart as well.
 """
 
@@ -30,7 +30,7 @@ from typing import Any
 
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
-from mjxball.control.constants import trim_reach
+from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower
 from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.policies import load_policy
@@ -73,7 +73,7 @@ def fly(follower: Follower, cells: list[Any], common: dict[str, Any], disturbed:
 
 def reach_of(config: Config, mass: float, known: bool) -> float:
     """CG offset that can be trimmed [m]."""
-    return trim_reach(config.plant, mass, MARGIN, mass if known else BELIEVED)
+    return trim_limit(config.plant, mass, MARGIN, mass if known else BELIEVED)
 
 
 def feasible(config: Config) -> list[Cell]:

@@ -25,7 +25,7 @@ import numpy as np
 
 from mjxball.baselines import make_baseline
 from mjxball.cache import enable_compilation_cache
-from mjxball.config import ball_reach, preset
+from mjxball.config import ball_limit, preset
 from mjxball.control import rotations
 from mjxball.control.followers import Follower
 from mjxball.control.observation import OBSERVATION_SIZE
@@ -66,7 +66,7 @@ def stand(path: Path, starts: int) -> list[dict[str, Any]]:
             {
                 "follower": follower.name,
                 "starts": starts,
-                "kept": float((ball.max(axis=0) < ball_reach(config.plant) - 1e-3).mean()),
+                "kept": float((ball.max(axis=0) < ball_limit(config.plant) - 1e-3).mean()),
                 "ball rms": float(np.median(np.sqrt((ball[late] ** 2).mean(axis=0)))),
                 "roll rms": float(np.median(np.sqrt((flown.euler[late, :, 0] ** 2).mean(axis=0)))),
                 "height rms": float(np.median(np.sqrt((flown.error[late, :, 2] ** 2).mean(axis=0)))),

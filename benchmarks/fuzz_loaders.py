@@ -35,9 +35,8 @@ from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy, shipped_policies
-from mjxball.train.curves import told_by_the_run
-from mjxball.train.members import read_members
-from mjxball.train.record import read_config
+from mjxball.train.curves import read_members, training_summary
+from mjxball.train.run_directory import read_config
 from mutations import ANY, CSV, JSON, POLICY, WITNESS
 
 TRAIN = Path(__file__).parents[1] / "train.py"
@@ -139,7 +138,7 @@ def read_records(run: Path) -> None:
     """All that is read of a run directory besides its checkpoints."""
     read_config(run)
     read_members(run)
-    told_by_the_run(run, 0)
+    training_summary(run, 0)
 
 
 def fuzz_policies(files: int, seed: int, place: Path) -> list[Count]:

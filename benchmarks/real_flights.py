@@ -16,7 +16,7 @@ from pathlib import Path
 
 from mjxball import cli
 from mjxball.errors import InputError
-from mjxball.train.provenance import commit
+from mjxball.train.run_directory import commit
 from nanobench import report, study
 
 FIGURES = (".svg", ".png")

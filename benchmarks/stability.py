@@ -21,7 +21,7 @@ import numpy as np
 
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
-from mjxball.control.constants import trim_reach
+from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower
 from mjxball.evaluate.batch import Batch, law_of
 from mjxball.evaluate.policies import load_policy
@@ -42,7 +42,7 @@ def grid(config: Config, unknown: bool) -> list[tuple[float, float, float]]:
         (offset, mass, 0.2 if unknown else mass)
         for mass in MASSES
         for offset in OFFSETS
-        if abs(offset) <= trim_reach(config.plant, mass, MARGIN, 0.2 if unknown else mass)
+        if abs(offset) <= trim_limit(config.plant, mass, MARGIN, 0.2 if unknown else mass)
     ]
 
 
@@ -70,7 +70,7 @@ def random_scenarios(config: Config, count: int, unknown: bool, seed: int = 0) -
     random, scenarios = np.random.default_rng(seed), []
     for _ in range(count):
         mass = float(random.uniform(0.1, 0.35 if unknown else 0.6))
-        reach = min(0.17, trim_reach(config.plant, mass, MARGIN, 0.2 if unknown else mass))
+        reach = min(0.17, trim_limit(config.plant, mass, MARGIN, 0.2 if unknown else mass))
         vector = lambda size: tuple(map(float, random.uniform(-size, size, 3)))  # noqa: E731
         scenarios.append(
             Scenario(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball import rewards
-from mjxball.config import Config, Reward, ball_reach
+from mjxball.config import Config, Reward, ball_limit
 from mjxball.control import crazyflie, observation, rotations
 from mjxball.control.recall import recall_of
 from mjxball.physics import newton_euler
@@ -77,7 +77,7 @@ class CoupledPairEnv(Env):
         self._backend, self._reward = physics, reward
         self._disturbances = RandomDisturbances(config)
         self._loop = ClosedLoop(config, make_physics(config, physics), self._disturbances.sensors)
-        self._ball_reach = ball_reach(config.plant)
+        self._ball_limit = ball_limit(config.plant)
         self._recall = recall_of(config)
         self._resets = ResetDistribution(config)
         self._cg = make_cg_offset(config)
@@ -122,9 +122,9 @@ class CoupledPairEnv(Env):
         """Control period [s]."""
         return self.config.timing.control_period
 
-    def reset(self, rng: Array, reach: Array | float = 1.0) -> State:
-        """A fresh world at rest or nearly so, drawn from `config.scenario`; `reach` as in `ResetDistribution.draw`."""
-        world, seen = self._fresh_world(rng, reach)
+    def reset(self, rng: Array, difficulty: Array | float = 1.0) -> State:
+        """A fresh world at rest or nearly so; `difficulty` as in `ResetDistribution.draw`."""
+        world, seen = self._fresh_world(rng, difficulty)
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
@@ -197,13 +197,13 @@ class CoupledPairEnv(Env):
             info={**state.info, "truncation": truncated.astype(jnp.float32)},
         )
 
-    def _fresh_world(self, rng: Array, reach: Array | float) -> tuple[World, Array]:
+    def _fresh_world(self, rng: Array, difficulty: Array | float) -> tuple[World, Array]:
         """(world, observation (18,) at its start)."""
-        load, plant, goal = self._resets.draw(rng, reach)
+        load, plant, goal = self._resets.draw(rng, difficulty)
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         delay = disturbances.delay if self._disturbances.present else 0
         begins = self._resets.powered and self.config.follower.shares_integrals
-        integral = self._resets.begun(load, jax.random.fold_in(rng, 5)) if begins else None
+        integral = self._resets.initial_integrals(load, jax.random.fold_in(rng, 5)) if begins else None
         loop, seen = self._loop.start(plant, goal, sample, delay, integral)
         world = World(
             loop=loop,
@@ -242,10 +242,10 @@ class CoupledPairEnv(Env):
             parts += [world.plant.ball_rate[None]]
         if self.config.follower.shares_integrals:
             parts += [world.loop.integral]
-        if world.load.supply is not None:
-            supply: Array = world.load.supply
-            older: Array = world.load.older
-            parts += [jnp.stack([supply, older])]
+        if world.load.battery is not None:
+            battery: Array = world.load.battery
+            uncompensated: Array = world.load.uncompensated
+            parts += [jnp.stack([battery, uncompensated])]
         return jnp.concatenate(parts)
 
     def _follower_command(self, action: Array, seen: Array) -> Array:
@@ -275,7 +275,7 @@ class CoupledPairEnv(Env):
             leader_command=commands.leader,
             follower_command=commands.follower,
             tilt_disagreement=(commands.follower - commands.leader)[self._unloaded],
-            ball=plant.ball_offset / self._ball_reach,
+            ball=plant.ball_offset / self._ball_limit,
             terminated=terminated,
         )
 

@@ -17,10 +17,10 @@ def policy_of_run(run: Path) -> PolicyFile:
     """The policy of the newest checkpoint in the run directory `run`."""
     from mjxball.policy.export import is_sound, policy_file
     from mjxball.train.checkpoint import restore_policy
-    from mjxball.train.curves import told_by_the_run
+    from mjxball.train.curves import training_summary
 
     config, learnt, steps, origin = restore_policy(run)
-    policy = policy_file(config, learnt, steps, {**origin, **told_by_the_run(run, origin["seed"])})
+    policy = policy_file(config, learnt, steps, {**origin, **training_summary(run, origin["seed"])})
     if not is_sound(policy):
         raise InputError(f"the newest checkpoint of {run} holds values that are not finite")
     return policy

@@ -125,8 +125,8 @@ def test_onnx_computes_what_numpy_computes(contents: PolicyFile):
     names = [item.name for item in session.get_outputs()]
     answer = dict(zip(names, session.run(None, feed), strict=True))  # all steps as one batch
     np.testing.assert_allclose(answer["action"], flight.action, rtol=0, atol=ONNX_TOLERANCE)
-    reach = float(contents.action_scale.max())
-    np.testing.assert_allclose(answer["command"], flight.command, rtol=0, atol=1e-6 + reach * ONNX_TOLERANCE)
+    scale = float(contents.action_scale.max())
+    np.testing.assert_allclose(answer["command"], flight.command, rtol=0, atol=1e-6 + scale * ONNX_TOLERANCE)
     if flight.memory.shape[1]:
         np.testing.assert_allclose(answer["next_memory"], flight.next_memory, rtol=0, atol=1e-6 + ONNX_TOLERANCE)
     assert np.abs(flight.action).max() > 0.05
@@ -168,8 +168,8 @@ def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_pat
     done = subprocess.run([compiled(contents, tmp_path, real)], input=records, capture_output=True, check=True)
     answer = np.frombuffer(done.stdout, dtype).reshape(STEPS, -1)
     np.testing.assert_allclose(answer[:, :3], flight.action, rtol=0, atol=TOLERANCE)
-    reach = float(contents.action_scale.max())
-    np.testing.assert_allclose(answer[:, 3:6], flight.command, rtol=0, atol=1e-6 + reach * TOLERANCE)
+    scale = float(contents.action_scale.max())
+    np.testing.assert_allclose(answer[:, 3:6], flight.command, rtol=0, atol=1e-6 + scale * TOLERANCE)
     np.testing.assert_allclose(answer[:, 6:], flight.next_memory, rtol=0, atol=1e-6 + TOLERANCE)
     if real == "float":
         assert int(done.stderr) == footprint(contents).state

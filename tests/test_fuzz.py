@@ -26,7 +26,7 @@ from mjxball import config as configs
 from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFileError, shipped_policies
 from mjxball.train.checkpoint import Checkpoints
-from mjxball.train.record import read_config, write_config
+from mjxball.train.run_directory import read_config, write_config
 
 
 @pytest.fixture(scope="module")

@@ -39,15 +39,15 @@ class TestConversion:
     def test_the_papers_law_keeps_force_and_slope(self) -> None:
         """46 000 and 1000 units on the older curve; a unit more per acceleration gives the same force on both."""
         config = preset("stand")
-        older = with_curve(config, OLDER)
-        assert older.autopilot.hover_thrust == pytest.approx(46000, abs=50)
-        assert older.autopilot.thrust_per_acceleration == pytest.approx(1000, rel=2e-3)
+        uncompensated = with_curve(config, OLDER)
+        assert uncompensated.autopilot.hover_thrust == pytest.approx(46000, abs=50)
+        assert uncompensated.autopilot.thrust_per_acceleration == pytest.approx(1000, rel=2e-3)
         for vertical in (-0.1, 0.0, 0.1):
             forces = [
                 crazyflie.motor_force(
                     law.motor_curve, np.float64(law.hover_thrust + law.thrust_per_acceleration * vertical)
                 )
-                for law in (config.autopilot, older.autopilot)
+                for law in (config.autopilot, uncompensated.autopilot)
             ]
             # 100 units off hover the older curve bends by 3e-7 N of 0.09 N.
             assert forces[0] == pytest.approx(forces[1], rel=1e-5)
@@ -71,17 +71,17 @@ class TestConversion:
         assert not compensates(OLDER)
 
 
-def powered_load(volts: float, older: float, scale: tuple[float, float] = (1.0, 1.0)) -> Load:
+def powered_load(volts: float, uncompensated: float, scale: tuple[float, float] = (1.0, 1.0)) -> Load:
     mass, zero, none = np.array(0.0175), np.array(0.0), np.zeros(0)
-    return Load(mass, mass, zero, zero, zero, none, none, thrust_scale=np.array(scale), supply=np.array(volts),
-                older=np.array(older))  # fmt: skip
+    return Load(mass, mass, zero, zero, zero, none, none, thrust_scale=np.array(scale), battery=np.array(volts),
+                uncompensated=np.array(uncompensated))  # fmt: skip
 
 
-def asked(config: Config, volts: float, older: float, vertical: float) -> np.ndarray:
+def asked(config: Config, volts: float, uncompensated: float, vertical: float) -> np.ndarray:
     """Rotor forces (2, 4) that a level pair at rest is given for a vertical command."""
     still = np.zeros(3)
     state = start_state(config, still, still, still, np.array(0.0175), np.array(0.0))
-    return make_powered(config)(state, np.array([[0.0, 0.0, vertical]] * 2), powered_load(volts, older))[1]
+    return make_powered(config)(state, np.array([[0.0, 0.0, vertical]] * 2), powered_load(volts, uncompensated))[1]
 
 
 class TestBattery:
@@ -107,15 +107,17 @@ class TestBattery:
         assert forces[0] / forces[2] > 1.4
 
     def test_an_integral_that_hovers_a_drawn_world_hovers_it(self) -> None:
-        """`missing` commanded to both drones gives each its share of the weight, whatever battery and firmware."""
+        """`hover_commands` give each drone its share of the weight, whatever battery and firmware."""
         config, resets = preset("flight"), ResetDistribution(preset("flight"))
-        for volts, older, scale in ((3.3, 1.0, (0.95, 1.05)), (4.1, 1.0, (1.0, 0.9)), (3.7, 0.0, (0.97, 1.1))):
-            parts = (jnp.array([volts]), jnp.array([older]), jnp.array([scale]))
-            told = np.asarray(resets.missing(jnp.array(0.0175), *parts))[0]
+        for volts, uncompensated, scale in ((3.3, 1.0, (0.95, 1.05)), (4.1, 1.0, (1.0, 0.9)), (3.7, 0.0, (0.97, 1.1))):
+            parts = (jnp.array([volts]), jnp.array([uncompensated]), jnp.array([scale]))
+            command = np.asarray(resets.hover_commands(jnp.array(0.0175), *parts))[0]
             still = np.zeros(3)
             state = start_state(config, still, still, still, np.array(0.0175), np.array(0.0))
-            commands = np.array([[0.0, 0.0, one] for one in told])
-            force = make_powered(config)(state, commands, powered_load(volts, older))[1] * np.array(scale)[:, None]
+            commands = np.array([[0.0, 0.0, one] for one in command])
+            force = (
+                make_powered(config)(state, commands, powered_load(volts, uncompensated))[1] * np.array(scale)[:, None]
+            )
             # float32 and whole units of command
             assert force == pytest.approx(np.full((2, 4), 0.03775 * 9.81 / 4), rel=1e-4)
 
@@ -126,12 +128,14 @@ class TestDrawnWorlds:
         env = CoupledPairEnv(config, "newton-euler")
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(3), 512))
         load = state.pipeline_state.load
-        assert 0.4 < float(load.older.mean()) < 0.65  # half, and some of the others' candidates are refused
-        assert float(load.supply.min()) >= 3.2
-        assert float(load.supply.max()) <= 4.2
+        assert 0.4 < float(load.uncompensated.mean()) < 0.65  # half, and some of the others' candidates are refused
+        assert float(load.battery.min()) >= 3.2
+        assert float(load.battery.max()) <= 4.2
         resets = ResetDistribution(config)
         good = jax.vmap(
-            lambda one: resets.flyable(one.object_mass, one.supply[None], one.older[None], one.thrust_scale[None])[0]
+            lambda one: resets.flyable(
+                one.object_mass, one.battery[None], one.uncompensated[None], one.thrust_scale[None]
+            )[0]
         )(load)
         assert bool(good.all())
 
@@ -141,14 +145,14 @@ class TestDrawnWorlds:
         need = (1 + LIFT) * 0.03775 * 9.81 / 4 / cap  # factor on the force with which it just can
         for factor, fine in ((need + 0.002, True), (need - 0.002, False)):
             scale = jnp.array([[1.0, factor]])
-            told = resets.flyable(jnp.array(0.0175), jnp.array([4.0]), jnp.array([0.0]), scale)
-            assert bool(told[0]) is fine
+            command = resets.flyable(jnp.array(0.0175), jnp.array([4.0]), jnp.array([0.0]), scale)
+            assert bool(command[0]) is fine
 
     def test_other_presets_draw_no_battery(self) -> None:
         env = CoupledPairEnv(preset("robust"), "newton-euler")
         load = env.reset(jax.random.PRNGKey(0)).pipeline_state.load
-        assert load.supply is None
-        assert load.older is None
+        assert load.battery is None
+        assert load.uncompensated is None
 
 
 def test_rate_share_is_a_factor_on_all_rate_gains() -> None:

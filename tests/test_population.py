@@ -19,9 +19,9 @@ from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.policy.file import load_file
 from mjxball.train import program as programs
-from mjxball.train.members import best_member, read_members
-from mjxball.train.population import Population, _partitioned_by_gspmd
-from mjxball.train.sweep import read_sweep
+from mjxball.train.curves import best_member, read_members
+from mjxball.train.population import Population, partitioned_by_gspmd
+from mjxball.train.run_directory import read_sweep
 
 REPOSITORY = Path(__file__).parents[1]
 SMALL = {
@@ -70,7 +70,7 @@ def test_swept_settings_differ_between_members_and_between_traced_programs(
     small: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The swept numbers are constants in the traced program: the cache must tell them apart."""
-    monkeypatch.setattr("mjxball.train.traced.traced_directory", lambda: tmp_path)
+    monkeypatch.setattr("mjxball.train.compilation.traced_directory", lambda: tmp_path)
     moved = []
     for rates in ([1e-6, 1e-2], [1e-2, 1e-6], [1e-2, 1e-6]):
         population = Population(small, "newton-euler", 2, {"sac.learning_rate": rates})
@@ -189,6 +189,6 @@ for a, b in zip(leaves, jax.tree.leaves(alone.algorithm.learner.policy)):
 @pytest.mark.parametrize("spread", [True, False])
 def test_only_what_is_spread_over_devices_is_left_to_gspmd(spread: bool) -> None:
     mesh, before = jax.make_mesh((1,), ("members",)), jax.config.jax_use_shardy_partitioner
-    with _partitioned_by_gspmd(mesh if spread else None):
+    with partitioned_by_gspmd(mesh if spread else None):
         inside = jax.config.jax_use_shardy_partitioner
     assert (inside, jax.config.jax_use_shardy_partitioner) == (before and not spread, before)

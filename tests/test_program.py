@@ -22,7 +22,7 @@ class Compiled(NamedTuple):
 
     program: Program
     create: Any  # key -> TrainState
-    advance: Any  # (TrainState, Mode) -> (TrainState, Tally)
+    advance: Any  # (TrainState, Mode) -> (TrainState, Statistics)
     fresh: Any  # key -> worlds
 
 
@@ -75,9 +75,9 @@ def recorded(state: TrainState) -> np.ndarray:
 def evaluated_return(compiled: Compiled, state: TrainState, steps: int = 500) -> float:
     """Mean reward per step on the same fresh worlds every time."""
     worlds = compiled.fresh(jax.random.key(99))
-    _, tally, *_ = compiled.advance(state._replace(envs=worlds), programs.evaluate(steps))
-    assert int(tally.totals["diverged"]) == 0
-    return float(tally.reward) / steps
+    _, statistics, *_ = compiled.advance(state._replace(envs=worlds), programs.evaluate(steps))
+    assert int(statistics.totals["diverged"]) == 0
+    return float(statistics.reward) / steps
 
 
 def test_prefill_records_every_step_and_learns_nothing(compiled, prefilled):
@@ -169,7 +169,7 @@ class Ending(NamedTuple):
     """What the program recorded of one step in which every world ended."""
 
     after: TrainState
-    tally: programs.Tally
+    statistics: programs.Statistics
     discount: np.ndarray  # (worlds,)
     next_observation: np.ndarray  # (worlds, n)
     last: np.ndarray  # (worlds,)
@@ -179,12 +179,12 @@ def end_all_worlds(compiled: Compiled, prefilled: TrainState, **parts: Any) -> E
     """Step all worlds once after replacing `parts` of them, and read the newest rows."""
     worlds = prefilled.envs
     ending = worlds.replace(pipeline_state=worlds.pipeline_state._replace(**parts))
-    after, tally, *_ = compiled.advance(prefilled._replace(envs=ending), programs.warmup(1))
+    after, statistics, *_ = compiled.advance(prefilled._replace(envs=ending), programs.warmup(1))
     newest = recorded(after)[20 * WORLDS : 21 * WORLDS]
     seen = compiled.program.environments.observation_size
     np.testing.assert_array_equal(after.envs.pipeline_state.steps, 0)  # all start anew
     np.testing.assert_array_equal(after.envs.pipeline_state.plant.position, 0.0)
-    return Ending(after, tally, newest[:, seen + 4], newest[:, seen + 5 : 2 * seen + 5], newest[:, 2 * seen + 5])
+    return Ending(after, statistics, newest[:, seen + 4], newest[:, seen + 5 : 2 * seen + 5], newest[:, 2 * seen + 5])
 
 
 def test_lost_worlds_are_terminations(compiled, prefilled):
@@ -192,7 +192,7 @@ def test_lost_worlds_are_terminations(compiled, prefilled):
     loop = prefilled.envs.pipeline_state.loop
     lost = loop._replace(plant=loop.plant._replace(position=loop.plant.position + 10.0))
     ending = end_all_worlds(compiled, prefilled, loop=lost)
-    assert (int(ending.tally.ended), int(ending.tally.totals["diverged"])) == (WORLDS, 0)
+    assert (int(ending.statistics.ended), int(ending.statistics.totals["diverged"])) == (WORLDS, 0)
     np.testing.assert_array_equal(ending.discount, 0)
     np.testing.assert_array_equal(ending.last, 1)
     assert (ending.next_observation[:, :3] > 5).all()
@@ -203,7 +203,7 @@ def test_time_limits_are_bootstrapped(compiled, prefilled):
     steps = prefilled.envs.pipeline_state.steps
     limit = compiled.program.config.timing.episode_steps
     ending = end_all_worlds(compiled, prefilled, steps=jnp.full_like(steps, limit - 1))
-    assert int(ending.tally.ended) == 0
+    assert int(ending.statistics.ended) == 0
     np.testing.assert_array_equal(ending.discount, 1)
     np.testing.assert_array_equal(ending.last, 1)
     assert (ending.next_observation != np.asarray(ending.after.envs.obs)).any(axis=1).all()

@@ -131,24 +131,24 @@ def test_critics_are_told_the_truth_and_policies_are_not(disturbed: CompiledEnv)
         state = disturbed.step(state, jnp.zeros(3))
     world = state.pipeline_state
     assert state.obs.shape == (env.observation_size,)
-    told = np.asarray(state.obs[18:])
-    offset, moment, mass, unknown = told[:4]
+    command = np.asarray(state.obs[18:])
+    offset, moment, mass, unknown = command[:4]
     load = world.load
     expected = float(load.cg_amplitude * jnp.sin(load.cg_speed * world.plant.time + load.cg_phase))
     assert offset == pytest.approx(expected, rel=1e-4)
     assert moment == pytest.approx(expected * float(load.object_mass), rel=1e-4)
     assert mass == pytest.approx(float(load.object_mass))
     assert unknown == pytest.approx(float(load.object_mass) - 0.2, rel=1e-4)
-    np.testing.assert_allclose(told[4 + 9 : 4 + 12], world.goal - world.plant.position, rtol=1e-5)
-    np.testing.assert_allclose(told[19:22], world.disturbances.force, rtol=1e-6)
-    np.testing.assert_allclose(told[22:24], [1.0, 2.0])
-    np.testing.assert_allclose(told[24:], [load.rotor_lag_scale, *load.thrust_scale, *load.added_inertia], rtol=1e-6)
+    np.testing.assert_allclose(command[4 + 9 : 4 + 12], world.goal - world.plant.position, rtol=1e-5)
+    np.testing.assert_allclose(command[19:22], world.disturbances.force, rtol=1e-6)
+    np.testing.assert_allclose(command[22:24], [1.0, 2.0])
+    np.testing.assert_allclose(command[24:], [load.rotor_lag_scale, *load.thrust_scale, *load.added_inertia], rtol=1e-6)
     scale = 1 + load.added_inertia[0] / (2 * 2.3e-3 + float(load.object_mass) * (0.1**2 + 0.05**2) / 12)
     assert 0.6 < float(scale) < 1.4
-    assert env.input_mask[18:] == [0.0] * len(told)
-    assert env.critic_mask[18:] == [1.0] * len(told)
+    assert env.input_mask[18:] == [0.0] * len(command)
+    assert env.critic_mask[18:] == [1.0] * len(command)
     # What it sees is late and noisy.
-    assert not np.allclose(state.obs[12:15], told[13:16], atol=1e-4)
+    assert not np.allclose(state.obs[12:15], command[13:16], atol=1e-4)
 
 
 def test_a_gust_pushes(disturbed: CompiledEnv) -> None:
@@ -168,7 +168,7 @@ def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> 
     config = with_settings(transport, scenario={"cg_random_visits": 0.5, "cg_amplitude": (0.05, 0.1)})
     env = CoupledPairEnv(config, "newton-euler")
     load = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 400)).pipeline_state.load
-    assert 160 < int(load.cg_visits.sum()) < 240
+    assert 160 < int(load.follows_path.sum()) < 240
     assert load.cg_path.shape == (400, 16)
     assert float(jnp.abs(load.cg_path).max()) <= 1.0
     times = jnp.linspace(0.0, 60.0, 400)

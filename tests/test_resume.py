@@ -17,7 +17,7 @@ from conftest import HASTY
 
 from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS
-from mjxball.train.provenance import PACKAGE, SOURCES
+from mjxball.train.run_directory import PACKAGE, SOURCES
 
 REPOSITORY = Path(__file__).parents[1]
 TINY = [

@@ -11,7 +11,7 @@ from plants import BEAM
 
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
-from mjxball.config import Config, Leader, ball_reach
+from mjxball.config import Config, Leader, ball_limit
 from mjxball.control.constants import plant_constants
 from mjxball.evaluate.paper_figures import LEVEL, SETTINGS, STAND_START, StandFlight, fly_stand, stand_config
 from mjxball.policy import Policy
@@ -68,7 +68,7 @@ def flown() -> dict[str, dict[str, StandFlight]]:
 @pytest.mark.parametrize("settings", SETTINGS)
 def test_shipped_follower_keeps_the_ball_that_copying_loses(settings: str, flown: dict) -> None:
     mine, copied = flown[settings]["mine"], flown[settings]["copy"]
-    reach = ball_reach(stand_config().plant)
+    reach = ball_limit(stand_config().plant)
     assert np.abs(mine.ball).max() < 0.9 * reach
     assert np.abs(copied.ball).max() > reach - 1e-3
     assert mine.roll_rms < 0.1

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from mjxball.config import Config, preset
-from mjxball.control.constants import trim_reach
+from mjxball.control.constants import trim_limit
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,7 @@ def paper() -> Config:
 
 def test_reach_of_a_known_mass_by_hand(paper: Config) -> None:
     """0.2 kg: 10.791 N a drone, 2.698 N a rotor, 2 (5.5 - 2.698) 0.12 = 0.6725 N m, 85 % of it over 1.962 N."""
-    assert trim_reach(paper.plant, 0.2, 0.15) == pytest.approx(0.85 * 0.67254 / 1.962, rel=1e-4)
+    assert trim_limit(paper.plant, 0.2, 0.15) == pytest.approx(0.85 * 0.67254 / 1.962, rel=1e-4)
 
 
 @pytest.mark.parametrize(("mass", "believed"), [(0.2, 0.2), (0.5, 0.5), (0.3, 0.2), (0.1, 0.2)])
@@ -29,7 +29,7 @@ def test_at_the_reach_everything_balances_and_one_rotor_is_at_its_limit(
     """Force and moment about O of four weights' and eight rotors' forces, the leader's four alike."""
     plant = dataclasses.replace(paper.plant, leader_mass=drones[0], follower_mass=drones[1])
     gravity, half, arm = plant.gravity, plant.leader_mount[0], plant.arm
-    offset = trim_reach(plant, mass, 0.0, believed, thrust)
+    offset = trim_limit(plant, mass, 0.0, believed, thrust)
     leader = thrust[0] * (drones[0] + believed / 2) * gravity
     follower = (sum(drones) + mass) * gravity - leader
     # On which side the CG is harder to hold depends on who lifts too little.
@@ -42,5 +42,5 @@ def test_at_the_reach_everything_balances_and_one_rotor_is_at_its_limit(
 
 
 def test_a_mass_that_is_heavier_than_believed_leaves_less(paper: Config) -> None:
-    assert trim_reach(paper.plant, 0.3, 0.15, 0.2) < trim_reach(paper.plant, 0.3, 0.15)
-    assert trim_reach(paper.plant, 0.6, 0.15, 0.2) < 0
+    assert trim_limit(paper.plant, 0.3, 0.15, 0.2) < trim_limit(paper.plant, 0.3, 0.15)
+    assert trim_limit(paper.plant, 0.6, 0.15, 0.2) < 0

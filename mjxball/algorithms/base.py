@@ -88,7 +88,7 @@ class Transition(NamedTuple):
 
 
 class Environments(Protocol):
-    """Environments side by side, as an algorithm sees them (`mjxball.train.environments`)."""
+    """Environments side by side, as an algorithm sees them (`mjxball.train.program`)."""
 
     count: int  # of this shard
     observation_size: int

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.baselines.load_axis import load_axis
-from mjxball.config import Config, ball_reach
+from mjxball.config import Config, ball_limit
 from mjxball.control.hover import drone_loop, thrust_slopes
 
 STATES = (
@@ -92,5 +92,5 @@ def linear_model(config: Config, delay: float) -> LinearModel:
         a[at["load_rate"]] = -LOAD_RATE_DECAY * row["load_rate"]
     names = [name for name in STATES if free or name not in LATERAL]
     indices = [at[name] for name in names]
-    limit = ball * plant.gravity * ball_reach(plant) if config.motion.kind == "rolling" else math.inf
+    limit = ball * plant.gravity * ball_limit(plant) if config.motion.kind == "rolling" else math.inf
     return LinearModel(a[np.ix_(indices, indices)], b[indices], tuple(names), loop.integral_limit, limit)

@@ -29,7 +29,7 @@ from mjxball.physics.stepper import ENGINES
 from mjxball.policy import Policy, PolicyFileError
 from mjxball.policy.shipped import shipped_policies
 from mjxball.sim.scenario import Scenario
-from mjxball.train.provenance import versions
+from mjxball.train.run_directory import versions
 
 # What `--figures` fixes itself.
 NOT_WITH_FIGURES = ("suite", "num_seeds", "check", "followers", "json", "wn_pitch", "plant", *SCENARIO_FLAGS)

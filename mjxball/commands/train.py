@@ -24,9 +24,18 @@ from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.physics.stepper import TRAINING_ENGINES
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
-from mjxball.train.provenance import commit, differences, source_hash, versions
-from mjxball.train.record import CHECKPOINTS, EXTENSIONS, LARGEST_SEED, MOST_MEMBERS, POLICY
-from mjxball.train.sweep import read_sweep
+from mjxball.train.run_directory import (
+    CHECKPOINTS,
+    EXTENSIONS,
+    LARGEST_SEED,
+    MOST_MEMBERS,
+    POLICY,
+    commit,
+    differences,
+    read_sweep,
+    source_hash,
+    versions,
+)
 
 
 def parser() -> cli.Parser:
@@ -75,7 +84,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     else:
         settings, origin, out = _new_run(options, command)
     enable_compilation_cache()
-    with processes.ends_with_the_others(f"--resume {out}") if meeting else contextlib.nullcontext():
+    with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
         if meeting:
             processes.join(meeting)
         writes = processes.is_writer()
@@ -188,7 +197,7 @@ def _check_extensions(names: dict[str, str], settings: config.Config, physics: s
 
 def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
     """Configuration and origin of the run to be continued; InputError if this program is not the one that made it."""
-    from mjxball.train.record import read_config
+    from mjxball.train.run_directory import read_config
 
     settings, origin = read_config(run)
     changed = differences(origin)
@@ -211,7 +220,7 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
     from mjxball.evaluate.policies import load_policy
     from mjxball.evaluate.results import fly_scenarios, table
     from mjxball.policy.file import load_file, save_file
-    from mjxball.train.members import POLICIES, draw_members
+    from mjxball.train.curves import POLICIES, draw_members
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
     cells = fly_scenarios(settings, policies, standard_scenarios(settings)[-1:], origin["physics"])

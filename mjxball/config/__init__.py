@@ -30,7 +30,7 @@ from mjxball.config._tree import (
     to_dict,
     to_json,
 )
-from mjxball.config._validate import ball_reach, cg_reach, validate
+from mjxball.config._validate import ball_limit, cg_limit, validate
 
 __all__ = [
     "CONSTANT",
@@ -50,8 +50,8 @@ __all__ = [
     "Scenario",
     "Timing",
     "apply_overrides",
-    "ball_reach",
-    "cg_reach",
+    "ball_limit",
+    "cg_limit",
     "config_hash",
     "current_name",
     "from_dict",

@@ -143,27 +143,27 @@ def _validate_autopilot(config: Config) -> None:
         )
 
 
-def cg_reach(plant: Plant) -> float:
+def cg_limit(plant: Plant) -> float:
     """Largest offset of the CG from O that keeps the moving mass on the object [m]."""
     return plant.moving_fraction * plant.object_size["xy".index(plant.cg_axis)] / 2
 
 
-def ball_reach(plant: Plant) -> float:
+def ball_limit(plant: Plant) -> float:
     """Offset of a rolling ball at which it touches an end stop [m]."""
     return plant.ball_stop or plant.object_size["xy".index(plant.cg_axis)] / 2 - plant.ball_radius
 
 
 def _validate_motion(config: Config) -> None:
-    reach = cg_reach(config.plant) + 1e-12
+    limit = cg_limit(config.plant) + 1e-12
     scenario, motion = config.scenario, config.motion
-    if motion.kind == "sine" and scenario.cg_amplitude[1] > reach:
+    if motion.kind == "sine" and scenario.cg_amplitude[1] > limit:
         raise InputError(
-            f"scenario.cg_amplitude {scenario.cg_amplitude[1]:g} m leaves the object: the CG reaches {reach:.4g} m"
+            f"scenario.cg_amplitude {scenario.cg_amplitude[1]:g} m leaves the object: the CG reaches {limit:.4g} m"
         )
     if scenario.object_mass[0] + scenario.mass_change[0] <= 0:
         raise InputError(f"scenario.mass_change {scenario.mass_change[0]:g} kg would leave no object mass")
-    if motion.kind == "rolling" and scenario.ball_start > ball_reach(config.plant):
-        end = ball_reach(config.plant)
+    if motion.kind == "rolling" and scenario.ball_start > ball_limit(config.plant):
+        end = ball_limit(config.plant)
         raise InputError(f"scenario.ball_start {scenario.ball_start:g} m lies beyond the end stop at {end:.4g} m")
     if motion.kind == "waveform":
         if len(motion.times) != len(motion.offsets) or len(motion.times) < 2:
@@ -172,5 +172,5 @@ def _validate_motion(config: Config) -> None:
             raise InputError("motion.times and motion.offsets must be finite")
         if any(later <= earlier for earlier, later in itertools.pairwise(motion.times)):
             raise InputError("motion.times must increase from sample to sample")
-        if max(map(abs, motion.offsets)) > reach:
-            raise InputError(f"motion.offsets leave the object: the CG reaches {reach:.4g} m")
+        if max(map(abs, motion.offsets)) > limit:
+            raise InputError(f"motion.offsets leave the object: the CG reaches {limit:.4g} m")

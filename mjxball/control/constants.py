@@ -9,7 +9,7 @@ import numpy as np
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
 from mjxball.control.attitude import AttitudeGains, design_gains
-from mjxball.control.mixer import torque_reach
+from mjxball.control.mixer import torque_per_force
 
 Array = Any
 ROLLING_INERTIA = 0.4  # spin inertia of a solid ball over r^2 and its mass: (7/5) m x'' = m g sin
@@ -60,7 +60,7 @@ def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
     return PlantConstants(mass, mounts, share, gains, mass @ mounts, drone_inertia, shell, ball)
 
 
-def trim_reach(
+def trim_limit(
     plant: Plant,
     object_mass: Array,
     margin: float,
@@ -80,6 +80,6 @@ def trim_reach(
     led = strong * (plant.leader_mass - behind / (ahead - behind) * believed) - plant.leader_mass  # beyond its own mass
     lifted = object_mass - led  # by the follower
     asked = (plant.follower_mass + lifted) * plant.gravity / 4  # of each rotor, times `own`
-    torque = (1 - margin) * torque_reach(plant.arm, plant.layout) * (own * plant.rotor_force_max - asked)
+    torque = (1 - margin) * torque_per_force(plant.arm, plant.layout) * (own * plant.rotor_force_max - asked)
     uneven = abs(ahead * led + behind * lifted) * plant.gravity  # moment about O of both lifts
     return (torque - uneven) / (object_mass * plant.gravity)

@@ -40,6 +40,6 @@ def rotors_from_wrench(wrench: Array, arm: float, yaw_per_thrust: float, layout:
     return xp.stack([*rotors, thrust + roll + pitch - yaw, thrust + roll - pitch + yaw], axis=-1)
 
 
-def torque_reach(arm: float, layout: str) -> float:
+def torque_per_force(arm: float, layout: str) -> float:
     """Roll or pitch torque per force [m] that a drone has: times (F_max - T / 4) it is the largest at thrust T."""
     return (2 if layout == "plus" else 4) * lever(arm, layout)

@@ -76,7 +76,7 @@ def follower_command(
     scaled: Array,
     observation: Array,
     residual: bool,
-    reach: tuple[float, float],
+    action_scale: tuple[float, float],
     kp: Array,
     kd: Array,
     gravity: float,
@@ -84,10 +84,10 @@ def follower_command(
 ) -> Array:
     """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18).
 
-    `reach` = (tilt [rad], vertical [m/s2]) scales the action; with `residual` the PD law on the observed
+    `action_scale` = (tilt [rad], vertical [m/s2]) scales the action; with `residual` the PD law on the observed
     error is added. The sum is clipped to `limits` = (tilt [rad], vertical [m/s2]).
     """
-    command = scale_action(scaled, *reach)
+    command = scale_action(scaled, *action_scale)
     if residual:
         command = command + copy_command(observation, kp, kd, gravity, *limits)
     return leader.clip_command(command, *limits)

@@ -36,7 +36,7 @@ class Carry(NamedTuple):
     loop: LoopState
     observation: Array  # (n, 18)
     follower: Any
-    tally: metrics.Tally
+    running: metrics.RunningMetrics
 
 
 class Inputs(NamedTuple):
@@ -83,8 +83,8 @@ class Batch:
             np.arange(count + 1, dtype=np.int32), (goals[:-1], goals[1:]), force, later._replace(force=None)
         )
         with jax.default_matmul_precision("highest"):
-            tally = self._program(sensors, delays)(start, load, goals[0], samples.at(0), inputs)
-        return metrics.results(tally)
+            running = self._program(sensors, delays)(start, load, goals[0], samples.at(0), inputs)
+        return metrics.results(running)
 
     def _program(self, sensors: SensorModel, delays: np.ndarray) -> Any:
         """The compiled flight; delays, biases and resolutions are constants in it, everything else is given to it."""
@@ -97,11 +97,11 @@ class Batch:
 
     def _all(
         self, loop: ClosedLoop, delays: Array, start: PlantState, load: Load, goal: Array, first: Sample, inputs: Inputs
-    ) -> metrics.Tally:
+    ) -> metrics.RunningMetrics:
         state, seen = loop.start(start, goal, first, delays)
-        tally = metrics.begin(start.position, goal, start.rotor_force)
-        carry = Carry(state, seen, self._law.start(seen), tally)
-        return jax.lax.scan(lambda c, i: (self._step(loop, load, c, i), None), carry, inputs)[0].tally
+        running = metrics.begin(start.position, goal, start.rotor_force)
+        carry = Carry(state, seen, self._law.start(seen), running)
+        return jax.lax.scan(lambda c, i: (self._step(loop, load, c, i), None), carry, inputs)[0].running
 
     def _step(self, loop: ClosedLoop, load: Load, carry: Carry, inputs: Inputs) -> Carry:
         config, state, seen = self._config, carry.loop, carry.observation
@@ -113,7 +113,7 @@ class Batch:
         time = inputs.number * jnp.float32(config.timing.control_period)
         flown = (time, plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)
         limits = (config.scenario.termination_distance, config.plant.rotor_force_max)
-        return Carry(moved, after, follower, metrics.update(carry.tally, rollout.Tick(*flown), *limits))
+        return Carry(moved, after, follower, metrics.update(carry.running, rollout.Tick(*flown), *limits))
 
 
 def law_of(follower: Follower) -> Law:

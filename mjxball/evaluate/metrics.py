@@ -48,7 +48,7 @@ class Metrics:
         return math.hypot(*peaks) if len(peaks) == 3 else math.nan
 
 
-class Tally(NamedTuple):
+class RunningMetrics(NamedTuple):
     """Sums and extremes of n flights so far, NumPy or JAX arrays (n,) unless said otherwise."""
 
     steps: Array  # ()
@@ -74,12 +74,12 @@ class Tally(NamedTuple):
     target: Array  # (n, 3)
 
 
-def begin(position: Array, target: Array, rotor_force: Array) -> Tally:
+def begin(position: Array, target: Array, rotor_force: Array) -> RunningMetrics:
     """Before the first step, at `position` (n, 3) with `target` (n, 3) and `rotor_force` (n, 2, 4)."""
     xp = position.__array_namespace__()
     zero, none = xp.zeros_like(position[:, 0]), xp.full_like(position, xp.nan)
     scalar = xp.sum(zero[:0])
-    return Tally(
+    return RunningMetrics(
         *(scalar, scalar, scalar, zero, zero, zero, zero, zero, zero, zero > 1),
         initial=_norm(target - position),
         leg=zero,
@@ -95,54 +95,54 @@ def begin(position: Array, target: Array, rotor_force: Array) -> Tally:
     )
 
 
-def update(tally: Tally, tick: Tick, termination_distance: float, rotor_force_max: float) -> Tally:
+def update(running: RunningMetrics, tick: Tick, termination_distance: float, rotor_force_max: float) -> RunningMetrics:
     """Take one control step of all flights into account."""
     xp = tick.position.__array_namespace__()
     error = tick.target - tick.position
     distance = _norm(error)
     # Where the goal has changed, settling and peaks start again.
-    new = xp.any(tick.target != tally.target, axis=-1)
-    initial = xp.where(new, distance, tally.initial)
-    steady_from = xp.where(new, tick.time + WAYPOINT_SECONDS, tally.steady_from)
+    new = xp.any(tick.target != running.target, axis=-1)
+    initial = xp.where(new, distance, running.initial)
+    steady_from = xp.where(new, tick.time + WAYPOINT_SECONDS, running.steady_from)
     steady_from = xp.where(steady_from > STEADY_AFTER, steady_from, STEADY_AFTER)
-    outside = xp.where(new[:, None], -xp.inf, tally.outside)
+    outside = xp.where(new[:, None], -xp.inf, running.outside)
     beyond = xp.stack([~(distance <= share * initial) for share in SETTLED], axis=-1)
-    peaks = xp.where(new[:, None], xp.nan, tally.peaks)
+    peaks = xp.where(new[:, None], xp.nan, running.peaks)
     steady = tick.time >= steady_from - TINY
     rotors, tilts = tick.rotor_force[:, 1], tick.follower_command[:, :2]
     slack = SATURATED_WITHIN * rotor_force_max
     at_a_limit = (rotors <= slack) | (rotors >= rotor_force_max - slack)
     early = tick.time <= RMSE_UNTIL + TINY
     mimicry = paper_reward(tick.leader_command, tick.follower_command)
-    change = xp.mean((tilts - tally.tilts) ** 2, axis=-1)
-    return Tally(
-        steps=tally.steps + 1,
-        time=tally.time * 0 + tick.time,
-        early=tally.early + xp.where(early, 1.0, 0.0),
-        square=tally.square + xp.where(early, distance**2, 0.0),
-        difference=tally.difference + xp.mean((tick.follower_command - tick.leader_command) ** 2, axis=-1),
-        returned=tally.returned + xp.where(tally.steps < PAPER_STEPS, mimicry, 0.0),
-        effort=tally.effort + xp.mean((rotors - tally.hover) ** 2, axis=-1),
-        change=tally.change + xp.where(tally.steps > 0, change, 0.0),
-        saturated=tally.saturated + xp.mean(xp.where(at_a_limit, 1.0, 0.0), axis=-1),
-        failed=tally.failed | tick.diverged | ~(distance <= termination_distance),
+    change = xp.mean((tilts - running.tilts) ** 2, axis=-1)
+    return RunningMetrics(
+        steps=running.steps + 1,
+        time=running.time * 0 + tick.time,
+        early=running.early + xp.where(early, 1.0, 0.0),
+        square=running.square + xp.where(early, distance**2, 0.0),
+        difference=running.difference + xp.mean((tick.follower_command - tick.leader_command) ** 2, axis=-1),
+        returned=running.returned + xp.where(running.steps < PAPER_STEPS, mimicry, 0.0),
+        effort=running.effort + xp.mean((rotors - running.hover) ** 2, axis=-1),
+        change=running.change + xp.where(running.steps > 0, change, 0.0),
+        saturated=running.saturated + xp.mean(xp.where(at_a_limit, 1.0, 0.0), axis=-1),
+        failed=running.failed | tick.diverged | ~(distance <= termination_distance),
         initial=initial,
-        leg=xp.where(new, tick.time, tally.leg),
+        leg=xp.where(new, tick.time, running.leg),
         steady_from=steady_from,
-        steady=xp.where(new, 0.0, tally.steady) + xp.where(steady, 1.0, 0.0),
+        steady=xp.where(new, 0.0, running.steady) + xp.where(steady, 1.0, 0.0),
         outside=xp.where(beyond, tick.time, outside),
         peaks=xp.where(steady[:, None], xp.fmax(peaks, xp.abs(error)), peaks),
-        furthest=xp.fmax(tally.furthest, tick.position * xp.sign(tick.target)),
-        tilt=xp.fmax(tally.tilt, xp.hypot(tick.euler[:, 0], tick.euler[:, 1])),
-        hover=tally.hover,
+        furthest=xp.fmax(running.furthest, tick.position * xp.sign(tick.target)),
+        tilt=xp.fmax(running.tilt, xp.hypot(tick.euler[:, 0], tick.euler[:, 1])),
+        hover=running.hover,
         tilts=tilts,
         target=tick.target,
     )
 
 
-def results(tally: Tally) -> list[Metrics]:
+def results(running: RunningMetrics) -> list[Metrics]:
     """Metrics of every flight."""
-    t = Tally(*(np.asarray(leaf, float) for leaf in tally))
+    t = RunningMetrics(*(np.asarray(leaf, float) for leaf in running))
     with np.errstate(invalid="ignore", divide="ignore"):
         peaks = np.where((t.steady > 1)[:, None], t.peaks, np.nan)
         goal = np.where(t.target == 0, np.nan, t.target)
@@ -177,10 +177,10 @@ def measure(flight: Trajectory, termination_distance: float, rotor_force_max: fl
 def measure_batch(flights: Trajectory, termination_distance: float, rotor_force_max: float = 5.5) -> list[Metrics]:
     """Metrics of every flight of a recorded batch."""
     first = flights.tick(0)
-    tally = begin(first.position, first.target, first.rotor_force)
+    running = begin(first.position, first.target, first.rotor_force)
     for number in range(len(flights.time)):
-        tally = update(tally, flights.tick(number), termination_distance, rotor_force_max)
-    return results(tally)
+        running = update(running, flights.tick(number), termination_distance, rotor_force_max)
+    return results(running)
 
 
 def _norm(vector: Array) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
-from mjxball.config import Config, ball_reach
+from mjxball.config import Config, ball_limit
 from mjxball.control import rotations
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
@@ -351,7 +351,7 @@ def draw_stand(policies: Sequence[Policy], physics: str) -> Figure:
 def _stand_svg(flown: dict[str, dict[str, StandFlight]]) -> str:
     figure, axes = _panels([1.4] * 4, len(flown))
     shade = colours([name for flights in flown.values() for name in flights])
-    stop = ball_reach(stand_config().plant)
+    stop = ball_limit(stand_config().plant)
     for column, (settings, flights) in zip(axes.T, flown.items(), strict=True):
         for axis, lines in zip(column, ((LEVEL,), (0.0,), (), (-stop, stop)), strict=True):
             for value in lines:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mjxball.config import Config, ball_reach, cg_reach
+from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
 from mjxball.sim.scenario import Scenario, check_scenario
 
@@ -37,13 +37,13 @@ def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
     goal 0, and the goal is drawn in to what training may draw. A waveform or a rolling ball makes one scenario.
     """
     plant = settings.plant
-    reach = min(REFERENCE.goal[0], settings.scenario.goal_range)
+    distance = min(REFERENCE.goal[0], settings.scenario.goal_range)
     free = {"free": (1, 1, 1), "pivot": (0, 0, 0), "heave": (0, 0, 1)}[plant.stand]
-    common: dict[str, Any] = {"mass": plant.object_mass, "goal": tuple(reach * float(axis) for axis in free)}
+    common: dict[str, Any] = {"mass": plant.object_mass, "goal": tuple(distance * float(axis) for axis in free)}
     reference = dataclasses.replace(
         REFERENCE,
-        amplitude=min(REFERENCE.amplitude, cg_reach(plant), settings.scenario.cg_amplitude[1]),
-        ball_start=min(settings.scenario.ball_start, ball_reach(plant)),
+        amplitude=min(REFERENCE.amplitude, cg_limit(plant), settings.scenario.cg_amplitude[1]),
+        ball_start=min(settings.scenario.ball_start, ball_limit(plant)),
         **common,
     )
     others = [

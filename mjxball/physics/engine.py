@@ -50,9 +50,9 @@ class Load(NamedTuple):
     thrust_scale: Array | None = None  # (..., 2) factor on the rotor forces of leader and follower; None: 1
     added_inertia: Array | None = None  # (..., 3) about the body axes through O, without mass [kg m2]; None: none
     cg_path: Array | None = None  # (..., k) places in [-1, 1] that the CG visits instead of a sine, see `motion.visits`
-    cg_visits: Array | None = None  # (...) 1 where it does, 0 where it follows the sine
-    supply: Array | None = None  # (...) voltage of both batteries [V]; None: motors follow the curve
-    older: Array | None = None  # (...) 1 where the firmware does not compensate for the battery, else 0
+    follows_path: Array | None = None  # (...) 1 where it does, 0 where it follows the sine
+    battery: Array | None = None  # (...) voltage of both batteries [V]; None: motors follow the curve
+    uncompensated: Array | None = None  # (...) 1 where the firmware does not compensate for the battery, else 0
 
 
 class Wrench(NamedTuple):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.config import Config, ball_reach, cg_reach
+from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
 from mjxball.physics.engine import CgState, Load
 
@@ -51,11 +51,11 @@ def drawn(time: Array, load: Load) -> CgState:
     """A flight's own motion: its sine, or the places that it visits instead."""
     sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
     swinging = sine(time, *sines)
-    if load.cg_path is None or load.cg_visits is None:
+    if load.cg_path is None or load.follows_path is None:
         return swinging
     xp = time.__array_namespace__()
     visiting = visits(time, *sines, load.cg_path)
-    return CgState(*(xp.where(load.cg_visits > 0, b, a) for a, b in zip(swinging, visiting, strict=True)))
+    return CgState(*(xp.where(load.follows_path > 0, b, a) for a, b in zip(swinging, visiting, strict=True)))
 
 
 class Spline(NamedTuple):
@@ -105,11 +105,11 @@ def make_prescribed(config: Config) -> Prescribed:
     if config.motion.kind == "sine":
         return drawn
     spline = fit_spline(config.motion.times, config.motion.offsets)
-    reach = cg_reach(config.plant)
-    if largest_offset(spline) > reach + 1e-9:
+    limit = cg_limit(config.plant)
+    if largest_offset(spline) > limit + 1e-9:
         raise InputError(
             f"the waveform swings to {largest_offset(spline):.4g} m between its samples "
-            f"and leaves the object: the CG reaches {reach:.4g} m; add samples"
+            f"and leaves the object: the CG reaches {limit:.4g} m; add samples"
         )
     return lambda time, load: follow_spline(spline, time)
 
@@ -121,7 +121,7 @@ def make_rolling_force(config: Config) -> Callable[[Array, Array, Array], Array]
     inertia against it is 7/5 m_b, that of a solid ball that rolls.
     """
     plant, motion = config.plant, config.motion
-    end = ball_reach(plant)
+    end = ball_limit(plant)
     stiffness = 1.4 * motion.stop_frequency**2
     damping = 1.4 * 2 * motion.stop_damping * motion.stop_frequency
 

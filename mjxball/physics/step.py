@@ -143,12 +143,12 @@ def make_autopilot(config: Config) -> Autopilot:
     powered = make_powered(config)
 
     def firmware(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
-        if load.supply is not None:
+        if load.battery is not None:
             return powered(state, commands, load)
         if config.autopilot.drone and motor_curves.compensates(config.autopilot.motor_curve):
             # A motor gives more than a thrust command of 65 535 where the battery has it: full PWM is the limit.
             usual = commands[..., 0, 0] * 0.0
-            return powered(state, commands, load._replace(supply=usual + USUAL_BATTERY, older=usual))
+            return powered(state, commands, load._replace(battery=usual + USUAL_BATTERY, uncompensated=usual))
         xp, law, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
         own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
         sent = crazyflie.setpoints(law, commands, own + share * load.believed_mass[..., None], gravity)
@@ -163,40 +163,40 @@ def make_autopilot(config: Config) -> Autopilot:
 
 
 def make_powered(config: Config) -> Autopilot:
-    """The firmware's loops with motors that follow the battery, `load.supply`, with or without its compensation.
+    """The firmware's loops with motors that follow the battery, `load.battery`, with or without its compensation.
 
-    Where `load.older`, the firmware is one without compensation, and what it is sent and its gains are converted for
-    its curve (`motor_curves.with_curve`), as the runner does.
+    Where `load.uncompensated`, what the firmware is sent and its gains are converted for its curve
+    (`motor_curves.with_curve`), as the runner does.
     """
     constants = plant_constants(config.plant, config.attitude)
     law, gravity = config.autopilot, config.plant.gravity
     motor = motors.MOTORS[law.drone or "2.1"]
-    older = motor_curves.with_curve(config, motor_curves.OLDER).autopilot
-    slower = older.roll_rate[0] / law.roll_rate[0]
+    uncompensated_law = motor_curves.with_curve(config, motor_curves.OLDER).autopilot
+    slower = uncompensated_law.roll_rate[0] / law.roll_rate[0]
     line = motor_curves.compensates(law.motor_curve)
 
     def powered(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
         xp = commands.__array_namespace__()
         own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
         carried = own + share * load.believed_mass[..., None]
-        is_old: Array = load.older
-        volts: Array = load.supply
-        old, supply = is_old[..., None, None] > 0, volts[..., None, None]
+        uncompensated: Array = load.uncompensated
+        volts: Array = load.battery
+        old, battery = uncompensated[..., None, None] > 0, volts[..., None, None]
         sent = xp.where(
             old,
-            crazyflie.setpoints(older, commands, carried, gravity),
+            crazyflie.setpoints(uncompensated_law, commands, carried, gravity),
             crazyflie.setpoints(law, commands, carried, gravity),
         )
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
         integrals = crazyflie.integral_shares(xp, law, state.rates.dtype)
-        rate_share = 1.0 + (slower - 1.0) * is_old[..., None, None]
+        rate_share = 1.0 + (slower - 1.0) * uncompensated[..., None, None]
 
         def duty(command: Array) -> Array:
-            return xp.where(old, command, motors.compensated(motor, command, supply)) if line else command
+            return xp.where(old, command, motors.compensated(motor, command, battery)) if line else command
 
         loops, pwm = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals, duty, rate_share)
-        return loops, motors.force(motor, pwm, supply)
+        return loops, motors.force(motor, pwm, battery)
 
     return powered
 

@@ -28,7 +28,7 @@ def policy_file(config: Config, learnt: Any, steps: int, origin: dict[str, Any] 
     mask = np.array(recall_of(config).mask(follower.ignore_position))
     size = len(mask)  # behind it stands what only the critics were told; the policy's weights for it never moved
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
-    reach = [follower.action_scale_tilt, follower.action_scale_vertical]
+    action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
     card = {
         "format_version": FORMAT_VERSION,
         "observation": [list(slot) for slot in OBSERVATION],
@@ -37,7 +37,7 @@ def policy_file(config: Config, learnt: Any, steps: int, origin: dict[str, Any] 
         "filters": list(follower.observation_averages),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
-        "action_reach": reach,
+        "action_reach": action_scale,
         "command_limits": [leader.tilt_limit, leader.vertical_limit],
         "leader_kp": list(leader.kp),
         "leader_kd": list(leader.kd),
@@ -61,7 +61,7 @@ def policy_file(config: Config, learnt: Any, steps: int, origin: dict[str, Any] 
         biases=tuple(biases),
         observation_mean=np.asarray(learnt.mean, np.float32)[:size],
         observation_scale=(mask / deviation).astype(np.float32),
-        action_scale=np.array([reach[0], reach[0], reach[1]], np.float32),
+        action_scale=np.array([action_scale[0], action_scale[0], action_scale[1]], np.float32),
         card=card,
     )
 

@@ -146,7 +146,7 @@ def check(policy: PolicyFile, name: str) -> None:
         _check_array(name, label, array, (length,))
     if (policy.observation_scale < 0).any() or (policy.action_scale <= 0).any():
         raise PolicyFileError(f"{name}: observation_scale must not be negative and action_scale must be positive")
-    if not np.allclose(policy.action_scale, _reach(policy.card), rtol=1e-6, atol=0):
+    if not np.allclose(policy.action_scale, _action_scale(policy.card), rtol=1e-6, atol=0):
         raise PolicyFileError(f"{name}: action_scale differs from the card's action_reach")
     width = size
     for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
@@ -157,7 +157,7 @@ def check(policy: PolicyFile, name: str) -> None:
         width = out
 
 
-def _reach(card: dict[str, Any]) -> list[float]:
+def _action_scale(card: dict[str, Any]) -> list[float]:
     tilt, vertical = card["action_reach"]
     return [tilt, tilt, vertical]
 

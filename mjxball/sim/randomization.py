@@ -11,13 +11,13 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import crazyflie, motor_curves, motors
-from mjxball.control.constants import plant_constants, trim_reach
+from mjxball.control.constants import plant_constants, trim_limit
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import start_state
 
 Array = Any
 DRAWS = 18  # random numbers of a reset
-ASKED = 0.85  # share of the leader's vertical limit that a hover may take
+COMMAND_SHARE = 0.85  # share of the leader's vertical limit that a hover may take
 CANDIDATES = 8  # drives (battery, thrust of each drone) from which a world takes the first that can be flown
 LIFT, PULL = 0.06, 0.05  # shares of its weight that every drone must lift more, at most 60 000 units and at full power
 DRAWN_BACK = 8  # times at most that a world's thrust is drawn back by three tenths
@@ -49,10 +49,10 @@ class ResetDistribution:
         self._drones = np.asarray(config.plant.leader_inertia) + config.plant.follower_inertia
         self._object = constants.object_inertia_per_mass
 
-    def draw(self, rng: Array, reach: Array | float = 1.0) -> tuple[Load, PlantState, Array]:
+    def draw(self, rng: Array, difficulty: Array | float = 1.0) -> tuple[Load, PlantState, Array]:
         """(load, plant at rest or nearly so, goal (3,) of O [m]).
 
-        `reach` () in [0, 1]: the lower share of the ranges of the CG's amplitude and speed, which is drawn from.
+        `difficulty` () in [0, 1]: the lower share of the ranges of the CG's amplitude and speed, which is drawn from.
         """
         scenario = self.config.scenario
         # One draw for everything: a reset runs beside every training step, and each draw is kernels to launch.
@@ -61,8 +61,8 @@ class ResetDistribution:
         def between(low: float, high: Array | float) -> Array:
             return low + (high - low) * next(drawn)[0]
 
-        def symmetric(reach: float, size: int = 3) -> Array:
-            return reach * (2.0 * jnp.concatenate([next(drawn) for _ in range(size)]) - 1.0)
+        def symmetric(limit: float, size: int = 3) -> Array:
+            return limit * (2.0 * jnp.concatenate([next(drawn) for _ in range(size)]) - 1.0)
 
         mass = between(*scenario.object_mass)
         nominal = jnp.full_like(mass, self.config.plant.object_mass)
@@ -70,8 +70,8 @@ class ResetDistribution:
         load = Load(
             object_mass=mass,
             believed_mass=believed,
-            cg_amplitude=between(*shortened(scenario.cg_amplitude, reach)),
-            cg_speed=between(*shortened(scenario.cg_speed, reach)),
+            cg_amplitude=between(*shortened(scenario.cg_amplitude, difficulty)),
+            cg_speed=between(*shortened(scenario.cg_speed, difficulty)),
             cg_phase=between(0.0, 2 * jnp.pi),
             mass_change=between(*scenario.mass_change)[None],
             mass_change_time=between(*scenario.mass_change_time)[None],
@@ -97,14 +97,14 @@ class ResetDistribution:
         """CG amplitude that can be trimmed before and after the mass changes [m]; negative: none."""
         masses = (load.object_mass, load.object_mass + load.mass_change[0])
         if self.powered:
-            return jnp.minimum(*(self._powered_reach(load, mass) for mass in masses))
+            return jnp.minimum(*(self._powered_trim_limit(load, mass) for mass in masses))
         margin, plant = self.config.scenario.trim_margin, self.config.plant
         thrust = (1.0, 1.0) if load.thrust_scale is None else (load.thrust_scale[0], load.thrust_scale[1])
         if self.config.leader.ki[2] > 0:  # it finds the thrust for its share of the weight by itself
-            reaches = (trim_reach(plant, mass, margin, None, (1.0, thrust[1])) for mass in masses)
+            limits = (trim_limit(plant, mass, margin, None, (1.0, thrust[1])) for mass in masses)
         else:
-            reaches = (trim_reach(plant, mass, margin, load.believed_mass, thrust) for mass in masses)
-        return jnp.minimum(*reaches)
+            limits = (trim_limit(plant, mass, margin, load.believed_mass, thrust) for mass in masses)
+        return jnp.minimum(*limits)
 
     def _varied(self, load: Load, key: Array) -> Load:
         """`load` with rotors and inertia of its own."""
@@ -127,39 +127,39 @@ class ResetDistribution:
             load = jax.tree.map(functools.partial(jnp.where, self.trimmed(load) < 0), milder, load)
         return load
 
-    def _powered_reach(self, load: Load, mass: Array) -> Array:
+    def _powered_trim_limit(self, load: Load, mass: Array) -> Array:
         """As `trimmed` for drones that can be flown: one's rotors, and what one lifts more and the other less."""
         plant = self.config.plant
         weakest = 1.0 if load.thrust_scale is None else jnp.minimum(load.thrust_scale[0], load.thrust_scale[1])
         apart = LIFT * (plant.leader_mass + plant.follower_mass + mass) * self._lever if self._levels else 0.0
-        return trim_reach(plant, mass, self.config.scenario.trim_margin, None, (1.0, weakest)) + apart / mass
+        return trim_limit(plant, mass, self.config.scenario.trim_margin, None, (1.0, weakest)) + apart / mass
 
-    def drives(self, load: Load, key: Array, count: int = CANDIDATES) -> tuple[Array, Array, Array, Array]:
+    def draw_drives(self, load: Load, key: Array, count: int = CANDIDATES) -> tuple[Array, Array, Array, Array]:
         """(battery [V], 1 for an older firmware, thrust factors (.., 2), whether it can be flown), (count,) of each."""
         scenario, share = self.config.scenario, jax.random.uniform(key, (5, count))
         each = (scenario.thrust_scale, scenario.thrust_scale)
         ranges = (scenario.battery, *each, scenario.thrust_common)
-        supply, leader, follower, common = (
+        battery, leader, follower, common = (
             low + (high - low) * u for (low, high), u in zip(ranges, share[:4], strict=True)
         )
-        older = (share[4] < scenario.uncompensated_share).astype(supply.dtype)
+        uncompensated = (share[4] < scenario.uncompensated_share).astype(battery.dtype)
         scale = (common * jnp.stack([leader, follower])).T
-        return supply, older, scale, self.flyable(load.object_mass, supply, older, scale)
+        return battery, uncompensated, scale, self.flyable(load.object_mass, battery, uncompensated, scale)
 
-    def flyable(self, object_mass: Array, supply: Array, older: Array, scale: Array) -> Array:
+    def flyable(self, object_mass: Array, battery: Array, uncompensated: Array, scale: Array) -> Array:
         """(n,) whether both drones lift their share of the weight with room to command and to turn the stick."""
         law, motor = self.config.autopilot, self._motor
-        most, cap = (motors.force(motor, jnp.full_like(supply, pwm), supply) for pwm in (crazyflie.FULL, CEILING))
+        most, cap = (motors.force(motor, jnp.full_like(battery, pwm), battery) for pwm in (crazyflie.FULL, CEILING))
         if motor_curves.compensates(law.motor_curve):
-            cap = jnp.where(older > 0, cap, jnp.minimum(most, law.motor_curve[1] * CEILING / crazyflie.FULL))
+            cap = jnp.where(uncompensated > 0, cap, jnp.minimum(most, law.motor_curve[1] * CEILING / crazyflie.FULL))
         constants = self._constants
         carried = jnp.asarray(constants.drone_mass) + jnp.asarray(constants.share) * object_mass
         weight = carried * self.config.plant.gravity / 4
         enough = (scale * cap[:, None] >= (1 + LIFT) * weight) & (scale * most[:, None] >= (1 + LIFT + PULL) * weight)
-        told = jnp.abs(self.missing(object_mass, supply, older, scale)) < ASKED * self.config.leader.vertical_limit
-        return (enough & told).all(axis=-1)
+        command = jnp.abs(self.hover_commands(object_mass, battery, uncompensated, scale))
+        return (enough & (command < COMMAND_SHARE * self.config.leader.vertical_limit)).all(axis=-1)
 
-    def missing(self, object_mass: Array, supply: Array, older: Array, scale: Array) -> Array:
+    def hover_commands(self, object_mass: Array, battery: Array, uncompensated: Array, scale: Array) -> Array:
         """(n, 2) vertical acceleration that each drone has to be told so that it hovers its share [m/s2]."""
         carried = jnp.asarray(self._constants.drone_mass) + jnp.asarray(self._constants.share) * object_mass
         believed = jnp.asarray(self._constants.drone_mass) + jnp.asarray(self._constants.share) * (
@@ -167,33 +167,33 @@ class ResetDistribution:
         )
         gravity, curve = self.config.plant.gravity, self.config.autopilot.motor_curve
         force = carried * gravity / 4 / scale  # of each motor
-        pwm = crazyflie.FULL * motors.voltage(self._motor, force) / supply[:, None]
+        pwm = crazyflie.FULL * motors.voltage(self._motor, force) / battery[:, None]
         plain = motor_curves.OLDER if motor_curves.compensates(curve) else curve
-        asked = jnp.where(older[:, None] > 0, crazyflie.motor_force(plain, pwm), force)
+        asked = jnp.where(uncompensated[:, None] > 0, crazyflie.motor_force(plain, pwm), force)
         return 4 * asked / believed - gravity
 
-    def begun(self, load: Load, key: Array) -> Array:
+    def initial_integrals(self, load: Load, key: Array) -> Array:
         """(7,) integrals (see `ClosedLoop`) with which a world begins, in the air: nearly those that hover it."""
         law = self.config.leader
-        supply: Array = load.supply
-        older: Array = load.older
+        battery: Array = load.battery
+        uncompensated: Array = load.uncompensated
         scale: Array = load.thrust_scale
-        told = self.missing(load.object_mass, supply[None], older[None], scale[None])[0]
+        command = self.hover_commands(load.object_mass, battery[None], uncompensated[None], scale[None])[0]
         share = jax.random.uniform(key, (2,), minval=0.6, maxval=1.1)
         side = 1.0 if self.config.plant.cg_axis == "y" else -1.0
-        height = share[0] * (told[0] + told[1]) / 2 / law.ki[2] if law.ki[2] > 0 else 0.0
-        level = share[1] * side * (told[0] - told[1]) / 2 / law.level_gain if law.level_gain > 0 else 0.0
-        begun = jnp.zeros(7)
-        return begun.at[2].set(height).at[3].set(level)
+        height = share[0] * (command[0] + command[1]) / 2 / law.ki[2] if law.ki[2] > 0 else 0.0
+        level = share[1] * side * (command[0] - command[1]) / 2 / law.level_gain if law.level_gain > 0 else 0.0
+        initial_integrals = jnp.zeros(7)
+        return initial_integrals.at[2].set(height).at[3].set(level)
 
     def _powered(self, load: Load, key: Array) -> Load:
         """`load` with a battery, a firmware and drones that can be flown; if all candidates cannot, nominal drones."""
-        supply, older, scale, good = self.drives(load, key)
+        battery, uncompensated, scale, good = self.draw_drives(load, key)
         first = jnp.argmax(good)
         found = good[first]
         return load._replace(
-            supply=jnp.where(found, supply[first], self.config.scenario.battery[1]).astype(jnp.float32),
-            older=jnp.where(found, older[first], 0.0).astype(jnp.float32),
+            battery=jnp.where(found, battery[first], self.config.scenario.battery[1]).astype(jnp.float32),
+            uncompensated=jnp.where(found, uncompensated[first], 0.0).astype(jnp.float32),
             thrust_scale=jnp.where(found, scale[first], 1.0),
         )
 
@@ -202,7 +202,7 @@ class ResetDistribution:
         path_key, key = jax.random.split(key)
         places = jax.random.uniform(path_key, (PLACES,), minval=-1.0, maxval=1.0)
         visits = jax.random.uniform(key) < self.config.scenario.cg_random_visits
-        return load._replace(cg_path=places, cg_visits=visits.astype(jnp.float32))
+        return load._replace(cg_path=places, follows_path=visits.astype(jnp.float32))
 
 
 def shortened(ends: tuple[float, float], share: Array | float) -> tuple[float, Array | float]:

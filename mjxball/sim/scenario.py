@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.config import Config, ball_reach, cg_reach
+from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
 from mjxball.sim.disturbances import Disturbance, Vector3, check_disturbance
 
@@ -53,12 +53,12 @@ def check_scenario(config: Config, scenario: Scenario) -> None:
     if any(time < 0 for time, _ in scenario.mass_changes):
         raise InputError("the time of a mass change must not be negative")
     check_disturbance(scenario.disturbance, config.timing.control_period)
-    reach = cg_reach(config.plant)
-    if config.motion.kind == "sine" and scenario.amplitude > reach + 1e-12:
-        raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object: the CG reaches {reach:.4g} m")
-    if abs(scenario.ball_start) > ball_reach(config.plant) + 1e-12:
+    limit = cg_limit(config.plant)
+    if config.motion.kind == "sine" and scenario.amplitude > limit + 1e-12:
+        raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object: the CG reaches {limit:.4g} m")
+    if abs(scenario.ball_start) > ball_limit(config.plant) + 1e-12:
         raise InputError(
-            f"ball start {scenario.ball_start:g} m lies beyond the end stop at {ball_reach(config.plant):.4g} m"
+            f"ball start {scenario.ball_start:g} m lies beyond the end stop at {ball_limit(config.plant):.4g} m"
         )
     _check_goals(config, scenario)
     if scenario.seconds < config.timing.control_period or scenario.seconds > 86_400:

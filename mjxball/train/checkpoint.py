@@ -16,12 +16,12 @@ import orbax.checkpoint as ocp
 
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.train.curves import best_member, read_members
 from mjxball.train.extensions import Extensions, is_pair, resolve
-from mjxball.train.members import best_member, read_members
 from mjxball.train.population import Population
 from mjxball.train.processes import is_writer
 from mjxball.train.program import TrainState
-from mjxball.train.record import CHECKPOINTS, read_config
+from mjxball.train.run_directory import CHECKPOINTS, read_config
 
 KEEP = 2
 CHECKSUMS = "checksums"
@@ -86,9 +86,9 @@ class Checkpoints:
 
     def _read(self, step: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
         """The arrays of one checkpoint; ValueError if one of them is not what was written."""
-        told = {**wanted, CHECKSUMS: np.empty(len(wanted), np.uint32)}
+        template = {**wanted, CHECKSUMS: np.empty(len(wanted), np.uint32)}
         try:
-            arrays = self._manager.restore(step, args=ocp.args.StandardRestore(told))
+            arrays = self._manager.restore(step, args=ocp.args.StandardRestore(template))
         except Exception:  # checkpoints before 0.2 have no checksums; of others this fails once more
             return self._manager.restore(step, args=ocp.args.StandardRestore(wanted))
         checksums = arrays.pop(CHECKSUMS)

@@ -1,7 +1,9 @@
-"""The picture of a training run: return and accuracy over environment steps (the paper's Fig. 2)."""
+"""A run's tables and pictures: `members.csv` of a population, and return and accuracy over environment steps."""
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +11,92 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.train.members import read_members
-from mjxball.train.reading import read_rows
-from mjxball.train.record import METRICS
+from mjxball.train.run_directory import METRICS, read_rows
+
+LOG = "members.csv"
+POLICIES = "members"
+COLUMNS = ("steps", "seed", "eval_return")  # and what the environment reports of an evaluation
+
+
+class MemberLog:
+    """`members.csv` of a run: one row for each member and evaluation; without `out` nothing is written."""
+
+    def __init__(self, out: Path | None, seed: int, resumed_at: int = 0):
+        self._out, self._seed = out, seed
+        self._rows = [row for row in read_members(out) if row["steps"] <= resumed_at] if out else []
+
+    def add(self, steps: int, found: Mapping[str, np.ndarray]) -> None:
+        """Append one evaluation: every array is (members,)."""
+        for member, values in enumerate(zip(*found.values(), strict=True)):
+            named = dict(zip(found, map(float, values), strict=True))
+            self._rows.append({"steps": steps, "seed": self._seed + member, **named})
+        if self._out is None:
+            return
+        partial = self._out / f".{LOG}.partial"
+        with partial.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(self._rows[-1]))
+            writer.writeheader()
+            writer.writerows(self._rows)
+        partial.replace(self._out / LOG)
+
+    def best(self) -> int:
+        """The member with the highest return at the last evaluation; 0 before the first."""
+        return best_member(self._rows)
+
+    def policy_path(self, member: int) -> Path:
+        """Where a member's policy is written; only who writes the run may ask."""
+        if self._out is None:
+            raise RuntimeError("this process writes no policies")
+        place = self._out / POLICIES
+        place.mkdir(exist_ok=True)
+        return place / f"seed{self._seed + member}.npz"
+
+
+def read_members(run: Path) -> list[dict[str, float]]:
+    """Rows of a run's `members.csv`; none if it has no such file."""
+    try:
+        texts = read_rows(run / LOG)
+    except FileNotFoundError:
+        return []
+    try:
+        rows = [{name: float(row[name]) for name in {**dict.fromkeys(COLUMNS), **row}} for row in texts]
+        return [{**row, "steps": int(row["steps"]), "seed": int(row["seed"])} for row in rows]
+    except (KeyError, ValueError, OverflowError):
+        raise InputError(f"{run / LOG} holds something else than the numbers of a population") from None
+
+
+def best_member(rows: list[dict[str, float]]) -> int:
+    """Index of the member with the highest finite return among the last evaluation's rows; 0 if there are none."""
+    last = [row for row in rows if row["steps"] == rows[-1]["steps"]]
+    returns = [row["eval_return"] if np.isfinite(row["eval_return"]) else -np.inf for row in last]
+    return int(np.argmax(returns)) if returns else 0
+
+
+def draw_members(run: Path, path: Path) -> None:
+    """Picture of all members over training: steady-state error and return, each one, their median and quartiles."""
+    from mjxball.plotting import pyplot
+
+    rows = read_members(run)
+    steps = sorted({row["steps"] for row in rows})
+    plt = pyplot()
+    figure, axes = plt.subplots(2, 1, sharex=True, figsize=(8, 7), constrained_layout=True)
+    labels = (("eval_steady_error", "steady-state error [m]"), ("eval_return", "return of an episode"))
+    for axis, (name, label) in zip(axes, labels, strict=True):
+        table = np.array([[row[name] for row in rows if row["steps"] == step] for step in steps])
+        low, middle, high = np.nanpercentile(table, [25, 50, 75], axis=1)
+        axis.plot(steps, table, color="#9bb7cc", linewidth=0.8)
+        axis.fill_between(steps, low, high, color="#1b6ca8", alpha=0.2, label="quartiles")
+        axis.plot(steps, middle, color="#1b6ca8", linewidth=2, label="median")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.25)
+    if any(row["eval_steady_error"] > 0 for row in rows):  # short episodes have no steady state
+        axes[0].set_yscale("log")
+    axes[0].legend()
+    axes[1].set_xlabel("environment steps of each member")
+    figure.suptitle(f"{table.shape[1]} followers")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
 
 PANELS = {
     "task": (("steady_error", "eval_steady_error", "steady-state error [m]"),),
@@ -23,7 +108,7 @@ PANELS = {
 BLUE, GREY = "#1b6ca8", "#9a9a9a"
 
 
-def told_by_the_run(run: Path, seed: int) -> dict[str, Any]:
+def training_summary(run: Path, seed: int) -> dict[str, Any]:
     """What a policy's card says of the run directory `run` so far: its `curve` and the `seconds` it has taken.
 
     Raises InputError if its tables are damaged.

@@ -26,7 +26,7 @@ class Extensions(NamedTuple):
     algorithm: Any = None  # class, see `mjxball.algorithms.base.Algorithm`
 
 
-OURS = Extensions()
+DEFAULTS = Extensions()
 
 
 def find(name: str, flag: str) -> Any:

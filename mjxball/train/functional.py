@@ -47,11 +47,11 @@ def train(
     def phase(carry: TrainState, mode: Mode) -> tuple[TrainState, dict[str, Array]]:
         evaluating = mode.phase.evaluate
         envs = jax.tree.map(lambda new, old: jnp.where(evaluating, new, old), fresh, carry.envs)
-        after, tally, metrics = program.advance(carry._replace(envs=envs), mode)
+        after, statistics, metrics = program.advance(carry._replace(envs=envs), mode)
         kept = jax.tree.map(lambda old, new: jnp.where(evaluating, old, new), carry, after)
-        returned = tally.reward / jnp.maximum(mode.steps, 1) * episode
+        returned = statistics.reward / jnp.maximum(mode.steps, 1) * episode
         count = mode.steps * program.schedule.num_envs
-        own = {f"eval_{name}": total / jnp.maximum(count, 1) for name, total in tally.totals.items()}
+        own = {f"eval_{name}": total / jnp.maximum(count, 1) for name, total in statistics.totals.items()}
         return kept, {"steps": kept.steps, "return": returned, **metrics, **own}
 
     modes = _phases(program)

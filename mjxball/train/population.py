@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,27 +15,19 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from mjxball import config as configs
 from mjxball.algorithms.base import Policy, Shards
 from mjxball.config import Config
-from mjxball.train.environments import Tally, report
-from mjxball.train.extensions import OURS, Extensions
-from mjxball.train.program import Mode, Program, TrainState, warmup
-from mjxball.train.provenance import source_hash, versions
-from mjxball.train.sweep import Sweep
-from mjxball.train.traced import Traced
+from mjxball.train.compilation import GPU_OPTIONS, PLAIN_PRODUCTS, TracedProgram, jax_setting, partitioned_by_gspmd
+from mjxball.train.extensions import DEFAULTS, Extensions
+from mjxball.train.program import Mode, Program, Statistics, TrainState, report, warmup
+from mjxball.train.run_directory import Sweep, source_hash, versions
 
 Array = Any
-# Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
-# (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/results.md.)
-GPU_OPTIONS: dict[str, bool | int | float | str] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
-# One follower's products of layers of 64 are small enough for plain loops, which spare XLA a kernel in Triton for each
-# (2 - 5 s to compile). For many followers at once Triton's are faster (64: by a quarter).
-PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in both matrices
 
 
 class Executables(NamedTuple):
     """A population's compiled functions."""
 
     create: Callable[[Any, Any], TrainState]  # (swept values, keys) -> state
-    advance: Callable[[TrainState, Mode], tuple[TrainState, Tally, Any]]  # gives away the state's memory
+    advance: Callable[[TrainState, Mode], tuple[TrainState, Statistics, Any]]  # gives away the state's memory
     evaluation_envs: Callable[[Any, Array], Any]  # (swept values, `_first_key()`) -> environments
 
 
@@ -55,7 +46,7 @@ class Population:
         members: int = 1,
         sweep: Sweep | None = None,
         devices: Sequence[Any] | None = None,
-        extensions: Extensions = OURS,
+        extensions: Extensions = DEFAULTS,
     ):
         self.config, self.members, self._physics, self._extensions = config, members, physics, extensions
         self._sweep = dict(sweep or {})
@@ -74,7 +65,7 @@ class Population:
         split: Any = PartitionSpec(*whole, "envs")
         self._whole, self._split = whole, split
         self._state_spec = TrainState(self.program.algorithm.partition(whole, split), split, whole, whole)
-        self._tally_spec = Tally(whole, whole, whole, split)
+        self._statistics_spec = Statistics(whole, whole, whole, split)
 
     def member_config(self, member: int) -> Config:
         """The configuration of one member."""
@@ -84,7 +75,7 @@ class Population:
         return config
 
     def member(self, value: Any, member: int) -> Any:
-        """One member's part of a state or tally."""
+        """One member's part of a state or of statistics."""
         return value if self._single else jax.tree.map(lambda leaf: leaf[member], value)
 
     def each(self, value: Array) -> np.ndarray:
@@ -100,13 +91,13 @@ class Population:
         """Shapes of what `create` returns, without computing it."""
         return jax.eval_shape(self._create, self._values, self._keys(0))
 
-    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally, dict[str, Array]]:
+    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Array]]:
         """See `Program.advance`."""
 
-        def one(program: Program, state: TrainState, mode: Mode) -> tuple[TrainState, Tally, dict[str, Array]]:
+        def one(program: Program, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Array]]:
             return program.advance(state, mode)
 
-        results = (self._state_spec, self._tally_spec, self._whole)
+        results = (self._state_spec, self._statistics_spec, self._whole)
         return self._on_mesh(one, (self._state_spec, PartitionSpec()), results, (0, None))(self._values, state, mode)
 
     def compile(self, creating: bool) -> Executables:
@@ -115,9 +106,9 @@ class Population:
         # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
         # end a process that shares GPUs with others by a segfault.
         with (
-            _partitioned_by_gspmd(self.mesh),
+            partitioned_by_gspmd(self.mesh),
             # Lines of Python in what is lowered are for profiles; XLA sorts and prints them all, a second's work.
-            _set("jax_traceback_in_locations_limit", 0),
+            jax_setting("jax_traceback_in_locations_limit", 0),
             ThreadPoolExecutor(3 if jax.process_count() == 1 else 1) as pool,
         ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
@@ -139,19 +130,19 @@ class Population:
         if any(self._extensions):
             key = None  # nobody knows all that they depend on
         mode, state = jax.tree.map(_shape, warmup(1)), self.template()
-        result = (state, *self._told(state))
-        yield Traced("advance", key, self.advance, (state, mode), result).lower(donate=0)
-        yield Traced("fresh", key, self._fresh, (values, _shape(_first_key())), state.envs).lower()
+        result = (state, *self._result_structure(state))
+        yield TracedProgram("advance", key, self.advance, (state, mode), result).lower(donate=0)
+        yield TracedProgram("fresh", key, self._fresh, (values, _shape(_first_key())), state.envs).lower()
         if creating:
-            yield Traced("create", key, self._create, (values, keys), state).lower()
+            yield TracedProgram("create", key, self._create, (values, keys), state).lower()
 
     def _lower_on_mesh(self, creating: bool) -> Iterator[Any]:
         """The same on several devices."""
         values, keys = self._starts(0)
-        key = self._lent(_first_key(), PartitionSpec())
+        key = self._as_argument(_first_key(), PartitionSpec())
         state = self._placed_shapes(self.template(), self._state_spec)
         mode = self.mode(warmup(1))
-        results = self._results(self._state_spec, self._tally_spec, self._whole)
+        results = self._results(self._state_spec, self._statistics_spec, self._whole)
         yield jax.jit(self.advance, donate_argnums=0, **results).lower(state, mode)
         yield jax.jit(self._fresh, **self._results(self._split)).lower(values, key)
         if creating:
@@ -163,33 +154,33 @@ class Population:
 
     def evaluation_envs(self, executables: Executables) -> Any:
         """Newly reset environments, the same for every member and every evaluation."""
-        values, key = self._lent(self._values, self._whole), self._lent(_first_key(), PartitionSpec())
+        values, key = self._as_argument(self._values, self._whole), self._as_argument(_first_key(), PartitionSpec())
         return executables.evaluation_envs(values, key)
 
     def policy(self, state: TrainState, member: int) -> Policy:
         """The policy of one member of a state of NumPy arrays."""
         return self.program.policy(self.member(state, member))
 
-    def report(self, tally: Tally, steps: int, evaluation: bool) -> dict[str, np.ndarray]:
-        """What a tally of NumPy arrays over `steps` says of the environment's metrics: {name: (members,)}."""
+    def report(self, statistics: Statistics, steps: int, evaluation: bool) -> dict[str, np.ndarray]:
+        """What statistics of NumPy arrays over `steps` say of the environment's metrics: {name: (members,)}."""
         each = lambda values: {name: self.each(value).astype(float) for name, value in values.items()}  # noqa: E731
         count = steps * self.program.schedule.num_envs
-        return report(self.program.env, each(tally.totals), each(tally.peaks), count, evaluation)
+        return report(self.program.env, each(statistics.totals), each(statistics.peaks), count, evaluation)
 
     def metric_names(self) -> tuple[list[str], list[str]]:
         """Names of what `report` says of training and of evaluation."""
-        tally, _ = self._told(self.template())
-        zeros = Tally(*(jax.tree.map(lambda leaf: np.zeros((self.members, 1)), part) for part in tally))
+        statistics, _ = self._result_structure(self.template())
+        zeros = Statistics(*(jax.tree.map(lambda leaf: np.zeros((self.members, 1)), part) for part in statistics))
         found = [
             report(self.program.env, {k: v[:, 0] for k, v in zeros.totals.items()}, zeros.peaks, 1, evaluation)
             for evaluation in (False, True)
         ]
         return list(found[0]), list(found[1])
 
-    def _told(self, state: TrainState) -> tuple[Tally, dict[str, int]]:
-        """The structure of a tally and of the algorithm's metrics."""
+    def _result_structure(self, state: TrainState) -> tuple[Statistics, dict[str, int]]:
+        """The structure of the statistics and of the algorithm's metrics."""
         names = dict.fromkeys(state.envs.metrics, 0)
-        return Tally(0, 0, names, names), dict.fromkeys(self.program.algorithm.metrics, 0)
+        return Statistics(0, 0, names, names), dict.fromkeys(self.program.algorithm.metrics, 0)
 
     def place_state(self, state: TrainState) -> TrainState:
         """A whole state of NumPy arrays, the same in every process, spread over the devices."""
@@ -201,7 +192,7 @@ class Population:
 
     def mode(self, mode: Mode) -> Mode:
         """`mode` where every device sees it."""
-        return self._lent(mode, PartitionSpec())
+        return self._as_argument(mode, PartitionSpec())
 
     def place(self, tree: Any, spec: PartitionSpec) -> Any:
         """Arrays that every process holds alike, cut over the devices as `spec` says."""
@@ -215,7 +206,7 @@ class Population:
 
         return jax.tree.map(cut, tree)
 
-    def _lent(self, tree: Any, spec: PartitionSpec) -> Any:
+    def _as_argument(self, tree: Any, spec: PartitionSpec) -> Any:
         """`place` for arguments that no program keeps: one device takes NumPy's arrays as they are."""
         return tree if self.mesh is None else self.place(tree, spec)
 
@@ -224,7 +215,7 @@ class Population:
         return keys[0] if self._single else keys
 
     def _starts(self, seed: int) -> tuple[Any, Array]:
-        return self._lent(self._values, self._whole), self._lent(self._keys(seed), self._whole)
+        return self._as_argument(self._values, self._whole), self._as_argument(self._keys(seed), self._whole)
 
     def _create(self, values: Any, keys: Array) -> TrainState:
         return self._on_mesh(lambda program, key: program.create(key), (self._whole,), self._state_spec, (0,))(
@@ -241,7 +232,7 @@ class Population:
         def every(values: Any, *arguments: Any) -> Any:
             if self._single:
                 return one(self.program, *arguments)
-            each = lambda own, *arguments: one(self._of(own), *arguments)  # noqa: E731
+            each = lambda own, *arguments: one(self._member_program(own), *arguments)  # noqa: E731
             return jax.vmap(each, in_axes=(0, *axes), axis_size=self._members_here)(values, *arguments)
 
         if self.mesh is None:
@@ -272,31 +263,10 @@ class Population:
 
         return jax.tree.map(placed, specs, template, is_leaf=_is_spec)
 
-    def _of(self, values: Mapping[str, Array]) -> Program:
+    def _member_program(self, values: Mapping[str, Array]) -> Program:
         if not values:
             return self.program
         return Program(self.config, self._physics, values, self._shards, self._extensions)
-
-
-def _partitioned_by_gspmd(mesh: Mesh | None) -> contextlib.AbstractContextManager[None]:
-    """Leave the partitioning over `mesh` to XLA's older partitioner, GSPMD.
-
-    The newer one, Shardy, ends the process by a segfault where a constant that `shard_map` closes over is simplified
-    away (jax 0.11.2, `ManualComputationUnusedInputsPattern`), and MJX's model is hundreds of constants.
-    """
-    return contextlib.nullcontext() if mesh is None else _set("jax_use_shardy_partitioner", False)
-
-
-@contextlib.contextmanager
-def _set(name: str, value: Any) -> Iterator[None]:
-    """One of JAX's settings, put back afterwards."""
-    settings: Any = jax.config  # its settings are made while JAX is imported: no type checker knows them
-    before = getattr(settings, name)
-    settings.update(name, value)
-    try:
-        yield
-    finally:
-        settings.update(name, before)
 
 
 def _first_key() -> np.ndarray:

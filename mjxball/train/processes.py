@@ -105,7 +105,7 @@ def any_of(flags: tuple[bool, ...]) -> tuple[bool, ...]:
 
 
 @contextlib.contextmanager
-def ends_with_the_others(resume: str) -> Iterator[None]:
+def exit_when_a_process_is_lost(resume: str) -> Iterator[None]:
     """If this or another process fails, say so, name `resume` as the way on, and end with a non-zero exit code.
 
     A lost process shows in two ways: a collective operation raises, or JAX's runtime aborts this process. For the

@@ -1,7 +1,8 @@
-"""The training program: collect and update in one compiled function that also warms up and evaluates."""
+"""The training program: environments side by side, collect and update in one compiled function."""
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -11,16 +12,112 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball import config as configs
-from mjxball.algorithms.base import Algorithm, Phase, Policy, Schedule, Shards
+from mjxball.algorithms.base import Algorithm, Phase, Policy, Schedule, Shards, Transition
 from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.config import Config
-from mjxball.train.environments import Environments, Tally
-from mjxball.train.extensions import OURS, Extensions, make_env
+from mjxball.train.extensions import DEFAULTS, Extensions, make_env
 
 Array = Any
 MATMUL_PRECISION = "highest"  # float32 throughout: GPUs would else round products to TF32
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
 EVALUATION_DRAW = 20_261_121  # tells the evaluation's environments from those of any seed
+
+
+class Statistics(NamedTuple):
+    """Sums over the steps of one call of `Program.advance`."""
+
+    reward: Array  # mean reward per step, summed over steps
+    ended: Array  # episodes terminated
+    totals: dict[str, Array]  # each of the environment's metrics, summed over environments and steps
+    peaks: dict[str, Array]  # (envs,) the largest of each
+
+
+class Envs(NamedTuple):
+    """What `Environments.step` carries on."""
+
+    states: Any  # brax State of all environments
+    statistics: Statistics
+    difficulty: Array | float  # of what is drawn at a reset, 0 to 1: see `Schedule.curriculum`
+
+
+def report(env: Any, totals: Mapping[str, Any], peaks: Mapping[str, Any], count: float, evaluation: bool) -> Any:
+    """What metrics.csv says of an environment's metrics: {name: (members,)}, NaN where there is nothing to say.
+
+    The environment's own `report(totals, peaks, count, evaluation)`, else the mean of each of its metrics.
+    """
+    if hasattr(env, "report"):
+        return env.report(totals, peaks, count, evaluation)
+    return {name: total / count for name, total in totals.items() if name != "reward"}
+
+
+class Environments:
+    """`count` environments on each shard; see `mjxball.algorithms.base.Environments`.
+
+    Beyond Brax's `Env` an environment may have `input_mask` and `critic_mask` (n,), `report` (above), and a second
+    argument of `reset`, the difficulty of what is drawn.
+    """
+
+    def __init__(self, env: Any, count: int, shards: Shards | None = None):
+        self.env, self.count, self.shards = env, count, shards or Shards()
+        self.observation_size, self.action_size = env.observation_size, env.action_size
+        self.policy_mask = getattr(env, "input_mask", None) or [1.0] * self.observation_size
+        self.critic_mask = getattr(env, "critic_mask", None) or self.policy_mask
+        self._graded = len(inspect.signature(env.reset).parameters) > 1
+        self._step = jax.vmap(env.step)
+
+    def reset(self, key: Array, difficulty: Array | float = 1.0) -> Any:
+        """New states of all environments."""
+        keys = jax.random.split(self.shards.own(key), self.count)
+        if not self._graded:
+            return jax.vmap(self.env.reset)(keys)
+        return jax.vmap(lambda one: self.env.reset(one, difficulty))(keys)
+
+    def staggered(self, states: Any, key: Array, episode_steps: int) -> Any:
+        """`states` with part of their episodes behind them, so that they do not end together."""
+        steps = jax.random.randint(self.shards.own(key), (self.count,), 0, episode_steps)
+        if "steps" in states.info:
+            kept = states.info["steps"]
+            return states.replace(info={**states.info, "steps": steps.astype(kept.dtype)})
+        world = states.pipeline_state
+        if "steps" in getattr(world, "_fields", ()):
+            return states.replace(pipeline_state=world._replace(steps=steps))
+        return states
+
+    def begin(self, states: Any, difficulty: Array | float) -> Envs:
+        """`states` with empty statistics."""
+        zero = jnp.zeros(())
+        totals = dict.fromkeys(states.metrics, zero)
+        peaks = dict.fromkeys(states.metrics, jnp.zeros(self.count))
+        return Envs(states, Statistics(zero, zero, totals, peaks), difficulty)
+
+    def step(self, envs: Envs, action: Array, key: Array) -> tuple[Envs, Transition]:
+        """See `mjxball.algorithms.base.Environments`."""
+        before = envs.states
+        after = self._step(before, action)
+        terminated = after.done * (1 - after.info["truncation"])
+        fresh = self.reset(key, envs.difficulty)
+
+        def reset_if_done(new: Array, old: Array) -> Array:
+            done = after.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
+            return jnp.where(done, new, old)
+
+        states = jax.tree.map(reset_if_done, fresh, after)
+        statistics, metrics = envs.statistics, after.metrics
+        statistics = Statistics(
+            reward=statistics.reward + after.reward.mean(),
+            ended=statistics.ended + terminated.sum(),
+            totals={name: total + metrics[name].sum() for name, total in statistics.totals.items()},
+            peaks={name: jnp.maximum(peak, metrics[name]) for name, peak in statistics.peaks.items()},
+        )
+        seen = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
+        return Envs(states, statistics, envs.difficulty), seen
+
+    def over_shards(self, statistics: Statistics) -> Statistics:
+        """Statistics of all shards together; `peaks` stay each shard's own environments."""
+        total = self.shards.total
+        return statistics._replace(
+            reward=self.shards.mean(statistics.reward), ended=total(statistics.ended), totals=total(statistics.totals)
+        )
 
 
 class Mode(NamedTuple):
@@ -72,7 +169,7 @@ class Program:
         physics: str,
         overrides: Mapping[str, Any] | None = None,
         shards: Shards | None = None,
-        extensions: Extensions = OURS,
+        extensions: Extensions = DEFAULTS,
     ):
         for path, value in (overrides or {}).items():
             config = configs.replace(config, configs.current_name(path), value)
@@ -104,7 +201,7 @@ class Program:
         grown = jnp.clip(steps / (share * self.schedule.total_steps), 0.0, 1.0)
         return jnp.where(recording, grown, 1.0)
 
-    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally, dict[str, Array]]:
+    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Array]]:
         """Step all environments `mode.steps` times (rounded up to whole collections), and learn.
 
         Returns the state, sums over all steps, and the metrics of the algorithm's last update.
@@ -114,22 +211,24 @@ class Program:
         recording = mode.phase.recording
 
         def body(_: Array, carry: Any) -> Any:
-            state, tally, _ = carry
+            state, statistics, _ = carry
             # One draw for many keys: each draw is kernels to compile and to launch.
             *keys, key = jax.random.split(state.key, first + algorithm.update_keys + 1)
-            envs = self.environments.begin(state.envs, self._difficulty(state.steps, recording))._replace(tally=tally)
+            envs = self.environments.begin(state.envs, self._difficulty(state.steps, recording))._replace(
+                statistics=statistics
+            )
             known, envs = algorithm.collect(state.algorithm, envs, keys[:first], mode.phase)
             steps = state.steps + jnp.where(recording, taken, 0)
             progress = jnp.minimum(steps / self.schedule.total_steps, 1.0)
             known, metrics = algorithm.update(known, keys[first:], progress, mode.phase)
-            return TrainState(known, envs.states, key, steps), envs.tally, metrics
+            return TrainState(known, envs.states, key, steps), envs.statistics, metrics
 
-        tally = self.environments.begin(state.envs, 1.0).tally
+        statistics = self.environments.begin(state.envs, 1.0).statistics
         metrics = dict.fromkeys(algorithm.metrics, jnp.zeros(()))
         rounds = -(-mode.steps // algorithm.steps_per_collect)
         with jax.default_matmul_precision(MATMUL_PRECISION):
-            state, tally, metrics = jax.lax.fori_loop(0, rounds, body, (state, tally, metrics))
-        return state, self.environments.over_shards(tally), self._shards.mean(metrics)
+            state, statistics, metrics = jax.lax.fori_loop(0, rounds, body, (state, statistics, metrics))
+        return state, self.environments.over_shards(statistics), self._shards.mean(metrics)
 
     def evaluation_envs(self, key: Array) -> Any:
         """Newly reset environments, the same at every evaluation with `key`."""

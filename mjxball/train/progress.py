@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from mjxball.quiet import import_tensorboard_writer
-from mjxball.train.reading import read_rows
+from mjxball.train.run_directory import read_rows
 
 EVENTS = "tensorboard"  # directory beside metrics.csv
 
@@ -95,7 +95,7 @@ class Progress:
         evaluated = "eval_return" in row
         text = (
             f"{row['steps']:>9,} / {self._total:,} steps  {row['rate'] / 1e3:6.1f} k/s  "
-            f"{int(left) // 60}:{int(left) % 60:02d} left  {self._told(row, evaluated)}"
+            f"{int(left) // 60}:{int(left) % 60:02d} left  {self._summary(row, evaluated)}"
         )
         if self._live and not evaluated:
             self._stream.write("\r" + text.ljust(self._width))
@@ -104,7 +104,7 @@ class Progress:
         else:
             self.say(text)
 
-    def _told(self, row: Row, evaluated: bool) -> str:
+    def _summary(self, row: Row, evaluated: bool) -> str:
         """The return and the first metrics behind it, of the evaluation or exploring."""
         chosen = [name for name in self._names if name.startswith("eval_") == evaluated and name not in COMMON]
         shown = chosen[:3] if evaluated else ["episode_return", *chosen[:2]]

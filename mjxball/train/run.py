@@ -23,14 +23,12 @@ from mjxball.policy import save_file
 from mjxball.policy.export import is_sound, network_file, policy_file
 from mjxball.train import processes
 from mjxball.train import program as programs
-from mjxball.train.curves import told_by_the_run
-from mjxball.train.environments import Tally
+from mjxball.train.curves import MemberLog, training_summary
 from mjxball.train.extensions import Extensions, is_pair, resolve
-from mjxball.train.members import MemberLog
 from mjxball.train.population import Population
-from mjxball.train.program import Mode, TrainState
+from mjxball.train.program import Mode, Statistics, TrainState
 from mjxball.train.progress import Progress, Row, columns
-from mjxball.train.record import CONFIG_FILE, METRICS, POLICY, write_config
+from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, write_config
 
 CHUNKS = 50  # rows of metrics.csv in a run
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
@@ -155,8 +153,8 @@ class Run:
             self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
 
-    def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Tally, dict[str, Any]]:
-        """See `Program.advance`; tally and metrics come back whole, as NumPy."""
+    def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Any]]:
+        """See `Program.advance`; statistics and metrics come back whole, as NumPy."""
         state, *told = self._compiled.advance(state, self.population.mode(mode))
         return state, *processes.gather(told)
 
@@ -190,10 +188,10 @@ class Run:
 
     def _chunk(self, steps: int) -> Row:
         before = self.progress.elapsed()
-        self.state, tally, metrics = self._advance(self.state, programs.train(steps))
+        self.state, statistics, metrics = self._advance(self.state, programs.train(steps))
         after = self.progress.elapsed()
         each, members = self.population.each, self.population.members
-        learnt = {name: _middle(each(value)) for name, value in metrics.items()}
+        learnt = {name: _median(each(value)) for name, value in metrics.items()}
         broken = [name for name, value in learnt.items() if not math.isfinite(value)]
         if broken:
             raise TrainingDivergedError(f"{broken[0]} is not finite after {self._steps():,} steps")
@@ -201,11 +199,14 @@ class Run:
             "steps": self._steps(),
             "seconds": round(self.progress.seconds(), 3),
             "rate": round(steps * self._schedule.num_envs * members / max(after - before, 1e-9), 1),
-            "episode_return": _middle(each(tally.reward)) / steps * self.config.timing.episode_steps,
-            **{name: _known(values) for name, values in self.population.report(tally, steps, False).items()},
+            "episode_return": _median(each(statistics.reward)) / steps * self.config.timing.episode_steps,
+            **{
+                name: _median_or_none(values)
+                for name, values in self.population.report(statistics, steps, False).items()
+            },
             **learnt,
-            "terminated": int(each(tally.ended).sum()),
-            "diverged": int(each(tally.totals["diverged"]).sum()) if "diverged" in tally.totals else 0,
+            "terminated": int(each(statistics.ended).sum()),
+            "diverged": int(each(statistics.totals["diverged"]).sum()) if "diverged" in statistics.totals else 0,
         }
 
     def _evaluated(self) -> Row:
@@ -215,14 +216,14 @@ class Run:
         keys = processes.gather(kept.key)
         envs = population.evaluation_envs(self._compiled)
         lent = kept._replace(envs=envs, key=population.place_keys(keys))
-        after, tally, _ = self._advance(lent, programs.evaluate(steps))
+        after, statistics, _ = self._advance(lent, programs.evaluate(steps))
         self.state = after._replace(envs=kept.envs, key=population.place_keys(keys))
-        returns = population.each(tally.reward) / steps * self.config.timing.episode_steps
+        returns = population.each(statistics.reward) / steps * self.config.timing.episode_steps
         found = {"eval_return": returns}
-        found |= {f"eval_{name}": values for name, values in population.report(tally, steps, True).items()}
+        found |= {f"eval_{name}": values for name, values in population.report(statistics, steps, True).items()}
         if population.members > 1:
             self.members.add(self._steps(), found)
-        return {name: _known(values) for name, values in found.items()}
+        return {name: _median_or_none(values) for name, values in found.items()}
 
     def _save(self) -> None:
         began = self.progress.elapsed()
@@ -230,7 +231,7 @@ class Run:
             return
         self._saved_steps = self._steps()
         exported = self._export()
-        kept = self._kept()
+        kept = self._snapshot()
         if exported and self._checkpoints:
             if self._pending:
                 self._pending.result()
@@ -238,7 +239,7 @@ class Run:
         self._saved_at = self.progress.elapsed()
         self._saving += self._saved_at - began
 
-    def _kept(self) -> TrainState:
+    def _snapshot(self) -> TrainState:
         """A copy of the state: the next chunk of training reuses its buffers while it is still being written.
 
         It stays on the device, if that has room for it, and comes to the host in the thread that writes.
@@ -263,7 +264,7 @@ class Run:
         for member in range(self.population.members):
             learnt = self.population.policy(state, member)
             seed = self.origin["seed"] + member
-            origin = {**self.origin, "seed": seed, **told_by_the_run(self.out, seed)}
+            origin = {**self.origin, "seed": seed, **training_summary(self.out, seed)}
             config = self.population.member_config(member)
             if not is_pair(self.population.program.env):  # no policy file: its observation is another
                 exported |= network_file(self._network_path(member), learnt, steps, origin)
@@ -294,13 +295,13 @@ def _count(state: TrainState) -> int:
     return int(np.ravel(processes.gather(state.steps))[0])
 
 
-def _middle(values: np.ndarray) -> float:
+def _median(values: np.ndarray) -> float:
     """Median over the members whose value is finite; NaN if none is."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else math.nan
 
 
-def _known(values: np.ndarray) -> float | None:
-    """`_middle`, None if there was nothing to count."""
-    middle = _middle(values)
+def _median_or_none(values: np.ndarray) -> float | None:
+    """`_median`, None if there was nothing to count."""
+    middle = _median(values)
     return None if math.isnan(middle) else middle

@@ -45,7 +45,7 @@ def c_header(policy: PolicyFile, name: str) -> str:
     for number, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         arrays += [_array(f"weight_{number}", weight.T), _array(f"bias_{number}", bias)]
     tilt, vertical = card["command_limits"]
-    arrays += [_array("reach", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
+    arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
     return HEADER.format(
         name=_plain(name),
         origin=_plain(f"preset {card['preset']}, configuration {card['config_hash']}, {card['training_steps']} steps"),

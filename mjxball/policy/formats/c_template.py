@@ -74,7 +74,7 @@ static inline void mjxball_follow(
     for (i = 0; i < 3; i++) action[i] = (mjxball_real)tanh((double)action[i]);
 {command}
     for (i = 0; i < 3; i++)
-        command[i] = mjxball_clip(command[i] + mjxball_reach[i] * action[i], mjxball_limit[i]);
+        command[i] = mjxball_clip(command[i] + mjxball_action_scale[i] * action[i], mjxball_limit[i]);
 {remember}
 }}
 

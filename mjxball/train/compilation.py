@@ -1,22 +1,51 @@
-"""Traced programs, kept beside XLA's compilation cache: a second run need not trace physics and learner again."""
+"""Compilation: JAX's settings around it, and traced programs, kept beside XLA's compilation cache for the next run."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
+from jax.sharding import Mesh
 
 from mjxball.cache import traced_directory
 
 OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
+# Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
+# (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/results.md.)
+GPU_OPTIONS: dict[str, bool | int | float | str] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
+# One follower's products of layers of 64 are small enough for plain loops, which spare XLA a kernel in Triton for each
+# (2 - 5 s to compile). For many followers at once Triton's are faster (64: by a quarter).
+PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in both matrices
 
 
-class Traced:
+def partitioned_by_gspmd(mesh: Mesh | None) -> contextlib.AbstractContextManager[None]:
+    """Leave the partitioning over `mesh` to XLA's older partitioner, GSPMD.
+
+    The newer one, Shardy, ends the process by a segfault where a constant that `shard_map` closes over is simplified
+    away (jax 0.11.2, `ManualComputationUnusedInputsPattern`), and MJX's model is hundreds of constants.
+    """
+    return contextlib.nullcontext() if mesh is None else jax_setting("jax_use_shardy_partitioner", False)
+
+
+@contextlib.contextmanager
+def jax_setting(name: str, value: Any) -> Iterator[None]:
+    """One of JAX's settings, put back afterwards."""
+    settings: Any = jax.config  # its settings are made while JAX is imported: no type checker knows them
+    before = getattr(settings, name)
+    settings.update(name, value)
+    try:
+        yield
+    finally:
+        settings.update(name, before)
+
+
+class TracedProgram:
     """One function of arrays, traced or found in the cache. `lower(donate)` readies it for compilation."""
 
     def __init__(

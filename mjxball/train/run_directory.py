@@ -1,0 +1,213 @@
+"""The files of a run directory: configuration and sweep, and the versions and source that made the run.
+
+They are read as if a stranger had written them: one sentence for whatever is wrong."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.errors import InputError
+from mjxball.physics.stepper import TRAINING_ENGINES
+
+MAX_BYTES = 16 * 2**20  # JSON and CSV take some ten times their own length in memory
+
+
+def read_json(path: Path, called: str) -> Any:
+    """The contents of a JSON file; FileNotFoundError if there is none, InputError if it cannot be read.
+
+    `called` says in the error what the file is, '' for nothing but its path.
+    """
+    text = _text(path, called)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise _refusal(path, called, error) from None
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file with a header; a row that is cut short or too long is left out.
+
+    FileNotFoundError if there is no such file, InputError if it cannot be read.
+    """
+    lines = _text(path, "").splitlines()
+    try:
+        rows = list(csv.DictReader(lines))
+    except csv.Error as error:
+        raise _refusal(path, "", error) from None
+    return [row for row in rows if None not in row and None not in row.values()]
+
+
+def _text(path: Path, called: str) -> str:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise _refusal(path, called, f"it is larger than {MAX_BYTES >> 20} MiB")
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError) as error:
+        raise _refusal(path, called, getattr(error, "strerror", None) or error) from None
+
+
+def _refusal(path: Path, called: str, why: object) -> InputError:
+    words = " ".join(str(why).split())[:200]
+    return InputError(f"{called}{' ' if called else ''}{path} cannot be read: {words}")
+
+
+# What a run directory holds.
+CONFIG_FILE, METRICS, POLICY, CHECKPOINTS = "config.json", "metrics.csv", "policy.npz", "checkpoints"
+EXTENSIONS = ("env", "reward", "algorithm")  # what a run may use of the user's own, by name
+MOST_MEMBERS = 4096
+LARGEST_SEED = 2**31 - 1
+ORIGIN = ("seed", "physics", "seeds", "sweep")  # what it must say beside the configuration
+
+
+def _is_whole(value: Any, low: int, high: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+
+
+def write_config(run: Path, config: Config, origin: dict[str, Any]) -> None:
+    """Write the run's `config.json`: configuration, its hash, and `origin` (seed, physics, command, commit)."""
+    record = {"config": configs.to_dict(config), "config_hash": configs.config_hash(config), **origin}
+    partial = run / f".{CONFIG_FILE}.partial"
+    partial.write_text(json.dumps(record, indent=2) + "\n")
+    partial.replace(run / CONFIG_FILE)
+
+
+def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
+    """Configuration and origin of a run directory; raise InputError if it is none."""
+    path = run / CONFIG_FILE
+    try:
+        record = read_json(path, "")
+    except FileNotFoundError:
+        raise InputError(f"{run} is not a run directory: it has no {CONFIG_FILE}") from None
+    if not isinstance(record, dict) or "config" not in record:
+        raise InputError(f"{path} holds no configuration")
+    settings = record.pop("config")
+    try:
+        config = configs.from_dict(settings)
+    except (TypeError, OverflowError) as error:  # a value of another kind than any setting, a number beyond all floats
+        raise InputError(f"{path} holds no configuration: {error}") from None
+    lost = [name for name in ORIGIN if name not in record]
+    if lost:
+        raise InputError(f"{path} lacks {', '.join(lost)}")
+    sound = _is_whole(record["seed"], 0, LARGEST_SEED) and _is_whole(record["seeds"], 1, MOST_MEMBERS)
+    if not sound or record["physics"] not in TRAINING_ENGINES:
+        raise InputError(f"{path} has no sound seed, seeds or physics")
+    if record["sweep"] is not None:
+        record["sweep"] = check_sweep(record["sweep"], record["seeds"], configs.validate(config), str(path))
+    if record.pop("config_hash", None) != configs.config_hash(settings):
+        raise InputError(f"the configuration in {path} was changed after the run began; restore it, or start a new run")
+    return configs.validate(config), record
+
+
+PACKAGE = Path(__file__).parents[1]
+# What a training result depends on; the judge and the flight code are not among it.
+SOURCES = (
+    "config",
+    "assembly.py",
+    "env.py",
+    "rewards.py",
+    "control",
+    "physics",
+    "sim",
+    "algorithms",
+    "train",
+)
+LIBRARIES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
+
+
+def source_hash() -> str:
+    """First 16 hex digits of the SHA-256 of all source files that a training result depends on."""
+    digest = hashlib.sha256()
+    for name in SOURCES:
+        place = PACKAGE / name
+        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the libraries that a training result depends on."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+def commit() -> str:
+    """The commit of the source tree, marked `-dirty` if it has changes, or 'unknown' outside a repository.
+
+    `MJXBALL_COMMIT` overrules it, for containers and copied trees.
+    """
+    if given := os.environ.get("MJXBALL_COMMIT"):
+        return given
+    command = ["git", "-C", str(PACKAGE), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def differences(recorded: Mapping[str, Any]) -> list[str]:
+    """How this program differs from the one that made a run with the origin `recorded`, one phrase each."""
+    found = []
+    if recorded.get("source_hash") != source_hash():
+        found.append(f"source {recorded.get('source_hash')} (commit {recorded.get('commit')}) is now {source_hash()}")
+    old = recorded.get("versions") or {}
+    for name, version in versions().items():
+        if old.get(name) != version:
+            found.append(f"{name} {old.get(name)} is now {version}")
+    return found
+
+
+UNSWEPT = ("sac.curriculum", "sac.max_grad_norm")  # the program branches on whether they are 0
+# Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
+SWEEPABLE = (
+    *(
+        path
+        for path, value, _ in configs.leaves(Config())
+        if isinstance(value, float) and path.startswith(("sac.", "reward.")) and path not in UNSWEPT
+    ),
+    "follower.action_scale_tilt",
+    "follower.action_scale_vertical",
+)
+Sweep = Mapping[str, Sequence[float]]
+
+
+def read_sweep(path: Path, members: int, config: Config) -> dict[str, list[float]]:
+    """A sweep file: JSON {"<config path>": [one number for each member], ...}. Raises InputError if unsound."""
+    try:
+        sweep = read_json(path, "sweep file")
+    except FileNotFoundError:
+        raise InputError(f"sweep file {path} does not exist") from None
+    return check_sweep(sweep, members, config, f"sweep file {path}")
+
+
+def check_sweep(sweep: Any, members: int, config: Config, where: str) -> dict[str, list[float]]:
+    """`sweep` under the settings' present names; InputError that begins with `where` unless it fits the members."""
+    if not isinstance(sweep, dict) or not sweep:
+        raise InputError(f"{where} must hold an object of settings")
+    for given, values in sweep.items():
+        name = configs.current_name(given)
+        if name not in SWEEPABLE:
+            raise InputError(f"{where}: {given!r} cannot differ between members; {', '.join(SWEEPABLE)} can")
+        if not isinstance(values, list) or len(values) != members:
+            raise InputError(f"{where}: {name} needs {members} numbers, one for each seed")
+        for value in values:
+            whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) < 2**53
+            configs.validate(configs.replace(config, name, float(value) if whole else value))
+    return {configs.current_name(name): values for name, values in sweep.items()}
