@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.fly import flight_log, packets
-from mjxball.fly.loop import urgent
+from mjxball.fly.process import urgent
 from mjxball.fly.twin.conditions import FAULT_KINDS, Injection, LinkFaults
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Truth, Twin

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjxball.control import observation, rotations
-from mjxball.fly import loop
+from mjxball.fly import process
 from mjxball.fly.card import Controller, config_of
-from mjxball.fly.loop import Metronome
 from mjxball.fly.packets import DroneState, pack_state, unpack_state
+from mjxball.fly.process import Metronome
 from mjxball.fly.telemetry import Rig, object_state
 from mjxball.physics.engine import PlantState
 from mjxball.policy import Policy, PolicyFile, load_file
@@ -114,8 +114,8 @@ def test_forgetting_starts_anew() -> None:
 
 def test_late_ticks_do_not_shift_the_later_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(loop.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    monkeypatch.setattr(process.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(process.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
     metronome = Metronome(0.01)
     metronome.start()
     times = []

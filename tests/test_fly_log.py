@@ -19,10 +19,11 @@ from mjxball import config as configs
 from mjxball.commands import evaluate
 from mjxball.control.firmware_gains import pair_gains, to_json
 from mjxball.errors import InputError
-from mjxball.fly import flight_log, packets
-from mjxball.fly.flight_log import SILENCE, Journal, Tail, load, read
+from mjxball.fly import packets, recording
+from mjxball.fly.flight_log import Journal, Tail, read
 from mjxball.fly.log_schema import KINDS, SCHEMA
 from mjxball.fly.packets import DroneState
+from mjxball.fly.recording import SILENCE, load
 from mjxball.rig import identify
 from mjxball.view.command import main as view
 
@@ -71,7 +72,7 @@ def test_what_is_noted_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tick["ages"], [0.01, np.inf])
     assert (seen["drone"], seen["raw"].stamp, seen["raw"].state.info) == ("follower", 0xABCDEF, 25)
     np.testing.assert_allclose(
-        flight_log.numbers(seen["raw"].state), flight_log.numbers(state), atol=1e-9
+        recording.numbers(seen["raw"].state), recording.numbers(state), atol=1e-9
     )  # whole millimetres and milliradians
     assert seen["raw"].state.battery == pytest.approx(3.71)
 
@@ -142,7 +143,7 @@ def test_lines_that_are_no_records_are_left_out_and_told(tmp_path: Path, damage:
     assert len(list(read(path, remarks.append))) == len(lines)
     assert len(remarks) == 1
     assert remarks[0].startswith("line 2 is damaged: ")
-    assert load(path).remarks == tuple(remarks)
+    assert load(path).remarks == tuple(f"{path.name}: {remark}" for remark in remarks)
 
 
 def test_what_newer_programs_add_is_skipped(tmp_path: Path) -> None:
@@ -240,11 +241,11 @@ def test_gaps_and_frozen_estimates_are_told(tmp_path: Path) -> None:
     assert (silent.begin, silent.end) == pytest.approx((1.49, 2.0))  # between the states at either side
     assert (frozen.begin, frozen.end) == pytest.approx((2.2, 2.79))
     assert log.remarks == (
-        "there is no state of the leader for 0.51 s from 1.5 s on",
-        "the follower's estimate is frozen for 0.59 s from 2.2 s on",
+        f"{path.name}: there is no state of the leader for 0.51 s from 1.5 s on",
+        f"{path.name}: the follower's estimate is frozen for 0.59 s from 2.2 s on",
     )
     assert silent.end - silent.begin > SILENCE
-    assert flight_log.outages("leader", np.arange(9) * 0.01, np.arange(9)[:, None], 1.0)[0].end == 1.0  # to the end
+    assert recording.outages("leader", np.arange(9) * 0.01, np.arange(9)[:, None], 1.0)[0].end == 1.0  # to the end
 
 
 def test_it_never_overwrites(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_gain_files_that_are_none(text: str, tmp_path: Path, capsys: pytest.Capt
 
 
 def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
-    modules = ["main", "link", "session", "watchdog", "display", "twin.server", "twin.physics", "rehearse"]
+    modules = ["main", "link", "session", "watchdog", "display", "twin.server", "twin.physics", "process"]
     imports = ", ".join(f"mjxball.fly.{name}" for name in modules)
     heavy = ("jax", "jaxlib", "mujoco", "flax", "brax", "cflib")
     script = f"import sys, {imports}; print([name for name in {heavy!r} if name in sys.modules])"

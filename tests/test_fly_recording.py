@@ -57,9 +57,9 @@ def test_the_log_holds_the_flight(recording: Recording) -> None:
     assert np.isnan(recording.leader[np.array(recording.phase) == "ramp"]).all()
     # The leader and a copy of it: they climb and stay over the place, and drift along the stick as the CG moves.
     assert (np.abs(recording.position[flying][-1] - [0.1, 0.0, 0.4]) < [0.1, 0.5, 0.15]).all()
-    assert recording.curves == ("older", "older")  # as the motors said, whatever the header takes them for
+    assert recording.setup.curves == ("older", "older")  # as the motors said, whatever the header takes them for
     config = card.with_curve(recording.config, "older")
-    assert recording.gains == card.gains_of(config)
+    assert recording.setup.gains == card.gains_of(config)
     plant = config.plant
     weight = (plant.leader_mass + plant.follower_mass + plant.object_mass) * plant.gravity
     # It hangs in the air for the last second: what the curve makes of the thrust that was sent is its weight.

@@ -23,7 +23,7 @@ from fly_policies import untrained
 from fly_virtual import World, log_header
 
 from mjxball.errors import InputError
-from mjxball.fly.display import LiveView
+from mjxball.fly.display import live_view
 from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.main import main as fly
@@ -268,13 +268,13 @@ def test_a_log_that_turns_out_to_be_none(tmp_path: Path) -> None:
 
 def test_a_flight_starts_and_ends_its_view(lines: list[bytes], tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
-    with LiveView(path) as live_view:
-        address = re.fullmatch(r"the live view is at (http://127\.0\.0\.1:(\d+)/), and waits for .*", live_view.line)
+    with live_view(path) as page_process:
+        address = re.fullmatch(r"the live view is at (http://127\.0\.0\.1:(\d+)/), and waits for .*", page_process.line)
         path.write_bytes(b"".join(lines))
         with urllib.request.urlopen(address[1], timeout=LIMIT) as page:
             assert page.status == 200
         with pytest.raises(InputError, match="the port of --view"):
-            LiveView(path, int(address[2]))
+            live_view(path, int(address[2]))
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", int(address[2])), LIMIT)
 

@@ -24,6 +24,7 @@ from typing import Any
 
 from mjxball.errors import InputError
 from mjxball.fly.packets import Packet
+from mjxball.fly.process import bounded
 
 
 @dataclass(frozen=True)
@@ -48,17 +49,6 @@ class Identity:
     version: str = "?"  # of the firmware, such as 2026.08
     device: str = "?"  # such as Crazyflie 2.1
     revision: str = "?"  # of the firmware's source
-
-
-def bounded(action: Callable[[], Any], seconds: float) -> bool:
-    """Run `action` in a thread; false if it has not returned after `seconds`, it is then left behind.
-
-    cflib waits without limit in places, and some of its callbacks can lock each other out.
-    """
-    thread = threading.Thread(target=action, daemon=True)
-    thread.start()
-    thread.join(seconds)
-    return not thread.is_alive()
 
 
 def table_cache() -> str | None:

@@ -7,7 +7,6 @@ import math
 import os
 import select
 import signal
-import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -18,9 +17,9 @@ from typing import TextIO
 import numpy as np
 
 from mjxball.control import rotations
-from mjxball.errors import InputError
 from mjxball.fly.flight import View
 from mjxball.fly.limits import NAMES, Limits
+from mjxball.fly.process import Child
 from mjxball.fly.supervisor import ENDED, GUIDED, State
 
 RED, YELLOW, GREEN, PLAIN = "\x1b[1;37;41m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
@@ -87,43 +86,13 @@ class Display:
             self._drawn = len(text)
 
 
-class LiveView:
-    """A running `python -m mjxball.view --live`. A context manager; `line` says where its page is.
+def live_view(log: Path, port: int = 0) -> Child:
+    """A running `python -m mjxball.view --live` of the flight log `log`, whose `line` says where its page is.
 
-    Nothing waits for it while flying: it reads the log and nobody reads what it writes. It ends with this process.
+    Nothing waits for it while flying: it reads the log and nobody reads what it writes. Raises InputError.
     """
-
-    def __init__(self, log: Path, port: int = 0, start_limit: float = 30.0):
-        """Start it for the flight log `log`, before the flight. Raises InputError if it does not start."""
-        flags = ["--live", "--attached", "--port", str(port)]
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "mjxball.view", *flags, "--", str(log)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            start_new_session=True,  # Ctrl-C lands the flight, and that is worth seeing
-            text=True,
-        )
-        assert self._process.stdout is not None
-        readable, _, _ = select.select([self._process.stdout], [], [], start_limit)
-        self.line = self._process.stdout.readline().strip() if readable else ""
-        if not self.line:
-            self.close()
-            raise InputError("the live view did not start; is the port of --view free?")
-
-    def __enter__(self) -> LiveView:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """End it, once an open page has the rest of the flight."""
-        try:
-            with contextlib.suppress(OSError, ValueError):
-                self._process.communicate(timeout=5)  # closes its input, which ends it
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate(timeout=5)
+    flags = ["--live", "--attached", "--port", str(port), "--", str(log)]
+    return Child(["mjxball.view", *flags], "the live view did not start; is the port of --view free?")
 
 
 KILL_KEYS = b" kK"  # the largest key, found without looking

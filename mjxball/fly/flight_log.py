@@ -2,7 +2,7 @@
 
 Every line has "t", seconds of the monotonic clock, and "kind"; `log_schema` says which kinds there are. `Journal`
 writes in a thread of its own and flushes as it goes, so that the log is readable after a kill -9. `Tail` reads a log
-that grows, `read` a whole one, `load` the flight in it.
+that grows, `read` a whole one; `recording` makes a flight of it.
 """
 
 from __future__ import annotations
@@ -15,25 +15,15 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
-import numpy as np
-
-from mjxball.config import Config
-from mjxball.control.firmware_gains import PairGains
 from mjxball.errors import InputError
-from mjxball.fly.command import CURVE_NAMES, CurveName
-from mjxball.fly.flown import RECORDS, Flown
-from mjxball.fly.limits import NAMES
+from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.log_schema import SCHEMA, Record, decode
-from mjxball.fly.packets import DroneState
 
 SYNC_PERIOD = 1.0  # [s] between two fsyncs: a killed process loses nothing that was flushed, a power cut this much
 CHUNK = 2**20  # bytes read at once
 LONGEST_LINE = 2**20  # bytes
-SILENCE = 0.1  # [s] between two states of a drone from which on the log has a gap
-FROZEN = 0.25  # [s] of equal states from which on an estimator counts as frozen while the laws are in command
-GUIDED = "fly"  # the supervisor's state in which both laws fly
 
 
 class Journal:
@@ -204,101 +194,3 @@ def read(path: Path, remark: Callable[[str], None] | None = None) -> Iterator[Re
         if remark and tail.damaged:
             more = len(tail.damaged) - 1
             remark(tail.damaged[0] + (f", as are {more} more" if more else ""))
-
-
-class Outage(NamedTuple):
-    """A time in which a drone's states say nothing."""
-
-    drone: str
-    frozen: bool  # equal states came; else none
-    begin: float  # [s] of the log's clock
-    end: float
-
-
-class FlightLog(NamedTuple):
-    """A log that holds a flight, from where its motors are first told to turn to its last tick."""
-
-    path: Path
-    policy: str
-    config: Config
-    curves: tuple[CurveName, CurveName]  # of leader's and follower's firmware
-    gains: PairGains  # that they flew with
-    records: tuple[Record, ...]  # ticks and states alone, in the order of time; the states in force come first
-    outages: tuple[Outage, ...]
-    remarks: tuple[str, ...]  # half a sentence each: what a reader should know who relies on it
-
-    def told(self) -> Iterator[str]:
-        """The remarks as lines for a terminal."""
-        return (f"{self.path.name}: {remark}" for remark in self.remarks)
-
-
-def load(path: Path) -> FlightLog:
-    """The flight in the whole log `path`. Raises InputError with one sentence if there is none."""
-    remarks: list[str] = []
-    header, *records = read(path, remarks.append)
-    settings = header.get("settings")
-    if isinstance(settings, dict) and settings.get("dry_run") is True:
-        raise InputError(f"flight log {path} holds no flight: it is of a dry run")
-    rows = sorted((one for one in records if one["kind"] in ("tick", "state")), key=lambda one: float(one["t"]))
-    turning = [one["t"] for one in rows if one["kind"] == "tick" and one["sent"][:, 3].max() > 0]
-    if not turning:
-        why = f"; {remarks[-1]}" if remarks else ""
-        raise InputError(f"flight log {path} holds no flight: no motor was ever told to turn{why}")
-    last = max(one["t"] for one in rows if one["kind"] == "tick")
-    before = _newest_before(rows, turning[0])
-    flown = (*before, *(one for one in rows if turning[0] <= one["t"] <= last))
-    for drone in NAMES:
-        if not any(one["kind"] == "state" and one["drone"] == drone for one in flown):
-            raise InputError(f"flight log {path} holds no flight: it has no state of the {drone}")
-    if not any(one["kind"] == "end" for one in records):
-        remarks.append("it has no end: the runner was killed, or the log was cut")
-    found = _outages(flown, turning[-1])
-    remarks += [_sentence(gap, turning[0]) for gap in found]
-    with_what = Flown.of(header)
-    for one in records:
-        with_what = with_what.after(one, header["config"]) if one["kind"] in RECORDS else with_what
-    policy = header["policy"][:80]
-    return FlightLog(path, policy, header["config"], *with_what, flown, found, tuple(remarks))
-
-
-def outages(drone: str, time: np.ndarray, states: np.ndarray, end: float) -> list[Outage]:
-    """Where the rows of `states` (S, n) at `time` (S,) leave a gap, or do not change for long, until `end`."""
-    edges = np.append(time, max(end, time[-1]))
-    gaps = [(edges[k], edges[k + 1]) for k in np.flatnonzero(np.diff(edges) > SILENCE)]
-    changes = np.flatnonzero((np.diff(states, axis=0) != 0).any(axis=1)) + 1
-    runs = zip([0, *changes], [*(changes - 1), len(time) - 1], strict=True)
-    kept = [(time[a], min(time[b], end)) for a, b in runs if min(time[b], end) - time[a] > FROZEN]
-    return [
-        Outage(drone, frozen, float(begin), float(over))
-        for frozen, spans in ((False, gaps), (True, kept))
-        for begin, over in spans
-    ]
-
-
-def numbers(state: DroneState) -> np.ndarray:
-    """(13,) position, velocity, quaternion (w, x, y, z), body rates."""
-    return np.concatenate([state.position, state.velocity, state.quaternion, state.rates])
-
-
-def _outages(rows: tuple[Record, ...], stopped: float) -> tuple[Outage, ...]:
-    """Gaps until the motors have `stopped`; equal states while the laws are in command, since a pair may rest."""
-    guided = [one["t"] for one in rows if one["kind"] == "tick" and one["state"] == GUIDED]
-    found = []
-    for drone in NAMES:
-        own = [one for one in rows if one["kind"] == "state" and one["drone"] == drone]
-        time, states = np.array([one["t"] for one in own]), np.array([numbers(one["raw"].state) for one in own])
-        found += [gap for gap in outages(drone, time, states, stopped) if not gap.frozen]
-        if guided and (within := (time >= guided[0]) & (time <= guided[-1])).any():
-            found += [gap for gap in outages(drone, time[within], states[within], guided[-1]) if gap.frozen]
-    return tuple(sorted(found, key=lambda gap: gap.begin))
-
-
-def _newest_before(rows: list[Record], time: float) -> list[Record]:
-    """Each drone's last state before `time`."""
-    newest = {one["drone"]: one for one in rows if one["kind"] == "state" and one["t"] < time}
-    return sorted(newest.values(), key=lambda one: float(one["t"]))
-
-
-def _sentence(gap: Outage, start: float) -> str:
-    what = f"the {gap.drone}'s estimate is frozen" if gap.frozen else f"there is no state of the {gap.drone}"
-    return f"{what} for {gap.end - gap.begin:.2f} s from {max(gap.begin - start, 0.0):.1f} s on"

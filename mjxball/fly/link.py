@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from mjxball.fly import packets
-from mjxball.fly.connection import PORT, Deadlines, Element, Identity, LinkError, Parameters, bounded, connect
+from mjxball.fly.connection import PORT, Deadlines, Element, Identity, LinkError, Parameters, connect
 from mjxball.fly.packets import Packet, PacketError
+from mjxball.fly.process import bounded
 from mjxball.fly.telemetry import HealthSample, Note, Telemetry
 
 PROTOCOL = 12  # CRTP version with a supervisor port

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.util
+import json
 import math
 import re
 import sys
@@ -19,10 +20,10 @@ from mjxball.errors import InputError
 from mjxball.fly import limits, mocap
 from mjxball.fly.card import Controller, ThrustChoice, drone_of, goal_of, motor_of, times_of, variants
 from mjxball.fly.command import CURVE_NAMES
-from mjxball.fly.display import LiveView
+from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.preflight import Preflight, read_gains
-from mjxball.fly.rehearse import Rehearsal
+from mjxball.fly.process import Child
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, asked_of_twin, check_twin, read_fault
@@ -168,11 +169,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             uris = (options.leader, options.follower)
             if options.rehearse:
                 ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
-                uris = stack.enter_context(Rehearsal(options.policy, ports, twin_options(options))).uris
+                flags = ["--ports", *map(str, ports), "--policy", str(options.policy), *twin_options(options)]
+                failure = "the twin did not start; are the ports of --leader and --follower free?"
+                twin = stack.enter_context(Child(["mjxball.fly.twin", *flags], failure))
+                uris = tuple(json.loads(twin.line)["uris"])
             if capture is not None:
                 setup = replace(setup, mocap=stack.enter_context(mocap.ready(capture, rig.span)))
             if options.view is not None and log is not None:
-                print(stack.enter_context(LiveView(log, options.view)).line, flush=True)  # noqa: T201
+                print(stack.enter_context(live_view(log, options.view)).line, flush=True)  # noqa: T201
             if log and not options.log:
                 print(f"log: {log}", flush=True)  # noqa: T201
             return fly(uris, setup, settings, log, list(sys.argv if arguments is None else arguments))

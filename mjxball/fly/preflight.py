@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import math
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from mjxball.fly.connection import LinkError
 from mjxball.fly.limits import Limits
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
+from mjxball.fly.process import together
 from mjxball.fly.spin import curve_of_version
 from mjxball.fly.telemetry import Rig, yaw_of
 
@@ -64,25 +64,6 @@ def read_gains(path: Path) -> PairGains:
             f"gain file {path} must be one JSON object of parameter names with finite numbers, or two of them, named "
             "leader and follower"
         ) from None
-
-
-def together(actions: Sequence[Callable[[], None]]) -> None:
-    """Run all `actions` at once; raise the first one's error after all have ended."""
-    errors: list[Exception] = []
-
-    def guarded(action: Callable[[], None]) -> None:
-        try:
-            action()
-        except Exception as error:  # carried over to the caller's thread
-            errors.append(error)
-
-    threads = [threading.Thread(target=guarded, args=(action,), daemon=True) for action in actions]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if errors:
-        raise errors[0]
 
 
 KALMAN = 2  # of stabilizer.estimator

@@ -1,31 +1,180 @@
-"""A flight log as arrays, one row per tick, and the same commands flown again by the twin's physics."""
+"""The flight in a log: what it flew with and what is missing; as arrays, a row per tick; flown again on the twin."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import crazyflie
-from mjxball.control.firmware_gains import PairGains
+from mjxball.control.firmware_gains import PARAMETERS, Gains, PairGains
 from mjxball.errors import InputError
 from mjxball.fly import flight_log
-from mjxball.fly.card import drone_of
-from mjxball.fly.command import CurveName
-from mjxball.fly.flight_log import FlightLog
-from mjxball.fly.flown import force_curve, one_curve
+from mjxball.fly.card import ThrustChoice, command_maps, drone_of, gains_of, with_curve
+from mjxball.fly.command import CURVE_NAMES, CurveName, ForceCurve
 from mjxball.fly.limits import NAMES
+from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
+from mjxball.fly.supervisor import State
 from mjxball.fly.telemetry import ObjectState, Rig, object_state
 from mjxball.fly.twin.conditions import DroneKind, Surroundings, drone_kind
 from mjxball.fly.twin.physics import PairState, pair_of
 
+SILENCE = 0.1  # [s] between two states of a drone from which on the log has a gap
+FROZEN = 0.25  # [s] of equal states from which on an estimator counts as frozen while the laws are in command
+GUIDED = State.FLY.value  # both laws fly
 LONGEST = 3600.0  # [s] of a flight that is read
 OBSERVATION = 18  # numbers of an observation, where the log holds none
+SAME = 1e-5  # of two gains of which one was sent as a 32-bit float
+
+
+class FirmwareSetup(NamedTuple):
+    """Force curves and gains of leader's and follower's firmware, as a log tells."""
+
+    curves: tuple[CurveName, CurveName]
+    gains: PairGains
+
+    @classmethod
+    def of_header(cls, header: Record) -> FirmwareSetup:
+        """What a log's `header` says; a curve that it does not name is the one that the policy's numbers are for."""
+        curve = header.get("curve") or own_curve(header["config"])
+        return cls((curve, curve), header["gains"])
+
+    def after(self, record: Record, config: Config) -> FirmwareSetup:
+        """What holds after one more record, of a flight by a policy of `config`.
+
+        A firmware that is found to have another curve is given the card's gains for it, and keeps those that were
+        not the card's.
+        """
+        if record["kind"] not in ("thrust", "parameter"):
+            return self
+        number = NAMES.index(record["drone"])
+        curves, gains = list(self.curves), list(self.gains)
+        if record["kind"] == "thrust":
+            gains[number] = _for_curve(gains[number], config, number, curves[number], record["curve"])
+            curves[number] = record["curve"]
+        elif record["name"] in PARAMETERS:
+            gains[number] = {**gains[number], record["name"]: record["value"]}
+        return FirmwareSetup((curves[0], curves[1]), (gains[0], gains[1]))
+
+    def force_curves(self, config: Config) -> tuple[ForceCurve, ForceCurve]:
+        """Force of both drones' motors by the thrust that they are sent."""
+        leader, follower = (
+            command_maps(with_curve(config, name), ThrustChoice(curve=name))[0].curve for name in self.curves
+        )
+        return leader, follower
+
+
+def own_curve(config: Config) -> CurveName:
+    """The curve of the firmware that the numbers of `config` are for."""
+    return next(name for name in CURVE_NAMES if with_curve(config, name) is config)
+
+
+def one_curve(curves: tuple[CurveName, CurveName]) -> CurveName | None:
+    """The curve of both drones, None if they have different ones."""
+    return curves[0] if curves[0] == curves[1] else None
+
+
+def _for_curve(gains: Gains, config: Config, number: int, before: CurveName, after: CurveName) -> Gains:
+    """`gains` of drone `number`, of which those that were the card's for one curve become the card's for another."""
+    old, new = (gains_of(with_curve(config, name))[number] for name in (before, after))
+    return {
+        name: new[name] if name in old and math.isclose(value, old[name], rel_tol=SAME) else value
+        for name, value in gains.items()
+    }
+
+
+class Outage(NamedTuple):
+    """A time in which a drone's states say nothing."""
+
+    drone: str
+    frozen: bool  # equal states came; else none
+    begin: float  # [s] of the log's clock
+    end: float
+
+
+class FlightLog(NamedTuple):
+    """A log that holds a flight, from where its motors are first told to turn to its last tick."""
+
+    path: Path
+    policy: str
+    config: Config
+    setup: FirmwareSetup  # at the end
+    records: tuple[Record, ...]  # ticks and states alone, in the order of time; the states in force come first
+    outages: tuple[Outage, ...]
+    remarks: tuple[str, ...]  # a line each: what a reader should know who relies on it
+
+
+def load(path: Path) -> FlightLog:
+    """The flight in the whole log `path`. Raises InputError with one sentence if there is none."""
+    remarks: list[str] = []
+    header, *records = flight_log.read(path, remarks.append)
+    settings = header.get("settings")
+    if isinstance(settings, dict) and settings.get("dry_run") is True:
+        raise InputError(f"flight log {path} holds no flight: it is of a dry run")
+    rows = sorted((one for one in records if one["kind"] in ("tick", "state")), key=lambda one: float(one["t"]))
+    turning = [one["t"] for one in rows if one["kind"] == "tick" and one["sent"][:, 3].max() > 0]
+    if not turning:
+        why = f"; {remarks[-1]}" if remarks else ""
+        raise InputError(f"flight log {path} holds no flight: no motor was ever told to turn{why}")
+    last = max(one["t"] for one in rows if one["kind"] == "tick")
+    newest = {one["drone"]: one for one in rows if one["kind"] == "state" and one["t"] < turning[0]}
+    before = sorted(newest.values(), key=lambda one: float(one["t"]))
+    flown = (*before, *(one for one in rows if turning[0] <= one["t"] <= last))
+    for drone in NAMES:
+        if not any(one["kind"] == "state" and one["drone"] == drone for one in flown):
+            raise InputError(f"flight log {path} holds no flight: it has no state of the {drone}")
+    if not any(one["kind"] == "end" for one in records):
+        remarks.append("it has no end: the runner was killed, or the log was cut")
+    found = _outages(flown, turning[-1])
+    remarks += [_sentence(gap, turning[0]) for gap in found]
+    setup = FirmwareSetup.of_header(header)
+    for one in records:
+        setup = setup.after(one, header["config"])
+    lines = tuple(f"{path.name}: {remark}" for remark in remarks)
+    return FlightLog(path, header["policy"][:80], header["config"], setup, flown, found, lines)
+
+
+def outages(drone: str, time: np.ndarray, states: np.ndarray, end: float) -> list[Outage]:
+    """Where the rows of `states` (S, n) at `time` (S,) leave a gap, or do not change for long, until `end`."""
+    edges = np.append(time, max(end, time[-1]))
+    gaps = [(edges[k], edges[k + 1]) for k in np.flatnonzero(np.diff(edges) > SILENCE)]
+    changes = np.flatnonzero((np.diff(states, axis=0) != 0).any(axis=1)) + 1
+    runs = zip([0, *changes], [*(changes - 1), len(time) - 1], strict=True)
+    kept = [(time[a], min(time[b], end)) for a, b in runs if min(time[b], end) - time[a] > FROZEN]
+    return [
+        Outage(drone, frozen, float(begin), float(over))
+        for frozen, spans in ((False, gaps), (True, kept))
+        for begin, over in spans
+    ]
+
+
+def numbers(state: DroneState) -> np.ndarray:
+    """(13,) position, velocity, quaternion (w, x, y, z), body rates."""
+    return np.concatenate([state.position, state.velocity, state.quaternion, state.rates])
+
+
+def _outages(rows: tuple[Record, ...], stopped: float) -> tuple[Outage, ...]:
+    """Gaps until the motors have `stopped`; equal states while the laws are in command, since a pair may rest."""
+    guided = [one["t"] for one in rows if one["kind"] == "tick" and one["state"] == GUIDED]
+    found = []
+    for drone in NAMES:
+        own = [one for one in rows if one["kind"] == "state" and one["drone"] == drone]
+        time, states = np.array([one["t"] for one in own]), np.array([numbers(one["raw"].state) for one in own])
+        found += [gap for gap in outages(drone, time, states, stopped) if not gap.frozen]
+        if guided and (within := (time >= guided[0]) & (time <= guided[-1])).any():
+            found += [gap for gap in outages(drone, time[within], states[within], guided[-1]) if gap.frozen]
+    return tuple(sorted(found, key=lambda gap: gap.begin))
+
+
+def _sentence(gap: Outage, start: float) -> str:
+    what = f"the {gap.drone}'s estimate is frozen" if gap.frozen else f"there is no state of the {gap.drone}"
+    return f"{what} for {gap.end - gap.begin:.2f} s from {max(gap.begin - start, 0.0):.1f} s on"
 
 
 @dataclass(frozen=True)
@@ -34,8 +183,7 @@ class Recording:
 
     policy: str
     config: Config
-    curves: tuple[CurveName, CurveName]  # of leader's and follower's firmware
-    gains: PairGains  # that they flew with
+    setup: FirmwareSetup
     time: np.ndarray  # (T,) from 0 [s]
     phase: tuple[str, ...]  # (T,) the supervisor's state
     sent: np.ndarray  # (T, 2, 4) leader, follower: roll, pitch [deg], yaw rate [deg/s], thrust, wire's signs
@@ -54,7 +202,7 @@ class Recording:
 
 def read_recording(path: Path) -> Recording:
     """The flight in the log `path`. Raises InputError with one sentence if there is none."""
-    log = flight_log.load(path)
+    log = load(path)
     plant = log.config.plant
     rig = Rig(plant.leader_mount, plant.follower_mount)
     ticks: list[Mapping[str, Any]] = []
@@ -77,7 +225,7 @@ def _recording(log: FlightLog, ticks: Sequence[Mapping[str, Any]], seen: Sequenc
         return np.array([tick.get(name, np.full(width, np.nan)) for tick in ticks])
 
     position, velocity, quaternion, rates = (np.array(part) for part in zip(*seen, strict=True))
-    curves = [force_curve(log.config, name) for name in log.curves]
+    curves = log.setup.force_curves(log.config)
     force = np.array([[c.force(s[3]) / 4 for c, s in zip(curves, tick["sent"], strict=True)] for tick in ticks])
     lengths = {len(tick["observation"]) for tick in ticks if "observation" in tick} or {OBSERVATION}
     if len(lengths) > 1:
@@ -85,8 +233,7 @@ def _recording(log: FlightLog, ticks: Sequence[Mapping[str, Any]], seen: Sequenc
     return Recording(
         policy=log.policy,
         config=log.config,
-        curves=log.curves,
-        gains=log.gains,
+        setup=log.setup,
         time=np.array([tick["t"] for tick in ticks]) - ticks[0]["t"],
         phase=tuple(tick["state"] for tick in ticks),
         sent=column("sent", 8),
@@ -100,36 +247,36 @@ def _recording(log: FlightLog, ticks: Sequence[Mapping[str, Any]], seen: Sequenc
         observation=column("observation", lengths.pop()),
         rotor_force=np.repeat(force[..., None], 4, axis=-1),
         cg_offset=np.full(len(ticks), np.nan),
-        remarks=tuple(log.told()),
+        remarks=log.remarks,
     )
 
 
 def twin_of(recording: Recording) -> DroneKind:
     """The twin's drones whose firmware has the force curve that flew. Raises InputError if both had different ones."""
-    curve = one_curve(recording.curves)
+    curve = one_curve(recording.setup.curves)
     if curve is None:
-        told = ", ".join(f"{name} {own}" for name, own in zip(NAMES, recording.curves, strict=True))
-        raise InputError(f"the flight was flown on two force curves ({told}), and the twin's drones have one")
+        named = ", ".join(f"{name} {own}" for name, own in zip(NAMES, recording.setup.curves, strict=True))
+        raise InputError(f"the flight was flown on two force curves ({named}), and the twin's drones have one")
     return drone_kind(drone_of(recording.config), curve)
 
 
 def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
     """The recorded setpoints through the physics of drones of `kind`, from rest where the recorded flight began.
 
-    Without a `kind` they are those that the log tells of (`twin_of`). Nobody steers: what both disagree on adds up
-    with time. The object's mass and the CG's motion, which no log knows, are those of a rehearsal
+    Without a `kind` they are those that the log tells of (`twin_of`). The loop is open: what both disagree on adds
+    up with time. The object's mass and the CG's motion, which no log knows, are those of a rehearsal
     (`twin.coupled.Conditions.of`).
     """
     pair = pair_of(recording.config, kind or twin_of(recording), Surroundings(exact=True))
-    for drone, gains in enumerate(recording.gains):
+    for drone, gains in enumerate(recording.setup.gains):
         for name, value in gains.items():
             pair.set_parameter(drone, name, value)
     rig = Rig(recording.config.plant.leader_mount, recording.config.plant.follower_mount)
     state, seen, forces, offsets = pair.start(), [], [], []
     for time, sent in zip(recording.time, recording.sent, strict=True):
-        seen.append(object_state(_drones(state), rig))
-        forces.append(getattr(pair, "rotor_force", np.zeros((2, 4))))
-        offsets.append(getattr(pair, "cg_offset", np.nan))
+        seen.append(object_state([drone_state(state, number) for number in range(2)], rig))
+        forces.append(pair.rotor_force)
+        offsets.append(pair.cg_offset)
         step = recording.time[len(seen)] - time if len(seen) < len(recording.time) else 0.0
         sound = np.where(sent[:, 3:] >= crazyflie.IDLE, sent, 0.0)
         state = pair.advance(sound, step)
@@ -145,11 +292,7 @@ def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
     return Recording(**{**vars(recording), **changed})
 
 
-def _drones(state: PairState) -> list[DroneState]:
-    """Both drones' states as perfect estimators would report them."""
-    return [
-        DroneState(
-            state.position[n], state.velocity[n], state.quaternion[n], state.rates[n], 0, float(state.battery[n])
-        )
-        for n in range(2)
-    ]
+def drone_state(state: PairState, number: int) -> DroneState:
+    """What a perfect estimator of drone `number` would report."""
+    pose, moving = (state.position[number], state.velocity[number]), (state.quaternion[number], state.rates[number])
+    return DroneState(*pose, *moving, 0, float(state.battery[number]))

@@ -23,9 +23,9 @@ from mjxball.fly.flight import Flight
 from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
-from mjxball.fly.loop import Metronome, Timing, urgent
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.preflight import Check, Preflight, check, prepare
+from mjxball.fly.process import Metronome, Timing, urgent
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.watchdog import NOTHING, Watchdog

@@ -21,8 +21,8 @@ from mjxball.control.hover import hover
 from mjxball.errors import InputError
 from mjxball.fly.card import with_curve
 from mjxball.fly.command import CurveName
-from mjxball.fly.flown import one_curve, own_curve
 from mjxball.fly.preflight import read_gains
+from mjxball.fly.recording import one_curve, own_curve
 from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify, pair_mass
 from mjxball.rig.log import Log, read_log

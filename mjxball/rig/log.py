@@ -12,10 +12,9 @@ from mjxball.control import rotations
 from mjxball.control.crazyflie import PERIOD
 from mjxball.control.firmware_gains import PairGains
 from mjxball.errors import InputError
-from mjxball.fly import flight_log
 from mjxball.fly.command import CurveName
-from mjxball.fly.flight_log import GUIDED, FlightLog, Outage, numbers, outages
 from mjxball.fly.limits import NAMES
+from mjxball.fly.recording import GUIDED, FlightLog, Outage, load, numbers, outages
 
 STATE = 13  # numbers of a drone's state in an .npz: position, velocity, quaternion (w, x, y, z), body rates
 OFF_THE_GROUND = 0.03  # [m] above the start of a flight from which on nothing touches the pair
@@ -44,7 +43,7 @@ def read_log(path: Path) -> Log:
     Raises InputError.
     """
     if path.suffix != ".npz":
-        return _of_flight(flight_log.load(path))
+        return _of_flight(load(path))
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = [np.asarray(data[name], float) for name in ("time", "setpoints", "states")]
@@ -126,9 +125,9 @@ def _of_flight(flown: FlightLog) -> Log:
     except ValueError as error:
         raise InputError(f"flight log {flown.path} cannot be used: {error}") from None
     return log._replace(
-        remarks=tuple(flown.told()),
+        remarks=flown.remarks,
         stand=flown.config.plant.stand,
-        gains=flown.gains,
-        curves=flown.curves,
+        gains=flown.setup.gains,
+        curves=flown.setup.curves,
         volts=float(np.median([one["raw"].state.battery for rows in own for one in rows])),
     )

@@ -12,11 +12,10 @@ from mjxball.control import rotations
 from mjxball.fly import packets
 from mjxball.fly.card import variants
 from mjxball.fly.flight_log import Tail
-from mjxball.fly.flown import Flown
 from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
-from mjxball.fly.recording import LONGEST
+from mjxball.fly.recording import LONGEST, FirmwareSetup
 from mjxball.fly.supervisor import FAULTS, State
 from mjxball.fly.telemetry import Rig, object_state
 from mjxball.view.page import plant_of
@@ -81,8 +80,8 @@ class Feed:
             self._tell(record["kind"], record)
 
     def _begin(self, header: Record) -> None:
-        self._config, self._flown = header["config"], Flown.of(header)
-        self._curves = self._flown.force_curves(self._config)
+        self._config, self._firmware = header["config"], FirmwareSetup.of_header(header)
+        self._curves = self._firmware.force_curves(self._config)
         plant = self._config.plant
         self._rig = Rig(plant.leader_mount, plant.follower_mount)
         # Of whichever curve: it is known once the motors turn, when the page has its scale.
@@ -128,8 +127,8 @@ class Feed:
     def _tell(self, kind: str, record: Record) -> None:
         """Note anything but states and ticks."""
         if kind == "thrust":
-            self._flown = self._flown.after(record, self._config)
-            self._curves = self._flown.force_curves(self._config)
+            self._firmware = self._firmware.after(record, self._config)
+            self._curves = self._firmware.force_curves(self._config)
         elif kind == "check":
             self.text = f"{'good' if record['passed'] else 'BAD'}: {record['name']}: {record['found']}"
         elif kind == "transition":

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from mjxball.cli import make_parser, run_command
-from mjxball.fly.loop import urgent
+from mjxball.fly.process import urgent
 from mjxball.fly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings

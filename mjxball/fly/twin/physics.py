@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -61,6 +62,16 @@ class Pair(Protocol):
     The firmware's supervisor is not part of it: setpoints come after thrust lock, watchdog and stops.
     """
 
+    @property
+    def cg_offset(self) -> float:
+        """Where the CG is, from O along the stick [m]; NaN if there is none that moves."""
+        ...
+
+    @property
+    def rotor_force(self) -> np.ndarray:
+        """(2, 4) of leader and follower [N]."""
+        ...
+
     def start(self) -> PairState:
         """Put everything back to rest on the ground (stand: at its lowest) and return that state."""
         ...
@@ -105,7 +116,10 @@ class StandInPlant:
 
 
 class StandIn:
-    """See `body.Pair`."""
+    """See `Pair`."""
+
+    cg_offset = math.nan
+    rotor_force = np.zeros((2, 4))  # not modelled
 
     def __init__(self, plant: StandInPlant = StandInPlant()):
         self.plant = plant

@@ -296,7 +296,7 @@ class World:
         line = state.position[0] - state.position[1]
         tilt = math.acos(min(max(packets.level_share(state.quaternion[0]), -1.0), 1.0))
         origin = state.position.mean(axis=0)
-        ball = float(getattr(self.pair, "cg_offset", 0.0))
+        ball = self.pair.cg_offset
         roll = math.atan2(float(line[2]), float(line[1]))
         value = self.flight.supervisor.state.value
         low, pwm = float(state.battery.min()), state.report.pwm

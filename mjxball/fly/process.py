@@ -1,13 +1,20 @@
-"""The clock of the control loop: monotonic deadlines, and how well they were met."""
+"""Clocks, threads and processes: deadlines of the control loop, its priority, waiting with a limit, child processes."""
 
 from __future__ import annotations
 
 import collections
 import contextlib
 import os
+import select
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
+
+from mjxball.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -95,3 +102,71 @@ def urgent() -> Iterator[str]:
         elif granted.startswith("nice"):
             with contextlib.suppress(OSError):
                 os.nice(10)
+
+
+def bounded(action: Callable[[], Any], seconds: float) -> bool:
+    """Run `action` in a thread; false if it has not returned after `seconds`, it is then left behind.
+
+    cflib waits without limit in places, and some of its callbacks can lock each other out.
+    """
+    thread = threading.Thread(target=action, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    return not thread.is_alive()
+
+
+def together(actions: Sequence[Callable[[], None]]) -> None:
+    """Run all `actions` at once; raise the first one's error after all have ended."""
+    errors: list[Exception] = []
+
+    def guarded(action: Callable[[], None]) -> None:
+        try:
+            action()
+        except Exception as error:  # carried over to the caller's thread
+            errors.append(error)
+
+    threads = [threading.Thread(target=guarded, args=(action,), daemon=True) for action in actions]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    if errors:
+        raise errors[0]
+
+
+class Child:
+    """`python -m MODULE ...` that prints one line when it is ready and ends when its standard input does.
+
+    A context manager. Ctrl-C does not reach it: what it serves lands first.
+    """
+
+    def __init__(self, arguments: Sequence[str], failure: str, start_limit: float = 30.0):
+        """Start it. Raises InputError with the sentence `failure` if it is not ready within `start_limit` [s]."""
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+            text=True,
+        )
+        assert self._process.stdout is not None
+        readable, _, _ = select.select([self._process.stdout], [], [], start_limit)
+        self.line = self._process.stdout.readline().strip() if readable else ""
+        if not self.line:
+            self.close()
+            raise InputError(failure)
+
+    def __enter__(self) -> Child:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close its input and wait for its end; kill it after 5 s."""
+        try:
+            with contextlib.suppress(OSError, ValueError):
+                self._process.communicate(timeout=5)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.communicate(timeout=5)
