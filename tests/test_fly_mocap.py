@@ -20,12 +20,13 @@ from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environme
 from fly_virtual import World
 from vrpn_server import Poses, VrpnServer
 
-from mjxball.fly import mocap_source, packets
+from mjxball.fly import mocap as motion_capture
+from mjxball.fly import packets, process
 from mjxball.fly.flight_log import read
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
-from mjxball.fly.main import main
-from mjxball.fly.mocap import Mocap, MocapError, MocapSettings, default_rate, ready
+from mjxball.fly.main import default_rate, main
+from mjxball.fly.mocap import Mocap, MocapError, MocapSettings, ready
 from mjxball.fly.mocap_child import Decimation
 from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose
 from mjxball.fly.packets import Setpoint
@@ -145,9 +146,9 @@ def test_what_a_server_sends_is_refused_in_a_sentence(
 def test_without_the_package_it_says_how_to_install_it(
     deaf: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = mocap_source.importlib.util.find_spec
+    found = motion_capture.importlib.util.find_spec
     without = lambda name: None if name == "motioncapture" else found(name)  # noqa: E731
-    monkeypatch.setattr(mocap_source.importlib.util, "find_spec", without)
+    monkeypatch.setattr(motion_capture.importlib.util, "find_spec", without)
     assert call(main, [TRANSPORT, *deaf[0], "--mocap", "vrpn", *HERE]) == 2
     errors = capsys.readouterr().err
     assert "pip install 'mjxball[mocap]'" in errors
@@ -167,7 +168,7 @@ def test_a_reader_that_hangs_or_dies_hurts_nobody() -> None:
         assert mocap.faults(time.monotonic()) == []
         assert mocap._source is not None
         mocap._source._process.kill()
-        assert mocap_source.wait_until(lambda: bool(mocap.faults(time.monotonic())), 5.0)
+        assert process.wait_until(lambda: bool(mocap.faults(time.monotonic())), 5.0)
         (one, other) = mocap.faults(time.monotonic())
         assert one.event is other.event is Event.POSE
 
@@ -176,7 +177,7 @@ def test_a_reader_that_hangs_or_dies_hurts_nobody() -> None:
 def test_the_reader_ends_with_the_runner() -> None:
     """Its standard input ends when the runner dies in any way, while it waits inside the package."""
     with VrpnServer(standing, mute=True) as server:
-        source = mocap_source.Source(MocapSettings("vrpn", server.host, BODIES), lambda frame: None)
+        source = motion_capture.Source(MocapSettings("vrpn", server.host, BODIES), lambda frame: None)
         assert source._process.stdin is not None
         assert source._process.poll() is None
         source._process.stdin.close()
@@ -228,7 +229,7 @@ def test_a_pose_goes_out_only_when_no_setpoint_waits(monkeypatch: pytest.MonkeyP
     link._sender.start()
     poses = [packets.pose_packet((float(n), 0, 0), LEVEL) for n in range(4)]
     setpoints = [packets.setpoint_packet(Setpoint(0, 0, 0, thrust)) for thrust in (11000, 12000, 13000)]
-    sent = functools.partial(mocap_source.wait_until, seconds=5.0)
+    sent = functools.partial(process.wait_until, seconds=5.0)
     link.pose(poses[0])
     assert sent(lambda: len(driver.ports) == 1)
     assert link.stuck_for(time.monotonic()) == 0
@@ -267,7 +268,7 @@ class Seen:
         self.mocap = Mocap(MocapSettings("mock", "", BODIES), self.world.rig.span)
         self.heard: list[list[tuple[np.ndarray, np.ndarray]]] = [[], []]
         self._noise, self._spoil, self._begin = np.random.default_rng(0), spoil, 0.0
-        self.mocap.log(self.world.log.note)
+        self.mocap.note = self.world.log.note
         for number, link in enumerate(self.world.links):
             link.pose = lambda packet, number=number: self.heard[number].append(packets.unpack_pose(packet.data))
             self.mocap.feed(number, link)
@@ -289,7 +290,7 @@ class Seen:
     def fly(self) -> str:
         """Fly to the end; the cause of an abort, empty if there was none."""
         spoil, self._spoil = self._spoil, lambda elapsed, frame: frame
-        self.mocap.guard()
+        self.mocap.guarding = True
         self.world.fly_until(State.FLY)
         self.world.fly_for(1.0)
         self._spoil, self._begin = spoil, self.world.now

@@ -12,8 +12,8 @@ import pytest
 
 from mjxball.control import rotations
 from mjxball.fly import packets
-from mjxball.fly.mocap_source import wait_until
 from mjxball.fly.packets import Setpoint
+from mjxball.fly.process import wait_until
 from mjxball.fly.twin import logs, protocol
 from mjxball.fly.twin.physics import RUNNING, Modes, PairState, StandIn
 from mjxball.fly.twin.server import HOST, Twin

@@ -11,6 +11,7 @@ import collections
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -83,6 +84,14 @@ class FlightSettings:
     stand: bool = False  # sideways and pitch are locked
     limits: Limits = Limits()
     times: Times = Times()
+
+
+class Check(NamedTuple):
+    """One check and how it went."""
+
+    name: str
+    passed: bool
+    found: str
 
 
 def within_fence(goal: Sequence[float], rig: Rig, limits: Limits) -> bool:

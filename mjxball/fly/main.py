@@ -17,11 +17,12 @@ from pathlib import Path
 from mjxball import cli
 from mjxball.cli import run_command
 from mjxball.errors import InputError
-from mjxball.fly import limits, mocap
+from mjxball.fly import limits
 from mjxball.fly.card import Controller, ThrustChoice, drone_of, goal_of, motor_of, times_of, variants
 from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
+from mjxball.fly.mocap import KINDS, MocapSettings, ready
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.process import Child
 from mjxball.fly.session import FlightSetup, fly
@@ -30,6 +31,7 @@ from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, asked_of_
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
+DONGLE = re.compile(r"radio://([^/]+)/")
 LOOP_RATE = 100.0  # [Hz] at least: the policy's period is a whole number of ticks
 # Numbers with least and most: of the battery, and of the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
@@ -86,8 +88,59 @@ def make_parser() -> cli.Parser:
     parser.add_argument("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
     parser.add_argument("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
     parser.add_argument("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
-    mocap.add_flags(parser)
+    add_mocap_options(parser)
     return parser
+
+
+def add_mocap_options(parser: argparse.ArgumentParser) -> None:
+    """The flags of motion capture."""
+    parser.add_argument("--mocap", choices=KINDS, metavar="KIND", help=f"forward poses from: {', '.join(KINDS)}")
+    parser.add_argument("--mocap-host", metavar="HOST", help="--mocap: its server; optitrack: as numbers")
+    parser.add_argument("--bodies", nargs=2, metavar=("LEADER", "FOLLOWER"), help="--mocap: names of the rigid bodies")
+    parser.add_argument("--mocap-rate", type=float, metavar="HZ", help="--mocap: poses to each drone, 50 to 100")
+    parser.add_argument(
+        "--mocap-std", type=float, nargs=2, metavar=("M", "RAD"), help="--mocap: deviations told the estimators"
+    )
+    parser.add_argument(
+        "--mocap-option", action="append", default=[], metavar="KEY=VALUE", help="--mocap: more, such as port=22222"
+    )
+
+
+def mocap_settings(options: argparse.Namespace) -> MocapSettings | None:
+    """What the flags ask for, None without --mocap. Raises InputError for anything unsound."""
+    if options.mocap is None:
+        for name in ("mocap_host", "bodies", "mocap_rate", "mocap_std", "mocap_option"):
+            if getattr(options, name):
+                raise InputError(f"--{name.replace('_', '-')} needs --mocap KIND")
+        return None
+    if options.rehearse:
+        raise InputError("--mocap is for drones that the cameras see: leave it out with --rehearse")
+    if options.mocap_host is None and options.mocap != "mock":
+        raise InputError(f"--mocap {options.mocap} needs --mocap-host HOST")
+    if options.bodies is None:
+        raise InputError("--mocap needs --bodies LEADER FOLLOWER, the names of the two rigid bodies")
+    if options.bodies[0] == options.bodies[1]:
+        raise InputError("--bodies names one body for both drones")
+    rate = options.mocap_rate or default_rate((options.leader, options.follower))
+    if not 50 <= rate <= 100:
+        raise InputError(f"--mocap-rate must be 50 to 100, not {rate:g}")
+    deviation = tuple(options.mocap_std or MocapSettings.deviation)
+    if not all(1e-4 <= value <= 1 for value in deviation):
+        raise InputError("--mocap-std must be two numbers of 0.0001 to 1")
+    pairs = [text.partition("=") for text in options.mocap_option]
+    for text, (key, sign, _) in zip(options.mocap_option, pairs, strict=True):
+        if not key or not sign:
+            raise InputError(f"--mocap-option {text} is no KEY=VALUE")
+    more = {key: value for key, _, value in pairs}
+    bodies = (options.bodies[0], options.bodies[1])
+    return MocapSettings(options.mocap, options.mocap_host or "", bodies, rate, (deviation[0], deviation[1]), more)
+
+
+def default_rate(uris: Sequence[str | None]) -> float:
+    """Poses a second to each drone: 100, and 50 where both share one dongle, which 400 packets a second would fill."""
+    dongles = [DONGLE.match(uri or "") for uri in uris]
+    shared = dongles[0] and dongles[1] and dongles[0][1] == dongles[1][1]
+    return 50.0 if shared else 100.0
 
 
 def check_options(options: argparse.Namespace) -> None:
@@ -144,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def command() -> int:
         check_options(options)
         check_twin_options(options)
-        capture = mocap.settings_of(options)
+        capture = mocap_settings(options)
         log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
         policy = Policy.load(options.policy)
         controller = Controller(policy)
@@ -174,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 twin = stack.enter_context(Child(["mjxball.fly.twin", *flags], failure))
                 uris = tuple(json.loads(twin.line)["uris"])
             if capture is not None:
-                setup = replace(setup, mocap=stack.enter_context(mocap.ready(capture, rig.span)))
+                setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
             if options.view is not None and log is not None:
                 print(stack.enter_context(live_view(log, options.view)).line, flush=True)  # noqa: T201
             if log and not options.log:

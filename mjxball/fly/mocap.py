@@ -1,53 +1,143 @@
 """Motion capture: poses of both drones' bodies, supervised and forwarded to the drones' estimators over our own links.
 
-How it is used: `Mocap(settings, span)` as a context manager; `wait_ready` before anything is connected; `parameters`
-and then `feed` for each drone once its link is open; `checks` before flight; `guard` when they passed; `faults` at
-every tick. Poses go out in the reader's thread, beside the loop and never through it.
+How it is used: `ready(settings, span)` as a context manager, before anything is connected; `parameters` and then `feed`
+for each drone once its link is open; `checks` before flight; `guarding` when they passed; `faults` at every tick. Frames
+come from a child process that may hang or crash without hurting a flight. Poses go out in the thread that reads it,
+beside the control loop and never through it.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
+import importlib.util
+import json
 import math
-import re
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from mjxball.errors import InputError
 from mjxball.fly import mocap_supervision as supervision
 from mjxball.fly import packets
-from mjxball.fly.limits import NAMES
-from mjxball.fly.mocap_source import KINDS, MocapError, MocapSettings, Source, wait_until
-from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose, Track, Tracks
-from mjxball.fly.packets import Packet
+from mjxball.fly.limits import NAMES, Check
+from mjxball.fly.link import Link
+from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose, Track, Tracks, clean
+from mjxball.fly.process import wait_until
 from mjxball.fly.supervisor import Fault
-from mjxball.fly.telemetry import Telemetry
+from mjxball.fly.telemetry import Note
 
+BUILT = ("vicon", "optitrack", "qualisys", "vrpn", "mock")  # what the package on PyPI was built with
+KINDS = (*BUILT, "optitrack_closed_source", "nokov", "motionanalysis", "fzmotion")
 LIMITS = MocapLimits()
 NOTE_PERIOD = 0.02  # [s] between two poses of a drone in the log
-DONGLE = re.compile(r"radio://([^/]+)/")
+KALMAN = 2  # of the firmware's parameter stabilizer.estimator
 
 
-class PoseLink(Protocol):
-    """What forwarding needs of `link.Link`."""
-
-    telemetry: Telemetry
-
-    def pose(self, packet: Packet) -> None:
-        """Newest pose, behind any setpoint, without blocking."""
+class MocapError(InputError):
+    """A motion capture system that cannot be had or flown on, in one sentence."""
 
 
-class PoseCheck(NamedTuple):
-    """One check before flight and how it went: the fields of `preflight.Check`."""
+@dataclass(frozen=True)
+class MocapSettings:
+    """Which system, which bodies, and how their poses are used."""
 
-    name: str
-    passed: bool
-    found: str
+    kind: str  # one of KINDS
+    host: str = ""
+    bodies: tuple[str, str] = ("leader", "follower")
+    rate: float = 100.0  # of poses to each drone, at most [Hz]
+    deviation: tuple[float, float] = (0.01, 0.05)  # standard deviations, position [m] and attitude [rad]
+    options: dict[str, str] = field(default_factory=dict)  # more of what the package takes for this kind
+
+    def given(self) -> dict[str, str]:
+        """What the package is given. Raises MocapError for a host without an address."""
+        host = self.host
+        if self.kind == "optitrack":  # the package takes numbers only
+            try:
+                host = socket.gethostbyname(host)
+            except OSError:
+                raise MocapError(f"--mocap-host {host} has no address") from None
+        return {"hostname": host, **self.options}
+
+
+class Source:
+    """The child process and the thread that reads it. A context manager; `take` is called in that thread."""
+
+    def __init__(self, settings: MocapSettings, take: Callable[[Frame], None]):
+        """Start both. Raises MocapError if the package is missing."""
+        if importlib.util.find_spec("motioncapture") is None:
+            raise MocapError("motioncapture is not installed; pip install 'mjxball[mocap]'")
+        self._take = take
+        self.names: list[str] = []  # of all bodies that were seen
+        self.failure = ""  # why no more frames will come
+        self.frames = self.damaged = 0
+        self._stopping = False
+        arguments = [settings.kind, f"{settings.rate}", *settings.bodies, json.dumps(settings.given())]
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "mjxball.fly.mocap_child", "--", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # Ctrl-C is for the runner
+        )
+        self._thread = threading.Thread(target=self._read_all, name="mocap", daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int:
+        """Of the child."""
+        return self._process.pid
+
+    def __enter__(self) -> Source:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the child and its thread."""
+        self._stopping = True
+        self._process.kill()  # it may be deep inside a call that never returns
+        self._process.wait(timeout=5)
+        self._thread.join(timeout=5)
+        for stream in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                assert stream is not None
+                stream.close()
+
+    def _read_all(self) -> None:
+        assert self._process.stdout is not None
+        pipe, waiting = self._process.stdout.fileno(), b""
+        while not self._stopping:
+            readable, _, _ = select.select([pipe], [], [], 0.1)
+            if not readable:
+                continue
+            received = os.read(pipe, 65536)
+            if not received:
+                self.failure = self.failure or "its reader ended"
+                return
+            *lines, waiting = (waiting + received).split(b"\n")
+            for line in lines:
+                self._line(json.loads(line))
+
+    def _line(self, what: Any) -> None:
+        if isinstance(what, dict):
+            self.names = what.get("names", self.names)
+            self.failure = what.get("error", self.failure)
+            return
+        poses = [None if one is None else clean(one[0], one[1:]) for one in what]
+        self.damaged += sum(one is not None and pose is None for one, pose in zip(what, poses, strict=True))
+        self.frames += 1
+        self._take((poses[0], poses[1]))
 
 
 class Mocap:
@@ -59,11 +149,11 @@ class Mocap:
         self.tracks: Tracks = (Track(), Track())  # replaced as a whole, by the reader's thread alone
         self.sent = [0, 0]
         self._span = span
-        self._links: list[PoseLink | None] = [None, None]
-        self._note: Callable[..., None] = lambda kind, t=None, **fields: None
+        self._links: list[Link | None] = [None, None]
+        self.note: Note = lambda kind, t=None, **fields: None  # the log's, of gaps and of what is forwarded
+        self.guarding = False  # a pose far from the drone's own estimate is not sent; before, the estimate follows it
         self._noted = [-math.inf, -math.inf]
         self._gap = [False, False]
-        self._guarding = False
         self._source: Source | None = None
 
     def __enter__(self) -> Mocap:
@@ -120,31 +210,23 @@ class Mocap:
     def parameters(self) -> dict[str, float]:
         """What each drone's firmware must be told: Kalman estimator, deviations of poses."""
         position, attitude = self.settings.deviation
-        return {"stabilizer.estimator": 2.0, "locSrv.extPosStdDev": position, "locSrv.extQuatStdDev": attitude}
+        return {"stabilizer.estimator": KALMAN, "locSrv.extPosStdDev": position, "locSrv.extQuatStdDev": attitude}
 
-    def log(self, note: Callable[..., None]) -> None:
-        """Tell `note`, the log's, of gaps and of what is forwarded."""
-        self._note = note
-
-    def feed(self, number: int, link: PoseLink) -> None:
+    def feed(self, number: int, link: Link) -> None:
         """Forward the poses of body `number` (0 leader, 1 follower) to `link` from now on."""
         self._links[number] = link
 
-    def checks(self) -> list[PoseCheck]:
+    def checks(self) -> list[Check]:
         """What must hold of poses and estimates before the motors may turn; takes `limits.measure` seconds."""
         fault, now = self._watch(), time.monotonic()
-        found = [PoseCheck("motion capture", not fault, fault or "both bodies in place")]
+        found = [Check("motion capture", not fault, fault or "both bodies in place")]
         for name, track, place in zip(NAMES, self.tracks, self._places(now), strict=True):
             error = math.dist(place, track.last.position) if place is not None and track.last is not None else math.inf
             text = f"{1000 * error:.0f} mm from the drone's estimate"
-            found.append(PoseCheck(f"{name} pose", error <= self.limits.disagreement, text))
+            found.append(Check(f"{name} pose", error <= self.limits.disagreement, text))
         return found
 
     # In flight.
-
-    def guard(self) -> None:
-        """From now on a pose far from the drone's own estimate is not sent: before, the estimate followed the poses."""
-        self._guarding = True
 
     def faults(self, now: float) -> list[Fault]:
         """What is wrong with the poses at `now` [s]; never blocks."""
@@ -154,13 +236,13 @@ class Mocap:
             if gap != self._gap[number]:
                 self._gap[number] = gap
                 text = track.reason or "none came"
-                self._note("gap", drone=NAMES[number], begins=gap, age=track.age(now), text=text if gap else "")
+                self.note("gap", drone=NAMES[number], begins=gap, age=track.age(now), text=text if gap else "")
         return supervision.faults(tracks, now, self.limits)
 
     def take(self, frame: Frame, now: float | None = None) -> None:
         """One frame, in the reader's thread: judge it, send what is fit to be sent."""
         before, now = self.tracks, time.monotonic() if now is None else now
-        places = self._places(now) if self._guarding else (None, None)
+        places = self._places(now) if self.guarding else (None, None)
         after = supervision.follow(before, frame, self.limits, self._span, places)
         self.tracks = after
         for number, (old, new) in enumerate(zip(before, after, strict=True)):
@@ -175,8 +257,8 @@ class Mocap:
         self.sent[number] += 1
         if now - self._noted[number] >= 0.75 * NOTE_PERIOD:
             self._noted[number] = now
-            where: Mapping[str, Any] = {"position": pose.position, "quaternion": pose.quaternion}
-            self._note("pose", drone=NAMES[number], age=now - pose.time, **where)
+            age, where = now - pose.time, pose.position
+            self.note("pose", drone=NAMES[number], age=age, position=where, quaternion=pose.quaternion)
 
     def _places(self, now: float) -> list[Sequence[float] | None]:
         """Where each drone's estimator has it [m], None if that is not known or old."""
@@ -194,61 +276,3 @@ def ready(settings: MocapSettings, span: np.ndarray, limits: MocapLimits = LIMIT
     with Mocap(settings, span, limits) as mocap:
         mocap.wait_ready()
         yield mocap
-
-
-# The command line.
-
-
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags of motion capture."""
-    parser.add_argument("--mocap", choices=KINDS, metavar="KIND", help=f"forward poses from: {', '.join(KINDS)}")
-    parser.add_argument("--mocap-host", metavar="HOST", help="--mocap: its server; optitrack: as numbers")
-    parser.add_argument("--bodies", nargs=2, metavar=("LEADER", "FOLLOWER"), help="--mocap: names of the rigid bodies")
-    parser.add_argument("--mocap-rate", type=float, metavar="HZ", help="--mocap: poses to each drone, 50 to 100")
-    parser.add_argument(
-        "--mocap-std", type=float, nargs=2, metavar=("M", "RAD"), help="--mocap: deviations told the estimators"
-    )
-    parser.add_argument(
-        "--mocap-option", action="append", default=[], metavar="KEY=VALUE", help="--mocap: more, such as port=22222"
-    )
-
-
-def settings_of(options: argparse.Namespace) -> MocapSettings | None:
-    """What the flags ask for, None without --mocap. Raises InputError for anything unsound."""
-    others = ("mocap_host", "bodies", "mocap_rate", "mocap_std", "mocap_option")
-    if options.mocap is None:
-        for name in others:
-            if getattr(options, name):
-                raise InputError(f"--{name.replace('_', '-')} needs --mocap KIND")
-        return None
-    if options.rehearse:
-        raise InputError("--mocap is for drones that the cameras see: leave it out with --rehearse")
-    if options.mocap_host is None and options.mocap != "mock":
-        raise InputError(f"--mocap {options.mocap} needs --mocap-host HOST")
-    if options.bodies is None:
-        raise InputError("--mocap needs --bodies LEADER FOLLOWER, the names of the two rigid bodies")
-    if options.bodies[0] == options.bodies[1]:
-        raise InputError("--bodies names one body for both drones")
-    rate = options.mocap_rate or default_rate((options.leader, options.follower))
-    if not 50 <= rate <= 100:
-        raise InputError(f"--mocap-rate must be 50 to 100, not {rate:g}")
-    deviation = tuple(options.mocap_std or MocapSettings.deviation)
-    if not all(1e-4 <= value <= 1 for value in deviation):
-        raise InputError("--mocap-std must be two numbers of 0.0001 to 1")
-    pairs = [text.partition("=") for text in options.mocap_option]
-    for text, (key, sign, _) in zip(options.mocap_option, pairs, strict=True):
-        if not key or not sign:
-            raise InputError(f"--mocap-option {text} is no KEY=VALUE")
-    more = {key: value for key, _, value in pairs}
-    bodies = (options.bodies[0], options.bodies[1])
-    return MocapSettings(options.mocap, options.mocap_host or "", bodies, rate, (deviation[0], deviation[1]), more)
-
-
-def default_rate(uris: Sequence[str | None]) -> float:
-    """Poses a second to each drone: 100, and 50 where both share one dongle, which 400 packets a second would fill."""
-    dongles = [DONGLE.match(uri or "") for uri in uris]
-    shared = dongles[0] and dongles[1] and dongles[0][1] == dongles[1][1]
-    return 50.0 if shared else 100.0
-
-
-__all__ = ["Mocap", "MocapError", "MocapSettings", "add_flags", "ready", "settings_of"]

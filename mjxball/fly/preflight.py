@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +17,9 @@ from mjxball.errors import InputError
 from mjxball.fly import limits, packets
 from mjxball.fly.command import CurveName, Variants
 from mjxball.fly.connection import LinkError
-from mjxball.fly.limits import Limits
+from mjxball.fly.limits import Check, Limits
 from mjxball.fly.link import Link
-from mjxball.fly.mocap import Mocap
+from mjxball.fly.mocap import KALMAN, Mocap
 from mjxball.fly.process import together
 from mjxball.fly.spin import curve_of_version
 from mjxball.fly.telemetry import Rig, yaw_of
@@ -41,14 +40,6 @@ class Preflight:
     drone: str = "2.1"  # which Crazyflie the policy was trained for, a key of `motors.MOTORS`
 
 
-class Check(NamedTuple):
-    """One check and how it went."""
-
-    name: str
-    passed: bool
-    found: str
-
-
 def read_gains(path: Path) -> PairGains:
     """Parameters of leader and follower from a JSON file, see `firmware_gains.read_pair_gains`. Raises InputError."""
     try:
@@ -64,9 +55,6 @@ def read_gains(path: Path) -> PairGains:
             f"gain file {path} must be one JSON object of parameter names with finite numbers, or two of them, named "
             "leader and follower"
         ) from None
-
-
-KALMAN = 2  # of stabilizer.estimator
 
 
 def prepare(
@@ -89,7 +77,7 @@ def prepare(
         curves[link.name] = promised_curve(link, own)
         link.write_parameters(own[curves[link.name]].gains)
         if mocap is not None:
-            link.write_parameters(mocap.parameters() | {"stabilizer.estimator": KALMAN})
+            link.write_parameters(mocap.parameters())
             mocap.feed(links.index(link), link)
         link.start_states()
         reset_estimator(link, asked)

@@ -134,6 +134,16 @@ def together(actions: Sequence[Callable[[], None]]) -> None:
         raise errors[0]
 
 
+def wait_until(condition: Callable[[], bool], seconds: float) -> bool:
+    """True once `condition` holds, false if it does not within `seconds`."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
 class Child:
     """`python -m MODULE ...` that prints one line when it is ready and ends when its standard input does.
 

@@ -24,7 +24,7 @@ from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
-from mjxball.fly.preflight import Check, Preflight, check, prepare
+from mjxball.fly.preflight import Preflight, check, prepare
 from mjxball.fly.process import Metronome, Timing, urgent
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
@@ -71,7 +71,7 @@ def fly(
             with urgent() as priority, Watchdog(uris) as watchdog:
                 journal.note("priority", granted=priority)
                 if setup.mocap is not None:
-                    setup.mocap.log(journal.note)
+                    setup.mocap.note = journal.note
                 curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
                 flight = Flight(
                     links,
@@ -145,8 +145,8 @@ def _emergency(flight: Flight) -> bool:
 def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings, journal: Journal) -> bool:
     checks = check(links, setup.rig, settings.limits, setup.preflight)
     if setup.mocap is not None:
-        checks += [Check(*one) for one in setup.mocap.checks()]
-        setup.mocap.guard()
+        checks += setup.mocap.checks()
+        setup.mocap.guarding = True
     for one in checks:
         journal.note("check", name=one.name, passed=one.passed, found=one.found)
         _say(f"{'good' if one.passed else 'BAD '}  {one.name}: {one.found}")
