@@ -1,9 +1,9 @@
 """Motion capture: poses of both drones' bodies, supervised and forwarded to the drones' estimators over our own links.
 
 How it is used: `ready(settings, span)` as a context manager, before anything is connected; `parameters` and then `feed`
-for each drone once its link is open; `checks` before flight; `guarding` when they passed; `faults` at every tick. Frames
-come from a child process that may hang or crash without hurting a flight. Poses go out in the thread that reads it,
-beside the control loop and never through it.
+for each drone once its link is open; `checks` before flight; `guarding` when they passed; `faults` at every tick.
+Frames come from a child process that may hang or crash without hurting a flight; poses go out in the thread that reads
+it, not through the control loop.
 """
 
 from __future__ import annotations
