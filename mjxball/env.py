@@ -12,7 +12,7 @@ import numpy as np
 from mjxball import rewards
 from mjxball.config import Config, Reward, ball_limit
 from mjxball.control import crazyflie, observation, rotations
-from mjxball.control.recall import recall_of
+from mjxball.control.observation import observation_history
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mjx import jax_repeat, make_engine
@@ -42,7 +42,7 @@ class World(NamedTuple):
     load: Load
     goal: Array  # (3,) of O [m]
     disturbances: Any  # `sim.disturbances.RandomState`, () if nothing is disturbed
-    history: Any  # (m,) see `control.recall`, () if there is none: XLA's partitioner cannot bear arrays of no elements
+    history: Any  # (m,) observation history; () if none: XLA's partitioner cannot bear arrays of no elements
     action: Array  # (3,) last network action in [-1, 1]
     steps: Array  # () control steps since the reset
 
@@ -78,7 +78,7 @@ class CoupledPairEnv(Env):
         self._disturbances = RandomDisturbances(config)
         self._loop = ClosedLoop(config, make_physics(config, physics), self._disturbances.sensors)
         self._ball_limit = ball_limit(config.plant)
-        self._recall = recall_of(config)
+        self._history = observation_history(config)
         self._resets = ResetDistribution(config)
         self._cg = make_cg_offset(config)
         self._commanded = np.array(observation.commanded(config.follower.load_axis_only, config.plant.cg_axis))
@@ -95,17 +95,17 @@ class CoupledPairEnv(Env):
     @property
     def seen_size(self) -> int:
         """How many numbers of the observation the follower sees and remembers; only critics are told the rest."""
-        return observation.OBSERVATION_SIZE + self._recall.size
+        return observation.OBSERVATION_SIZE + self._history.size
 
     @property
     def input_mask(self) -> list[float]:
         """1 for each number of the observation that the policy uses, else 0."""
-        return [*self._recall.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
+        return [*self._history.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
 
     @property
     def critic_mask(self) -> list[float]:
         """1 for each number of the observation that the critics use, else 0."""
-        return [*self._recall.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
+        return [*self._history.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
 
     @property
     def action_size(self) -> int:
@@ -170,7 +170,7 @@ class CoupledPairEnv(Env):
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
-            history=self._recall.next(world.history, seen, action) if self._recall.size else (),
+            history=self._history.next(world.history, seen, action) if self._history.size else (),
             action=action,
             steps=world.steps + 1,
         )
@@ -210,7 +210,7 @@ class CoupledPairEnv(Env):
             load=load,
             goal=goal,
             disturbances=disturbances,
-            history=self._recall.start(seen) if self._recall.size else (),
+            history=self._history.start(seen) if self._history.size else (),
             action=jnp.zeros(3),
             steps=jnp.zeros((), jnp.int32),
         )
@@ -218,7 +218,7 @@ class CoupledPairEnv(Env):
 
     def _input(self, seen: Array, world: World) -> Array:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
-        shown = self._recall.network_input(seen, world.history) if self._recall.size else seen
+        shown = self._history.network_input(seen, world.history) if self._history.size else seen
         return jnp.concatenate([shown, self._privileged(world)]) if self.config.sac.privileged_critic else shown
 
     def _first_privileged(self, rng: Array) -> Array:
@@ -271,7 +271,7 @@ class CoupledPairEnv(Env):
             rates=plant.rates,
             action=after.action,
             last_action=before.action,
-            action_average=self._recall.slowest_action(before.history) if remembers else None,
+            action_average=self._history.slowest_action(before.history) if remembers else None,
             leader_command=commands.leader,
             follower_command=commands.follower,
             tilt_disagreement=(commands.follower - commands.leader)[self._unloaded],

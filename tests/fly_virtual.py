@@ -8,7 +8,7 @@ from typing import Any
 from command_line import TRANSPORT
 
 from mjxball import config as configs
-from mjxball.control.firmware_gains import to_json
+from mjxball.control.crazyflie import to_json
 from mjxball.fly import card, packets
 from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import FlightSettings

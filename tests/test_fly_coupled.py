@@ -9,9 +9,9 @@ import pytest
 
 from mjxball import config as configs
 from mjxball.config import Config
-from mjxball.control import crazyflie, motor_curves, rotations
+from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.constants import plant_constants
-from mjxball.control.firmware_gains import PARAMETERS, STOCK, gains_of, pair_gains, with_gains
+from mjxball.control.crazyflie import PARAMETERS, STOCK, gains_of, pair_gains, with_gains
 from mjxball.fly.twin.conditions import Conditions, DroneKind, Surroundings, drone_kind
 from mjxball.fly.twin.coupled import CoupledPair
 from mjxball.fly.twin.physics import PairState
@@ -59,7 +59,7 @@ def start_of(config: Config, ball: float) -> PlantState:
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_second_in_the_air_is_that_of_the_closed_form(preset: str) -> None:
     # The older firmware, whose force does not hang on the battery's filtered voltage.
-    config = motor_curves.with_curve(configs.preset(preset), motor_curves.OLDER)
+    config = motors.with_curve(configs.preset(preset), motors.OLDER)
     mass = config.plant.object_mass
     conditions = Conditions(mass, cg_amplitude=0.03, cg_speed=1.0, ball=0.02)
     pair, state = pair_of(config, conditions), start_of(config, 0.02)

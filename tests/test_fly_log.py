@@ -17,7 +17,7 @@ from command_line import REPOSITORY, assert_one_line, call, environment
 
 from mjxball import config as configs
 from mjxball.commands import evaluate
-from mjxball.control.firmware_gains import pair_gains, to_json
+from mjxball.control.crazyflie import pair_gains, to_json
 from mjxball.errors import InputError
 from mjxball.fly import packets, recording
 from mjxball.fly.flight_log import Journal, Tail, read

@@ -14,7 +14,7 @@ from mjxball.config import Autopilot, preset
 from mjxball.control import attitude, crazyflie, leader, mixer, observation, rotations
 from mjxball.control.attitude import AttitudeGains
 from mjxball.control.followers import PrivilegedInfo
-from mjxball.control.recall import Recall
+from mjxball.control.observation import ObservationHistory
 
 WORLDS = 64
 random = np.random.default_rng(7)
@@ -34,8 +34,8 @@ KP, KD, KI = (0.5, 0.4, 0.3), (1.0, 0.9, 0.8), (0.1, 0.0, 0.2)
 GAINS = AttitudeGains((0.24, 3.22, 0.543), (0.0433, 0.579, 0.244))
 MOUNT = np.array([-0.17, 0.0, 0.0])
 LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
-RECALL = Recall(history=3, previous_action=True, filters=(0.1, 0.5))
-SEEN, MEMORY, ACTION = normal(18), normal(RECALL.size), random.uniform(-1, 1, (WORLDS, 3))
+HISTORY = ObservationHistory(length=3, previous_action=True, filters=(0.1, 0.5))
+SEEN, MEMORY, ACTION = normal(18), normal(HISTORY.size), random.uniform(-1, 1, (WORLDS, 3))
 MASSES = random.uniform(0.1, 0.3, WORLDS)
 PRIVILEGED = PrivilegedInfo(MASSES, 0.01 * normal(), 0.01 * normal(), random.uniform(2.1, 2.3, WORLDS))
 FLIGHT = 0.1 * normal(2, 18)  # two observations in a row
@@ -107,9 +107,9 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
         observation.observe,
         (normal(3), MATRIX, normal(3), normal(3), normal(3), np.array([-0.17, 0, 0])),
     ),
-    "recall.network_input": (RECALL.network_input, (SEEN, MEMORY)),
-    "recall.start": (RECALL.start, (SEEN,)),
-    "recall.next": (RECALL.next, (MEMORY, SEEN, ACTION)),
+    "history.network_input": (HISTORY.network_input, (SEEN, MEMORY)),
+    "history.start": (HISTORY.start, (SEEN,)),
+    "history.next": (HISTORY.next, (MEMORY, SEEN, ACTION)),
     "observation.copy_command": (lambda s: observation.copy_command(s, KP, KD, G, *LIMITS), (3 * SEEN,)),
     "observation.scale_action": (lambda a: observation.scale_action(a, *REACH), (ACTION,)),
     "observation.follower_command": (
@@ -126,7 +126,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
 NOT_LAWS = {
     "attitude.design_gains",
     "mixer.lever",
-    "mixer.torque_reach",
+    "attitude.torque_reach",
     "crazyflie.unpack",
     "crazyflie.cascade",
     "crazyflie.integral_shares",

@@ -11,8 +11,8 @@ import pytest
 
 from mjxball.config import RIGS, Config, apply_overrides, preset, validate
 from mjxball.control import crazyflie, motors
-from mjxball.control.hover import drone_loop, hover
-from mjxball.control.motor_curves import OLDER, compensates, firmware, with_curve
+from mjxball.control.constants import drone_loop, hover
+from mjxball.control.motors import OLDER, compensates, firmware, with_curve
 from mjxball.env import CoupledPairEnv
 from mjxball.physics.engine import Load
 from mjxball.physics.step import make_powered, start_state

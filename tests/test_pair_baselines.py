@@ -13,8 +13,8 @@ from mjxball.baselines.crazyflie_model import MEASURED, linear_model
 from mjxball.baselines.load_axis import load_axis
 from mjxball.config import apply_overrides, preset, replace
 from mjxball.control import crazyflie
-from mjxball.control.hover import drone_loop, thrust_slopes
-from mjxball.control.motor_curves import OLDER, with_curve
+from mjxball.control.constants import drone_loop, thrust_slopes
+from mjxball.control.motors import OLDER, with_curve
 from mjxball.errors import InputError
 from mjxball.physics.step import hover_rotor_force
 from mjxball.physics.stepper import make_stepper

@@ -11,7 +11,7 @@ import pytest
 
 from mjxball import config as configs
 from mjxball.control import crazyflie, motors, rotations
-from mjxball.control.firmware_gains import pair_gains
+from mjxball.control.crazyflie import pair_gains
 from mjxball.fly import packets
 from mjxball.fly.packets import ARMED, AUTO_ARMED, CAN_ARM, CAN_FLY, CRASHED, FLYING, LOCKED, TUMBLED, ZERO, Setpoint
 from mjxball.fly.twin import logs, protocol

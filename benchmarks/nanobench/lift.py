@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.control import motor_curves, motors
+from mjxball.control import motors
 from mjxball.control.motors import FULL, MOTORS
 from nanobench.flights import ROW, Array, Flight
 from nanobench.rotation import TICK, lagged
 
-OLDER = motor_curves.OLDER  # [N] a p^2 + b p without voltage, `Autopilot.motor_curve`
+OLDER = motors.OLDER  # [N] a p^2 + b p without voltage, `Autopilot.motor_curve`
 LINEAR = 0.12  # [N] at full command
 AVERAGED = 25  # rows that one sample averages: 0.25 s, beyond propeller noise
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from mjxball.baselines.load_axis import load_axis
 from mjxball.config import Config, ball_limit
-from mjxball.control.hover import drone_loop, thrust_slopes
+from mjxball.control.constants import drone_loop, thrust_slopes
 
 STATES = (
     "y",  # of O [m]

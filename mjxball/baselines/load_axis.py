@@ -8,9 +8,8 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import leader
-from mjxball.control.constants import plant_constants
+from mjxball.control.constants import drone_loop, plant_constants, thrust_slopes
 from mjxball.control.followers import copy_gains
-from mjxball.control.hover import drone_loop, thrust_slopes
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 from mjxball.errors import InputError
 

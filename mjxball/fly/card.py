@@ -10,8 +10,8 @@ import numpy as np
 
 from mjxball import config as configs
 from mjxball.config import Config
-from mjxball.control import firmware_gains, motor_curves
-from mjxball.control.firmware_gains import PairGains
+from mjxball.control import crazyflie, motors
+from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
 from mjxball.fly.limits import Times
@@ -46,7 +46,7 @@ def gains_of(config: Config) -> PairGains:
     """Firmware parameters that make both cascades those that the policy was trained with; none for others."""
     if not is_crazyflie(config):
         return {}, {}
-    return firmware_gains.pair_gains(config.autopilot)
+    return crazyflie.pair_gains(config.autopilot)
 
 
 def goal_of(config: Config) -> tuple[float, float, float]:
@@ -71,7 +71,7 @@ class ThrustChoice:
 
 def drone_of(config: Config) -> str:
     """Which Crazyflie the policy was trained for, a key of `motors.MOTORS`."""
-    return str(motor_curves.firmware(config)["drone"])
+    return str(motors.firmware(config)["drone"])
 
 
 def motor_of(config: Config) -> Motor:
@@ -85,11 +85,11 @@ def curve_of(config: Config, name: CurveName) -> ForceCurve:
 
 
 def with_curve(config: Config, name: CurveName) -> Config:
-    """`config` for firmwares of the named force curve, see `motor_curves.with_curve`; others' plants stay."""
-    if not is_crazyflie(config) or name == motor_curves.firmware(config)["curve"]:
+    """`config` for firmwares of the named force curve, see `motors.with_curve`; others' plants stay."""
+    if not is_crazyflie(config) or name == motors.firmware(config)["curve"]:
         return config
     curve = curve_of(config, name)
-    return motor_curves.with_curve(config, (curve.quadratic, curve.linear))
+    return motors.with_curve(config, (curve.quadratic, curve.linear))
 
 
 def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGains = ({}, {})) -> list[Variants]:
@@ -97,7 +97,7 @@ def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGa
 
     `choice.curve` leaves one; `more` gains are laid over the card's, whichever the curve.
     """
-    known = motor_curves.firmware(config)
+    known = motors.firmware(config)
     names = [name for name in CURVE_NAMES if name in (known["curve"], *known["converts"], choice.curve)]
     if choice.curve is not None:
         names = [choice.curve]

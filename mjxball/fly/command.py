@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from mjxball.control import crazyflie, leader, motor_curves
-from mjxball.control.firmware_gains import Gains
+from mjxball.control import crazyflie, leader, motors
+from mjxball.control.crazyflie import Gains
 from mjxball.fly.limits import Times
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, Setpoint, setpoint
 
@@ -36,7 +36,7 @@ class ForceCurve:
 
 
 LINEAR = ForceCurve()
-OLDER = ForceCurve(*motor_curves.OLDER)  # firmware without battery compensation, 2.1 motors
+OLDER = ForceCurve(*motors.OLDER)  # firmware without battery compensation, 2.1 motors
 
 
 Array = Any

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball import config as configs
-from mjxball.control.firmware_gains import read_pair_gains
+from mjxball.control.crazyflie import read_pair_gains
 from mjxball.fly import packets
 from mjxball.fly.limits import NAMES
 

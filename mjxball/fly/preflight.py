@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjxball.control.firmware_gains import PairGains, read_pair_gains
+from mjxball.control.crazyflie import PairGains, read_pair_gains
 from mjxball.errors import InputError
 from mjxball.fly import limits, packets
 from mjxball.fly.command import CurveName, Variants

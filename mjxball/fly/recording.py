@@ -12,7 +12,7 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import crazyflie
-from mjxball.control.firmware_gains import PARAMETERS, Gains, PairGains
+from mjxball.control.crazyflie import PARAMETERS, Gains, PairGains
 from mjxball.errors import InputError
 from mjxball.fly import flight_log
 from mjxball.fly.card import ThrustChoice, command_maps, drone_of, gains_of, with_curve

@@ -13,7 +13,7 @@ from typing import Any
 
 from mjxball import __version__
 from mjxball import config as configs
-from mjxball.control.firmware_gains import to_json
+from mjxball.control.crazyflie import to_json
 from mjxball.errors import InputError
 from mjxball.fly import packets
 from mjxball.fly.card import Controller

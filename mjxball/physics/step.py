@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjxball.config import Config
-from mjxball.control import attitude, crazyflie, mixer, motor_curves, motors, rotations
+from mjxball.control import attitude, crazyflie, mixer, motors, rotations
 from mjxball.control.constants import plant_constants
 from mjxball.physics import motion
 from mjxball.physics.engine import Engine, Load, PlantState, Wrench
@@ -145,7 +145,7 @@ def make_autopilot(config: Config) -> Autopilot:
     def firmware(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
         if load.battery is not None:
             return powered(state, commands, load)
-        if config.autopilot.drone and motor_curves.compensates(config.autopilot.motor_curve):
+        if config.autopilot.drone and motors.compensates(config.autopilot.motor_curve):
             # A motor gives more than a thrust command of 65 535 where the battery has it: full PWM is the limit.
             usual = commands[..., 0, 0] * 0.0
             return powered(state, commands, load._replace(battery=usual + USUAL_BATTERY, uncompensated=usual))
@@ -155,9 +155,9 @@ def make_autopilot(config: Config) -> Autopilot:
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
         integrals = crazyflie.integral_shares(xp, law, state.rates.dtype)
-        loops, motors = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals)
+        loops, duty = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals)
         left = xp.maximum(1.0 - law.sag * state.time, xp.zeros_like(state.time))[..., None, None]
-        return loops, left * crazyflie.motor_force(law.motor_curve, motors)
+        return loops, left * crazyflie.motor_force(law.motor_curve, duty)
 
     return firmware
 
@@ -166,14 +166,14 @@ def make_powered(config: Config) -> Autopilot:
     """The firmware's loops with motors that follow the battery, `load.battery`, with or without its compensation.
 
     Where `load.uncompensated`, what the firmware is sent and its gains are converted for its curve
-    (`motor_curves.with_curve`), as the runner does.
+    (`motors.with_curve`), as the runner does.
     """
     constants = plant_constants(config.plant, config.attitude)
     law, gravity = config.autopilot, config.plant.gravity
     motor = motors.MOTORS[law.drone or "2.1"]
-    uncompensated_law = motor_curves.with_curve(config, motor_curves.OLDER).autopilot
+    uncompensated_law = motors.with_curve(config, motors.OLDER).autopilot
     slower = uncompensated_law.roll_rate[0] / law.roll_rate[0]
-    line = motor_curves.compensates(law.motor_curve)
+    line = motors.compensates(law.motor_curve)
 
     def powered(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
         xp = commands.__array_namespace__()

@@ -12,9 +12,8 @@ import numpy as np
 
 from mjxball import __version__
 from mjxball.config import Config, config_hash, to_dict
-from mjxball.control.motor_curves import firmware
-from mjxball.control.observation import ACTION, OBSERVATION, commanded
-from mjxball.control.recall import recall_of
+from mjxball.control.motors import firmware
+from mjxball.control.observation import ACTION, OBSERVATION, commanded, observation_history
 from mjxball.policy.file import FORMAT_VERSION, PolicyFile, write_whole
 
 
@@ -25,7 +24,7 @@ def policy_file(config: Config, learnt: Any, steps: int, origin: dict[str, Any] 
     """
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
-    mask = np.array(recall_of(config).mask(follower.ignore_position))
+    mask = np.array(observation_history(config).mask(follower.ignore_position))
     size = len(mask)  # behind it stands what only the critics were told; the policy's weights for it never moved
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]

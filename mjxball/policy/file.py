@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE
-from mjxball.control.recall import Recall
+from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, ObservationHistory
 from mjxball.policy.container import PolicyFileError, read_arrays
 
 FORMAT_VERSION = 1
@@ -55,10 +54,10 @@ class PolicyFile:
     card: dict[str, Any]
 
 
-def recall_of(card: dict[str, Any]) -> Recall:
+def history_of(card: dict[str, Any]) -> ObservationHistory:
     """What the follower of a policy file remembers; `filters` is absent from the first files."""
     filters = tuple(card.get("filters", ()))
-    return Recall(card["history"], card["previous_action"], filters, float(card["control_period"]))
+    return ObservationHistory(card["history"], card["previous_action"], filters, float(card["control_period"]))
 
 
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
@@ -136,7 +135,7 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
 def check(policy: PolicyFile, name: str) -> None:
     """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
     _check_card(policy.card, name)
-    size = OBSERVATION_SIZE + recall_of(policy.card).size
+    size = OBSERVATION_SIZE + history_of(policy.card).size
     vectors = [
         ("observation_mean", policy.observation_mean, size),
         ("observation_scale", policy.observation_scale, size),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.control import observation as layout
-from mjxball.policy.file import PolicyFile, load_file, recall_of
+from mjxball.policy.file import PolicyFile, history_of, load_file
 from mjxball.policy.network import mean_action
 
 Array = Any
@@ -35,7 +35,7 @@ class Policy:
         self._biases: list[np.ndarray] = [np.ascontiguousarray(bias, dtype) for bias in biases]
         self._mean: np.ndarray = contents.observation_mean.astype(dtype)
         self._scale: np.ndarray = contents.observation_scale.astype(dtype)
-        self._recall = recall_of(card)
+        self._history = history_of(card)
         self._memory: Array | None = None
         self._law: tuple[Any, ...] = (
             card["action_mode"] == "residual",
@@ -60,13 +60,13 @@ class Policy:
         seen = np.asarray(observation, self._dtype)
         if seen.shape[-1:] != (layout.OBSERVATION_SIZE,):
             raise ValueError(f"observation must have {layout.OBSERVATION_SIZE} numbers last, not shape {seen.shape}")
-        if not self._recall.size:
+        if not self._history.size:
             return mean_action(self._weights, self._biases, self._mean, self._scale, seen)
         if self._memory is None:
-            self._memory = self._recall.start(seen)
-        full = self._recall.network_input(seen, self._memory)
+            self._memory = self._history.start(seen)
+        full = self._history.network_input(seen, self._memory)
         action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
-        self._memory = self._recall.next(self._memory, seen, action)
+        self._memory = self._history.next(self._memory, seen, action)
         return action
 
     def __call__(self, observation: Array) -> Array:
@@ -82,11 +82,11 @@ class NetworkLaw:
     def __init__(self, policy: Policy):
         self.name = policy.name
         self._parts = (policy._weights, policy._biases, policy._mean, policy._scale)
-        self._recall, self._law = policy._recall, policy._law
+        self._history, self._law = policy._history, policy._law
 
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
-        return self._recall.start(observation)
+        return self._history.start(observation)
 
     def step(self, memory: Array, observation: Array, brief: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `brief` is not read."""
@@ -99,7 +99,7 @@ class NetworkLaw:
         weights, biases, mean, scale = self._parts
         mean, scale = (xp.asarray(part, dtype=observation.dtype) for part in (mean, scale))
         weights, biases = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
-        return mean_action(weights, biases, mean, scale, self._recall.network_input(observation, memory))
+        return mean_action(weights, biases, mean, scale, self._history.network_input(observation, memory))
 
     def command(self, scaled: Array, observation: Array) -> Array:
         """Command (..., 3) of the action `scaled` (..., 3)."""
@@ -107,4 +107,4 @@ class NetworkLaw:
 
     def remember(self, memory: Array, observation: Array, scaled: Array) -> Array:
         """Memory of the next step."""
-        return self._recall.next(memory, observation, scaled)
+        return self._history.next(memory, observation, scaled)

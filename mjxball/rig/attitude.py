@@ -10,8 +10,7 @@ import numpy as np
 
 from mjxball.config import Autopilot, Config
 from mjxball.control import crazyflie, mixer, rotations
-from mjxball.control.constants import plant_constants
-from mjxball.control.hover import hover
+from mjxball.control.constants import hover, plant_constants
 
 NAMES = ("roll", "pitch", "yaw")
 DRONE = np.array([1.66e-5, 1.66e-5, 2.93e-5])  # inertia for which the delivered gains were found good [kg m2]

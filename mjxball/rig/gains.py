@@ -13,8 +13,7 @@ import numpy as np
 
 from mjxball import cli, config
 from mjxball.config import Autopilot, Config
-from mjxball.control.crazyflie import PERIOD
-from mjxball.control.firmware_gains import pair_gains, to_json
+from mjxball.control.crazyflie import PERIOD, pair_gains, to_json
 from mjxball.errors import InputError
 from mjxball.plotting import pyplot
 from mjxball.rig.attitude import Trial, pair, simulate

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.control import rotations
-from mjxball.control.crazyflie import PERIOD
-from mjxball.control.firmware_gains import PairGains
+from mjxball.control.crazyflie import PERIOD, PairGains
 from mjxball.errors import InputError
 from mjxball.fly.command import CurveName
 from mjxball.fly.limits import NAMES

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control import crazyflie, motor_curves, motors
+from mjxball.control import crazyflie, motors
 from mjxball.control.constants import plant_constants, trim_limit
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import start_state
@@ -150,7 +150,7 @@ class ResetDistribution:
         """(n,) whether both drones lift their share of the weight with room to command and to turn the stick."""
         law, motor = self.config.autopilot, self._motor
         most, cap = (motors.force(motor, jnp.full_like(battery, pwm), battery) for pwm in (crazyflie.FULL, CEILING))
-        if motor_curves.compensates(law.motor_curve):
+        if motors.compensates(law.motor_curve):
             cap = jnp.where(uncompensated > 0, cap, jnp.minimum(most, law.motor_curve[1] * CEILING / crazyflie.FULL))
         constants = self._constants
         carried = jnp.asarray(constants.drone_mass) + jnp.asarray(constants.share) * object_mass
@@ -168,7 +168,7 @@ class ResetDistribution:
         gravity, curve = self.config.plant.gravity, self.config.autopilot.motor_curve
         force = carried * gravity / 4 / scale  # of each motor
         pwm = crazyflie.FULL * motors.voltage(self._motor, force) / battery[:, None]
-        plain = motor_curves.OLDER if motor_curves.compensates(curve) else curve
+        plain = motors.OLDER if motors.compensates(curve) else curve
         asked = jnp.where(uncompensated[:, None] > 0, crazyflie.motor_force(plain, pwm), force)
         return 4 * asked / believed - gravity
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from mjxball.config import Config
-from mjxball.control import motor_curves
+from mjxball.control import motors
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.errors import InputError
 
-OLDER_FORCE = motor_curves.OLDER  # [N] shares of p^2 and p, p = PWM / 65535: a fit that ignores the voltage
+OLDER_FORCE = motors.OLDER  # [N] shares of p^2 and p, p = PWM / 65535: a fit that ignores the voltage
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import numpy as np
 from mjxball.assembly import ASSEMBLY, BALL_JOINT, FOLLOWER, LEADER, build_spec
 from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
-from mjxball.control.firmware_gains import with_stock_gains
+from mjxball.control.crazyflie import with_stock_gains
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.estimators import matrix_of, skew
 from mjxball.fly.twin.onboard import TICK, Onboard, Power

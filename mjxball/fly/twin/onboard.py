@@ -8,7 +8,7 @@ import numpy as np
 
 from mjxball.config import Autopilot
 from mjxball.control import crazyflie, motors
-from mjxball.control.firmware_gains import PARAMETERS, gains_of, with_gains
+from mjxball.control.crazyflie import PARAMETERS, gains_of, with_gains
 from mjxball.fly.twin.conditions import OLDER_FORCE, Battery, DroneKind, Surroundings
 from mjxball.fly.twin.estimators import Complementary, Imu, Kalman, Positioning, euler_of
 from mjxball.fly.twin.physics import RUNNING, Modes, Report

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjxball.control.firmware_gains import STOCK, gains_of
+from mjxball.control.crazyflie import STOCK, gains_of
 from mjxball.fly import packets
 from mjxball.fly.packets import PacketError
 from mjxball.fly.twin.conditions import DroneKind

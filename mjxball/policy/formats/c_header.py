@@ -10,9 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control.observation import ACTION_SIZE, ERROR, ERROR_RATE, OBSERVATION, OBSERVATION_SIZE
-from mjxball.control.recall import Recall
-from mjxball.policy.file import PolicyFile, recall_of
+from mjxball.control.observation import (
+    ACTION_SIZE,
+    ERROR,
+    ERROR_RATE,
+    OBSERVATION,
+    OBSERVATION_SIZE,
+    ObservationHistory,
+)
+from mjxball.policy.file import PolicyFile, history_of
 from mjxball.policy.formats.c_template import APPROACH, HEADER
 
 FLOAT = 4  # bytes
@@ -38,7 +44,7 @@ def footprint(policy: PolicyFile) -> Footprint:
 
 def c_header(policy: PolicyFile, name: str) -> str:
     """The header's text. `mjxball_follow` computes what `mjxball.Policy` computes, in float."""
-    recall, card, cost = recall_of(policy.card), policy.card, footprint(policy)
+    history, card, cost = history_of(policy.card), policy.card, footprint(policy)
     weights, biases = _mean_layers(policy)
     sizes = [len(policy.observation_mean), *map(len, biases)]
     arrays = [_array("mean", policy.observation_mean), _array("scale", policy.observation_scale)]
@@ -58,13 +64,13 @@ def c_header(policy: PolicyFile, name: str) -> str:
         stack=cost.stack,
         size=sizes[0],
         widest=max(sizes[1:]),
-        memory_size=recall.size,
-        memory_field=f"    mjxball_real memory[{recall.size}];\n" if recall.size else "",
-        helpers=APPROACH if recall.filters else "",
-        memory_pointer="    mjxball_real *memory = follower->memory;\n" if recall.size else "",
+        memory_size=history.size,
+        memory_field=f"    mjxball_real memory[{history.size}];\n" if history.size else "",
+        helpers=APPROACH if history.filters else "",
+        memory_pointer="    mjxball_real *memory = follower->memory;\n" if history.size else "",
         arrays="\n".join(arrays),
-        recall=_recall(recall),
-        remember=_remember(recall),
+        history=_history(history),
+        history_update=_history_update(history),
         network=_network(sizes),
         command=_command(card),
     )
@@ -97,40 +103,40 @@ def _table() -> str:
     return "\n".join(f" *   {slot:2d}  {name:<22}{unit}" for slot, (name, unit) in enumerate(OBSERVATION))
 
 
-def _recall(recall: Recall) -> str:
-    """Lines that make the network's input of observation and memory (see `control.recall`)."""
-    if not recall.size:
+def _history(history: ObservationHistory) -> str:
+    """Lines that make the network's input of observation and memory (see `control.observation.ObservationHistory`)."""
+    if not history.size:
         return "    (void)follower;"
-    older, width = (recall.history - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
+    older, width = (history.length - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
     lines = ["    if (!follower->running) {"]
-    lines += [f"        for (i = 0; i < {recall.size}; i++) memory[i] = 0;"]
-    for k in range(recall.history - 1):
+    lines += [f"        for (i = 0; i < {history.size}; i++) memory[i] = 0;"]
+    for k in range(history.length - 1):
         lines += [f"        mjxball_copy(memory + {k * OBSERVATION_SIZE}, observation, {OBSERVATION_SIZE});"]
-    for k in range(len(recall.filters)):
+    for k in range(len(history.filters)):
         lines += [f"        mjxball_copy(memory + {older + k * width}, observation, {OBSERVATION_SIZE});"]
     lines += ["        follower->running = 1;", "    }"]
-    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {recall.size});"]
-    for k in range(len(recall.filters)):
+    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
+    for k in range(len(history.filters)):
         place = OBSERVATION_SIZE + older + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
     return "\n".join(lines)
 
 
-def _remember(recall: Recall) -> str:
+def _history_update(history: ObservationHistory) -> str:
     """Lines that move the memory on by one step."""
     lines = []
-    older, width = (recall.history - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
+    older, width = (history.length - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
     if older:
         lines += [
             f"    for (i = {older - 1}; i >= {OBSERVATION_SIZE}; i--) memory[i] = memory[i - {OBSERVATION_SIZE}];"
         ]
         lines += [f"    mjxball_copy(memory, observation, {OBSERVATION_SIZE});"]
-    for k, tau in enumerate(recall.filters):
-        place, share = older + k * width, _number(-math.expm1(-recall.period / tau))
+    for k, tau in enumerate(history.filters):
+        place, share = older + k * width, _number(-math.expm1(-history.period / tau))
         lines += [f"    mjxball_approach(memory + {place}, observation, {OBSERVATION_SIZE}, {share});"]
         lines += [f"    mjxball_approach(memory + {place + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
-    if recall.previous_action:
-        lines += [f"    mjxball_copy(memory + {recall.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
+    if history.previous_action:
+        lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
     return "\n".join(lines)
 
 

@@ -68,14 +68,14 @@ static inline void mjxball_follow(
     mjxball_real input[{size}], hidden[2][{widest}];
 {memory_pointer}    int i;
     mjxball_copy(input, observation, 18);
-{recall}
+{history}
     for (i = 0; i < {size}; i++) input[i] = (input[i] - mjxball_mean[i]) * mjxball_scale[i];
 {network}
     for (i = 0; i < 3; i++) action[i] = (mjxball_real)tanh((double)action[i]);
 {command}
     for (i = 0; i < 3; i++)
         command[i] = mjxball_clip(command[i] + mjxball_action_scale[i] * action[i], mjxball_limit[i]);
-{remember}
+{history_update}
 }}
 
 #endif

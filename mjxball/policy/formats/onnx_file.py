@@ -10,7 +10,7 @@ import onnx
 from onnx import TensorProto, helper
 
 from mjxball.control import observation as layout
-from mjxball.policy.file import PolicyFile, recall_of
+from mjxball.policy.file import PolicyFile, history_of
 from mjxball.policy.formats.onnx_graph import Graph, Traced
 from mjxball.policy.policy import NetworkLaw, Policy
 
@@ -25,16 +25,16 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
     roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m).
     """
-    graph, recall = Graph(), recall_of(contents.card)
+    graph, history = Graph(), history_of(contents.card)
     seen = Traced(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
-    memory = recall.start(seen)
-    if recall.size:
-        inputs += [_value("memory", TensorProto.FLOAT, recall.size), _value("start", TensorProto.BOOL, 1)]
-        start, given = Traced(graph, "start", 1), Traced(graph, "memory", recall.size)
-        memory = Traced(graph, graph.add("Where", start, memory, given), recall.size)
+    memory = history.start(seen)
+    if history.size:
+        inputs += [_value("memory", TensorProto.FLOAT, history.size), _value("start", TensorProto.BOOL, 1)]
+        start, given = Traced(graph, "start", 1), Traced(graph, "memory", history.size)
+        memory = Traced(graph, graph.add("Where", start, memory, given), history.size)
     results = dict(zip(("action", "command", "next_memory"), _answers(contents, seen, memory), strict=True))
-    if not recall.size:
+    if not history.size:
         del results["next_memory"]
     for label, value in results.items():
         graph.nodes.append(helper.make_node("Identity", [value.name], [label], name=label))

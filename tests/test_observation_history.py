@@ -7,31 +7,30 @@ import math
 import numpy as np
 import pytest
 
-from mjxball.control.observation import OBSERVATION
-from mjxball.control.recall import Recall
+from mjxball.control.observation import OBSERVATION, ObservationHistory
 
-FULL = Recall(history=3, previous_action=True, filters=(0.1, 0.5), period=0.02)
+FULL = ObservationHistory(length=3, previous_action=True, filters=(0.1, 0.5), period=0.02)
 
 
 @pytest.mark.parametrize(
-    ("recall", "size"),
+    ("history", "size"),
     [
-        (Recall(), 0),
-        (Recall(previous_action=True), 3),
-        (Recall(history=3), 36),
-        (Recall(history=3, previous_action=True), 39),
-        (Recall(filters=(0.1,)), 21),
+        (ObservationHistory(), 0),
+        (ObservationHistory(previous_action=True), 3),
+        (ObservationHistory(length=3), 36),
+        (ObservationHistory(length=3, previous_action=True), 39),
+        (ObservationHistory(filters=(0.1,)), 21),
         (FULL, 36 + 42 + 3),
     ],
 )
-def test_size_is_what_the_memory_holds(recall: Recall, size: int) -> None:
+def test_size_is_what_the_memory_holds(history: ObservationHistory, size: int) -> None:
     seen = np.arange(18.0)
-    memory = recall.start(seen)
-    assert recall.size == size
+    memory = history.start(seen)
+    assert history.size == size
     assert memory.shape == (size,)
-    assert recall.next(memory, seen, np.zeros(3)).shape == (size,)
-    assert recall.network_input(seen, memory).shape == (18 + size,)
-    assert len(recall.mask(ignore_position=True)) == 18 + size
+    assert history.next(memory, seen, np.zeros(3)).shape == (size,)
+    assert history.network_input(seen, memory).shape == (18 + size,)
+    assert len(history.mask(ignore_position=True)) == 18 + size
 
 
 def test_memory_starts_as_if_the_first_observation_had_always_been() -> None:
@@ -43,32 +42,32 @@ def test_memory_starts_as_if_the_first_observation_had_always_been() -> None:
 
 
 def test_history_keeps_the_newest_first() -> None:
-    recall = Recall(history=3, previous_action=True)
+    history = ObservationHistory(length=3, previous_action=True)
     observations = [np.full(18, float(k)) for k in range(5)]
     actions = [np.full(3, 0.1 * k) for k in range(5)]
-    memory = recall.start(observations[0])
+    memory = history.start(observations[0])
     for seen, action in zip(observations, actions, strict=True):
-        memory = recall.next(memory, seen, action)
+        memory = history.next(memory, seen, action)
     np.testing.assert_array_equal(memory, [*observations[4], *observations[3], *actions[4]])
-    seen = recall.network_input(np.full(18, 5.0), memory)
+    seen = history.network_input(np.full(18, 5.0), memory)
     np.testing.assert_array_equal(seen, [*[5.0] * 18, *[4.0] * 18, *[3.0] * 18, *actions[4]])
 
 
 def test_the_slowest_action_is_that_of_the_longest_average() -> None:
     """After one step with the action 1 an average of tau has come 1 - exp(-T / tau) of the way, whatever the order."""
     for filters in ((0.1, 0.5), (0.5, 0.1)):
-        recall = FULL._replace(filters=filters)
-        memory = recall.next(recall.start(np.zeros(18)), np.zeros(18), np.ones(3))
-        np.testing.assert_allclose(recall.slowest_action(memory), 1 - math.exp(-0.02 / 0.5), rtol=1e-12)
+        history = FULL._replace(filters=filters)
+        memory = history.next(history.start(np.zeros(18)), np.zeros(18), np.ones(3))
+        np.testing.assert_allclose(history.slowest_action(memory), 1 - math.exp(-0.02 / 0.5), rtol=1e-12)
 
 
 def test_a_ramp_lags_its_average_by_the_time_constant() -> None:
     """In the long run the average of k t is k (t - tau_d), with tau_d = T q / (1 - q) of the sampled filter."""
-    recall = Recall(filters=(0.1,), period=0.02)
-    memory = recall.start(np.zeros(18))
+    history = ObservationHistory(filters=(0.1,), period=0.02)
+    memory = history.start(np.zeros(18))
     for number in range(200):
-        memory = recall.next(memory, np.full(18, 0.02 * number), np.full(3, 0.5))
-    shown = recall.network_input(np.full(18, 0.02 * 200), memory)
+        memory = history.next(memory, np.full(18, 0.02 * number), np.full(3, 0.5))
+    shown = history.network_input(np.full(18, 0.02 * 200), memory)
     q = math.exp(-0.02 / 0.1)
     np.testing.assert_allclose(shown[18:36], -0.02 / (1 - q), rtol=1e-12)
     np.testing.assert_allclose(shown[36:], 0.5, rtol=1e-12)
@@ -76,7 +75,7 @@ def test_a_ramp_lags_its_average_by_the_time_constant() -> None:
 
 def test_memory_without_extras_is_empty_and_the_network_sees_the_observation_alone() -> None:
     seen = np.arange(18.0)
-    np.testing.assert_array_equal(Recall().network_input(seen, Recall().start(seen)), seen)
+    np.testing.assert_array_equal(ObservationHistory().network_input(seen, ObservationHistory().start(seen)), seen)
 
 
 def test_memory_of_a_batch_is_the_memory_of_each() -> None:
@@ -99,12 +98,12 @@ def test_mask_hides_every_absolute_position_and_nothing_else() -> None:
 
 def test_moving_the_whole_flight_changes_no_number_that_is_shown() -> None:
     random = np.random.default_rng(1)
-    recall = FULL
+    history = FULL
     shift = np.array([5.0, -3.0, 2.0, *[0.0] * 15])
-    here, there = recall.start(np.zeros(18)), recall.start(shift)
+    here, there = history.start(np.zeros(18)), history.start(shift)
     for _ in range(20):
         seen, action = random.normal(size=18), random.normal(size=3)
-        here, there = recall.next(here, seen, action), recall.next(there, seen + shift, action)
-    mask = np.array(recall.mask(ignore_position=True))
-    first, second = (recall.network_input(s, m) * mask for s, m in ((seen, here), (seen + shift, there)))
+        here, there = history.next(here, seen, action), history.next(there, seen + shift, action)
+    mask = np.array(history.mask(ignore_position=True))
+    first, second = (history.network_input(s, m) * mask for s, m in ((seen, here), (seen + shift, there)))
     np.testing.assert_allclose(first, second, atol=1e-12)
