@@ -126,11 +126,16 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
 NOT_LAWS = {
     "attitude.design_gains",
     "mixer.lever",
-    "attitude.torque_reach",
+    "mixer.torque_per_force",
     "crazyflie.unpack",
     "crazyflie.cascade",
     "crazyflie.integral_shares",
     "observation.commanded",
+    "observation.observation_history",
+    *(
+        f"crazyflie.{name}"
+        for name in ("gains_of", "pair_gains", "read_pair_gains", "gains_to_json", "with_gains", "with_stock_gains")
+    ),
 }
 each_law = rows("name", LAWS)
 

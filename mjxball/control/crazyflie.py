@@ -213,7 +213,7 @@ def read_pair_gains(data: Any) -> PairGains:
     return _sound(data), _sound(data)
 
 
-def to_json(gains: PairGains) -> dict[str, Gains]:
+def gains_to_json(gains: PairGains) -> dict[str, Gains]:
     """What `read_pair_gains` reads."""
     return dict(zip(PAIR, gains, strict=True))
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjxball import cli, config
 from mjxball.config import Autopilot, Config
-from mjxball.control.crazyflie import PERIOD, pair_gains, to_json
+from mjxball.control.crazyflie import PERIOD, gains_to_json, pair_gains
 from mjxball.errors import InputError
 from mjxball.plotting import pyplot
 from mjxball.rig.attitude import Trial, pair, simulate
@@ -75,7 +75,7 @@ def _gains(options: argparse.Namespace) -> int:
 
 def parameter_file(autopilot: config.Autopilot) -> str:
     """JSON of both drones' firmware parameters, as `mjxball.fly --gains` reads it."""
-    return json.dumps(to_json(pair_gains(autopilot)), indent=1) + "\n"
+    return json.dumps(gains_to_json(pair_gains(autopilot)), indent=1) + "\n"
 
 
 def report(designs: Sequence[Design], lag: float) -> str:
