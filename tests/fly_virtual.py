@@ -8,7 +8,7 @@ from typing import Any
 from command_line import TRANSPORT
 
 from mjxball import config as configs
-from mjxball.control.crazyflie import to_json
+from mjxball.control.crazyflie import gains_to_json
 from mjxball.fly import card, packets
 from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import FlightSettings
@@ -49,7 +49,7 @@ class World(virtual.World):
 def log_header(contents: PolicyFile, name: str = "nobody") -> dict[str, Any]:
     """What the runner writes first into the log of a flight of the policy: both firmwares are taken for linear ones."""
     config = card.config_of(contents.card)
-    gains = to_json(card.gains_of(card.with_curve(config, "linear")))
+    gains = gains_to_json(card.gains_of(card.with_curve(config, "linear")))
     return {"policy": name, "config": configs.to_dict(config), "curve": "linear", "gains": gains}
 
 

@@ -17,7 +17,7 @@ from command_line import REPOSITORY, assert_one_line, call, environment
 
 from mjxball import config as configs
 from mjxball.commands import evaluate
-from mjxball.control.crazyflie import pair_gains, to_json
+from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.errors import InputError
 from mjxball.fly import packets, recording
 from mjxball.fly.flight_log import Journal, Tail, read
@@ -28,7 +28,7 @@ from mjxball.rig import identify
 from mjxball.view.command import main as view
 
 PRESET = configs.preset("flight")
-HEADER = {"policy": "nobody", "config": configs.to_dict(PRESET), "gains": to_json(pair_gains(PRESET.autopilot))}
+HEADER = {"policy": "nobody", "config": configs.to_dict(PRESET), "gains": gains_to_json(pair_gains(PRESET.autopilot))}
 ZEROS = [[0.0] * 4] * 2
 
 

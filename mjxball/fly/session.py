@@ -13,7 +13,7 @@ from typing import Any
 
 from mjxball import __version__
 from mjxball import config as configs
-from mjxball.control.crazyflie import to_json
+from mjxball.control.crazyflie import gains_to_json
 from mjxball.errors import InputError
 from mjxball.fly import packets
 from mjxball.fly.card import Controller
@@ -62,7 +62,7 @@ def fly(
     header |= {"policy": setup.controller.policy.name, "config_hash": setup.controller.policy.card["config_hash"]}
     header |= {"mocap": str(setup.mocap.settings)} if setup.mocap else {}
     gains = (setup.variants[0][setup.curve].gains, setup.variants[1][setup.curve].gains)
-    header |= {"config": configs.to_dict(setup.controller.config), "gains": to_json(gains), "curve": setup.curve}
+    header |= {"config": configs.to_dict(setup.controller.config), "gains": gains_to_json(gains), "curve": setup.curve}
     before = sys.getswitchinterval()
     with Journal(log, **header) as journal:
         links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]
