@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from mjxball.config import Plant
 from mjxball.control import mixer, rotations
 from mjxball.control.constants import PlantConstants
 from mjxball.physics.engine import PlantState
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from mjxball.physics.engine import Array, Vector
 
 
 def contact_wrenches(
-    plant: Plant, constants: PlantConstants, state: PlantState, linear: Array, angular: Array
-) -> tuple[Array, Array]:
-    """Contact forces (..., 2, 3) [N] and torques (..., 2, 3) [N m] of leader and follower on the object, body axes.
+    plant: Plant, constants: PlantConstants, state: PlantState, linear: Vector, angular: Vector
+) -> tuple[Float[Array, "... 2 3"], Float[Array, "... 2 3"]]:
+    """Contact forces [N] and torques [N m] of leader and follower on the object, body axes.
 
-    `linear` (..., 3) is the acceleration of O in the world, `angular` (..., 3) in body axes:
+    `linear` is the acceleration of O in the world, `angular` in body axes:
     F_i = T_i e3 - m_i g R^T E3 - m_i a_i, a_i = a_b + w' x r_i + w x (w x r_i),
     tau_i = tau_rotor,i - w x I_i w - I_i w', torques about each drone's own centre.
     """

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-Array = Any
+Array = Any  # NumPy's or JAX's
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    Scalar = Float[Array, "..."]
+    Vector = Float[Array, "... 3"]
+    Matrix = Float[Array, "... 3 3"]
 
 
 class PlantState(NamedTuple):
     """State of the rigid assembly, its rotors and a rolling ball, any leading batch shape."""
 
-    position: Array  # (..., 3) of O in the world [m]
-    quaternion: Array  # (..., 4) body -> world, (w, x, y, z)
-    velocity: Array  # (..., 3) of O in the world [m/s]
-    rates: Array  # (..., 3) angular velocity in body axes [rad/s]
-    rotor_force: Array  # (..., 2, 4) leader, follower [N]
-    time: Array  # (...) since the start of the episode [s]
-    ball_offset: Array  # (...) of a rolling ball from O along the CG axis [m]; unused by prescribed motions
-    ball_rate: Array  # (...) [m/s]
-    loops: Array | None = None  # (..., 2, 13) what a Crazyflie's own loops carry, see `control.crazyflie`; None: ideal
+    position: Vector  # of O in the world [m]
+    quaternion: Float[Array, "... 4"]  # body -> world, (w, x, y, z)
+    velocity: Vector  # of O in the world [m/s]
+    rates: Vector  # angular velocity in body axes [rad/s]
+    rotor_force: Float[Array, "... 2 4"]  # leader, follower [N]
+    time: Scalar  # since the start of the episode [s]
+    ball_offset: Scalar  # of a rolling ball from O along the CG axis [m]; unused by prescribed motions
+    ball_rate: Scalar  # [m/s]
+    loops: Float[Array, "... 2 13"] | None = None  # of a Crazyflie, see `control.crazyflie`; None: ideal
 
     def each(self, function: Callable[..., Any], *others: PlantState) -> PlantState:
         """`function` of every leaf that there is, and of the same leaf of `others`."""
@@ -30,36 +36,36 @@ class PlantState(NamedTuple):
 class CgState(NamedTuple):
     """CG offset from O along the CG axis, with consistent derivatives."""
 
-    offset: Array  # (...) [m]
-    rate: Array  # (...) [m/s]
-    acceleration: Array  # (...) [m/s2]
+    offset: Scalar  # [m]
+    rate: Scalar  # [m/s]
+    acceleration: Scalar  # [m/s2]
 
 
 class Load(NamedTuple):
     """The object's mass and the motion of its centre of gravity."""
 
-    object_mass: Array  # (...) true mass at the start [kg]
-    believed_mass: Array  # (...) mass that the hover thrust assumes [kg]
-    cg_amplitude: Array  # (...) of a sine [m]
-    cg_speed: Array  # (...) of a sine [rad/s]
-    cg_phase: Array  # (...) of a sine [rad]
-    mass_change: Array  # (..., k) mass added, or dropped if negative [kg]
-    mass_change_time: Array  # (..., k) when [s]
-    external_force: Array | None = None  # (..., 3) force on O in the world, held over a control step [N]; None: none
-    rotor_lag_scale: Array | None = None  # (...) factor on the rotors' time constant; None: 1
-    thrust_scale: Array | None = None  # (..., 2) factor on the rotor forces of leader and follower; None: 1
-    added_inertia: Array | None = None  # (..., 3) about the body axes through O, without mass [kg m2]; None: none
-    cg_path: Array | None = None  # (..., k) places in [-1, 1] that the CG visits instead of a sine, see `motion.visits`
-    follows_path: Array | None = None  # (...) 1 where it does, 0 where it follows the sine
-    battery: Array | None = None  # (...) voltage of both batteries [V]; None: motors follow the curve
-    uncompensated: Array | None = None  # (...) 1 where the firmware does not compensate for the battery, else 0
+    object_mass: Scalar  # true mass at the start [kg]
+    believed_mass: Scalar  # mass that the hover thrust assumes [kg]
+    cg_amplitude: Scalar  # of a sine [m]
+    cg_speed: Scalar  # of a sine [rad/s]
+    cg_phase: Scalar  # of a sine [rad]
+    mass_change: Float[Array, "... changes"]  # mass added, or dropped if negative [kg]
+    mass_change_time: Float[Array, "... changes"]  # when [s]
+    external_force: Vector | None = None  # force on O in the world, held over a control step [N]; None: none
+    rotor_lag_scale: Scalar | None = None  # factor on the rotors' time constant; None: 1
+    thrust_scale: Float[Array, "... 2"] | None = None  # factor on the rotor forces of leader and follower; None: 1
+    added_inertia: Vector | None = None  # about the body axes through O, without mass [kg m2]; None: none
+    cg_path: Float[Array, "... places"] | None = None  # in [-1, 1], see `motion.visits`; None: the CG follows the sine
+    follows_path: Scalar | None = None  # 1 where it does, 0 where it follows the sine
+    battery: Scalar | None = None  # voltage of both batteries [V]; None: motors follow the curve
+    uncompensated: Scalar | None = None  # 1 where the firmware does not compensate for the battery, else 0
 
 
 class Wrench(NamedTuple):
     """All rotors' wrench on the assembly about O, body axes."""
 
-    force: Array  # (..., 3) [N]
-    torque: Array  # (..., 3) [N m]
+    force: Vector  # [N]
+    torque: Vector  # [N m]
 
 
 class Engine(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,11 @@ from mjxball.control.constants import ROLLING_INERTIA, plant_constants
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
 from mjxball.quiet import import_mjx
 
-Array = Any
+if TYPE_CHECKING:
+    from jax import Array
+    from jaxtyping import Float
+
+    from mjxball.physics.engine import Scalar, Vector
 
 
 def make_engine(plant: Plant, attitude: Attitude) -> Engine:
@@ -30,16 +34,16 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
     share = plant.moving_fraction
 
     def prescribed(
-        state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState, added: Array | None = None
-    ) -> tuple[Array, Array]:
+        state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
+    ) -> tuple[Vector, Vector]:
         mass, bias = stages.equations(state, object_mass, cg.offset / share, cg.rate / share, added)
         n = stages.root
         force = stages.applied(state, wrench) - bias[:n] - mass[:n, n] * (cg.acceleration / share)
         return stages.result(state, _solve(mass[:n, :n], force))
 
     def rolling(
-        state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array, added: Array | None = None
-    ) -> tuple[Array, Array, Array]:
+        state: PlantState, wrench: Wrench, object_mass: Scalar, ball_force: Scalar, added: Vector | None = None
+    ) -> tuple[Vector, Vector, Scalar]:
         mass, bias = stages.equations(state, object_mass, state.ball_offset, state.ball_rate, added)
         n = stages.root
         driven = _solve(mass[:n, :n], stages.applied(state, wrench) - bias[:n])
@@ -68,9 +72,9 @@ class _Stages:
         self.root = model.nv - 1  # degrees of freedom of the root; the ball's slide comes last
 
     def equations(
-        self, state: PlantState, object_mass: Array, offset: Array, rate: Array, added: Array | None
-    ) -> tuple[Array, Array]:
-        """Mass matrix (nv, nv) and bias force (nv,), ball at `offset` moving at `rate`; inertia (3,) is `added`."""
+        self, state: PlantState, object_mass: Scalar, offset: Scalar, rate: Scalar, added: Vector | None
+    ) -> tuple[Float[Array, "nv nv"], Float[Array, " nv"]]:
+        """Mass matrix and bias force, ball at `offset` moving at `rate`; inertia is `added`."""
         dtype = state.rates.dtype
         zero = jnp.zeros((), dtype)
         if self._stand == "free":
@@ -89,7 +93,9 @@ class _Stages:
         mass, bias = mjx.full_m(model, data), data.qfrc_bias
         return (mass, bias) if added is None else self._spun(state, mass, bias, added)
 
-    def _spun(self, state: PlantState, mass: Array, bias: Array, added: Array) -> tuple[Array, Array]:
+    def _spun(
+        self, state: PlantState, mass: Float[Array, "nv nv"], bias: Float[Array, " nv"], added: Vector
+    ) -> tuple[Float[Array, "nv nv"], Float[Array, " nv"]]:
         """With inertia about the body axes through O, without mass, on the root's rotation."""
         n = self.root
         axes = slice(3, 6) if self._stand == "free" else slice(n - 1, n)
@@ -98,7 +104,7 @@ class _Stages:
         gyration = gyration if self._stand == "free" else 0.0 * added[:1]
         return mass.at[axes, axes].add(jnp.diag(inertia)), bias.at[axes].add(gyration)
 
-    def _loaded(self, object_mass: Array, dtype: Any) -> Any:
+    def _loaded(self, object_mass: Scalar, dtype: Any) -> Any:
         m = self._model
         mass, inertia, armature = (a.astype(dtype) for a in (m.body_mass, m.body_inertia, m.dof_armature))
         part = slice(1, None) if self._rigid else slice(None)
@@ -109,16 +115,16 @@ class _Stages:
             dof_armature=armature.at[-1].set(ROLLING_INERTIA * object_mass * self._fractions[1].astype(dtype)),
         )
 
-    def applied(self, state: PlantState, wrench: Wrench) -> Array:
-        """Generalized force of the rotors on the root (root,)."""
+    def applied(self, state: PlantState, wrench: Wrench) -> Float[Array, " root"]:
+        """Generalized force of the rotors on the root."""
         force = rotations.rotate(rotations.matrix_from_quaternion(state.quaternion), wrench.force)
         if self._stand == "free":
             return jnp.concatenate([force, wrench.torque])
         heave = [force[2:]] if self._stand == "heave" else []
         return jnp.concatenate([*heave, wrench.torque[:1]])
 
-    def result(self, state: PlantState, solution: Array) -> tuple[Array, Array]:
-        """Accelerations of O in the world (3,) and about the body axes (3,) from the root's (root,)."""
+    def result(self, state: PlantState, solution: Float[Array, " root"]) -> tuple[Vector, Vector]:
+        """Accelerations of O in the world and about the body axes from the root's."""
         if self._stand == "free":
             return solution[:3], solution[3:]
         zero = jnp.zeros((), solution.dtype)
@@ -126,7 +132,7 @@ class _Stages:
         return jnp.stack([zero, zero, rise]), jnp.stack([solution[-1], zero, zero])
 
 
-def _solve(mass: Array, force: Array) -> Array:
+def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Float[Array, " root"]:
     """Solve M a = f for the root: 6 (free joint, whose linear block is the total mass times I), 2 or 1."""
     if mass.shape[0] == 1:
         return force / mass[0]

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
-from mjxball.physics.engine import CgState, Load
+from mjxball.physics.engine import Array, CgState, Load
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from mjxball.physics.engine import Scalar
+
 Prescribed = Callable[[Array, Load], CgState]
 CREEP = 0.005  # [m/s] below which rolling friction fades to zero, so that its sign is smooth
 
 
-def sine(time: Array, amplitude: Array, speed: Array, phase: Array) -> CgState:
+def sine(time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar) -> CgState:
     """c = A sin(Omega t + phase) and its two derivatives; `speed` is Omega [rad/s]."""
     angle = speed * time + phase
     xp = angle.__array_namespace__()
@@ -25,8 +29,10 @@ def sine(time: Array, amplitude: Array, speed: Array, phase: Array) -> CgState:
     return CgState(offset, amplitude * speed * xp.cos(angle), -speed * speed * offset)
 
 
-def visits(time: Array, amplitude: Array, speed: Array, phase: Array, places: Array) -> CgState:
-    """The CG goes from place to place, `places` (..., k) in units of the amplitude, again and again (ours).
+def visits(
+    time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar, places: Float[Array, "... places"]
+) -> CgState:
+    """The CG goes from place to place, `places` in units of the amplitude, again and again (ours).
 
     Each way takes half of a sine's period, pi / Omega, along the quintic that starts and ends at rest: between the
     ends of the object its speed and acceleration are at most 1.2 times that sine's.
@@ -47,7 +53,7 @@ def visits(time: Array, amplitude: Array, speed: Array, phase: Array, places: Ar
     )
 
 
-def drawn(time: Array, load: Load) -> CgState:
+def drawn(time: Scalar, load: Load) -> CgState:
     """A flight's own motion: its sine, or the places that it visits instead."""
     sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
     swinging = sine(time, *sines)
@@ -61,8 +67,8 @@ def drawn(time: Array, load: Load) -> CgState:
 class Spline(NamedTuple):
     """A C2 cubic spline: on piece k, c = sum_j coefficients[k, j] (t - times[k])^(3 - j)."""
 
-    times: np.ndarray  # (n,) knots [s]
-    coefficients: np.ndarray  # (n - 1, 4)
+    times: Float[np.ndarray, " n"]  # knots [s]
+    coefficients: Float[np.ndarray, "n-1 4"]
 
 
 def fit_spline(times: Any, offsets: Any) -> Spline:
@@ -83,8 +89,8 @@ def largest_offset(spline: Spline) -> float:
     return float(np.abs(curve(places)).max())
 
 
-def follow_spline(spline: Spline, time: Array) -> CgState:
-    """Offset, rate and acceleration of `spline` at `time` (...); before and after it the CG stands still."""
+def follow_spline(spline: Spline, time: Scalar) -> CgState:
+    """Offset, rate and acceleration of `spline` at `time`; before and after it the CG stands still."""
     xp = time.__array_namespace__()
     knots, table = (xp.asarray(value, dtype=time.dtype) for value in spline)
     piece = xp.clip((time[..., None] >= knots[1:-1]).sum(axis=-1), 0, len(spline.times) - 2)
@@ -125,7 +131,7 @@ def make_rolling_force(config: Config) -> Callable[[Array, Array, Array], Array]
     stiffness = 1.4 * motion.stop_frequency**2
     damping = 1.4 * 2 * motion.stop_damping * motion.stop_frequency
 
-    def force(offset: Array, rate: Array, ball_mass: Array) -> Array:
+    def force(offset: Scalar, rate: Scalar, ball_mass: Scalar) -> Scalar:
         xp = offset.__array_namespace__()
         friction = -motion.rolling_friction * plant.gravity * xp.tanh(rate / CREEP)
         beyond = xp.maximum(offset - end, 0.0)
@@ -137,7 +143,7 @@ def make_rolling_force(config: Config) -> Callable[[Array, Array, Array], Array]
     return force
 
 
-def object_mass(time: Array, load: Load) -> Array:
-    """The object's mass (...) [kg] at `time`: a change is impulse-free, velocities carry over."""
+def object_mass(time: Scalar, load: Load) -> Scalar:
+    """The object's mass [kg] at `time`: a change is impulse-free, velocities carry over."""
     due = time[..., None] >= load.mass_change_time
     return load.object_mass + (due * load.mass_change).sum(axis=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -15,7 +15,10 @@ from mjxball.control.constants import ROLLING_INERTIA, plant_constants
 from mjxball.physics import motion
 from mjxball.physics.engine import CgState, Engine, Load, PlantState, Wrench
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from mjxball.physics.engine import Array, Scalar, Vector
 
 
 def make_engine(plant: Plant, attitude: Attitude) -> Engine:
@@ -28,8 +31,8 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
     share = plant.moving_fraction
 
     def prescribed(
-        state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState, added: Array | None = None
-    ) -> tuple[Array, Array]:
+        state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
+    ) -> tuple[Vector, Vector]:
         _refuse(added)
 
         def one(s: PlantState, w: Wrench, mass: float, c: CgState) -> np.ndarray:
@@ -41,8 +44,8 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
         return result[..., :3], result[..., 3:6]
 
     def rolling(
-        state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array, added: Array | None = None
-    ) -> tuple[Array, Array, Array]:
+        state: PlantState, wrench: Wrench, object_mass: Scalar, ball_force: Scalar, added: Vector | None = None
+    ) -> tuple[Vector, Vector, Scalar]:
         _refuse(added)
 
         def one(s: PlantState, w: Wrench, mass: float, force: float) -> np.ndarray:
@@ -56,7 +59,7 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
     return Engine(prescribed, rolling)
 
 
-def _refuse(added: Array | None) -> None:
+def _refuse(added: Vector | None) -> None:
     if added is not None and np.any(added):
         raise NotImplementedError("C MuJoCo knows bodies only, no inertia without mass")
 
@@ -111,7 +114,7 @@ class MujocoWorld:
         origin = self.data.xpos[self._shell]
         mujoco.mj_applyFT(self.model, self.data, force, torque, origin, self._shell, self.data.qfrc_applied)
 
-    def drive(self, acceleration: float) -> np.ndarray:
+    def drive(self, acceleration: float) -> Float[np.ndarray, " 7"]:
         """Give the ball `acceleration` along its slide by the force that it takes; see `roll` for the result."""
         model, data = self.model, self.data
         unit = np.zeros((1, model.nv))
@@ -122,8 +125,8 @@ class MujocoWorld:
         mujoco.mj_solveM(model, data, response, unit)
         return self.roll((acceleration - free[0, self._slide]) / response[0, self._slide])
 
-    def roll(self, force: float) -> np.ndarray:
-        """Accelerations (7,): O in the world, angular in body axes, ball; with `force` on the slide [N]."""
+    def roll(self, force: float) -> Float[np.ndarray, " 7"]:
+        """Accelerations: O in the world, angular in body axes, ball; with `force` on the slide [N]."""
         model, data = self.model, self.data
         data.qfrc_applied[self._slide] += force
         mujoco.mj_fwdActuation(model, data)
@@ -135,7 +138,7 @@ class MujocoWorld:
         rise = a[0] if self._plant.stand == "heave" else 0.0
         return np.array([0.0, 0.0, rise, a[-2], 0.0, 0.0, a[-1]])
 
-    def load_drones(self, state: PlantState, rotor_force: Array) -> None:
+    def load_drones(self, state: PlantState, rotor_force: Float[Array, "2 4"]) -> None:
         """Apply each drone's rotor wrench to its own body, so that the welds carry it to the object."""
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         wrenches = mixer.wrench_from_rotors(
@@ -145,8 +148,8 @@ class MujocoWorld:
             self.data.xfrc_applied[body, :3] = matrix[:, 2] * wrench[0]
             self.data.xfrc_applied[body, 3:] = matrix @ wrench[1:]
 
-    def contact_wrenches(self, state: PlantState) -> np.ndarray:
-        """Force and torque (2, 2, 3) that leader and follower exert on the object, body axes, at their centres.
+    def contact_wrenches(self, state: PlantState) -> Float[np.ndarray, "2 2 3"]:
+        """Force and torque that leader and follower exert on the object, body axes, at their centres.
 
         MuJoCo's `cfrc_int` of a drone's body is what the weld exerts on the drone: world axes, torque first,
         about the centre of mass of the whole tree. `load_drones` and `drive` or `roll` must come first.
@@ -161,8 +164,8 @@ class MujocoWorld:
             result[number] = force @ matrix, moved @ matrix
         return result
 
-    def _external(self) -> np.ndarray:
-        """Generalized force of `xfrc_applied` (nv,)."""
+    def _external(self) -> Float[np.ndarray, " nv"]:
+        """Generalized force of `xfrc_applied`."""
         total = np.zeros(self.model.nv)
         for body in self._drones:
             force, torque = self.data.xfrc_applied[body, :3], self.data.xfrc_applied[body, 3:]
@@ -170,8 +173,10 @@ class MujocoWorld:
         return total
 
 
-def flown_contact_wrenches(config: Config, flown: PlantState, load: Load) -> tuple[np.ndarray, np.ndarray]:
-    """Contact forces and torques (T, n, 2, 3) of recorded states (T, n, ...) from MuJoCo's internal forces."""
+def flown_contact_wrenches(
+    config: Config, flown: PlantState, load: Load
+) -> tuple[Float[np.ndarray, "T n 2 3"], Float[np.ndarray, "T n 2 3"]]:
+    """Contact forces and torques of recorded states (T, n, ...) from MuJoCo's internal forces."""
     world = MujocoWorld(config.plant, config.attitude)
     share, rolling = config.plant.moving_fraction, config.motion.kind == "rolling"
     mass = motion.object_mass(flown.time, load)

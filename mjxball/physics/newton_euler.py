@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
 from mjxball.control.constants import ROLLING_INERTIA, PlantConstants, plant_constants
-from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
+from mjxball.physics.engine import Array, CgState, Engine, PlantState, Wrench
 
-Array = Any
+if TYPE_CHECKING:
+    from mjxball.physics.engine import Matrix, Scalar, Vector
+
 # solve(mass, moment S, inertia J_O, down u = R^T E3, force, torque) -> (a_b, w') in body axes
 Solve = Callable[[Array, Array, Array, Array, Array, Array], tuple[Array, Array]]
 
@@ -22,8 +24,8 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
     axis = "xy".index(plant.cg_axis)
 
     def prescribed(
-        state: PlantState, wrench: Wrench, object_mass: Array, cg: CgState, added: Array | None = None
-    ) -> tuple[Array, Array]:
+        state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
+    ) -> tuple[Vector, Vector]:
         terms = _terms(plant, constants, state, wrench, object_mass, cg, added)
         matrix, (mass, moment, inertia, down, force, torque) = terms
         pushed = _shift(force, axis, -object_mass * cg.acceleration)
@@ -31,8 +33,8 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
         return rotations.rotate(matrix, linear), angular
 
     def rolling(
-        state: PlantState, wrench: Wrench, object_mass: Array, ball_force: Array, added: Array | None = None
-    ) -> tuple[Array, Array, Array]:
+        state: PlantState, wrench: Wrench, object_mass: Scalar, ball_force: Scalar, added: Vector | None = None
+    ) -> tuple[Vector, Vector, Scalar]:
         xp = state.rates.__array_namespace__()
         share = plant.moving_fraction
         ball_mass = share * object_mass
@@ -53,8 +55,8 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
     return Engine(prescribed, rolling)
 
 
-def _shift(vector: Array, axis: int, amount: Array) -> Array:
-    """`vector` (..., 3) with `amount` (...) added to component `axis`."""
+def _shift(vector: Vector, axis: int, amount: Scalar) -> Vector:
+    """`vector` with `amount` added to component `axis`."""
     xp = vector.__array_namespace__()
     return xp.stack([vector[..., i] + amount if i == axis else vector[..., i] for i in range(3)], axis=-1)
 
@@ -64,10 +66,10 @@ def _terms(
     constants: PlantConstants,
     state: PlantState,
     wrench: Wrench,
-    object_mass: Array,
+    object_mass: Scalar,
     cg: CgState,
-    added: Array | None,
-) -> tuple[Array, tuple[Array, Array, Array, Array, Array, Array]]:
+    added: Vector | None,
+) -> tuple[Matrix, tuple[Scalar, Vector, Matrix, Vector, Vector, Vector]]:
     """R, and (M, S, J_O, u, f, n) of docs/model.md without the term of c''."""
     rates = state.rates
     xp = rates.__array_namespace__()
@@ -93,9 +95,9 @@ def _terms(
 
 
 def _inertia(
-    plant: Plant, constants: PlantConstants, dtype: Any, object_mass: Array, offset: Array, added: Array | None
-) -> Array:
-    """J_O (..., 3, 3): drones, shell and ball, which sits at c / share, and what is added (..., 3)."""
+    plant: Plant, constants: PlantConstants, dtype: Any, object_mass: Scalar, offset: Scalar, added: Vector | None
+) -> Matrix:
+    """J_O: drones, shell and ball, which sits at c / share, and what is added."""
     xp = object_mass.__array_namespace__()
     own = xp.asarray(constants.object_inertia_per_mass, dtype=dtype)
     square = offset * offset / plant.moving_fraction
@@ -112,8 +114,8 @@ def _inertia(
 
 
 def _solve_free(
-    mass: Array, moment: Array, inertia: Array, down: Array, force: Array, torque: Array
-) -> tuple[Array, Array]:
+    mass: Scalar, moment: Vector, inertia: Matrix, down: Vector, force: Vector, torque: Vector
+) -> tuple[Vector, Vector]:
     """Eliminate a_b: (J_O + [S]x[S]x / M) w' = n - S x f / M, the inertia about the assembly's centre of mass."""
     arm = moment / mass[..., None]
     central = inertia - mass[..., None, None] * rotations.point_inertia(arm)
@@ -122,8 +124,8 @@ def _solve_free(
 
 
 def _solve_pivot(
-    mass: Array, moment: Array, inertia: Array, down: Array, force: Array, torque: Array
-) -> tuple[Array, Array]:
+    mass: Scalar, moment: Vector, inertia: Matrix, down: Vector, force: Vector, torque: Vector
+) -> tuple[Vector, Vector]:
     """O stands still and only roll is free."""
     xp = torque.__array_namespace__()
     roll = torque[..., 0] / inertia[..., 0, 0]
@@ -132,8 +134,8 @@ def _solve_pivot(
 
 
 def _solve_heave(
-    mass: Array, moment: Array, inertia: Array, down: Array, force: Array, torque: Array
-) -> tuple[Array, Array]:
+    mass: Scalar, moment: Vector, inertia: Matrix, down: Vector, force: Vector, torque: Vector
+) -> tuple[Vector, Vector]:
     """Only roll and the world's vertical are free: a_b = a u."""
     xp = torque.__array_namespace__()
     coupling = rotations.cross(moment, down)[..., 0]

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjxball.config import Config
 from mjxball.control import attitude, crazyflie, mixer, motors, rotations
 from mjxball.control.constants import plant_constants
 from mjxball.physics import motion
-from mjxball.physics.engine import Engine, Load, PlantState, Wrench
+from mjxball.physics.engine import Array, Engine, Load, PlantState, Wrench
 
-Array = Any
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float
+
+    from mjxball.physics.engine import Scalar, Vector
+
 # control_step(state, commands (..., 2, 3) of leader and follower, load) -> state one control period later
 ControlStep = Callable[[PlantState, Array, Load], PlantState]
 # autopilot(state, commands, load) -> (loops, rotor forces asked for)
@@ -48,7 +53,7 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
 
     autopilot = make_autopilot(config)
 
-    def physics_step(state: PlantState, commands: Array, load: Load) -> PlantState:
+    def physics_step(state: PlantState, commands: Float[Array, "... 2 3"], load: Load) -> PlantState:
         xp = commands.__array_namespace__()
         loops, target = autopilot(state, commands, load)
         keep, mean = nominal, plant.rotor_lag / h * (1 - nominal)  # `mean`: its mean share over the step
@@ -72,7 +77,7 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
         )
         return _drift(kicked, h / 2)
 
-    def control_step(state: PlantState, commands: Array, load: Load) -> PlantState:
+    def control_step(state: PlantState, commands: Float[Array, "... 2 3"], load: Load) -> PlantState:
         return repeat(lambda s: physics_step(s, commands, load), config.timing.physics_steps, state)
 
     return control_step
@@ -111,8 +116,10 @@ def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Array]:
     return lambda state, load: prescribed(state.time, load).offset
 
 
-def rotor_targets(config: Config, constants: Any, state: PlantState, commands: Array, believed_mass: Array) -> Array:
-    """Rotor forces (..., 2, 4) [N] that both attitude loops ask for at `commands` (..., 2, 3)."""
+def rotor_targets(
+    config: Config, constants: Any, state: PlantState, commands: Float[Array, "... 2 3"], believed_mass: Scalar
+) -> Float[Array, "... 2 4"]:
+    """Rotor forces [N] that both attitude loops ask for at `commands`."""
     xp = commands.__array_namespace__()
     plant = config.plant
     euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
@@ -142,7 +149,9 @@ def make_autopilot(config: Config) -> Autopilot:
 
     powered = make_powered(config)
 
-    def firmware(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
+    def firmware(
+        state: PlantState, commands: Float[Array, "... 2 3"], load: Load
+    ) -> tuple[Float[Array, "... 2 13"], Float[Array, "... 2 4"]]:
         if load.battery is not None:
             return powered(state, commands, load)
         if config.autopilot.drone and motors.compensates(config.autopilot.motor_curve):
@@ -175,7 +184,9 @@ def make_powered(config: Config) -> Autopilot:
     slower = uncompensated_law.roll_rate[0] / law.roll_rate[0]
     line = motors.compensates(law.motor_curve)
 
-    def powered(state: PlantState, commands: Array, load: Load) -> tuple[Array, Array]:
+    def powered(
+        state: PlantState, commands: Float[Array, "... 2 3"], load: Load
+    ) -> tuple[Float[Array, "... 2 13"], Float[Array, "... 2 4"]]:
         xp = commands.__array_namespace__()
         own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
         carried = own + share * load.believed_mass[..., None]
@@ -202,9 +213,14 @@ def make_powered(config: Config) -> Autopilot:
 
 
 def total_wrench(
-    xp: Any, rotor_force: Array, mounts: Array, arm: float, yaw_per_thrust: float, layout: str = "plus"
+    xp: Any,
+    rotor_force: Float[Array, "... 2 4"],
+    mounts: Float[np.ndarray, "2 3"],
+    arm: float,
+    yaw_per_thrust: float,
+    layout: str = "plus",
 ) -> Wrench:
-    """Wrench about O of all rotors, `rotor_force` (..., 2, 4) [N], drones at `mounts` (2, 3) [m]."""
+    """Wrench about O of all rotors, `rotor_force` [N], drones at `mounts` [m]."""
     drones = mixer.wrench_from_rotors(rotor_force, arm, yaw_per_thrust, layout)  # (..., 2, 4)
     thrust = drones[..., 0]
     zero = xp.zeros_like(thrust[..., 0])
@@ -222,12 +238,12 @@ def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench
     return wrench._replace(force=wrench.force + rotations.rotate_back(matrix, load.external_force))
 
 
-def _total(pair: Array) -> Array:
+def _total(pair: Float[Array, "... 2"]) -> Scalar:
     return pair[..., 0] + pair[..., 1]
 
 
-def hover_rotor_force(config: Config, believed_mass: Array) -> Array:
-    """Rotor forces (..., 2, 4) [N] that hover the believed object mass (...) [kg] with the CG at O."""
+def hover_rotor_force(config: Config, believed_mass: Scalar) -> Float[Array, "... 2 4"]:
+    """Rotor forces [N] that hover the believed object mass [kg] with the CG at O."""
     xp = believed_mass.__array_namespace__()
     constants = plant_constants(config.plant, config.attitude)
     own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (constants.drone_mass, constants.share))
@@ -237,9 +253,9 @@ def hover_rotor_force(config: Config, believed_mass: Array) -> Array:
 
 
 def start_state(
-    config: Config, position: Array, euler: Array, velocity: Array, believed_mass: Array, ball_offset: Array
+    config: Config, position: Vector, euler: Vector, velocity: Vector, believed_mass: Scalar, ball_offset: Scalar
 ) -> PlantState:
-    """State at time 0 with the rotors at the believed hover thrust; `position`, `euler`, `velocity` (..., 3).
+    """State at time 0 with the rotors at the believed hover thrust.
 
     A stand overrules what it locks: position and velocity (height and climb stay free with `heave`), pitch, yaw.
     """

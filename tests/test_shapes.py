@@ -1,0 +1,116 @@
+"""The shapes in signatures are those of the arrays, in every call of a training step and of flights.
+
+Modules import `jaxtyping` for type checkers alone; here they are loaded as a type checker reads them.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import types
+import typing
+from collections.abc import Callable
+from typing import Any
+
+import jaxtyping
+from command_line import REPOSITORY, run
+
+CHECKED = ("physics", "sim", "algorithms", "env", "rewards", "evaluate.batch")
+
+
+def check(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, which raises TypeError if an array that it is given or returns has another shape or dtype."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def checked(*arguments: Any, **named: Any) -> Any:
+        hints = typing.get_type_hints(function)
+        for name, value in signature.bind(*arguments, **named).arguments.items():
+            verify(value, hints.get(name), f"{name} of {function.__qualname__}")
+        result = function(*arguments, **named)
+        verify(result, hints.get("return"), f"result of {function.__qualname__}")
+        return result
+
+    return checked
+
+
+def verify(value: Any, hint: Any, where: str) -> None:
+    """Raise TypeError unless arrays in `value` are as `hint` says; of other types nothing is asked."""
+    parts = typing.get_args(hint)
+    if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
+        if (value is None and type(None) in parts) or (isinstance(value, (int, float)) and {int, float} & {*parts}):
+            return
+        for part in parts:
+            if is_array(part):
+                return verify(value, part, where)
+    elif typing.get_origin(hint) is tuple:
+        hints = parts[:1] * len(value) if Ellipsis in parts else parts
+        for number, (one, part) in enumerate(zip(value, hints, strict=True)):
+            verify(one, part, f"{where}[{number}]")
+    elif is_array(hint):
+        if not isinstance(value, hint):
+            found = f"{value.dtype}{list(value.shape)}" if hasattr(value, "shape") else repr(value)
+            raise TypeError(f"{where} is {found}, not {hint.dtypes[0]}[{hint.dim_str}]")
+    elif hasattr(hint, "_fields") and isinstance(value, hint):
+        hints = typing.get_type_hints(hint)
+        for name in hint._fields:
+            verify(getattr(value, name), hints[name], f"{where}.{name}")
+
+
+def is_array(hint: Any) -> bool:
+    return isinstance(hint, type) and issubclass(hint, jaxtyping.AbstractArray)
+
+
+PROGRAM = """
+import sys, typing
+import brax.envs.base, jax, jaxtyping, mujoco.mjx, optax, scipy.interpolate  # their own are not meant
+sys.path.insert(0, "tests")
+import test_shapes
+typing.TYPE_CHECKING = True
+packages = [f"mjxball.{name}" for name in %r]
+with jaxtyping.install_import_hook(packages, "test_shapes.check"):
+    import mjxball.env, mjxball.evaluate.batch, mjxball.physics.stepper
+typing.TYPE_CHECKING = False
+%s
+print("done")
+"""
+TRAINING = """
+import jax
+from conftest import with_settings
+from mjxball import config
+from mjxball.train.program import Program, train
+for preset, physics in (("robust", "mjx"), ("flight", "newton-euler"), ("paper", "newton-euler")):
+    settings = with_settings(config.preset(preset), sac={"num_envs": 8, "batch_size": 8, "replay_size": 8000})
+    program = Program(settings, physics)
+    state = jax.eval_shape(program.create, jax.random.key(0))
+    jax.eval_shape(program.advance, state, train(1))
+"""
+FLIGHTS = """
+import dataclasses
+from mjxball import config
+from mjxball.baselines import make_baseline
+from mjxball.evaluate.batch import Batch
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.rollout import simulate_batch
+from mjxball.sim.scenario import Scenario
+settings = config.preset("paper")
+disturbed = Disturbance(noise=1.0, delay=0.04, relay_rate=10.0, gust=0.1, estimator_drift=1.0, quantize=True)
+flown = [Scenario(seconds=0.1), Scenario(seconds=0.1, disturbance=disturbed, mass_changes=((0.05, 0.1),))]
+follower = make_baseline("copy", settings)
+Batch(settings, follower).fly(flown)
+for physics in ("newton-euler", "mujoco"):
+    simulate_batch(settings, [(follower, flown)], physics)
+"""
+
+
+def passes(body: str) -> None:
+    done = run(["-c", PROGRAM % (CHECKED, body)], REPOSITORY)
+    assert done.stdout.endswith("done\n"), done.stderr[-3000:]
+
+
+def test_shapes_of_a_training_step() -> None:
+    passes(TRAINING)
+
+
+def test_shapes_of_flights() -> None:
+    passes(FLIGHTS)
