@@ -25,7 +25,7 @@ from mjxball.baselines import make_baseline
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config, preset
 from mjxball.evaluate.policies import load_policy
-from mjxball.physics.stepper import TRAINING_ENGINES
+from mjxball.physics.step import TRAINING_ENGINES
 
 BASE = "transport-large"
 # What the preset was when the rows were trained; its smoothness and return steps were chosen after them.

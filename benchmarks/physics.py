@@ -22,8 +22,7 @@ import numpy as np
 from mjxball import config as configs
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import make_control_step, python_repeat, start_state
-from mjxball.physics.stepper import make_stepper
+from mjxball.physics.step import make_control_step, make_stepper, python_repeat, start_state
 
 REPEATS = 5
 ENGINES = {"newton-euler": newton_euler.make_engine, "mjx": mjx.make_engine}

@@ -17,8 +17,7 @@ from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mjx import jax_repeat, make_engine
 from mjxball.physics.motion import object_mass
-from mjxball.physics.step import ControlStep, make_cg_offset, make_control_step
-from mjxball.physics.stepper import TRAINING_ENGINES
+from mjxball.physics.step import TRAINING_ENGINES, ControlStep, make_cg_offset, make_control_step
 from mjxball.quiet import import_brax_env
 from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
 from mjxball.sim.disturbances import RandomDisturbances

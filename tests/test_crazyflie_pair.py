@@ -14,9 +14,9 @@ from mjxball.config import Autopilot, Config, preset
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
+from mjxball.physics.autopilot import make_autopilot
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import hover_rotor_force, make_autopilot, make_control_step, start_state
-from mjxball.physics.stepper import make_stepper
+from mjxball.physics.step import hover_rotor_force, make_control_step, make_stepper, start_state
 from mjxball.policy import Policy
 from mjxball.policy.shipped import shipped_policy
 from mjxball.rig.attitude import Body, Trial

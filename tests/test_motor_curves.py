@@ -14,8 +14,9 @@ from mjxball.control import crazyflie, motors
 from mjxball.control.constants import drone_loop, hover
 from mjxball.control.motors import OLDER, compensates, firmware, with_curve
 from mjxball.env import CoupledPairEnv
+from mjxball.physics.autopilot import make_powered
 from mjxball.physics.engine import Load
-from mjxball.physics.step import make_powered, start_state
+from mjxball.physics.step import start_state
 from mjxball.sim.randomization import LIFT, ResetDistribution
 
 NEWER = (0.0, 0.12)

@@ -16,8 +16,7 @@ from mjxball.control import crazyflie
 from mjxball.control.constants import drone_loop, thrust_slopes
 from mjxball.control.motors import OLDER, with_curve
 from mjxball.errors import InputError
-from mjxball.physics.step import hover_rotor_force
-from mjxball.physics.stepper import make_stepper
+from mjxball.physics.step import hover_rotor_force, make_stepper
 from mjxball.sim.rollout import load_of, simulate_batch, start_of
 from mjxball.sim.scenario import Scenario
 

@@ -172,7 +172,7 @@ def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> 
     assert load.cg_path.shape == (400, 16)
     assert float(jnp.abs(load.cg_path).max()) <= 1.0
     times = jnp.linspace(0.0, 60.0, 400)
-    offsets = jax.vmap(lambda time: motion.drawn(jnp.full(400, time), load).offset)(times)
+    offsets = jax.vmap(lambda time: motion.sine_or_visits(jnp.full(400, time), load).offset)(times)
     assert bool((jnp.abs(offsets).max(axis=0) <= load.cg_amplitude * (1 + 1e-5)).all())
 
 

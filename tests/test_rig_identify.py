@@ -18,8 +18,7 @@ from mjxball.control.constants import plant_constants
 from mjxball.errors import InputError
 from mjxball.fly.preflight import read_gains
 from mjxball.physics.engine import Load
-from mjxball.physics.step import start_state
-from mjxball.physics.stepper import make_stepper
+from mjxball.physics.step import make_stepper, start_state
 from mjxball.rig import identify as command
 from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify

@@ -69,7 +69,7 @@ import test_shapes
 typing.TYPE_CHECKING = True
 packages = [f"mjxball.{name}" for name in %r]
 with jaxtyping.install_import_hook(packages, "test_shapes.check"):
-    import mjxball.env, mjxball.evaluate.batch, mjxball.physics.stepper
+    import mjxball.env, mjxball.evaluate.batch, mjxball.physics.step
 typing.TYPE_CHECKING = False
 %s
 print("done")

@@ -12,7 +12,7 @@ from tables import rows
 from mjxball.config import replace
 from mjxball.control import rotations
 from mjxball.errors import InputError
-from mjxball.physics.stepper import make_stepper
+from mjxball.physics.step import make_stepper
 from mjxball.sim.rollout import Trajectory, load_of, simulate, simulate_batch, start_of
 from mjxball.sim.scenario import Scenario
 

@@ -18,9 +18,8 @@ from mjxball.errors import InputError
 from mjxball.fly.card import config_of
 from mjxball.policy import load_file
 from mjxball.view.command import main
-from mjxball.view.flight_file import SHAPES, Flight, load_flight, save_flight
+from mjxball.view.flight import SHAPES, Flight, flight_from, load_flight, save_flight
 from mjxball.view.page import flight_page, page_contents
-from mjxball.view.sources import flight_from
 
 SECONDS = 4.0
 

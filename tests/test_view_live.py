@@ -31,8 +31,8 @@ from mjxball.fly.recording import read_recording
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.physics import make_pair
 from mjxball.view.command import main
-from mjxball.view.feed import COLUMNS, STEP, Feed, columns
 from mjxball.view.live import Board, Server
+from mjxball.view.live_log import COLUMNS, STEP, LiveLog, columns
 
 LIMIT = 20.0  # [s] that anything may take here on a busy machine
 
@@ -49,20 +49,20 @@ def lines(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     return path.read_bytes().splitlines(keepends=True)
 
 
-def read_all(path: Path) -> Feed:
-    with contextlib.closing(Feed(path)) as feed:
-        while feed.update():
+def read_all(path: Path) -> LiveLog:
+    with contextlib.closing(LiveLog(path)) as log:
+        while log.update():
             pass
-    return feed
+    return log
 
 
 def test_rows_are_the_recording(lines: list[bytes], tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     path.write_bytes(b"".join(lines))
-    feed, recording = read_all(path), read_recording(path)
-    shown = {name: values.reshape(len(feed.rows), -1) for name, values in columns(feed.rows).items()}
+    log, recording = read_all(path), read_recording(path)
+    shown = {name: values.reshape(len(log.rows), -1) for name, values in columns(log.rows).items()}
     time = shown["time"][:, 0]
-    assert (feed.ended, feed.text, feed.mood) == (True, "the flight has ended, exit code 0: time up", "busy")
+    assert (log.ended, log.text, log.level) == (True, "the flight has ended, exit code 0: time up", "busy")
     np.testing.assert_allclose(np.diff(time), STEP, atol=2e-3)
     # A recording counts from where the motors turned, the view from the first tick.
     first = [json.loads(line)["t"] for line in lines if b'"tick"' in line]
@@ -82,18 +82,18 @@ def test_a_log_in_pieces_gives_the_same_rows(lines: list[bytes], tmp_path: Path)
     """However a line is torn, it counts once it is whole; damaged ones in between do not count at all."""
     whole, pieces = tmp_path / "whole.jsonl", tmp_path / "pieces.jsonl"
     whole.write_bytes(b"".join(lines))
-    feed = Feed(pieces)
-    assert not feed.update()
-    assert feed.text == "waiting for pieces.jsonl"
+    log = LiveLog(pieces)
+    assert not log.update()
+    assert log.text == "waiting for pieces.jsonl"
     damaged = [b"{torn\n", b"[]\n", b'{"t": 1, "kind": "tick"}\n', b'{"t": 1, "kind": "state", "drone": 7}\n', b"\n"]
     text = b"".join([lines[0], *damaged, *lines[1:]])
     with pieces.open("ab", buffering=0) as stream:
         for start in range(0, len(text), 1777):
             stream.write(text[start : start + 1777])
-            feed.update()
-            assert feed.mood == ("good" if feed.text in ("fly", "land: time up") else "busy")
-    assert feed.rows == read_all(whole).rows
-    assert feed.ended
+            log.update()
+            assert log.level == ("good" if log.text in ("fly", "land: time up") else "busy")
+    assert log.rows == read_all(whole).rows
+    assert log.ended
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def server(lines: list[bytes], tmp_path: Path) -> Iterator[Server]:
     """Serves a log that has ended."""
     path = tmp_path / "log.jsonl"
     path.write_bytes(b"".join(lines))
-    board = Board(Feed(path))
+    board = Board(LiveLog(path))
     while board.update():
         pass
     result = Server(0, board)
@@ -293,5 +293,5 @@ def test_a_fault_is_told(lines: list[bytes], tmp_path: Path) -> None:
     path = tmp_path / "log.jsonl"
     fault = {"t": 1.0, "kind": "transition", "before": "fly", "after": "descend", "events": ["FENCE: leader left"]}
     path.write_bytes(lines[0] + json.dumps(fault).encode() + b"\n")
-    feed = read_all(path)
-    assert (feed.text, feed.mood, feed.ended) == ("descend: fence: leader left", "bad", False)
+    log = read_all(path)
+    assert (log.text, log.level, log.ended) == ("descend: fence: leader left", "bad", False)

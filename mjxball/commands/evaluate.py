@@ -25,7 +25,7 @@ from mjxball.evaluate.report import write_page, write_report
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
 from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
 from mjxball.evaluate.suites import Suite, find_suites, list_suites
-from mjxball.physics.stepper import ENGINES
+from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy, PolicyFileError
 from mjxball.policy.shipped import shipped_policies
 from mjxball.sim.scenario import Scenario

@@ -18,8 +18,7 @@ from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import make_control_step
-from mjxball.physics.stepper import TRAINING_ENGINES
+from mjxball.physics.step import TRAINING_ENGINES, make_control_step
 from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim import rollout

@@ -15,8 +15,7 @@ from mjxball.env import CoupledPairEnv
 from mjxball.errors import InputError
 from mjxball.gym import worlds
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import make_cg_offset
-from mjxball.physics.stepper import make_stepper, on_the_host
+from mjxball.physics.step import make_cg_offset, make_stepper, on_the_host
 
 Array = Any
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}

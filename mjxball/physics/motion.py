@@ -53,7 +53,7 @@ def visits(
     )
 
 
-def drawn(time: Scalar, load: Load) -> CgState:
+def sine_or_visits(time: Scalar, load: Load) -> CgState:
     """A flight's own motion: its sine, or the places that it visits instead."""
     sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
     swinging = sine(time, *sines)
@@ -109,7 +109,7 @@ def make_prescribed(config: Config) -> Prescribed:
     Raises InputError if a waveform's spline leaves the object between its samples.
     """
     if config.motion.kind == "sine":
-        return drawn
+        return sine_or_visits
     spline = fit_spline(config.motion.times, config.motion.offsets)
     limit = cg_limit(config.plant)
     if largest_offset(spline) > limit + 1e-9:

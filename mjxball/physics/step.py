@@ -1,32 +1,35 @@
-"""One control step of the plant: attitude loops, rotor lag and the integrator, the same for every engine."""
+"""One control step of the plant: autopilot, rotor lag and the integrator, the same for every engine."""
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mjxball.config import Config
-from mjxball.control import attitude, crazyflie, mixer, motors, rotations
+from mjxball.control import crazyflie, mixer, rotations
 from mjxball.control.constants import plant_constants
+from mjxball.errors import InputError
 from mjxball.physics import motion
+from mjxball.physics.autopilot import make_autopilot
 from mjxball.physics.engine import Array, Engine, Load, PlantState, Wrench
 
 if TYPE_CHECKING:
-    import numpy as np
     from jaxtyping import Float
 
     from mjxball.physics.engine import Scalar, Vector
 
+TRAINING_ENGINES = ("mjx", "newton-euler")  # on JAX
+ENGINES = (*TRAINING_ENGINES, "mujoco")
 # control_step(state, commands (..., 2, 3) of leader and follower, load) -> state one control period later
 ControlStep = Callable[[PlantState, Array, Load], PlantState]
-# autopilot(state, commands, load) -> (loops, rotor forces asked for)
-Autopilot = Callable[[PlantState, Array, Load], tuple[Any, Array]]
 # repeat(body, count, value): apply `body` to `value` `count` times
 Repeat = Callable[[Callable[[PlantState], PlantState], int, PlantState], PlantState]
-
-
-USUAL_BATTERY = 3.7  # [V] in hover, where none is drawn
 
 
 def python_repeat(body: Callable[[PlantState], PlantState], count: int, value: PlantState) -> PlantState:
@@ -116,102 +119,6 @@ def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Array]:
     return lambda state, load: prescribed(state.time, load).offset
 
 
-def rotor_targets(
-    config: Config, constants: Any, state: PlantState, commands: Float[Array, "... 2 3"], believed_mass: Scalar
-) -> Float[Array, "... 2 4"]:
-    """Rotor forces [N] that both attitude loops ask for at `commands`."""
-    xp = commands.__array_namespace__()
-    plant = config.plant
-    euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-    own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
-    return attitude.rotor_commands(
-        commands,
-        euler[..., None, :],
-        state.rates[..., None, :],
-        own + share * believed_mass[..., None],
-        constants.gains,
-        plant.gravity,
-        plant.arm,
-        plant.yaw_per_thrust,
-        plant.rotor_force_max,
-        plant.layout,
-    )
-
-
-def make_autopilot(config: Config) -> Autopilot:
-    """Return `autopilot(state, commands (..., 2, 3), load)` -> (loops, rotor forces (..., 2, 4) asked for [N])."""
-    constants = plant_constants(config.plant, config.attitude)
-    if config.autopilot.kind == "ideal":
-        return lambda state, commands, load: (
-            state.loops,
-            rotor_targets(config, constants, state, commands, load.believed_mass),
-        )
-
-    powered = make_powered(config)
-
-    def firmware(
-        state: PlantState, commands: Float[Array, "... 2 3"], load: Load
-    ) -> tuple[Float[Array, "... 2 13"], Float[Array, "... 2 4"]]:
-        if load.battery is not None:
-            return powered(state, commands, load)
-        if config.autopilot.drone and motors.compensates(config.autopilot.motor_curve):
-            # A motor gives more than a thrust command of 65 535 where the battery has it: full PWM is the limit.
-            usual = commands[..., 0, 0] * 0.0
-            return powered(state, commands, load._replace(battery=usual + USUAL_BATTERY, uncompensated=usual))
-        xp, law, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
-        own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
-        sent = crazyflie.setpoints(law, commands, own + share * load.believed_mass[..., None], gravity)
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-        euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
-        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype)
-        loops, duty = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals)
-        left = xp.maximum(1.0 - law.sag * state.time, xp.zeros_like(state.time))[..., None, None]
-        return loops, left * crazyflie.motor_force(law.motor_curve, duty)
-
-    return firmware
-
-
-def make_powered(config: Config) -> Autopilot:
-    """The firmware's loops with motors that follow the battery, `load.battery`, with or without its compensation.
-
-    Where `load.uncompensated`, what the firmware is sent and its gains are converted for its curve
-    (`motors.with_curve`), as the runner does.
-    """
-    constants = plant_constants(config.plant, config.attitude)
-    law, gravity = config.autopilot, config.plant.gravity
-    motor = motors.MOTORS[law.drone or "2.1"]
-    uncompensated_law = motors.with_curve(config, motors.OLDER).autopilot
-    slower = uncompensated_law.roll_rate[0] / law.roll_rate[0]
-    line = motors.compensates(law.motor_curve)
-
-    def powered(
-        state: PlantState, commands: Float[Array, "... 2 3"], load: Load
-    ) -> tuple[Float[Array, "... 2 13"], Float[Array, "... 2 4"]]:
-        xp = commands.__array_namespace__()
-        own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
-        carried = own + share * load.believed_mass[..., None]
-        uncompensated: Array = load.uncompensated
-        volts: Array = load.battery
-        old, battery = uncompensated[..., None, None] > 0, volts[..., None, None]
-        sent = xp.where(
-            old,
-            crazyflie.setpoints(uncompensated_law, commands, carried, gravity),
-            crazyflie.setpoints(law, commands, carried, gravity),
-        )
-        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-        euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
-        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype)
-        rate_share = 1.0 + (slower - 1.0) * uncompensated[..., None, None]
-
-        def duty(command: Array) -> Array:
-            return xp.where(old, command, motors.compensated(motor, command, battery)) if line else command
-
-        loops, pwm = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals, duty, rate_share)
-        return loops, motors.force(motor, pwm, battery)
-
-    return powered
-
-
 def total_wrench(
     xp: Any,
     rotor_force: Float[Array, "... 2 4"],
@@ -288,3 +195,44 @@ def _drift(state: PlantState, h: float) -> PlantState:
         time=state.time + h,
         ball_offset=state.ball_offset + h * state.ball_rate,
     )
+
+
+def make_stepper(config: Config, physics: str) -> ControlStep:
+    """Return a control step for batches (n, ...) of NumPy float64 arrays; raise InputError for an unknown engine."""
+    if physics == "mujoco":
+        from mjxball.physics.mujoco import make_engine
+
+        return make_control_step(config, make_engine(config.plant, config.attitude))
+    if physics not in ENGINES:
+        raise InputError(f"unknown physics {physics!r}; choose from {', '.join(ENGINES)}")
+    return _jax_stepper(config, physics)
+
+
+@functools.lru_cache(maxsize=8)  # compiling takes seconds
+def _jax_stepper(config: Config, physics: str) -> ControlStep:
+    import jax
+
+    from mjxball.cache import enable_compilation_cache
+    from mjxball.physics import mjx, newton_euler
+
+    enable_compilation_cache()
+    make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
+    with jax.enable_x64(True), on_the_host():
+        step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
+        compiled = jax.jit(jax.vmap(step))
+
+    def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:
+        with jax.enable_x64(True), on_the_host():
+            return PlantState(*compiled(state, commands, load)).each(np.asarray)
+
+    return stepper
+
+
+def on_the_host() -> AbstractContextManager[Any]:
+    """Compute on the CPU: a GPU takes 4 ms for each control step of a few worlds, most of it waiting."""
+    import jax
+
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:  # JAX was told to leave the CPU alone
+        return contextlib.nullcontext()

@@ -15,11 +15,16 @@ from mjxball.control.constants import plant_constants
 from mjxball.control.followers import Baseline, Follower, PrivilegedInfo
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
-from mjxball.physics.contact import contact_wrenches
-from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.engine import Load, PlantState, contact_wrenches
 from mjxball.physics.motion import make_prescribed, object_mass
-from mjxball.physics.step import make_accelerations, make_cg_offset, start_state, total_wrench, with_external_force
-from mjxball.physics.stepper import make_stepper
+from mjxball.physics.step import (
+    make_accelerations,
+    make_cg_offset,
+    make_stepper,
+    start_state,
+    total_wrench,
+    with_external_force,
+)
 from mjxball.sim.closed_loop import ClosedLoop
 from mjxball.sim.disturbances import record, sensors_of
 from mjxball.sim.scenario import Scenario, check_scenario

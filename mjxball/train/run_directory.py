@@ -18,7 +18,7 @@ from typing import Any
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.physics.stepper import TRAINING_ENGINES
+from mjxball.physics.step import TRAINING_ENGINES
 
 MAX_BYTES = 16 * 2**20  # JSON and CSV take some ten times their own length in memory
 

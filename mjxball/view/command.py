@@ -10,9 +10,8 @@ from pathlib import Path
 from mjxball.cli import Parser, make_parser, output_file, run_command
 from mjxball.errors import InputError
 from mjxball.policy.file import write_whole
-from mjxball.view.flight_file import save_flight
+from mjxball.view.flight import flight_from, save_flight
 from mjxball.view.page import flight_page
-from mjxball.view.sources import flight_from
 
 CHANGES = ("omega", "amplitude", "mass", "goal", "seconds")  # flags, and fields of a scenario
 

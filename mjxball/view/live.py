@@ -18,7 +18,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from mjxball.errors import InputError
-from mjxball.view.feed import Feed, columns
+from mjxball.view.live_log import LiveLog, columns
 from mjxball.view.page import live_page, packed
 
 HOST = "127.0.0.1"
@@ -34,36 +34,36 @@ POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inli
 class Board:
     """What the pages are told: written by the loop, read by the server's threads."""
 
-    def __init__(self, feed: Feed):
-        self.page = live_page(f"{feed.path.name}, live", token := secrets.token_hex(8)).encode()
+    def __init__(self, log: LiveLog):
+        self.page = live_page(f"{log.path.name}, live", token := secrets.token_hex(8)).encode()
         self.token = token
         self.lock = threading.Lock()
         self.asked: float | None = None  # when a page last asked for rows [s]
-        self.told_all = False
-        self._feed, self._heard = feed, time.monotonic()
+        self.all_sent = False
+        self._log, self._last_news = log, time.monotonic()
 
     def update(self) -> bool:
         """Read on in the log; true if there was something."""
         with self.lock:
-            added = self._feed.update()
+            added = self._log.update()
         if added:
-            self._heard, self.told_all = time.monotonic(), False
+            self._last_news, self.all_sent = time.monotonic(), False
         return added
 
     def answer(self, after: int) -> dict[str, Any]:
         """The rows from number `after` on, and how the flight is."""
         now = time.monotonic()
         with self.lock:
-            feed = self._feed
-            total = len(feed.rows) if len(feed.rows) > 1 else 0  # a plot needs two
-            rows = feed.rows[after : min(total, after + BATCH)]
-            text, mood, ended, plant = feed.text, feed.mood, feed.ended, feed.plant
-            self.asked, self.told_all = now, ended and after + len(rows) >= total
-        silent = now - self._heard
+            log = self._log
+            total = len(log.rows) if len(log.rows) > 1 else 0  # a plot needs two
+            rows = log.rows[after : min(total, after + BATCH)]
+            text, level, ended, plant = log.text, log.level, log.ended, log.plant
+            self.asked, self.all_sent = now, ended and after + len(rows) >= total
+        silent = now - self._last_news
         if plant and not ended and silent > SILENCE:
-            text, mood = f"nothing new for {silent:.0f} s; last: {text}", "bad"
+            text, level = f"nothing new for {silent:.0f} s; last: {text}", "bad"
         arrays = {name: packed(column) for name, column in columns(rows).items()}
-        known = {"text": text, "mood": mood, "ended": ended, "plant": plant}
+        known = {"text": text, "level": level, "ended": ended, "plant": plant}
         return {**known, "total": total, "rows": len(rows), "arrays": arrays}
 
 
@@ -143,28 +143,28 @@ def follow(path: Path, port: int = 0, attached: bool = False) -> int:
 
     Prints the address, and unless attached what happens to the log. Raises InputError if `path` is no flight log.
     """
-    feed = Feed(path)
+    log = LiveLog(path)
     with contextlib.suppress(OSError, AttributeError):
         os.nice(10)  # whatever flies comes first
-    board, leave = Board(feed), threading.Event()
-    with contextlib.closing(feed), _serving(Server(port, board)) as address, _until(leave, attached):
+    board, leave = Board(log), threading.Event()
+    with contextlib.closing(log), _serving(Server(port, board)) as address, _until(leave, attached):
         begun = board.update()
         waits = "" if begun else f", and waits for {path}"
         print(f"the live view is at {address}{waits}", flush=True)  # noqa: T201
-        _watch(board, feed, leave, attached)
+        _watch(board, log, leave, attached)
         _linger(board)
     return 0
 
 
-def _watch(board: Board, feed: Feed, leave: threading.Event, attached: bool) -> None:
+def _watch(board: Board, log: LiveLog, leave: threading.Event, attached: bool) -> None:
     """Read on until it is time to leave."""
     told = False
     while True:
         busy = board.update()
-        if feed.ended and not told and not attached:
+        if log.ended and not told and not attached:
             told = True
-            print(f"{feed.text}; Ctrl-C ends the view", flush=True)  # noqa: T201
-        if leave.wait(0 if busy and not feed.ended else PERIOD):
+            print(f"{log.text}; Ctrl-C ends the view", flush=True)  # noqa: T201
+        if leave.wait(0 if busy and not log.ended else PERIOD):
             return
 
 
@@ -173,7 +173,7 @@ def _linger(board: Board) -> None:
     until = time.monotonic() + LINGER
     while board.update():
         pass
-    while board.asked is not None and not board.told_all and time.monotonic() < min(until, board.asked + LINGER):
+    while board.asked is not None and not board.all_sent and time.monotonic() < min(until, board.asked + LINGER):
         time.sleep(0.02)
     time.sleep(0.1 if board.asked is not None else 0.0)  # the last answer is on its way
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from mjxball.config import Plant
 from mjxball.control import mixer
-from mjxball.view.flight_file import Flight
+from mjxball.view.flight import Flight
 
 PARTS = Path(__file__).parent / "parts"
 UNMEASURED = ("cg_offset", "object_mass", "contact_force")  # in a flight log

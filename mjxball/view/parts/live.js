@@ -26,9 +26,9 @@ class Live {
     this.ask();
   }
 
-  tell(text, mood) {
+  tell(text, level) {
     this.status.textContent = text;
-    this.status.className = mood;
+    this.status.className = level;
   }
 
   async ask() {
@@ -44,7 +44,7 @@ class Live {
       setTimeout(() => this.ask(), 1000);
       return;
     }
-    this.tell(answer.text, answer.mood);
+    this.tell(answer.text, answer.level);
     if (answer.rows) this.take(answer);
     if (answer.ended && this.rows === answer.total) return;
     // A slow browser asks less often: most of its time is its own.

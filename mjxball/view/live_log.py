@@ -42,8 +42,8 @@ SEVERITY = {state.value: state.severity for state in State}
 FAULT_NAMES = {event.name for event in FAULTS}
 
 
-class Feed:
-    """See the module. `update` reads on; `rows`, `text`, `mood` and `ended` say what is known."""
+class LiveLog:
+    """A log that is being written. `update` reads on; `rows`, `text`, `level` and `ended` say what is known."""
 
     def __init__(self, path: Path):
         """Follow the log `path`, which need not exist yet."""
@@ -51,7 +51,7 @@ class Feed:
         self.rows: list[list[float]] = []
         self.plant: dict[str, Any] | None = None  # None: the log has not begun
         self.text = f"waiting for {path.name}"
-        self.mood = "busy"  # good: the laws are in command; bad: a fault
+        self.level = "busy"  # good: the laws are in command; bad: a fault
         self.ended = False
         self._tail = Tail(path)
         self._newest: list[DroneState | None] = [None, None]
@@ -77,7 +77,7 @@ class Feed:
         elif record["kind"] == "tick":
             self._tick(record)
         else:
-            self._tell(record["kind"], record)
+            self._note(record["kind"], record)
 
     def _begin(self, header: Record) -> None:
         self._config, self._firmware = header["config"], FirmwareSetup.of_header(header)
@@ -121,10 +121,10 @@ class Feed:
         if self.ended:
             return
         self.text = f"{name}: {self._why}" if self._why else name
-        if self.mood != "bad":
-            self.mood = "good" if name in (State.FLY.value, State.LAND.value) else "busy"
+        if self.level != "bad":
+            self.level = "good" if name in (State.FLY.value, State.LAND.value) else "busy"
 
-    def _tell(self, kind: str, record: Record) -> None:
+    def _note(self, kind: str, record: Record) -> None:
         """Note anything but states and ticks."""
         if kind == "thrust":
             self._firmware = self._firmware.after(record, self._config)
@@ -132,19 +132,19 @@ class Feed:
         elif kind == "check":
             self.text = f"{'good' if record['passed'] else 'BAD'}: {record['name']}: {record['found']}"
         elif kind == "transition":
-            self._turn(record["after"], record["events"])
+            self._transition(record["after"], record["events"])
         elif kind == "refused":
-            self.ended, self.mood, self.text = True, "bad", f"refused: {record['text']}"
+            self.ended, self.level, self.text = True, "bad", f"refused: {record['text']}"
         elif kind == "end":
             why = f": {self._why}" if self._why else ""
             self.ended, self.text = True, f"the flight has ended, exit code {record['code']}{why}"
-            self.mood = "bad" if record["code"] else "busy"
+            self.level = "bad" if record["code"] else "busy"
 
-    def _turn(self, after: str, events: Sequence[str]) -> None:
+    def _transition(self, after: str, events: Sequence[str]) -> None:
         severity = SEVERITY.get(after, 0)
         causes = [event for event in events if event.partition(":")[0] in FAULT_NAMES]
         if causes:
-            self.mood = "bad"
+            self.level = "bad"
         if causes or (severity > State.FLY.severity and events):
             self._why = self._why or (causes or events)[0].lower().replace("_", " ")
         self._state(after)
