@@ -255,7 +255,7 @@ def make_brief(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
 def flown_contact_wrenches(
     config: Config, flown: PlantState, load: Load, physics: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Contact forces and torques (T, n, 2, 3) of recorded states (T, n, ...), see `physics.contact`.
+    """Contact forces and torques (T, n, 2, 3) of recorded states (T, n, ...), see `physics.engine.contact_wrenches`.
 
     `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with a push, share the closed form.
     """
