@@ -14,7 +14,7 @@ from mjxball.config import Config, Reward, ball_limit
 from mjxball.control import crazyflie, observation, rotations
 from mjxball.control.observation import observation_history
 from mjxball.physics import newton_euler
-from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.engine import Array, Load, PlantState
 from mjxball.physics.mjx import jax_repeat, make_engine
 from mjxball.physics.motion import object_mass
 from mjxball.physics.step import TRAINING_ENGINES, ControlStep, make_cg_offset, make_control_step
@@ -23,10 +23,10 @@ from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
 from mjxball.sim.disturbances import RandomDisturbances
 from mjxball.sim.randomization import ResetDistribution
 
-Array = Any
 RewardFunction = Callable[[Reward, rewards.Transition], Array]
 if TYPE_CHECKING:
     from brax.envs.base import Env, State
+    from jaxtyping import Bool, Float, Int
 else:
     Env, State = import_brax_env()
 # [s] of an episode, after which its error counts as steady state in training's metrics. Episodes last 20 s, after which
@@ -39,11 +39,11 @@ class World(NamedTuple):
 
     loop: LoopState  # plant, leader's integral, sensors
     load: Load
-    goal: Array  # (3,) of O [m]
+    goal: Float[Array, "3"]  # of O [m]
     disturbances: Any  # `sim.disturbances.RandomState`, () if nothing is disturbed
     history: Any  # (m,) observation history; () if none: XLA's partitioner cannot bear arrays of no elements
-    action: Array  # (3,) last network action in [-1, 1]
-    steps: Array  # () control steps since the reset
+    action: Float[Array, "3"]  # last network action in [-1, 1]
+    steps: Int[Array, ""]  # control steps since the reset
 
     @property
     def plant(self) -> PlantState:
@@ -55,8 +55,8 @@ class Applied(NamedTuple):
     """What is done in one control period, and the network's action behind it."""
 
     commands: Commands
-    action: Array  # (3,) the network's in [-1, 1], zeros if it was not finite
-    finite: Array  # () whether it was
+    action: Float[Array, "3"]  # the network's in [-1, 1], zeros if it was not finite
+    finite: Bool[Array, ""]  # whether it was
 
 
 class CoupledPairEnv(Env):
@@ -121,7 +121,7 @@ class CoupledPairEnv(Env):
         """Control period [s]."""
         return self.config.timing.control_period
 
-    def reset(self, rng: Array, difficulty: Array | float = 1.0) -> State:
+    def reset(self, rng: Array, difficulty: Float[Array, ""] | float = 1.0) -> State:
         """A fresh world at rest or nearly so; `difficulty` as in `ResetDistribution.draw`."""
         world, seen = self._fresh_world(rng, difficulty)
         zero = jnp.zeros(())
@@ -129,12 +129,12 @@ class CoupledPairEnv(Env):
         metrics = dict.fromkeys(names, zero)
         return State(world, self._input(seen, world), zero, zero, metrics, {"truncation": zero})
 
-    def step(self, state: State, action: Array) -> State:
-        """Apply the network's `action` (3,) in [-1, 1] for one control period."""
+    def step(self, state: State, action: Float[Array, "3"]) -> State:
+        """Apply the network's `action` in [-1, 1] for one control period."""
         return self._step(state, *self.command(state, action))
 
-    def step_with_command(self, state: State, follower_command: Array) -> State:
-        """`step` of a follower that is no network: `follower_command` (3,) is flown as it is."""
+    def step_with_command(self, state: State, follower_command: Float[Array, "3"]) -> State:
+        """`step` of a follower that is no network: `follower_command` is flown as it is."""
         applied, load = self.command(state, jnp.zeros(observation.ACTION_SIZE))
         commands = applied.commands._replace(follower=follower_command)
         return self._step(state, applied._replace(commands=commands), load, 0.0)
@@ -143,8 +143,8 @@ class CoupledPairEnv(Env):
         plant = self._loop.physics(state.pipeline_state.plant, self._loop.stack(applied.commands), load)
         return self.after_physics(state, applied, plant, shares)
 
-    def command(self, state: State, action: Array) -> tuple[Applied, Load]:
-        """What the physics is given for one control period at the network's `action` (3,)."""
+    def command(self, state: State, action: Float[Array, "3"]) -> tuple[Applied, Load]:
+        """What the physics is given for one control period at the network's `action`."""
         world: World = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
@@ -196,8 +196,8 @@ class CoupledPairEnv(Env):
             info={**state.info, "truncation": truncated.astype(jnp.float32)},
         )
 
-    def _fresh_world(self, rng: Array, difficulty: Array | float) -> tuple[World, Array]:
-        """(world, observation (18,) at its start)."""
+    def _fresh_world(self, rng: Array, difficulty: Float[Array, ""] | float) -> tuple[World, Float[Array, "18"]]:
+        """(world, observation at its start)."""
         load, plant, goal = self._resets.draw(rng, difficulty)
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         delay = disturbances.delay if self._disturbances.present else 0
@@ -215,15 +215,15 @@ class CoupledPairEnv(Env):
         )
         return world, seen
 
-    def _input(self, seen: Array, world: World) -> Array:
+    def _input(self, seen: Float[Array, "18"], world: World) -> Float[Array, " input"]:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
         shown = self._history.network_input(seen, world.history) if self._history.size else seen
         return jnp.concatenate([shown, self._privileged(world)]) if self.config.sac.privileged_critic else shown
 
-    def _first_privileged(self, rng: Array) -> Array:
+    def _first_privileged(self, rng: Array) -> Float[Array, " privileged"]:
         return self._privileged(self._fresh_world(rng, 1.0)[0])
 
-    def _privileged(self, world: World) -> Array:
+    def _privileged(self, world: World) -> Float[Array, " privileged"]:
         """CG offset, first moment, object mass, error of the believed one; of disturbed worlds the truth as well."""
         offset, mass = self._cg(world.plant, world.load), object_mass(world.plant.time, world.load)
         parts: list[Any] = [jnp.stack([offset, mass * offset, mass, mass - world.load.believed_mass])]
@@ -247,7 +247,7 @@ class CoupledPairEnv(Env):
             parts += [jnp.stack([battery, uncompensated])]
         return jnp.concatenate(parts)
 
-    def _follower_command(self, action: Array, seen: Array) -> Array:
+    def _follower_command(self, action: Float[Array, "3"], seen: Float[Array, "18"]) -> Float[Array, "3"]:
         follower, law = self.config.follower, self.config.leader
         return observation.follower_command(
             action,
@@ -260,7 +260,9 @@ class CoupledPairEnv(Env):
             (law.tilt_limit, law.vertical_limit),
         )
 
-    def _transition(self, before: World, after: World, commands: Commands, terminated: Array) -> rewards.Transition:
+    def _transition(
+        self, before: World, after: World, commands: Commands, terminated: Bool[Array, ""]
+    ) -> rewards.Transition:
         plant = after.plant
         remembers = bool(self.config.follower.observation_averages)
         return rewards.Transition(

@@ -2,44 +2,47 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from mjxball.config import Reward
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+    from mjxball.physics.engine import Array, Scalar, Vector
 
 
 class Transition(NamedTuple):
     """What a reward may depend on: the truth after one control step, and what was commanded in it."""
 
-    error: Array  # (..., 3) e_o, goal less position of O [m]
-    velocity: Array  # (..., 3) of O [m/s]
-    euler: Array  # (..., 3) roll, pitch, yaw [rad]
-    rates: Array  # (..., 3) about the body axes [rad/s]
-    action: Array  # (..., 3) of the network in [-1, 1]
-    last_action: Array  # (..., 3) the one before
-    action_average: Array | None  # (..., 3) over the longest of `follower.observation_averages`; None: there is none
-    leader_command: Array  # (..., 3) roll, pitch [rad], vertical acceleration [m/s2]
-    follower_command: Array  # (..., 3) likewise
-    tilt_disagreement: Array  # (...) follower's less leader's command about the axis that no load turns [rad]
-    ball: Array  # (...) a rolling ball's offset over its end stop's
-    terminated: Array  # (...) bool, whether the episode ended by leaving the termination distance or by diverging
+    error: Vector  # e_o, goal less position of O [m]
+    velocity: Vector  # of O [m/s]
+    euler: Vector  # roll, pitch, yaw [rad]
+    rates: Vector  # about the body axes [rad/s]
+    action: Vector  # of the network in [-1, 1]
+    last_action: Vector  # the one before
+    action_average: Vector | None  # over the longest of `follower.observation_averages`; None: there is none
+    leader_command: Vector  # roll, pitch [rad], vertical acceleration [m/s2]
+    follower_command: Vector  # likewise
+    tilt_disagreement: Scalar  # follower's less leader's command about the axis that no load turns [rad]
+    ball: Scalar  # a rolling ball's offset over its end stop's
+    terminated: Bool[Array, "..."]  # whether the episode ended by leaving the termination distance or by diverging
 
 
-def paper_reward(leader_command: Array, follower_command: Array) -> Array:
-    """-10 (|az_l - az_f| + |phi_l - phi_f| + |theta_l - theta_f|) of two commands (..., 3) -> (...) (the paper's)."""
+def paper_reward(leader_command: Vector, follower_command: Vector) -> Scalar:
+    """-10 (|az_l - az_f| + |phi_l - phi_f| + |theta_l - theta_f|) of two commands (the paper's)."""
     xp = leader_command.__array_namespace__()
     return -10.0 * xp.abs(leader_command - follower_command).sum(axis=-1)
 
 
-def task_reward(weights: Reward, step: Transition) -> Array:
-    """Minus a weighted sum of costs -> (...) (ours); every term but that of `weights.termination`.
+def task_reward(weights: Reward, step: Transition) -> Scalar:
+    """Minus a weighted sum of costs (ours); every term but that of `weights.termination`.
 
     The error's cost is a pseudo-Huber: |e| / scale far away, (e / scale)^2 / 2 near the goal.
     """
     xp = step.error.__array_namespace__()
 
-    def square(vector: Array) -> Array:
+    def square(vector: Float[Array, "... k"]) -> Scalar:
         return (vector * vector).sum(axis=-1)
 
     distance = xp.sqrt(1.0 + square(step.error) / weights.error_scale**2) - 1.0
@@ -60,13 +63,13 @@ def task_reward(weights: Reward, step: Transition) -> Array:
     return total
 
 
-def _used(weight: Array) -> bool:
+def _used(weight: Scalar | float) -> bool:
     """False for a weight of 0; one that a sweep traces may be anything."""
     return not isinstance(weight, (int, float)) or weight != 0
 
 
-def reward(weights: Reward, step: Transition) -> Array:
-    """The reward (...) of `weights.kind`, less the cost of a termination."""
+def reward(weights: Reward, step: Transition) -> Scalar:
+    """The reward of `weights.kind`, less the cost of a termination."""
     xp = step.error.__array_namespace__()
     mimics = weights.kind == "paper"
     earned = paper_reward(step.leader_command, step.follower_command) if mimics else task_reward(weights, step)

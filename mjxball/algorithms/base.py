@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import Array
 
 from mjxball.config import Config
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
 
 
 class Phase(NamedTuple):
     """What the environments are stepped for. Traced, so that one compiled program serves all phases."""
 
-    random: Array  # () act uniformly at random and record, before anything is learnt
-    evaluate: Array  # () act with the policy's mean; nothing is recorded or learnt
+    random: Bool[Array | np.ndarray, ""]  # act uniformly at random and record, before anything is learnt
+    evaluate: Bool[Array | np.ndarray, ""]  # act with the policy's mean; nothing is recorded or learnt
 
     @property
-    def recording(self) -> Array:
-        """() whether what happens is remembered."""
+    def recording(self) -> Bool[Array, ""]:
+        """Whether what happens is remembered."""
         return jnp.logical_not(self.evaluate)
 
     @property
-    def learning(self) -> Array:
-        """() whether the algorithm updates what it has learnt."""
+    def learning(self) -> Bool[Array, ""]:
+        """Whether the algorithm updates what it has learnt."""
         return jnp.logical_not(jnp.logical_or(self.random, self.evaluate))
 
 
@@ -43,12 +46,12 @@ class Policy(NamedTuple):
     """What is exported: a tanh-squashed network of ReLU layers on normalised observations. A pytree of arrays."""
 
     layers: Any  # Flax's {"hidden_0": {"kernel", "bias"}, ...}; the last gives mean and deviation of the action
-    mean: Array  # (n,) of the observations
-    deviation: Array  # (n,)
-    mask: Array  # (n,) 0 for a slot that the policy does not use, else 1
+    mean: Float[Array, " n"]  # of the observations
+    deviation: Float[Array, " n"]
+    mask: Float[Array, " n"]  # 0 for a slot that the policy does not use, else 1
 
-    def __call__(self, observation: Array) -> Array:
-        """Mean action (..., actions) in [-1, 1] at `observation` (..., n)."""
+    def __call__(self, observation: Float[Array, "... n"]) -> Float[Array, "... actions"]:
+        """Mean action in [-1, 1] at `observation`."""
         names = sorted(self.layers, key=lambda name: int(name.rsplit("_", 1)[1]))
         hidden = (observation - self.mean) / self.deviation * self.mask
         for name in names[:-1]:
@@ -79,12 +82,12 @@ class Shards(NamedTuple):
 class Transition(NamedTuple):
     """One step of all environments of a shard, before any of them starts anew."""
 
-    observation: Array  # (envs, n)
-    action: Array  # (envs, actions) in [-1, 1]
-    reward: Array  # (envs,)
-    terminated: Array  # (envs,) 1. if the episode ended other than by the time limit
-    next_observation: Array  # (envs, n)
-    done: Array  # (envs,) 1. if the episode ended
+    observation: Float[Array, "envs n"]
+    action: Float[Array, "envs actions"]  # in [-1, 1]
+    reward: Float[Array, " envs"]
+    terminated: Float[Array, " envs"]  # 1. if the episode ended other than by the time limit
+    next_observation: Float[Array, "envs n"]
+    done: Float[Array, " envs"]  # 1. if the episode ended
 
 
 class Environments(Protocol):
@@ -97,8 +100,8 @@ class Environments(Protocol):
     critic_mask: Any  # (n,) the same for what is needed in training only
     shards: Shards
 
-    def step(self, envs: Any, action: Array, key: Array) -> tuple[Any, Transition]:
-        """Step `envs` with `action` (count, actions); those that end start anew, at states drawn with `key`."""
+    def step(self, envs: Any, action: Float[Array, "envs actions"], key: Array) -> tuple[Any, Transition]:
+        """Step `envs` with `action`; those that end start anew, at states drawn with `key`."""
         ...
 
 
@@ -121,8 +124,10 @@ class Algorithm(Protocol):
         """Step the environments and remember what is to be learnt from: (state, envs)."""
         ...
 
-    def update(self, state: Any, keys: Any, progress: Array, phase: Phase) -> tuple[Any, dict[str, Array]]:
-        """Learn, if `phase.learning`: (state, `metrics`). `progress` () is the share of training done, 0 to 1."""
+    def update(
+        self, state: Any, keys: Any, progress: Float[Array, ""], phase: Phase
+    ) -> tuple[Any, dict[str, Float[Array, ""]]]:
+        """Learn, if `phase.learning`: (state, `metrics`). `progress` is the share of training done, 0 to 1."""
         ...
 
     def policy(self, state: Any) -> Policy:

@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int, UInt
 
 
 class Transitions(NamedTuple):
     """A batch of transitions. `discount` is 0 after a termination (a time limit is none), else gamma^(n-1)."""
 
-    observation: Array  # (..., n)
-    action: Array  # (..., 3) in [-1, 1]
-    reward: Array  # (...)
-    discount: Array  # (...)
-    next_observation: Array  # (..., n), the true one, before any reset
-    last: Array  # (...) 1 if the episode ended here, by termination or time limit
+    observation: Float[Array, "... n"]
+    action: Float[Array, "... actions"]  # in [-1, 1]
+    reward: Float[Array, "..."]
+    discount: Float[Array, "..."]
+    next_observation: Float[Array, "... n"]  # the true one, before any reset
+    last: Float[Array, "..."]  # 1 if the episode ended here, by termination or time limit
 
 
 class Replay(NamedTuple):
     """`rows` holds the capacity and, behind it, one step of scratch rows for steps that are not recorded."""
 
-    rows: Array  # (capacity + worlds, 2 n + 6)
-    inserted: Array  # () transitions ever recorded, folded at twice the capacity
+    rows: Float[Array, "rows width"]  # capacity + environments, 2 n + 6
+    inserted: Int[Array, ""]  # transitions ever recorded, folded at twice the capacity
 
 
 def create(capacity: int, worlds: int, observation_size: int, action_size: int) -> Replay:
@@ -34,7 +36,7 @@ def create(capacity: int, worlds: int, observation_size: int, action_size: int) 
     return Replay(jnp.zeros((capacity + worlds, width), jnp.float32), jnp.zeros((), jnp.int32))
 
 
-def insert(replay: Replay, transitions: Transitions, record: Array) -> Replay:
+def insert(replay: Replay, transitions: Transitions, record: Bool[Array, ""]) -> Replay:
     """Write one step of all worlds (worlds, ...) over the oldest rows, or to scratch unless `record`."""
     columns = [column if column.ndim == 2 else column[:, None] for column in transitions]
     rows = jnp.concatenate(columns, axis=-1)
@@ -49,14 +51,14 @@ def insert(replay: Replay, transitions: Transitions, record: Array) -> Replay:
 
 def sample(
     replay: Replay,
-    draws: Array,
+    draws: UInt[Array, " batch"],
     worlds: int,
     observation_size: int,
     action_size: int,
     steps: int,
-    discount: Array | float,
+    discount: Float[Array, ""] | float,
 ) -> Transitions:
-    """Transitions of up to `steps` steps, one for each of `draws` (batch,), uniform 32-bit numbers, of those recorded.
+    """Transitions of up to `steps` steps, one for each of `draws`, uniform 32-bit numbers, of those recorded.
 
     Rewards are summed with `discount` (gamma) until `steps` or the episode's end, whichever comes first.
     The buffer must hold at least `steps` steps of all worlds.
@@ -90,7 +92,7 @@ def sample(
     )
 
 
-def _unpack(rows: Array, observation_size: int, action_size: int) -> Transitions:
+def _unpack(rows: Float[Array, "batch width"], observation_size: int, action_size: int) -> Transitions:
     n, a = observation_size, action_size
     return Transitions(
         observation=rows[:, :n],

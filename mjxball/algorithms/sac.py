@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax import Array
 
 from mjxball.algorithms import replay
 from mjxball.algorithms.base import Environments, Phase, Policy, Schedule
@@ -18,7 +19,9 @@ from mjxball.config import Config, Sac
 from mjxball.errors import InputError
 from mjxball.quiet import import_brax_training
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
 brax = import_brax_training()
 ADAM = optax.scale_by_adam()
 
@@ -30,7 +33,7 @@ class Learner(NamedTuple):
     critic: Any
     value: Any  # of a state, () unless `state_value`
     target: Any  # slow copy of the critic, or of the value if there is one
-    log_alpha: Array
+    log_alpha: Float[Array, ""]
     policy_adam: Any
     critic_adam: Any
     value_adam: Any
@@ -51,9 +54,9 @@ class Networks(NamedTuple):
 class Losses(NamedTuple):
     """Diagnostics of the last update."""
 
-    critic: Array
-    policy: Array
-    entropy: Array  # of the policy [nat], in [-1, 1] action units
+    critic: Float[Array, ""]
+    policy: Float[Array, ""]
+    entropy: Float[Array, ""]  # of the policy [nat], in [-1, 1] action units
 
 
 def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = None) -> Networks:
@@ -130,11 +133,13 @@ def make_update(
     distribution = networks.parametric_action_distribution
     target_entropy = config.target_entropy * action_size
 
-    def entropy_of(learner: Learner, seen: Array, key: Array) -> Array:
+    def entropy_of(learner: Learner, seen: Float[Array, "batch n"], key: Array) -> Float[Array, ""]:
         parameters = networks.policy_network.apply(learner.normaliser, learner.policy, seen)
         return -jnp.mean(distribution.log_prob(parameters, distribution.sample_no_postprocessing(parameters, key)))
 
-    def value_step(learner: Learner, batch: Any, key: Array, step: Array) -> tuple[Learner, Array]:
+    def value_step(
+        learner: Learner, batch: Any, key: Array, step: Float[Array, ""]
+    ) -> tuple[Learner, Float[Array, ""]]:
         """The paper's eqs. 6 and 7: V follows Q and the entropy, Q follows the reward and the slow V."""
         value_gradient = mean(jax.grad(value_loss)(learner.value, learner, batch, key))
         loss, gradient = jax.value_and_grad(q_loss)(learner.critic, learner, batch)
@@ -144,7 +149,9 @@ def make_update(
         moved = learner._replace(value=value, critic=critic, target=target, value_adam=value_adam, critic_adam=adam)
         return moved, loss
 
-    def critic_step(learner: Learner, batch: Any, key: Array, step: Array) -> tuple[Learner, Array]:
+    def critic_step(
+        learner: Learner, batch: Any, key: Array, step: Float[Array, ""]
+    ) -> tuple[Learner, Float[Array, ""]]:
         alpha = jnp.exp(learner.log_alpha)
         value, gradient = jax.value_and_grad(critic_loss)(
             learner.critic, learner.policy, learner.normaliser, learner.target, alpha, batch, key
@@ -153,7 +160,9 @@ def make_update(
         target = optax.incremental_update(critic, learner.target, config.tau)
         return learner._replace(critic=critic, critic_adam=adam, target=target), value
 
-    def policy_step(before: Learner, learner: Learner, batch: Any, keys: Any, rate: Array) -> tuple[Learner, Losses]:
+    def policy_step(
+        before: Learner, learner: Learner, batch: Any, keys: Any, rate: Float[Array, ""]
+    ) -> tuple[Learner, Losses]:
         """Policy and temperature move against the critic `before` the batch's own critic step, as in Brax."""
         alpha_key, policy_key = keys
         alpha, entropy = jnp.exp(before.log_alpha), mean(entropy_of(before, batch.observation, alpha_key))
@@ -174,7 +183,7 @@ def make_update(
         )
         return moved, Losses(jnp.zeros(()), value, entropy)
 
-    def update(learner: Learner, batch: Transitions, keys: Array, rate: Array) -> tuple[Learner, Losses]:
+    def update(learner: Learner, batch: Transitions, keys: Array, rate: Float[Array, ""]) -> tuple[Learner, Losses]:
         alpha_key, critic_key, policy_key = keys
         transitions = _brax_transitions(batch)
         evaluate = value_step if config.state_value else critic_step
@@ -193,7 +202,7 @@ def make_value_losses(networks: Networks, config: Sac) -> tuple[Any, Any]:
     """
     distribution = networks.parametric_action_distribution
 
-    def value_loss(value: Any, learner: Learner, batch: Any, key: Array) -> Array:
+    def value_loss(value: Any, learner: Learner, batch: Any, key: Array) -> Float[Array, ""]:
         parameters = networks.policy_network.apply(learner.normaliser, learner.policy, batch.observation)
         action = distribution.sample_no_postprocessing(parameters, key)
         log_probability = distribution.log_prob(parameters, action)
@@ -204,7 +213,7 @@ def make_value_losses(networks: Networks, config: Sac) -> tuple[Any, Any]:
             (networks.value_network.apply(learner.normaliser, value, batch.observation) - wanted) ** 2
         )
 
-    def q_loss(critic: Any, learner: Learner, batch: Any) -> Array:
+    def q_loss(critic: Any, learner: Learner, batch: Any) -> Float[Array, ""]:
         q = networks.q_network.apply(learner.normaliser, critic, batch.observation, batch.action)
         after = networks.value_network.apply(learner.normaliser, learner.target, batch.next_observation)
         wanted = batch.reward * config.reward_scale + batch.discount * config.discount * after
@@ -220,7 +229,7 @@ def _clip(gradient: Any, config: Sac) -> Any:
     return optax.clip_by_global_norm(config.max_grad_norm).update(gradient, optax.EmptyState())[0]
 
 
-def _descend(value: Any, gradient: Any, adam: Any, step: Array) -> tuple[Any, Any]:
+def _descend(value: Any, gradient: Any, adam: Any, step: Float[Array, ""]) -> tuple[Any, Any]:
     direction, adam = ADAM.update(gradient, adam)
     return jax.tree.map(lambda v, d: v - step * d, value, direction), adam
 
@@ -289,7 +298,9 @@ class SoftActorCritic:
         buffer = replay.insert(state.replay, transitions, phase.recording)
         return SacState(learner._replace(normaliser=normaliser), buffer), envs
 
-    def _act(self, learner: Learner, observation: Array, keys: Sequence[Array], phase: Phase) -> Array:
+    def _act(
+        self, learner: Learner, observation: Float[Array, "envs n"], keys: Sequence[Array], phase: Phase
+    ) -> Float[Array, "envs actions"]:
         sample_key, random_key = map(self._shards.own, keys)
         policy = jax.tree.map(lambda mean, new: jnp.where(phase.evaluate, mean, new), learner.average, learner.policy)
         parameters = self.networks.policy_network.apply(learner.normaliser, policy, observation)
@@ -300,8 +311,8 @@ class SoftActorCritic:
         return jnp.where(phase.evaluate, distribution.mode(parameters), chosen)
 
     def update(
-        self, state: SacState, keys: Sequence[Array], progress: Array, phase: Phase
-    ) -> tuple[SacState, dict[str, Array]]:
+        self, state: SacState, keys: Sequence[Array], progress: Float[Array, ""], phase: Phase
+    ) -> tuple[SacState, dict[str, Float[Array, ""]]]:
         """`updates_per_step` gradient steps, each on a batch from the replay."""
         sac = self._config
         rate = 1.0 + (sac.learning_rate_end - 1.0) * progress
@@ -310,7 +321,7 @@ class SoftActorCritic:
         draws = jax.random.bits(draws_key, shape, jnp.uint32)
         update_keys = jax.random.split(update_key, (sac.updates_per_step, 3))
 
-        def one(number: Array, carry: tuple[Learner, Losses]) -> tuple[Learner, Losses]:
+        def one(number: Int[Array, ""], carry: tuple[Learner, Losses]) -> tuple[Learner, Losses]:
             batch = replay.sample(
                 state.replay, draws[number], self._environments.count, *self._sizes, sac.n_step, sac.discount
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
 from mjxball.physics import mjx, newton_euler
-from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.engine import Array, Load, PlantState
 from mjxball.physics.step import TRAINING_ENGINES, make_control_step
 from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
@@ -26,24 +26,25 @@ from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.disturbances import Sample, SensorModel, record, sensors_of
 from mjxball.sim.scenario import Scenario, check_scenario
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
 
 
 class Carry(NamedTuple):
     """What flies on from step to step."""
 
     loop: LoopState
-    observation: Array  # (n, 18)
+    observation: Float[Array, "n 18"]
     follower: Any
     running: metrics.RunningMetrics
 
 
 class Inputs(NamedTuple):
-    """What is given to each control step, (count + 1, ...)."""
+    """What is given to each control step."""
 
-    number: Array
-    goals: tuple[Array, Array]  # (count + 1, n, 3) of O at its beginning and at its end [m]
-    force: Array | None  # (count + 1, n, 3) external force on O in it [N]
+    number: Int[Array, "..."]
+    goals: tuple[Float[Array, "... n 3"], Float[Array, "... n 3"]]  # of O at its beginning and at its end [m]
+    force: Float[Array, "... n 3"] | None  # external force on O in it [N]
     sample: Sample  # of the measurement at its end
 
 
@@ -95,7 +96,14 @@ class Batch:
         return self._compiled[key]
 
     def _all(
-        self, loop: ClosedLoop, delays: Array, start: PlantState, load: Load, goal: Array, first: Sample, inputs: Inputs
+        self,
+        loop: ClosedLoop,
+        delays: Int[Array, " n"],
+        start: PlantState,
+        load: Load,
+        goal: Float[Array, "n 3"],
+        first: Sample,
+        inputs: Inputs,
     ) -> metrics.RunningMetrics:
         state, seen = loop.start(start, goal, first, delays)
         running = metrics.begin(start.position, goal, start.rotor_force)

@@ -5,7 +5,7 @@ Importing it needs NumPy alone: the fly runner calls the laws, whoever simulates
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,11 +13,14 @@ from mjxball.config import Config
 from mjxball.control import leader, observation, rotations
 
 if TYPE_CHECKING:
-    from mjxball.physics.engine import Load, PlantState
-    from mjxball.physics.step import ControlStep
-    from mjxball.sim.disturbances import Sample, SensorModel, SensorState
+    from jaxtyping import Bool, Float, Int
 
-Array = Any
+    from mjxball.physics.engine import Array, Load, PlantState, Scalar, Vector
+    from mjxball.physics.step import ControlStep
+    from mjxball.sim.disturbances import Observation, Sample, SensorModel, SensorState
+
+    Integral = Float[Array, "... integrals"]  # 3, or 7 where the follower shares the integrals
+
 # Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
 MAX_LIFT_DIFFERENCE = 1.5
 # A flight beyond one of these has diverged: the physics no longer holds, and no flight came back from there.
@@ -27,46 +30,46 @@ MAX_POSITION, MAX_RATE = 1e3, 50.0  # [m] each coordinate, [rad/s] norm
 class BodyState(NamedTuple):
     """A body put together from an observation; see `Body`."""
 
-    position: Array
-    velocity: Array
-    quaternion: Array
-    rates: Array
+    position: Vector
+    velocity: Vector
+    quaternion: Float[Array, "... 4"]
+    rates: Vector
 
 
 class Body(Protocol):
     """What both drones' laws need of a state: a simulated one, or one that was put together from two drones'."""
 
     @property
-    def position(self) -> Array:
-        """(..., 3) of O in the world [m]."""
+    def position(self) -> Vector:
+        """Of O in the world [m]."""
 
     @property
-    def velocity(self) -> Array:
-        """(..., 3) of O in the world [m/s]."""
+    def velocity(self) -> Vector:
+        """Of O in the world [m/s]."""
 
     @property
-    def quaternion(self) -> Array:
-        """(..., 4) body -> world (w, x, y, z)."""
+    def quaternion(self) -> Float[Array, "... 4"]:
+        """Body -> world (w, x, y, z)."""
 
     @property
-    def rates(self) -> Array:
-        """(..., 3) about the body axes [rad/s]."""
+    def rates(self) -> Vector:
+        """About the body axes [rad/s]."""
 
 
 class Commands(NamedTuple):
     """What both drones are sent: roll, pitch [rad], vertical acceleration [m/s2]."""
 
-    leader: Array  # (..., 3)
-    follower: Array  # (..., 3)
+    leader: Vector
+    follower: Vector
 
 
 class LoopState(NamedTuple):
     """What the closed loop carries from step to step, any batch shape."""
 
     plant: PlantState
-    integral: Array  # (..., 3 or 7), see `ClosedLoop`
+    integral: Integral
     sensors: SensorState
-    diverged: Array  # (...) bool; a plant that diverged stays as it was
+    diverged: Bool[Array, "..."]  # a plant that diverged stays as it was
 
 
 class ClosedLoop:
@@ -103,11 +106,16 @@ class ClosedLoop:
         self._leader_mount, self._follower_mount = config.plant.leader_mount, config.plant.follower_mount
 
     def start(
-        self, plant: PlantState, goal: Array, sample: Sample, delay: Array = 0, integral: Array | None = None
-    ) -> tuple[LoopState, Array]:
-        """(state, observation (..., 18)) before the first step at `plant`; `integral`: None for none yet.
+        self,
+        plant: PlantState,
+        goal: Vector,
+        sample: Sample,
+        delay: Int[Array, "..."] | int = 0,
+        integral: Integral | None = None,
+    ) -> tuple[LoopState, Observation]:
+        """(state, observation) before the first step at `plant`; `integral`: None for none yet.
 
-        `goal` of O (..., 3) [m]; `delay` (...) of the measurements in control steps.
+        `goal` of O [m]; `delay` (...) of the measurements in control steps.
         """
         assert self._sensors is not None, "a ClosedLoop without sensors has the laws alone"
         sensors, seen = self._sensors.start(self.observe(plant, goal), sample, delay)
@@ -117,16 +125,16 @@ class ClosedLoop:
     def step(
         self,
         state: LoopState,
-        seen: Array,
-        follower: Array,
+        seen: Observation,
+        follower: Vector,
         load: Load,
-        goals: tuple[Array, Array],
+        goals: tuple[Vector, Vector],
         sample: Sample,
-        shares: Array = 1.0,
-    ) -> tuple[LoopState, Array, Commands]:
+        shares: Scalar | float = 1.0,
+    ) -> tuple[LoopState, Observation, Commands]:
         """One control period: (state, observation at its end, commands); arguments as of its three parts.
 
-        `goals`: of O (..., 3) at its beginning and at its end [m]. `load` with the external force that acts in it.
+        `goals`: of O at its beginning and at its end [m]. `load` with the external force that acts in it.
         """
         commands = self.commands(state, seen, follower, goals[0], shares)
         plant = self.physics(state.plant, self.stack(commands), load)
@@ -139,12 +147,14 @@ class ClosedLoop:
         return self._physics
 
     @staticmethod
-    def stack(commands: Commands) -> Array:
+    def stack(commands: Commands) -> Float[Array, "... 2 3"]:
         """Both commands as the physics takes them (..., 2, 3)."""
         return commands.leader.__array_namespace__().stack(commands, axis=-2)
 
-    def commands(self, state: LoopState, seen: Array, follower: Array, goal: Array, shares: Array = 1.0) -> Commands:
-        """Both commands at the observation `seen` (..., 18), which the follower's law answers with `follower` (..., 3).
+    def commands(
+        self, state: LoopState, seen: Observation, follower: Vector, goal: Vector, shares: Scalar | float = 1.0
+    ) -> Commands:
+        """Both commands at the observation `seen`, which the follower's law answers with `follower`.
 
         `shares` (...): 1 for a follower that shares the integrals, a network; 0 for one with a law of its own.
         """
@@ -157,13 +167,13 @@ class ClosedLoop:
     def after_physics(
         self,
         state: LoopState,
-        seen: Array,
+        seen: Observation,
         commands: Commands,
         plant: PlantState,
-        goals: tuple[Array, Array],
+        goals: tuple[Vector, Vector],
         sample: Sample,
-        shares: Array = 1.0,
-    ) -> tuple[LoopState, Array]:
+        shares: Scalar | float = 1.0,
+    ) -> tuple[LoopState, Observation]:
         """(state, observation) once the physics has brought the plant of `state` to `plant`."""
         assert self._sensors is not None, "a ClosedLoop without sensors has the laws alone"
         diverged = state.diverged | has_diverged(plant)
@@ -174,11 +184,11 @@ class ClosedLoop:
         sensors, seen = self._sensors.step(state.sensors, self.observe(plant, goals[1]), sample)
         return LoopState(plant, integral, sensors, diverged), seen
 
-    def _leader_sees(self, state: LoopState, seen: Array, goal: Array) -> Body:
+    def _leader_sees(self, state: LoopState, seen: Observation, goal: Vector) -> Body:
         return self.body_from_observation(seen, goal) if self._leader_measures else state.plant
 
-    def observe(self, state: Body, goal: Array) -> Array:
-        """The follower's observation (..., 18); `goal` of O (..., 3)."""
+    def observe(self, state: Body, goal: Vector) -> Observation:
+        """The follower's observation; `goal` of O."""
         xp = state.position.__array_namespace__()
         state, goal = self._unlocked(state), self._freed(goal)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
@@ -193,8 +203,8 @@ class ClosedLoop:
             return seen
         return xp.concat([seen[..., : observation.ERROR.start], *self._own_error(state, goal)], axis=-1)
 
-    def body_from_observation(self, seen: Array, goal: Array) -> BodyState:
-        """The body that the observation `seen` (..., 18) tells of, e_o or e_l in it; `goal` of O (..., 3)."""
+    def body_from_observation(self, seen: Observation, goal: Vector) -> BodyState:
+        """The body that the observation `seen` tells of, e_o or e_l in it; `goal` of O."""
         euler, rates = seen[..., 3:6], seen[..., 9:12]
         position = self._freed(goal) - seen[..., observation.ERROR]
         quaternion = rotations.quaternion_from_euler(euler)
@@ -205,8 +215,8 @@ class ClosedLoop:
             position, velocity = self._freed(position + mount - arm), self._freed(velocity - sweep)
         return BodyState(position, velocity, quaternion, rates)
 
-    def leader_error(self, state: Body, goal: Array) -> tuple[Array, Array]:
-        """(error, its rate) (..., 3) on which the leader flies."""
+    def leader_error(self, state: Body, goal: Vector) -> tuple[Vector, Vector]:
+        """(error, its rate) on which the leader flies."""
         if self._free is not None:
             state, goal = self._unlocked(state), self._freed(goal)
         if self._law.error == "object":
@@ -214,25 +224,25 @@ class ClosedLoop:
         error, rate = self._own_error(state, goal)
         return self._freed(error), self._freed(rate)
 
-    def zero_integral(self, position: Array) -> Array:
-        """The integral before a flight that begins at `position` (..., 3)."""
+    def zero_integral(self, position: Vector) -> Integral:
+        """The integral before a flight that begins at `position`."""
         xp = position.__array_namespace__()
         still = xp.zeros_like(position)
         return xp.concat([still, still[..., :1], still], axis=-1) if self._shares else still
 
     def integrate(
         self,
-        integral: Array,
+        integral: Integral,
         state: Body,
-        goal: Array,
+        goal: Vector,
         period: float,
-        shares: Array | None = None,
-        followed: Array | None = None,
-    ) -> Array:
+        shares: Float[Array, "... 1"] | None = None,
+        followed: Vector | None = None,
+    ) -> Integral:
         """`integral` one `period` [s] on, in which its error was that at `state`.
 
-        `shares` (..., 1), if given: 1 where the follower shares it, 0 where it flies a law of its own. `followed`
-        (..., 3): the command that a network's follower flew.
+        `shares`, if given: 1 where the follower shares it, 0 where it flies a law of its own. `followed`: the command
+        that a network's follower flew.
         """
         xp = goal.__array_namespace__()
         band = xp.asarray(self._law.integral_band, dtype=goal.dtype)
@@ -256,13 +266,13 @@ class ClosedLoop:
             level, average = level * shares, average * shares
         return xp.concat([own, level, average], axis=-1)
 
-    def leader_command(self, state: Body, goal: Array, integral: Array) -> Array:
-        """The leader's command (..., 3) at `state`; `integral` of its error so far, see `ClosedLoop`."""
+    def leader_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
+        """The leader's command at `state`; `integral` of its error so far, see `ClosedLoop`."""
         wanted = self._wanted(state, goal, integral)
         return wanted if not self._shares else self._clipped(self._lifted(wanted, integral, self._apart))
 
-    def follower_command(self, command: Array, integral: Array) -> Array:
-        """A network's `command` (..., 3), which holds the PD law, with its share of the integrals if it shares them."""
+    def follower_command(self, command: Vector, integral: Integral) -> Vector:
+        """A network's `command`, which holds the PD law, with its share of the integrals if it shares them."""
         if not self._shares:
             return command
         xp, law = command.__array_namespace__(), self._law
@@ -270,22 +280,22 @@ class ClosedLoop:
         more = leader.command(ki * integral[..., :3], 0.0, self._gravity, law.tilt_limit, law.vertical_limit)
         return self._clipped(self._lifted(command + more - integral[..., 4:], integral, -self._apart))
 
-    def _wanted(self, state: Body, goal: Array, integral: Array) -> Array:
+    def _wanted(self, state: Body, goal: Vector, integral: Integral) -> Vector:
         xp, law = goal.__array_namespace__(), self._law
         gains = (xp.asarray(gain, dtype=goal.dtype) for gain in (law.kp, law.kd, law.ki))
         wanted = leader.desired_acceleration(*self.leader_error(state, goal), integral[..., :3], *gains)
         return leader.command(wanted, 0.0, self._gravity, law.tilt_limit, law.vertical_limit)
 
-    def _lifted(self, command: Array, integral: Array, side: float) -> Array:
+    def _lifted(self, command: Vector, integral: Integral, side: float) -> Vector:
         """`command` with what this drone lifts more than the other to turn the stick."""
         xp = command.__array_namespace__()
         return xp.concat([command[..., :2], command[..., 2:] + side * self._level * integral[..., 3:4]], axis=-1)
 
-    def _clipped(self, command: Array) -> Array:
+    def _clipped(self, command: Vector) -> Vector:
         return leader.clip_command(command, self._law.tilt_limit, self._law.vertical_limit)
 
-    def _freed(self, vector: Array) -> Array:
-        """`vector` (..., 3) in the world without what the stand locks."""
+    def _freed(self, vector: Vector) -> Vector:
+        """`vector` in the world without what the stand locks."""
         if self._free is None:
             return vector
         return vector * vector.__array_namespace__().asarray(self._free, dtype=vector.dtype)
@@ -300,21 +310,21 @@ class ClosedLoop:
         quaternion = rotations.quaternion_from_euler(euler * rolls)
         return BodyState(self._freed(state.position), self._freed(state.velocity), quaternion, state.rates * rolls)
 
-    def _own_error(self, state: Body, goal: Array) -> tuple[Array, Array]:
-        """e_l = goal + mount - p_l (..., 3) and its rate: 0 where the object is level and at its goal (paper, V-B)."""
+    def _own_error(self, state: Body, goal: Vector) -> tuple[Vector, Vector]:
+        """e_l = goal + mount - p_l and its rate: 0 where the object is level and at its goal (paper, V-B)."""
         xp = goal.__array_namespace__()
         mount = xp.asarray(self._leader_mount, dtype=goal.dtype)
         arm, sweep = self._swept(state.quaternion, state.rates, goal)
         return goal + mount - state.position - arm, -state.velocity - sweep
 
-    def _swept(self, quaternion: Array, rates: Array, like: Array) -> tuple[Array, Array]:
-        """The leader's mount from O in the world (..., 3) and how fast it moves about it."""
+    def _swept(self, quaternion: Float[Array, "... 4"], rates: Vector, like: Array) -> tuple[Vector, Vector]:
+        """The leader's mount from O in the world and how fast it moves about it."""
         mount = like.__array_namespace__().asarray(self._leader_mount, dtype=like.dtype)
         matrix = rotations.matrix_from_quaternion(quaternion)
         return rotations.rotate(matrix, mount), rotations.rotate(matrix, rotations.cross(rates, mount))
 
 
-def has_diverged(plant: PlantState) -> Array:
+def has_diverged(plant: PlantState) -> Bool[Array, "..."]:
     """(...) true where a value of `plant` is not finite, or position or rates are beyond what the physics is for."""
     xp, batch = plant.position.__array_namespace__(), plant.position.ndim - 1
     with np.errstate(invalid="ignore", over="ignore"):
@@ -326,7 +336,7 @@ def has_diverged(plant: PlantState) -> Array:
     return far
 
 
-def _where(diverged: Array, old: Array, new: Array) -> Array:
+def _where(diverged: Bool[Array, "..."], old: Array, new: Array) -> Array:
     """`old` (..., k) where `diverged` (...), else `new`."""
     xp = new.__array_namespace__()
     return xp.where(xp.reshape(diverged, diverged.shape + (1,) * (new.ndim - diverged.ndim)), old, new)

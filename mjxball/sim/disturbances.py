@@ -11,13 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mjxball.config import Config
 from mjxball.control.observation import ERROR, ERROR_RATE, OBSERVATION_SIZE
 from mjxball.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+    from mjxball.physics.engine import Array, Vector
+
+    Observation = Float[Array, "... 18"]
 
 # Standard deviation of each observation slot at noise level 1: motion capture and a small drone's inertial sensors.
 NOISE = np.array([*[0.003] * 3, *[0.005] * 3, *[0.02] * 3, *[0.02] * 3, *[0.003] * 3, *[0.02] * 3])
@@ -27,7 +34,6 @@ DRIFT = np.array([*[1e-3] * 3, *[1e-3] * 3, *[4e-3] * 3, *[0.0] * 3, *[1e-3] * 3
 DRIFT_TIME = 1.0  # [s] over which it is correlated
 # Resolution of each slot in a Crazyflie's compressed state: 1 mm, 1 mm/s, 1 mrad/s, a quaternion in 32 bits.
 RESOLUTION = np.array([*[1e-3] * 3, *[2.8e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3, *[1e-3] * 3])
-Array = Any
 Vector3 = tuple[float, float, float]
 
 
@@ -63,9 +69,9 @@ def check_disturbance(disturbance: Disturbance, period: float) -> None:
 class Sample(NamedTuple):
     """Disturbances of one control step, or with a leading axis of all steps of a flight. The default is nothing."""
 
-    errors: tuple[Array, ...] = ()  # (..., 18) each, added to what is measured in this order
-    received: Array | None = None  # (...) whether a relayed message arrives; None: always
-    force: Array | None = None  # (..., 3) external force on O in the world until the next step [N]; None: none
+    errors: tuple[Observation, ...] = ()  # added to what is measured in this order
+    received: Bool[Array, "..."] | None = None  # whether a relayed message arrives; None: always
+    force: Vector | None = None  # external force on O in the world until the next step [N]; None: none
 
     def at(self, number: int | slice) -> Sample:
         """Step `number` of a flight, or a slice of its steps."""
@@ -86,11 +92,13 @@ class SensorModel:
     """From the true observation to the one that the follower sees. Any batch shape, NumPy and JAX arrays."""
 
     longest_delay: int = 0  # control steps
-    relay_bias: np.ndarray | None = None  # (..., 3) added to the object error [m]
-    quantized: np.ndarray | bool = False  # (..., 1) whether measurements have the resolution `RESOLUTION`
+    relay_bias: Float[np.ndarray, "... 3"] | None = None  # added to the object error [m]
+    quantized: Bool[np.ndarray, "... 1"] | bool = False  # whether measurements have the resolution `RESOLUTION`
 
-    def start(self, truth: Array, sample: Sample, delay: Array = 0) -> tuple[SensorState, Array]:
-        """(state, observation) at the first step, where the truth is `truth` (..., 18) and has always been so."""
+    def start(
+        self, truth: Observation, sample: Sample, delay: Int[Array, "..."] | int = 0
+    ) -> tuple[SensorState, Observation]:
+        """(state, observation) at the first step, where the truth is `truth` and has always been so."""
         xp = truth.__array_namespace__()
         measured, relayed = self._measure(truth, sample._replace(received=None), ())
         relayed = () if sample.received is None else relayed
@@ -99,8 +107,8 @@ class SensorModel:
         past = xp.broadcast_to(measured, (self.longest_delay + 1, *measured.shape))
         return SensorState(delay, relayed, past), measured
 
-    def step(self, state: SensorState, truth: Array, sample: Sample) -> tuple[SensorState, Array]:
-        """(state, observation) one control step on, where the truth is `truth` (..., 18)."""
+    def step(self, state: SensorState, truth: Observation, sample: Sample) -> tuple[SensorState, Observation]:
+        """(state, observation) one control step on, where the truth is `truth`."""
         xp = truth.__array_namespace__()
         measured, relayed = self._measure(truth, sample, state.relayed)
         relayed = () if sample.received is None else relayed
@@ -109,8 +117,8 @@ class SensorModel:
         past = xp.concat([measured[None], state.past[:-1]], axis=0)
         return SensorState(state.delay, relayed, past), past[(state.delay, *np.indices(truth.shape[:-1]))]
 
-    def _measure(self, truth: Array, sample: Sample, held: Any) -> tuple[Array, Array]:
-        """(what is measured now (..., 18), its object part (..., 6) before it is quantized)."""
+    def _measure(self, truth: Observation, sample: Sample, held: Any) -> tuple[Observation, Float[Array, "... 6"]]:
+        """(what is measured now, its object part (..., 6) before it is quantized)."""
         xp = truth.__array_namespace__()
         for error in sample.errors:
             truth = truth + error
@@ -126,15 +134,15 @@ class SensorModel:
         return truth, relayed
 
 
-def quantize(observation: Array) -> Array:
-    """`observation` (..., 18) rounded to the resolution in which a Crazyflie sends it."""
+def quantize(observation: Observation) -> Observation:
+    """`observation` rounded to the resolution in which a Crazyflie sends it."""
     xp = observation.__array_namespace__()
     steps = xp.asarray(RESOLUTION, dtype=observation.dtype)
     return xp.round(observation / steps) * steps
 
 
-def sensors_of(disturbances: Sequence[Disturbance], period: float) -> tuple[SensorModel, np.ndarray]:
-    """(sensors of n flights, delay of each (n,) in control steps)."""
+def sensors_of(disturbances: Sequence[Disturbance], period: float) -> tuple[SensorModel, Int[np.ndarray, " n"]]:
+    """(sensors of n flights, delay of each in control steps)."""
     delays = np.array([round(disturbance.delay / period) for disturbance in disturbances])
     bias = np.array([disturbance.relay_bias for disturbance in disturbances])
     quantized = np.array([[disturbance.quantize] for disturbance in disturbances])
@@ -165,8 +173,8 @@ def _random(disturbance: Disturbance, stream: int) -> np.random.Generator:
     return np.random.default_rng([disturbance.seed, stream])
 
 
-def _errors(disturbance: Disturbance, count: int, period: float) -> np.ndarray | None:
-    """Noise and estimator drift (count, 18)."""
+def _errors(disturbance: Disturbance, count: int, period: float) -> Float[np.ndarray, "count 18"] | None:
+    """Noise and estimator drift."""
     if not (disturbance.noise or disturbance.estimator_drift):
         return None
     drawn = _random(disturbance, 1).standard_normal((count, OBSERVATION_SIZE), np.float32)
@@ -177,8 +185,8 @@ def _errors(disturbance: Disturbance, count: int, period: float) -> np.ndarray |
     return white + (disturbance.estimator_drift * DRIFT * slow).astype(np.float32)
 
 
-def _received(disturbance: Disturbance, count: int, period: float) -> np.ndarray | None:
-    """True at the steps (count,) where a relayed message arrives; the first one always does."""
+def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.ndarray, " count"] | None:
+    """True at the steps where a relayed message arrives; the first one always does."""
     if not disturbance.relay_rate:
         return None
     sent = np.floor(np.arange(count) * period * disturbance.relay_rate + 1e-9)
@@ -188,15 +196,15 @@ def _received(disturbance: Disturbance, count: int, period: float) -> np.ndarray
     return arrives
 
 
-def _gusts(disturbance: Disturbance, count: int, period: float) -> np.ndarray | None:
-    """A first-order Gauss-Markov force (count, 3) [N] that starts in its steady state."""
+def _gusts(disturbance: Disturbance, count: int, period: float) -> Float[np.ndarray, "count 3"] | None:
+    """A first-order Gauss-Markov force [N] that starts in its steady state."""
     if not disturbance.gust:
         return None
     return disturbance.gust * _gauss_markov(_random(disturbance, 3).standard_normal((count, 3)), period / GUST_TIME)
 
 
-def _gauss_markov(drawn: np.ndarray, share: float) -> np.ndarray:
-    """First-order Gauss-Markov process of deviation 1 from white `drawn` (count, ...); `share` of its time a step."""
+def _gauss_markov(drawn: Float[np.ndarray, "count slots"], share: float) -> Float[np.ndarray, "count slots"]:
+    """First-order Gauss-Markov process of deviation 1 from white `drawn`; `share` of its time a step."""
     keep = math.exp(-share)
     slow = np.empty_like(drawn)
     slow[0] = drawn[0]
@@ -209,10 +217,10 @@ class RandomState(NamedTuple):
     """What one world's random disturbances carry from step to step."""
 
     key: Array
-    noise: Array  # () level, in units of `NOISE`
-    delay: Array  # () whole control steps
-    gust: Array  # () rms of each axis of `force` [N]
-    force: Array  # (3,) external force on O in the world, now [N]
+    noise: Float[Array, ""]  # level, in units of `NOISE`
+    delay: Int[Array, ""]  # whole control steps
+    gust: Float[Array, ""]  # rms of each axis of `force` [N]
+    force: Float[Array, "3"]  # external force on O in the world, now [N]
     drift: Any = ()  # (18,) slow error, now; () if there is none
     drift_level: Any = ()  # () in units of `DRIFT`
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,12 @@ from mjxball.control.constants import plant_constants, trim_limit
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import start_state
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+    from mjxball.physics.engine import Array, Scalar, Vector
+
+
 DRAWS = 18  # random numbers of a reset
 COMMAND_SHARE = 0.85  # share of the leader's vertical limit that a hover may take
 CANDIDATES = 8  # drives (battery, thrust of each drone) from which a world takes the first that can be flown
@@ -49,7 +54,7 @@ class ResetDistribution:
         self._drones = np.asarray(config.plant.leader_inertia) + config.plant.follower_inertia
         self._object = constants.object_inertia_per_mass
 
-    def draw(self, rng: Array, difficulty: Array | float = 1.0) -> tuple[Load, PlantState, Array]:
+    def draw(self, rng: Array, difficulty: Scalar | float = 1.0) -> tuple[Load, PlantState, Vector]:
         """(load, plant at rest or nearly so, goal (3,) of O [m]).
 
         `difficulty` () in [0, 1]: the lower share of the ranges of the CG's amplitude and speed, which is drawn from.
@@ -58,10 +63,10 @@ class ResetDistribution:
         # One draw for everything: a reset runs beside every training step, and each draw is kernels to launch.
         drawn = iter(jnp.split(jax.random.uniform(rng, (DRAWS,)), DRAWS))
 
-        def between(low: float, high: Array | float) -> Array:
+        def between(low: float, high: Scalar | float) -> Scalar:
             return low + (high - low) * next(drawn)[0]
 
-        def symmetric(limit: float, size: int = 3) -> Array:
+        def symmetric(limit: float, size: int = 3) -> Float[Array, " size"]:
             return limit * (2.0 * jnp.concatenate([next(drawn) for _ in range(size)]) - 1.0)
 
         mass = between(*scenario.object_mass)
@@ -93,7 +98,7 @@ class ResetDistribution:
         )
         return load, plant, symmetric(scenario.goal_range)
 
-    def trimmed(self, load: Load) -> Array:
+    def trimmed(self, load: Load) -> Scalar:
         """CG amplitude that can be trimmed before and after the mass changes [m]; negative: none."""
         masses = (load.object_mass, load.object_mass + load.mass_change[0])
         if self.powered:
@@ -127,14 +132,16 @@ class ResetDistribution:
             load = jax.tree.map(functools.partial(jnp.where, self.trimmed(load) < 0), milder, load)
         return load
 
-    def _powered_trim_limit(self, load: Load, mass: Array) -> Array:
+    def _powered_trim_limit(self, load: Load, mass: Scalar) -> Scalar:
         """As `trimmed` for drones that can be flown: one's rotors, and what one lifts more and the other less."""
         plant = self.config.plant
         weakest = 1.0 if load.thrust_scale is None else jnp.minimum(load.thrust_scale[0], load.thrust_scale[1])
         apart = LIFT * (plant.leader_mass + plant.follower_mass + mass) * self._lever if self._levels else 0.0
         return trim_limit(plant, mass, self.config.scenario.trim_margin, None, (1.0, weakest)) + apart / mass
 
-    def draw_drives(self, load: Load, key: Array, count: int = CANDIDATES) -> tuple[Array, Array, Array, Array]:
+    def draw_drives(
+        self, load: Load, key: Array, count: int = CANDIDATES
+    ) -> tuple[Float[Array, " count"], Float[Array, " count"], Float[Array, "count 2"], Bool[Array, " count"]]:
         """(battery [V], 1 for an older firmware, thrust factors (.., 2), whether it can be flown), (count,) of each."""
         scenario, share = self.config.scenario, jax.random.uniform(key, (5, count))
         each = (scenario.thrust_scale, scenario.thrust_scale)
@@ -146,7 +153,13 @@ class ResetDistribution:
         scale = (common * jnp.stack([leader, follower])).T
         return battery, uncompensated, scale, self.flyable(load.object_mass, battery, uncompensated, scale)
 
-    def flyable(self, object_mass: Array, battery: Array, uncompensated: Array, scale: Array) -> Array:
+    def flyable(
+        self,
+        object_mass: Scalar,
+        battery: Float[Array, " n"],
+        uncompensated: Float[Array, " n"],
+        scale: Float[Array, "n 2"],
+    ) -> Bool[Array, " n"]:
         """(n,) whether both drones lift their share of the weight with room to command and to turn the stick."""
         law, motor = self.config.autopilot, self._motor
         most, cap = (motors.force(motor, jnp.full_like(battery, pwm), battery) for pwm in (crazyflie.FULL, CEILING))
@@ -159,7 +172,13 @@ class ResetDistribution:
         command = jnp.abs(self.hover_commands(object_mass, battery, uncompensated, scale))
         return (enough & (command < COMMAND_SHARE * self.config.leader.vertical_limit)).all(axis=-1)
 
-    def hover_commands(self, object_mass: Array, battery: Array, uncompensated: Array, scale: Array) -> Array:
+    def hover_commands(
+        self,
+        object_mass: Scalar,
+        battery: Float[Array, " n"],
+        uncompensated: Float[Array, " n"],
+        scale: Float[Array, "n 2"],
+    ) -> Float[Array, "n 2"]:
         """(n, 2) vertical acceleration that each drone has to be told so that it hovers its share [m/s2]."""
         carried = jnp.asarray(self._constants.drone_mass) + jnp.asarray(self._constants.share) * object_mass
         believed = jnp.asarray(self._constants.drone_mass) + jnp.asarray(self._constants.share) * (
@@ -172,11 +191,11 @@ class ResetDistribution:
         asked = jnp.where(uncompensated[:, None] > 0, crazyflie.motor_force(plain, pwm), force)
         return 4 * asked / believed - gravity
 
-    def initial_integrals(self, load: Load, key: Array) -> Array:
+    def initial_integrals(self, load: Load, key: Array) -> Float[Array, "7"]:
         """(7,) integrals (see `ClosedLoop`) with which a world begins, in the air: nearly those that hover it."""
         law = self.config.leader
-        battery: Array = load.battery
-        uncompensated: Array = load.uncompensated
+        battery: Scalar = load.battery
+        uncompensated: Scalar = load.uncompensated
         scale: Array = load.thrust_scale
         command = self.hover_commands(load.object_mass, battery[None], uncompensated[None], scale[None])[0]
         share = jax.random.uniform(key, (2,), minval=0.6, maxval=1.1)
@@ -205,7 +224,7 @@ class ResetDistribution:
         return load._replace(cg_path=places, follows_path=visits.astype(jnp.float32))
 
 
-def shortened(ends: tuple[float, float], share: Array | float) -> tuple[float, Array | float]:
+def shortened(ends: tuple[float, float], share: Scalar | float) -> tuple[float, Scalar | float]:
     """The lower `share` () of the range between `ends`."""
     low, high = ends
     return low, high if isinstance(share, float) and share == 1.0 else low + share * (high - low)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,9 @@ from mjxball.sim.closed_loop import ClosedLoop
 from mjxball.sim.disturbances import record, sensors_of
 from mjxball.sim.scenario import Scenario, check_scenario
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
 Act = Callable[[np.ndarray, PrivilegedInfo], np.ndarray]  # observations (n, 18), what is known -> commands (n, 3)
 
 Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with the scenarios that it flies
@@ -39,16 +41,16 @@ class Tick(NamedTuple):
     """One control step of n flights: what `Trajectory` holds for every step, without the contact wrenches."""
 
     time: float  # [s]
-    position: np.ndarray  # (n, 3) of O in the world [m]
-    target: np.ndarray  # (n, 3) goal of O [m]
-    euler: np.ndarray  # (n, 3) roll, pitch, yaw [rad]
-    rotor_force: np.ndarray  # (n, 2, 4) leader, follower [N]
-    leader_command: np.ndarray  # (n, 3) roll, pitch [rad], vertical acceleration [m/s2]
-    follower_command: np.ndarray  # (n, 3) likewise
-    diverged: np.ndarray  # (n,) bool
+    position: Float[np.ndarray, "n 3"]  # of O in the world [m]
+    target: Float[np.ndarray, "n 3"]  # goal of O [m]
+    euler: Float[np.ndarray, "n 3"]  # roll, pitch, yaw [rad]
+    rotor_force: Float[np.ndarray, "n 2 4"]  # leader, follower [N]
+    leader_command: Float[np.ndarray, "n 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
+    follower_command: Float[np.ndarray, "n 3"]  # likewise
+    diverged: Bool[np.ndarray, " n"]
     state: PlantState | None = None
-    observation: np.ndarray | None = None  # (n, 18)
-    cg_offset: np.ndarray | None = None  # (n,) [m]
+    observation: Float[np.ndarray, "n 18"] | None = None
+    cg_offset: Float[np.ndarray, " n"] | None = None  # [m]
 
 
 @dataclass(frozen=True)
@@ -59,27 +61,27 @@ class Trajectory:
     rate beyond any bound, or a value that is not finite) is frozen there and marked in `diverged`.
     """
 
-    time: np.ndarray  # (T,) [s]
-    position: np.ndarray  # (T, ..., 3) of O in the world [m]
-    velocity: np.ndarray  # (T, ..., 3) of O in the world [m/s]
-    euler: np.ndarray  # (T, ..., 3) roll, pitch, yaw [rad]
-    rates: np.ndarray  # (T, ..., 3) body rates [rad/s]
-    quaternion: np.ndarray  # (T, ..., 4) body -> world (w, x, y, z)
-    rotor_force: np.ndarray  # (T, ..., 2, 4) leader, follower [N]
-    leader_command: np.ndarray  # (T, ..., 3) roll, pitch [rad], vertical acceleration [m/s2]
-    follower_command: np.ndarray  # (T, ..., 3) likewise
-    observation: np.ndarray  # (T, ..., 18) what the follower saw
-    cg_offset: np.ndarray  # (T, ...) along the CG axis from O [m]
-    object_mass: np.ndarray  # (T, ...) [kg]
-    contact_force: np.ndarray  # (T, ..., 2, 3) of leader, follower on the object, body axes [N]
-    contact_torque: np.ndarray  # (T, ..., 2, 3) likewise, about each drone's centre [N m]
-    goal: np.ndarray  # (..., 3) of O, the last one of a sequence of waypoints [m]
-    target: np.ndarray  # (T, ..., 3) goal of O at every step [m]
-    diverged: np.ndarray  # (...) bool
+    time: Float[np.ndarray, " T"]  # [s]
+    position: Float[np.ndarray, "T ... 3"]  # of O in the world [m]
+    velocity: Float[np.ndarray, "T ... 3"]  # of O in the world [m/s]
+    euler: Float[np.ndarray, "T ... 3"]  # roll, pitch, yaw [rad]
+    rates: Float[np.ndarray, "T ... 3"]  # body rates [rad/s]
+    quaternion: Float[np.ndarray, "T ... 4"]  # body -> world (w, x, y, z)
+    rotor_force: Float[np.ndarray, "T ... 2 4"]  # leader, follower [N]
+    leader_command: Float[np.ndarray, "T ... 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
+    follower_command: Float[np.ndarray, "T ... 3"]  # likewise
+    observation: Float[np.ndarray, "T ... 18"]  # what the follower saw
+    cg_offset: Float[np.ndarray, "T ..."]  # along the CG axis from O [m]
+    object_mass: Float[np.ndarray, "T ..."]  # [kg]
+    contact_force: Float[np.ndarray, "T ... 2 3"]  # of leader, follower on the object, body axes [N]
+    contact_torque: Float[np.ndarray, "T ... 2 3"]  # likewise, about each drone's centre [N m]
+    goal: Float[np.ndarray, "... 3"]  # of O, the last one of a sequence of waypoints [m]
+    target: Float[np.ndarray, "T ... 3"]  # goal of O at every step [m]
+    diverged: Bool[np.ndarray, "..."]
 
     @property
-    def error(self) -> np.ndarray:
-        """e_o = target - position (T, ..., 3) [m]."""
+    def error(self) -> Float[np.ndarray, "T ... 3"]:
+        """e_o = target - position [m]."""
         return self.target - self.position
 
     def tick(self, number: int) -> Tick:
@@ -160,17 +162,17 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     return scenarios, act
 
 
-def shares_of(flights: Flights) -> np.ndarray:
-    """(n,) 1.0 for every flight whose follower's base is the leader's whole PID law: a policy, not a baseline."""
+def shares_of(flights: Flights) -> Float[np.ndarray, " n"]:
+    """1.0 for every flight whose follower's base is the leader's whole PID law: a policy, not a baseline."""
     return np.array([0.0 if isinstance(follower, Baseline) else 1.0 for follower, part in flights for _ in part])
 
 
 def fly(
-    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, shares: np.ndarray | None = None
+    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, shares: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[Tick]:
     """Every control step of all scenarios at once, the start first; `act` is the followers' laws.
 
-    `shares` (n,) as from `shares_of`; None: all of them policies.
+    `shares` as from `shares_of`; None: all of them policies.
     """
     shares = np.ones(len(scenarios)) if shares is None else shares
     cg_offset, brief, period = make_cg_offset(config), make_brief(config), config.timing.control_period
@@ -194,7 +196,9 @@ def fly(
             state, seen = loop.after_physics(state, seen, commands, moved, goals, samples.at(number + 1), shares)
 
 
-def _record(config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, shares: np.ndarray) -> Trajectory:
+def _record(
+    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, shares: Float[np.ndarray, " n"]
+) -> Trajectory:
     ticks = list(fly(config, scenarios, act, physics, shares))
     grid = np.array([tick.time for tick in ticks])
     load, count = load_of(scenarios), len(ticks)
@@ -254,8 +258,8 @@ def make_brief(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
 
 def flown_contact_wrenches(
     config: Config, flown: PlantState, load: Load, physics: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """Contact forces and torques (T, n, 2, 3) of recorded states (T, n, ...), see `physics.engine.contact_wrenches`.
+) -> tuple[Float[np.ndarray, "T n 2 3"], Float[np.ndarray, "T n 2 3"]]:
+    """Contact forces and torques of recorded states (T, n, ...), see `physics.engine.contact_wrenches`.
 
     `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with a push, share the closed form.
     """
@@ -272,8 +276,8 @@ def flown_contact_wrenches(
     return contact_wrenches(config.plant, constants, flown, linear, angular)
 
 
-def targets(scenarios: Sequence[Scenario], count: int, period: float) -> np.ndarray:
-    """Goal of O (count + 1, n, 3) before the first control step and after each of `count`."""
+def targets(scenarios: Sequence[Scenario], count: int, period: float) -> Float[np.ndarray, "rows n 3"]:
+    """Goal of O, count + 1 rows, before the first control step and after each of `count`."""
     time = np.arange(count + 1) * period
     target = np.empty((count + 1, len(scenarios), 3))
     for number, scenario in enumerate(scenarios):
