@@ -31,8 +31,8 @@ from mjxball.control.followers import Follower
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.env import CoupledPairEnv
 from mjxball.evaluate.policies import load_policy
+from mjxball.policy.file import shipped_policy
 from mjxball.policy.policy import NetworkLaw, Policy
-from mjxball.policy.shipped import shipped_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import make_brief, simulate_batch
 from mjxball.sim.scenario import Scenario

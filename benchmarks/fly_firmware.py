@@ -45,7 +45,7 @@ from mjxball.fly.twin.conditions import (
 from mjxball.fly.twin.virtual import MemoryLog, Moment, World
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 
 SETTLED, HOVER = 5.0, 20.0  # [s]
 SETTLE = 1.0  # [s] that estimators get before a flight, as the check before a real one gives them

@@ -24,7 +24,7 @@ from mjxball.config import preset
 from mjxball.control.followers import Follower
 from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.policies import load_policy
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
 

@@ -20,7 +20,7 @@ from mjxball.baselines import make_baseline
 from mjxball.config import preset
 from mjxball.evaluate.render import frames
 from mjxball.policy import Policy
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 
 START, OMEGA, FRAMES = 25.0, 1.0, 63  # [s], [rad/s], one frame each 0.1 s
 LABELS = ("copying the leader", "transport (trained)")

@@ -32,7 +32,7 @@ def contents_of(source: Path) -> PolicyFile:
 
 
 def _write_onnx(out: Path, policy: PolicyFile) -> None:
-    from mjxball.policy.formats.onnx_file import onnx_model
+    from mjxball.policy.formats.onnx_model import onnx_model
 
     write_whole(out, onnx_model(policy, out.stem).SerializeToString())
 

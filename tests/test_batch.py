@@ -13,7 +13,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.results import fly_scenarios
 from mjxball.policy import Policy
-from mjxball.policy.shipped import shipped_policies
+from mjxball.policy.file import shipped_policies
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
 

@@ -13,7 +13,7 @@ from command_line import TRANSPORT, assert_one_line, call, listing, load_arrays,
 from mjxball.baselines import BASELINES
 from mjxball.commands.evaluate import main
 from mjxball.evaluate.policies import group_by_plant
-from mjxball.policy.shipped import shipped_policies
+from mjxball.policy.file import shipped_policies
 
 FAST = ["--physics", "newton-euler"]
 # The fixed keys, with the types that JSON gives back.

@@ -18,7 +18,7 @@ from mjxball.physics.autopilot import make_autopilot
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import hover_rotor_force, make_control_step, make_stepper, start_state
 from mjxball.policy import Policy
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 from mjxball.rig.attitude import Body, Trial
 from mjxball.rig.attitude import simulate as simulate_attitude
 from mjxball.sim.rollout import simulate

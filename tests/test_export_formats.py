@@ -17,9 +17,9 @@ from conftest import Trained
 
 from mjxball.export import main
 from mjxball.policy import Policy, PolicyFile, load_file
+from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
-from mjxball.policy.formats.onnx_file import onnx_model
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.formats.onnx_model import onnx_model
 
 STEPS = 60
 # Of one step's action in [-1, 1] by C, against NumPy in the same dtype: what docs/policy-file.md promises of float32.

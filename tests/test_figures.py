@@ -19,9 +19,9 @@ from mjxball.errors import InputError
 from mjxball.evaluate import paper_figures
 from mjxball.evaluate.paper_figures import NAMES, draw_reward, read_curve, swings
 from mjxball.evaluate.results import fly_scenarios
-from mjxball.evaluate.scenarios import REFERENCE
+from mjxball.evaluate.suites import REFERENCE
 from mjxball.policy import Policy
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 
 CONFIG = preset("paper")
 FAST = ["--physics", "newton-euler"]

@@ -19,7 +19,7 @@ from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.physics import StandIn, make_pair
 from mjxball.policy import load_file
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 
 PRESETS = ("flight", "stand")
 vertical = st.floats(-4, 4)

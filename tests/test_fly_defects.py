@@ -17,7 +17,7 @@ from mjxball.fly.supervisor import Event, State
 from mjxball.fly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
 from mjxball.fly.twin.virtual import MemoryLog, World
 from mjxball.policy import Policy
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 
 pytest.importorskip("mujoco")
 

@@ -36,7 +36,7 @@ from mjxball.fly.twin.conditions import QUIET, Surroundings
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin, TwinSettings
 from mjxball.policy import load_file
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 
 pytest.importorskip("cflib")
 pytest.importorskip("motioncapture")

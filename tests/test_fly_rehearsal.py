@@ -15,7 +15,7 @@ from mjxball.fly import card
 from mjxball.fly.flight_log import read
 from mjxball.fly.recording import fly_again, read_recording
 from mjxball.policy import load_file
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 
 pytest.importorskip("cflib")
 pytestmark = pytest.mark.alone  # by the clock

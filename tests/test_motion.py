@@ -13,7 +13,7 @@ from mjxball import config as configs
 from mjxball.commands.train import main as train
 from mjxball.config import Attitude, Motion, Plant
 from mjxball.errors import InputError
-from mjxball.evaluate.scenarios import read_waveform
+from mjxball.evaluate.suites import read_waveform
 from mjxball.physics import motion, newton_euler
 from mjxball.physics.engine import PlantState, Wrench
 from mjxball.sim.rollout import simulate

@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from mjxball.baselines import crazyflie_lqg, lqg, make_baseline, make_law
-from mjxball.baselines.crazyflie_model import MEASURED, linear_model
+from mjxball.baselines.crazyflie_lqg import MEASURED, linear_model
 from mjxball.baselines.load_axis import load_axis
 from mjxball.config import apply_overrides, preset, replace
 from mjxball.control import crazyflie

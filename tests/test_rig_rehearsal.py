@@ -24,7 +24,7 @@ from mjxball.fly.twin.conditions import Conditions
 from mjxball.fly.twin.coupled import CoupledPair
 from mjxball.fly.twin.virtual import STEP
 from mjxball.policy import load_file
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 from mjxball.rig import identify as command
 from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify

@@ -13,9 +13,9 @@ from mjxball import config as configs
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, Leader, ball_limit
 from mjxball.control.constants import plant_constants
-from mjxball.evaluate.paper_figures import LEVEL, SETTINGS, STAND_START, StandFlight, fly_stand, stand_config
+from mjxball.evaluate.stand_figure import LEVEL, SETTINGS, STAND_START, StandFlight, fly_stand, stand_config
 from mjxball.policy import Policy
-from mjxball.policy.shipped import shipped_policy
+from mjxball.policy.file import shipped_policy
 
 
 def pivoted() -> Config:

@@ -23,11 +23,11 @@ from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant, load_policy, native_config
 from mjxball.evaluate.report import write_page, write_report
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
-from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
-from mjxball.evaluate.suites import Suite, find_suites, list_suites
+from mjxball.evaluate.stand_figure import stand_config
+from mjxball.evaluate.suites import REFERENCE, Suite, find_suites, list_suites, standard_scenarios
 from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy, PolicyFileError
-from mjxball.policy.shipped import shipped_policies
+from mjxball.policy.file import shipped_policies
 from mjxball.sim.scenario import Scenario
 from mjxball.train.run_directory import versions
 
@@ -251,7 +251,7 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
 def _figure_config(path: Path) -> config.Config | None:
     """The configuration that the policy file `path` flies with in the figures, None if it fits none."""
     if paper_figures.on_stand(Policy.load(path)):
-        return paper_figures.stand_config()
+        return stand_config()
     return config.preset("paper") if native_config(path) is None else None
 
 

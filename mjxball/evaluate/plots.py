@@ -6,7 +6,8 @@ import io
 import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from mjxball.evaluate.results import RESULTS, Result, scenario_stem, scenario_ti
 from mjxball.plotting import pyplot
 
 POINTS = 240  # of a curve over time
+PAPER_WIDTH, PAPER_POINTS = 4.5, 700  # [in] readable on a phone; points of a curve: of the paper's figures
 COLOURS = {
     "copy": "#8a8a8a",
     "adaptive": "#d1495b",
@@ -197,3 +199,47 @@ def write_results(results: Sequence[Result], out: Path) -> None:
     for _, group in itertools.groupby(results, key=lambda result: result.scenario):
         same = list(group)
         draw_flights(same, scenario_title(same[0]), out / f"{scenario_stem(same[0])}.png")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure: its drawing, a caption, and a table of numbers computed from the curves."""
+
+    name: str
+    title: str
+    number: int  # of the paper's figure
+    svg: str
+    caption: str
+    heads: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+
+def panels(heights: Sequence[float], columns: int = 1) -> tuple[Any, np.ndarray]:
+    """A figure with panels (rows, columns) of `heights` [in] over one time axis."""
+    figure, axes = pyplot().subplots(
+        len(heights),
+        columns,
+        sharex=True,
+        figsize=(PAPER_WIDTH, sum(heights) + 0.5),
+        height_ratios=heights,
+        squeeze=False,
+        layout="constrained",
+    )
+    for axis in axes.flat:
+        axis.grid(alpha=0.25)
+        axis.margins(x=0)
+    return figure, axes
+
+
+def legend_above(figure: Any, axes: Iterable[Any]) -> None:
+    """One legend above the panels with every label of `axes`, each once."""
+    handles: dict[str, Any] = {}
+    for axis in axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(handles.values(), handles, loc="outside upper center", ncol=4, frameon=False)
+
+
+def thinned(count: int) -> np.ndarray:
+    """Rows of a curve of `count` that are drawn."""
+    return np.unique(np.linspace(0, count - 1, PAPER_POINTS).astype(int))

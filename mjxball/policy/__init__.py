@@ -5,9 +5,8 @@ roll, pitch, vertical_acceleration = policy(observation)  # SI units
 """
 
 from mjxball.policy.container import PolicyFileError
-from mjxball.policy.file import PolicyFile, load_file, save_file
+from mjxball.policy.file import PolicyFile, load_file, save_file, shipped_policies, shipped_policy
 from mjxball.policy.policy import Policy
-from mjxball.policy.shipped import shipped_policies, shipped_policy
 
 __all__ = [
     "Policy",

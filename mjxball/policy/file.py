@@ -6,15 +6,18 @@ import io
 import json
 import os
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, ObservationHistory
+from mjxball.errors import InputError
 from mjxball.policy.container import PolicyFileError, read_arrays
 
 FORMAT_VERSION = 1
+FOLDER = "policies"  # of those that come with mjxball
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by the judge, where a card has the configuration
 MAX_CARD = 2**20  # characters
 # Metrics that a card may bound, all of them the better the smaller.
@@ -217,3 +220,22 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
 
 def _is_finite(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER
+
+
+def shipped_policies() -> list[Path]:
+    """The policy files that come with mjxball, by name; empty if there are none."""
+    return sorted(_folder().glob("*.npz"))
+
+
+def shipped_policy(name: str) -> Path:
+    """The shipped policy file called `name`, such as `transport`; raise InputError if there is none."""
+    known = {path.stem: path for path in shipped_policies()}
+    if name not in known:
+        raise InputError(f"no shipped policy is called {name!r}; there are {', '.join(known) or 'none'}")
+    return known[name]
+
+
+def _folder() -> Path:
+    """A wheel carries them inside the package; a source tree and an editable install have them beside it."""
+    packaged = Path(str(resources.files("mjxball"))) / FOLDER
+    return packaged if packaged.is_dir() else Path(__file__).parents[2] / FOLDER

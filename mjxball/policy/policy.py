@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,21 @@ import numpy as np
 
 from mjxball.control import observation as layout
 from mjxball.policy.file import PolicyFile, history_of, load_file
-from mjxball.policy.network import mean_action
 
 Array = Any
+
+
+def mean_action(weights: Sequence[Array], biases: Sequence[Array], mean: Array, scale: Array, seen: Array) -> Array:
+    """tanh of the network's mean output (..., 3) in [-1, 1] for an input `seen` (..., n).
+
+    ReLU layers on (seen - mean) * scale; the last layer's first half is the mean, its second half belongs
+    to the exploration noise and is not computed.
+    """
+    xp = seen.__array_namespace__()
+    hidden = (seen - mean) * scale
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        hidden = xp.maximum(hidden @ weight + bias, 0.0)
+    return xp.tanh(hidden @ weights[-1] + biases[-1])
 
 
 class Policy:
@@ -88,10 +101,10 @@ class NetworkLaw:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
         return self._history.start(observation)
 
-    def step(self, memory: Array, observation: Array, brief: Any) -> tuple[Array, Array]:
-        """(memory, command (..., 3)) at `observation` (..., 18); `brief` is not read."""
+    def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
+        """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""
         scaled = self.scaled(memory, observation)
-        return self.remember(memory, observation, scaled), self.command(scaled, observation)
+        return self.next_memory(memory, observation, scaled), self.command(scaled, observation)
 
     def scaled(self, memory: Array, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3)."""
@@ -105,6 +118,6 @@ class NetworkLaw:
         """Command (..., 3) of the action `scaled` (..., 3)."""
         return layout.follower_command(scaled, observation, *self._law)
 
-    def remember(self, memory: Array, observation: Array, scaled: Array) -> Array:
+    def next_memory(self, memory: Array, observation: Array, scaled: Array) -> Array:
         """Memory of the next step."""
         return self._history.next(memory, observation, scaled)
