@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import html
 import importlib
 import json
 import re
@@ -138,9 +139,11 @@ def test_formulas_are_the_browsers_own(site: Path) -> None:
     assert "munderover><mi>" not in text.replace("\n", "")  # an accented letter's subscript stands beside it
 
 
-def test_the_reference_states_units(site: Path) -> None:
-    """Comments beside fields come through, and so does every setting."""
-    assert "(T, …, 3) of O in the world [m]" in (site / "reference" / "flights.html").read_text().replace("...", "…")
+def test_the_reference_states_shapes_and_units(site: Path) -> None:
+    """Shapes in signatures and comments beside fields come through, and so does every setting."""
+    flights = html.unescape(re.sub(r"<[^>]+>", "", (site / "reference" / "flights.html").read_text()))
+    assert "position: Float[np.ndarray, 'T ... 3']" in flights.replace("…", "...")
+    assert re.search(r"position:? *(?:– |— )?of O in the world \[m\]", flights)
     settings = (site / "reference" / "settings.html").read_text()
     for flag in ("--plant.object_mass", "--sac.total_steps", "--reward.error_scale"):
         assert flag in settings
