@@ -15,7 +15,7 @@ from typing import Any
 import jaxtyping
 from command_line import REPOSITORY, run
 
-CHECKED = ("physics", "sim", "algorithms", "env", "rewards", "evaluate.batch")
+CHECKED = ("physics", "sim", "algorithms", "env", "rewards", "train.program", "evaluate.batch")
 
 
 def check(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -38,24 +38,25 @@ def verify(value: Any, hint: Any, where: str) -> None:
     """Raise TypeError unless arrays in `value` are as `hint` says; of other types nothing is asked."""
     parts = typing.get_args(hint)
     if isinstance(hint, types.UnionType) or typing.get_origin(hint) is typing.Union:
-        others = tuple(part for part in parts if isinstance(part, type) and not is_array(part))
-        if Any in parts or isinstance(value, others) or (float in others and isinstance(value, int)):
-            return
-        for part in parts:
-            if is_array(part):
-                return verify(value, part, where)
+        plain = tuple(part for part in parts if isinstance(part, type) and part is not Any)
+        whole = float in parts and isinstance(value, int)
+        if any(map(is_array, parts)) and not (Any in parts or whole or isinstance(value, plain)):
+            raise TypeError(f"{where} is {told(value)}, not {hint}")
     elif typing.get_origin(hint) is tuple:
         hints = parts[:1] * len(value) if Ellipsis in parts else parts
         for number, (one, part) in enumerate(zip(value, hints, strict=True)):
             verify(one, part, f"{where}[{number}]")
     elif is_array(hint):
         if not isinstance(value, hint):
-            found = f"{value.dtype}{list(value.shape)}" if hasattr(value, "shape") else repr(value)
-            raise TypeError(f"{where} is {found}, not {hint.__name__}")
+            raise TypeError(f"{where} is {told(value)}, not {hint.__name__}")
     elif hasattr(hint, "_fields") and isinstance(value, hint):
         hints = typing.get_type_hints(hint)
         for name in hint._fields:
             verify(getattr(value, name), hints[name], f"{where}.{name}")
+
+
+def told(value: Any) -> str:
+    return f"{value.dtype}{list(value.shape)}" if hasattr(value, "shape") else repr(value)
 
 
 def is_array(hint: Any) -> bool:
@@ -70,7 +71,7 @@ import test_shapes
 typing.TYPE_CHECKING = True
 packages = [f"mjxball.{name}" for name in %r]
 with jaxtyping.install_import_hook(packages, "test_shapes.check"):
-    import mjxball.env, mjxball.evaluate.batch, mjxball.physics.step
+    import mjxball.env, mjxball.evaluate.batch, mjxball.physics.step, mjxball.train.program
 typing.TYPE_CHECKING = False
 %s
 print("done")

@@ -73,16 +73,16 @@ class Wrench(NamedTuple):
 
 
 class Engine(NamedTuple):
-    """Accelerations of the assembly. Both functions return the acceleration of O in the world (..., 3) [m/s2]
-    and the angular acceleration in body axes (..., 3) [rad/s2]; directions that a stand locks are 0.
+    """Accelerations of the assembly. Both functions return the acceleration of O in the world [m/s2]
+    and the angular acceleration in body axes [rad/s2]; directions that a stand locks are 0.
     """
 
-    # prescribed(state, wrench, object_mass (...), cg, added_inertia (..., 3) or None):
+    # prescribed(state, wrench, object_mass, cg, added_inertia):
     #   the CG follows `cg`, driven by whatever force that takes
-    prescribed: Callable[[PlantState, Wrench, Array, CgState, Array | None], tuple[Array, Array]]
-    # rolling(state, wrench, object_mass (...), force (...) on the ball along the axis [N], added_inertia):
-    #   the ball at state.ball_offset rolls freely; returns its acceleration (...) [m/s2] as well
-    rolling: Callable[[PlantState, Wrench, Array, Array, Array | None], tuple[Array, Array, Array]]
+    prescribed: Callable[[PlantState, Wrench, Scalar, CgState, Vector | None], tuple[Vector, Vector]]
+    # rolling(state, wrench, object_mass, force on the ball along the axis [N], added_inertia):
+    #   the ball at state.ball_offset rolls freely; returns its acceleration [m/s2] as well
+    rolling: Callable[[PlantState, Wrench, Scalar, Scalar, Vector | None], tuple[Vector, Vector, Scalar]]
 
 
 def contact_wrenches(

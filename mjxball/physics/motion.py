@@ -120,8 +120,8 @@ def make_prescribed(config: Config) -> Prescribed:
     return lambda time, load: follow_spline(spline, time)
 
 
-def make_rolling_force(config: Config) -> Callable[[Array, Array, Array], Array]:
-    """Return `force(offset, rate, ball_mass)` (...) [N] along the axis: rolling friction and end stops (ours).
+def make_rolling_force(config: Config) -> Callable[[Scalar, Scalar, Scalar], Scalar]:
+    """Return `force(offset, rate, ball_mass)` [N] along the axis: rolling friction and end stops (ours).
 
     Friction is -mu m_b g tanh(v / creep). A stop is a one-sided spring and damper that never pulls; the
     inertia against it is 7/5 m_b, that of a solid ball that rolls.

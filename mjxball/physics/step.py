@@ -86,15 +86,17 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
     return control_step
 
 
-def make_accelerations(config: Config, engine: Engine) -> Callable[[PlantState, Wrench, Load], tuple[Array, ...]]:
+def make_accelerations(
+    config: Config, engine: Engine
+) -> Callable[[PlantState, Wrench, Load], tuple[Vector, Vector, Scalar]]:
     """Return `accelerate(state, wrench, load)` -> (linear, angular, ball), whatever way the CG moves.
 
-    The ball's acceleration (...) is 0 for prescribed motions, whose offset is a function of time alone.
+    The ball's acceleration is 0 for prescribed motions, whose offset is a function of time alone.
     """
     if config.motion.kind == "rolling":
         force = motion.make_rolling_force(config)
 
-        def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Array, ...]:
+        def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Scalar]:
             mass = motion.object_mass(state.time, load)
             on_ball = force(state.ball_offset, state.ball_rate, config.plant.moving_fraction * mass)
             return engine.rolling(state, wrench, mass, on_ball, load.added_inertia)
@@ -102,7 +104,7 @@ def make_accelerations(config: Config, engine: Engine) -> Callable[[PlantState, 
         return roll
     prescribed = motion.make_prescribed(config)
 
-    def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Array, ...]:
+    def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Scalar]:
         mass = motion.object_mass(state.time, load)
         cg = prescribed(state.time, load)
         linear, angular = engine.prescribed(state, wrench, mass, cg, load.added_inertia)
@@ -111,8 +113,8 @@ def make_accelerations(config: Config, engine: Engine) -> Callable[[PlantState, 
     return follow
 
 
-def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Array]:
-    """Return `cg_offset(state, load)` (...) [m], where the CG is now."""
+def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Scalar]:
+    """Return `cg_offset(state, load)` [m], where the CG is now."""
     if config.motion.kind == "rolling":
         return lambda state, load: config.plant.moving_fraction * state.ball_offset
     prescribed = motion.make_prescribed(config)

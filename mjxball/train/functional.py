@@ -8,14 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from mjxball.algorithms.base import Phase, Policy
 from mjxball.config import Config
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions
 from mjxball.train.program import Mode, Program, TrainState
-
-Array = Any
 
 
 def train(

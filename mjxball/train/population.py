@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from mjxball import config as configs
@@ -19,8 +20,6 @@ from mjxball.train.compilation import GPU_OPTIONS, PLAIN_PRODUCTS, TracedProgram
 from mjxball.train.extensions import DEFAULTS, Extensions
 from mjxball.train.program import Mode, Program, Statistics, TrainState, report, warmup
 from mjxball.train.run_directory import Sweep, source_hash, versions
-
-Array = Any
 
 
 class Executables(NamedTuple):
@@ -78,10 +77,10 @@ class Population:
         """One member's part of a state or of statistics."""
         return value if self._single else jax.tree.map(lambda leaf: leaf[member], value)
 
-    def each(self, value: Array) -> np.ndarray:
+    def each(self, value: Array | np.ndarray) -> np.ndarray:
         """`value` as NumPy with the member axis first, also for a single member."""
-        value = np.asarray(value)
-        return value[None] if self._single else value
+        array = np.asarray(value)
+        return array[None] if self._single else array
 
     def create(self, seed: int) -> TrainState:
         """Fresh training states."""
@@ -179,8 +178,9 @@ class Population:
 
     def _result_structure(self, state: TrainState) -> tuple[Statistics, dict[str, int]]:
         """The structure of the statistics and of the algorithm's metrics."""
-        names = dict.fromkeys(state.envs.metrics, 0)
-        return Statistics(0, 0, names, names), dict.fromkeys(self.program.algorithm.metrics, 0)
+        leaf: Any = 0
+        names = dict.fromkeys(state.envs.metrics, leaf)
+        return Statistics(leaf, leaf, names, names), dict.fromkeys(self.program.algorithm.metrics, 0)
 
     def place_state(self, state: TrainState) -> TrainState:
         """A whole state of NumPy arrays, the same in every process, spread over the devices."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from mjxball import config as configs
 from mjxball.algorithms.base import Algorithm, Phase, Policy, Schedule, Shards, Transition
@@ -17,7 +18,9 @@ from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.config import Config
 from mjxball.train.extensions import DEFAULTS, Extensions, make_env
 
-Array = Any
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
 MATMUL_PRECISION = "highest"  # float32 throughout: GPUs would else round products to TF32
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
 EVALUATION_DRAW = 20_261_121  # tells the evaluation's environments from those of any seed
@@ -26,10 +29,10 @@ EVALUATION_DRAW = 20_261_121  # tells the evaluation's environments from those o
 class Statistics(NamedTuple):
     """Sums over the steps of one call of `Program.advance`."""
 
-    reward: Array  # mean reward per step, summed over steps
-    ended: Array  # episodes terminated
-    totals: dict[str, Array]  # each of the environment's metrics, summed over environments and steps
-    peaks: dict[str, Array]  # (envs,) the largest of each
+    reward: Float[Array, ""]  # mean reward per step, summed over steps
+    ended: Float[Array, ""]  # episodes terminated
+    totals: dict[str, Float[Array, ""]]  # each of the environment's metrics, summed over environments and steps
+    peaks: dict[str, Float[Array, " envs"]]  # the largest of each
 
 
 class Envs(NamedTuple):
@@ -37,7 +40,7 @@ class Envs(NamedTuple):
 
     states: Any  # brax State of all environments
     statistics: Statistics
-    difficulty: Array | float  # of what is drawn at a reset, 0 to 1: see `Schedule.curriculum`
+    difficulty: Float[Array, ""] | float  # of what is drawn at a reset, 0 to 1: see `Schedule.curriculum`
 
 
 def report(env: Any, totals: Mapping[str, Any], peaks: Mapping[str, Any], count: float, evaluation: bool) -> Any:
@@ -65,7 +68,7 @@ class Environments:
         self._graded = len(inspect.signature(env.reset).parameters) > 1
         self._step = jax.vmap(env.step)
 
-    def reset(self, key: Array, difficulty: Array | float = 1.0) -> Any:
+    def reset(self, key: Array, difficulty: Float[Array, ""] | float = 1.0) -> Any:
         """New states of all environments."""
         keys = jax.random.split(self.shards.own(key), self.count)
         if not self._graded:
@@ -83,14 +86,14 @@ class Environments:
             return states.replace(pipeline_state=world._replace(steps=steps))
         return states
 
-    def begin(self, states: Any, difficulty: Array | float) -> Envs:
+    def begin(self, states: Any, difficulty: Float[Array, ""] | float) -> Envs:
         """`states` with empty statistics."""
         zero = jnp.zeros(())
         totals = dict.fromkeys(states.metrics, zero)
         peaks = dict.fromkeys(states.metrics, jnp.zeros(self.count))
         return Envs(states, Statistics(zero, zero, totals, peaks), difficulty)
 
-    def step(self, envs: Envs, action: Array, key: Array) -> tuple[Envs, Transition]:
+    def step(self, envs: Envs, action: Float[Array, "envs actions"], key: Array) -> tuple[Envs, Transition]:
         """See `mjxball.algorithms.base.Environments`."""
         before = envs.states
         after = self._step(before, action)
@@ -123,7 +126,7 @@ class Environments:
 class Mode(NamedTuple):
     """What a call of `Program.advance` does; all traced, so that one executable serves every phase."""
 
-    steps: Array  # of every environment
+    steps: Int[Array | np.ndarray, ""]  # of every environment
     phase: Phase
 
 
@@ -153,7 +156,7 @@ class TrainState(NamedTuple):
     algorithm: Any  # what the algorithm knows
     envs: Any  # brax State of all environments
     key: Array
-    steps: Array  # () environment steps recorded
+    steps: Int[Array, ""]  # environment steps recorded
 
 
 class Program:
@@ -185,7 +188,7 @@ class Program:
     def create(self, key: Array) -> TrainState:
         """A fresh training state; the episodes are staggered so that they do not end together."""
         learner_key, env_key, stagger_key, key = jax.random.split(key, 4)
-        envs = self.environments.reset(env_key, self._difficulty(jnp.zeros(()), jnp.ones((), bool)))
+        envs = self.environments.reset(env_key, self._difficulty(jnp.zeros((), jnp.int32), jnp.ones((), bool)))
         return TrainState(
             algorithm=self.algorithm.init(learner_key),
             envs=self.environments.staggered(envs, stagger_key, self.config.timing.episode_steps),
@@ -193,7 +196,7 @@ class Program:
             steps=jnp.zeros((), jnp.int32),
         )
 
-    def _difficulty(self, steps: Array, recording: Array) -> Array | float:
+    def _difficulty(self, steps: Int[Array, ""], recording: Bool[Array, ""]) -> Float[Array, ""] | float:
         """How hard the drawn environments are after so many `steps`, 0 to 1; in evaluation as hard as can be."""
         share = self.schedule.curriculum
         if share == 0:
@@ -201,7 +204,7 @@ class Program:
         grown = jnp.clip(steps / (share * self.schedule.total_steps), 0.0, 1.0)
         return jnp.where(recording, grown, 1.0)
 
-    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Array]]:
+    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Float[Array, ""]]]:
         """Step all environments `mode.steps` times (rounded up to whole collections), and learn.
 
         Returns the state, sums over all steps, and the metrics of the algorithm's last update.
