@@ -236,7 +236,7 @@ class CoupledPairEnv(Env):
             parts += [lag[None], world.load.thrust_scale, world.load.added_inertia]
         if world.plant.loops is not None:
             integrals = crazyflie.unpack(world.plant.loops).rate_integral
-            parts += [(integrals / jnp.asarray(self.config.autopilot.rate_limits)).ravel()]
+            parts += [(integrals / jnp.asarray(crazyflie.RATE_LIMITS)).ravel()]
         if self.config.motion.kind == "rolling":
             parts += [world.plant.ball_rate[None]]
         if self.config.follower.shares_integrals:

@@ -53,8 +53,8 @@ class TestDelivered:
     def test_gains(self) -> None:
         assert (STOCK.roll, STOCK.pitch, STOCK.yaw) == ((6, 3, 0), (6, 3, 0), (6, 1, 0.35))
         assert (STOCK.roll_rate, STOCK.pitch_rate, STOCK.yaw_rate) == ((250, 500, 2.5), (250, 500, 2.5), (120, 16.7, 0))
-        assert STOCK.attitude_limits[:2] == (20, 20)
-        assert STOCK.rate_limits[:2] == (33.3, 33.3)
+        assert crazyflie.ATTITUDE_LIMITS[:2] == (20, 20)
+        assert crazyflie.RATE_LIMITS[:2] == (33.3, 33.3)
         assert crazyflie.PERIOD == 1 / 500
 
     def test_first_tick_of_a_roll_command(self) -> None:

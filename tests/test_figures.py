@@ -16,7 +16,7 @@ from conftest import opened
 from mjxball.commands.evaluate import main
 from mjxball.config import preset
 from mjxball.errors import InputError
-from mjxball.evaluate import paper_figures
+from mjxball.evaluate import stand_figure
 from mjxball.evaluate.paper_figures import NAMES, draw_reward, read_curve, swings
 from mjxball.evaluate.results import fly_scenarios
 from mjxball.evaluate.suites import REFERENCE
@@ -90,7 +90,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_arrays(here / "curved.npz", arrays, {**card, "curve": CURVE})
     flags = [here / "curved.npz", "--figures", "all", standing(here / "rocked.npz"), "--out", here / "out"]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(paper_figures, "STAND_START", dataclasses.replace(paper_figures.STAND_START, seconds=22.0))
+        patched.setattr(stand_figure, "STAND_START", dataclasses.replace(stand_figure.STAND_START, seconds=22.0))
         assert call(main, [*FAST, *flags]) == 0
     return here / "out"
 

@@ -143,8 +143,8 @@ def make_update(
         """The paper's eqs. 6 and 7: V follows Q and the entropy, Q follows the reward and the slow V."""
         value_gradient = mean(jax.grad(value_loss)(learner.value, learner, batch, key))
         loss, gradient = jax.value_and_grad(q_loss)(learner.critic, learner, batch)
-        value, value_adam = _descend(learner.value, _clip(value_gradient, config), learner.value_adam, step)
-        critic, adam = _descend(learner.critic, _clip(mean(gradient), config), learner.critic_adam, step)
+        value, value_adam = _descend(learner.value, value_gradient, learner.value_adam, step)
+        critic, adam = _descend(learner.critic, mean(gradient), learner.critic_adam, step)
         target = optax.incremental_update(value, learner.target, config.tau)
         moved = learner._replace(value=value, critic=critic, target=target, value_adam=value_adam, critic_adam=adam)
         return moved, loss
@@ -156,7 +156,7 @@ def make_update(
         value, gradient = jax.value_and_grad(critic_loss)(
             learner.critic, learner.policy, learner.normaliser, learner.target, alpha, batch, key
         )
-        critic, adam = _descend(learner.critic, _clip(mean(gradient), config), learner.critic_adam, step)
+        critic, adam = _descend(learner.critic, mean(gradient), learner.critic_adam, step)
         target = optax.incremental_update(critic, learner.target, config.tau)
         return learner._replace(critic=critic, critic_adam=adam, target=target), value
 
@@ -170,7 +170,7 @@ def make_update(
             before.policy, before.normaliser, before.critic, alpha, batch, policy_key
         )
         step = rate * config.learning_rate
-        policy, policy_adam = _descend(before.policy, _clip(mean(gradient), config), before.policy_adam, step)
+        policy, policy_adam = _descend(before.policy, mean(gradient), before.policy_adam, step)
         # d(alpha loss)/d(log alpha) of SAC's eq. 18: alpha (H - target).
         slope = 0.0 * alpha if config.alpha_fixed else alpha * (entropy - target_entropy)
         log_alpha, alpha_adam = _descend(before.log_alpha, slope, before.alpha_adam, rate * config.alpha_learning_rate)
@@ -220,13 +220,6 @@ def make_value_losses(networks: Networks, config: Sac) -> tuple[Any, Any]:
         return 0.5 * jnp.mean((q - wanted[:, None]) ** 2)
 
     return value_loss, q_loss
-
-
-def _clip(gradient: Any, config: Sac) -> Any:
-    """`gradient` scaled to a global norm of at most `config.max_grad_norm`, 0: untouched."""
-    if not config.max_grad_norm:
-        return gradient
-    return optax.clip_by_global_norm(config.max_grad_norm).update(gradient, optax.EmptyState())[0]
 
 
 def _descend(value: Any, gradient: Any, adam: Any, step: Float[Array, ""]) -> tuple[Any, Any]:

@@ -17,7 +17,6 @@ RENAMED = {
     "sac.privileged": "sac.privileged_critic",
     "sac.critics": "sac.num_critics",
     "sac.return_steps": "sac.n_step",
-    "sac.gradient_clip": "sac.max_grad_norm",
     "sac.target_rate": "sac.tau",
     "sac.evaluations": "sac.num_evaluations",
     "sac.policy_average": "sac.policy_ema_rate",
@@ -35,7 +34,17 @@ RENAMED = {
     "reward.opposition": "reward.tilt_disagreement",
 }
 # Former settings that are constants now, with their value. Files may hold no other.
-CONSTANT: dict[str, Any] = {"sac.policy_delay": 1}
+CONSTANT: dict[str, Any] = {
+    "motion.rolling_friction": 0.005,
+    "motion.stop_frequency": 60.0,
+    "motion.stop_damping": 0.4,
+    "autopilot.attitude_limits": (20.0, 20.0, 360.0),
+    "autopilot.rate_limits": (33.3, 33.3, 166.7),
+    "scenario.mass_change_time": (5.0, 15.0),
+    "sac.policy_delay": 1,
+    "sac.gradient_clip": 0.0,
+    "sac.max_grad_norm": 0.0,
+}
 
 
 def current_name(path: str) -> str:

@@ -26,6 +26,11 @@ def setting(
     return field(default=default, metadata=bounds)
 
 
+def drawn(default: Range, about: str, **bounds: Any) -> Any:
+    """Declare a range that resets draw from, low <= high."""
+    return setting(default, about, ordered=True, **bounds)
+
+
 @dataclass(frozen=True)
 class Plant:
     """The rigid assembly: two drones, one object. Defaults are the `paper` plant (docs/model.md)."""
@@ -33,18 +38,11 @@ class Plant:
     leader_mass: float = setting(1.0, "mass of the leader [kg]", above=0)
     follower_mass: float = setting(1.0, "mass of the follower [kg]", above=0)
     object_mass: float = setting(0.2, "nominal mass of the object, all of it moving with the CG [kg]", above=0)
-    leader_inertia: Vector3 = setting(
-        (2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the leader about its centre [kg m2]", above=0
-    )
-    follower_inertia: Vector3 = setting(
-        (2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the follower about its centre [kg m2]", above=0
-    )
+    leader_inertia: Vector3 = setting((2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the leader [kg m2]", above=0)
+    follower_inertia: Vector3 = setting((2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the follower [kg m2]", above=0)
     object_size: Vector3 = setting((0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", above=0)
     moving_fraction: float = setting(
-        1.0,
-        "share of the object's mass that moves, m_b / m_o; the rest is a fixed shell, a box about O",
-        above=0,
-        high=1,
+        1.0, "share of the object's mass that moves; the rest is a fixed box about O", above=0, high=1
     )
     ball_radius: float = setting(0.02, "radius of the moving ball [m]", above=0)
     ball_stop: float = setting(0.0, "ball's centre from O at an end stop, 0: it touches the object's end [m]", low=0)
@@ -75,22 +73,15 @@ class Motion:
     offsets: tuple[float, ...] = setting(
         (), "waveform: CG offsets at those times, a C2 spline between, held outside [m]"
     )
-    rolling_friction: float = setting(0.005, "rolling: friction over the normal force", low=0, high=1)
-    stop_frequency: float = setting(60.0, "rolling: natural frequency of the ball against an end stop [rad/s]", above=0)
-    stop_damping: float = setting(0.4, "rolling: damping ratio of an end stop, 1 does not bounce", low=0, high=2)
 
 
 @dataclass(frozen=True)
 class Attitude:
     """The PD attitude loop that each drone runs once per physics step (ours)."""
 
-    natural_frequency: Vector3 = setting(
-        (10.0, 10.0, 4.0), "closed-loop roll, pitch, yaw natural frequency [rad/s]", above=0
-    )
+    natural_frequency: Vector3 = setting((10.0, 10.0, 4.0), "natural frequency of roll, pitch, yaw [rad/s]", above=0)
     damping: float = setting(0.9, "damping ratio", above=0)
-    design_object_mass: float = setting(
-        0.2, "object mass that the gains are computed for, with the CG at O [kg]", low=0
-    )
+    design_object_mass: float = setting(0.2, "object mass that the gains are for [kg]", low=0)
 
 
 @dataclass(frozen=True)
@@ -106,8 +97,6 @@ class Autopilot:
     roll_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.roll_kp, ki, kd [motor command per deg/s]", low=0)
     pitch_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.pitch_kp, ki, kd", low=0)
     yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0)
-    attitude_limits: Vector3 = setting((20.0, 20.0, 360.0), "limits of the attitude integrals [deg s]", above=0)
-    rate_limits: Vector3 = setting((33.3, 33.3, 166.7), "limits of the rate integrals [deg]", above=0)
     follower_integrals: float = setting(
         1.0, "factor on the follower's ki: two drones that integrate on one body work against each other", low=0, high=1
     )
@@ -132,11 +121,7 @@ class Leader:
     kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0)
     kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0)
     ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0)
-    integral_band: Vector3 = setting(
-        (1e3, 1e3, 1e3),
-        "largest error per axis that is integrated [m]: none winds up on the way to a far goal",
-        above=0,
-    )
+    integral_band: Vector3 = setting((1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", above=0)
     integral_lead: float = setting(
         0.0,
         "the error is integrated with its rate times this, within the band: nothing winds up on the way to a goal [s]",
@@ -181,9 +166,7 @@ class Follower:
         "object", "what the slots of the object's error carry: e_o, or the leader's e_l"
     )
     history: int = setting(1, "observations that the network sees, the newest included", low=1, high=100)
-    ignore_position: bool = setting(
-        True, "the network's input omits the absolute position: the dynamics do not depend on it"
-    )
+    ignore_position: bool = setting(True, "the network does not see the absolute position")
     previous_action: bool = setting(False, "the network also sees its last action, scaled to [-1, 1]")
     observation_averages: tuple[float, ...] = setting(
         (), "time constants of exponential averages of observations and actions that the network sees [s]", above=1e-3
@@ -207,47 +190,30 @@ class Scenario:
     start_position: float = setting(0.0, "each coordinate of the start is drawn from +- this [m]", low=0)
     start_velocity: float = setting(0.0, "each start velocity is drawn from +- this [m/s]", low=0)
     start_tilt: float = setting(0.0, "start roll and pitch are drawn from +- this [rad]", low=0, high=1.0)
-    cg_speed: Range = setting((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0, ordered=True)
-    cg_amplitude: Range = setting((0.05, 0.05), "amplitude of the CG's sine [m]", low=0, ordered=True)
-    object_mass: Range = setting((0.2, 0.2), "true mass of the object [kg]", above=0, ordered=True)
+    cg_speed: Range = drawn((0.31, 0.31), "angular speed of the CG's sine [rad/s]", low=0)
+    cg_amplitude: Range = drawn((0.05, 0.05), "amplitude of the CG's sine [m]", low=0)
+    object_mass: Range = drawn((0.2, 0.2), "true mass of the object [kg]", above=0)
     trim_margin: float = setting(
         0.15, "the CG's amplitude is cut to where one drone holds it with this share of its torque left", low=0, high=1
     )
-    mass_change: Range = setting(
-        (0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]", ordered=True
-    )
-    mass_change_time: Range = setting((5.0, 15.0), "when the object's mass changes [s]", low=0, ordered=True)
+    mass_change: Range = drawn((0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]")
     ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0)
-    noise: Range = setting(
-        (0.0, 0.0),
-        "noise of the follower's senses, in deviations of motion capture and a small drone's IMU",
-        low=0,
-        ordered=True,
-    )
-    delay: Range = setting((0.0, 0.0), "delay of the follower's senses [s]", low=0, high=0.5, ordered=True)
-    estimator_drift: Range = setting(
-        (0.0, 0.0), "slow error of the senses, in deviations of a drone's estimator", low=0, ordered=True
-    )
+    noise: Range = drawn((0.0, 0.0), "noise of the senses, in deviations of motion capture and IMU", low=0)
+    delay: Range = drawn((0.0, 0.0), "delay of the follower's senses [s]", low=0, high=0.5)
+    estimator_drift: Range = drawn((0.0, 0.0), "slow error of the senses, in deviations of a drone's estimator", low=0)
     quantize: bool = setting(False, "states arrive with the resolution of a Crazyflie's log packets")
     leader_uses_measurements: bool = setting(False, "the leader flies on what the follower senses, else on the truth")
-    battery: Range = setting((0.0, 0.0), "voltage of the battery; 0: motors follow the curve [V]", low=0, ordered=True)
+    battery: Range = drawn((0.0, 0.0), "voltage of the battery; 0: motors follow the curve [V]", low=0)
     uncompensated_share: float = setting(
-        0.0, "share of the flights with a firmware that does not compensate for the battery", low=0, high=1
+        0.0, "share of flights whose firmware does not compensate the battery", low=0, high=1
     )
-    gust: Range = setting((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0, ordered=True)
-    rotor_lag_scale: Range = setting((1.0, 1.0), "factor on the rotors' time constant", above=0, ordered=True)
-    thrust_scale: Range = setting((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0, ordered=True)
-    thrust_common: Range = setting(
-        (1.0, 1.0), "factor on the rotor forces of both drones alike (batteries, air)", above=0, ordered=True
-    )
-    inertia_scale: Range = setting(
-        (1.0, 1.0),
-        "factor on the inertia of drones and object about their own centres, one factor for all",
-        above=0,
-        ordered=True,
-    )
+    gust: Range = drawn((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0)
+    rotor_lag_scale: Range = drawn((1.0, 1.0), "factor on the rotors' time constant", above=0)
+    thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0)
+    thrust_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", above=0)
+    inertia_scale: Range = drawn((1.0, 1.0), "one factor on the inertia of drones and object", above=0)
     cg_random_visits: float = setting(
-        0.0, "share of the flights whose CG goes from place to place at random instead of the sine", low=0, high=1
+        0.0, "share of flights whose CG goes from place to place at random", low=0, high=1
     )
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
     termination_distance: float = setting(2.5, "an episode ends when |e_o| exceeds this, d_term [m]", above=0)
@@ -288,9 +254,7 @@ class Sac:
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1)
     critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
-    privileged_critic: bool = setting(
-        False, "the critics, which no flight needs, also see where the CG is and the true mass"
-    )
+    privileged_critic: bool = setting(False, "the critics also see the CG and the true mass")
     num_critics: int = setting(2, "Q networks, of which the smallest value counts", low=1, high=2)
     state_value: bool = setting(
         False, "a state-value network with a slow copy gives the targets (the paper's eqs. 6-8), not slow Q networks"
@@ -305,16 +269,13 @@ class Sac:
         low=0,
         high=1,
     )
-    max_grad_norm: float = setting(0.0, "largest global norm of a gradient, 0: not clipped", low=0)
     tau: float = setting(0.02, "rate of the slow copies that give the targets", above=0, high=1)
     alpha: float = setting(0.02, "temperature at the start", above=0)
     alpha_fixed: bool = setting(False, "keep the temperature at its start")
     target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]")
     reward_scale: float = setting(1.0, "factor on the reward inside the critic", above=0)
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
-    policy_ema_rate: float = setting(
-        0.002, "rate of the running average of the policy that is exported", above=0, high=1
-    )
+    policy_ema_rate: float = setting(0.002, "rate of the exported running average of the policy", above=0, high=1)
     learning_rate_end: float = setting(0.1, "rate at the end of the run over the rate at its start", above=0, high=1)
 
 

@@ -132,7 +132,7 @@ def drone_loop(config: Config, axis: int) -> DroneLoop:
         kdd=torque * rate[2],
         slow=torque * rate[1],
         stiffness=attitude[0],
-        integral_limit=math.radians(law.rate_limits[axis]),
+        integral_limit=math.radians(crazyflie.RATE_LIMITS[axis]),
         # Two motors p up and two p down give 4 a p^2 more than none, p = output / 2 / FULL.
         surplus=law.motor_curve[0] * (math.degrees(1) / (torque * crazyflie.FULL)) ** 2,
     )

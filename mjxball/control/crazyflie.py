@@ -20,6 +20,8 @@ FULL = 65535.0  # motor command of full power
 THRUST_FLOOR, THRUST_CEILING = 10001, 60000  # what the laptop sends while flying; the firmware caps at the second
 IDLE = 1000.0  # thrust below which the firmware stops the motors
 TILT_LIMIT = 15.0  # of every roll and pitch that is sent [deg]
+ATTITUDE_LIMITS = (20.0, 20.0, 360.0)  # of the attitude integrals of roll, pitch, yaw [deg s]
+RATE_LIMITS = (33.3, 33.3, 166.7)  # of the rate integrals [deg]
 LARGEST = 32767.0  # of a rate loop's output
 SIGNS = (1.0, -1.0, 1.0)  # ours -> firmware's roll, pitch, yaw
 LOOPS = 13  # numbers that the loops of one drone carry, see `Loops`
@@ -127,9 +129,9 @@ def cascade(
     error = xp.concat([errors[..., :2], _wrapped(errors[..., 2:])], axis=-1)
     moved = attitude - old.attitude
     moved = xp.concat([moved[..., :2], _wrapped(moved[..., 2:])], axis=-1)
-    held, asked = _pid(outer, autopilot.attitude_limits, old.attitude_integral, error, moved, integrals)
+    held, asked = _pid(outer, ATTITUDE_LIMITS, old.attitude_integral, error, moved, integrals)
     rated = asked - turning, turning - old.rates
-    kept, output = _pid(inner, autopilot.rate_limits, old.rate_integral, *rated, integrals)
+    kept, output = _pid(inner, RATE_LIMITS, old.rate_integral, *rated, integrals)
     output = output if rate_share is None else rate_share * output
     output = xp.trunc(xp.clip(output, -LARGEST, LARGEST))
     thrust = setpoint[..., 3]

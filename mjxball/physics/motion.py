@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Scalar
 
 Prescribed = Callable[[Array, Load], CgState]
+ROLLING_FRICTION = 0.005  # over the normal force
+STOP_FREQUENCY, STOP_DAMPING = 60.0, 0.4  # of the ball against an end stop [rad/s]; 1 does not bounce
 CREEP = 0.005  # [m/s] below which rolling friction fades to zero, so that its sign is smooth
 
 
@@ -126,14 +128,14 @@ def make_rolling_force(config: Config) -> Callable[[Scalar, Scalar, Scalar], Sca
     Friction is -mu m_b g tanh(v / creep). A stop is a one-sided spring and damper that never pulls; the
     inertia against it is 7/5 m_b, that of a solid ball that rolls.
     """
-    plant, motion = config.plant, config.motion
+    plant = config.plant
     end = ball_limit(plant)
-    stiffness = 1.4 * motion.stop_frequency**2
-    damping = 1.4 * 2 * motion.stop_damping * motion.stop_frequency
+    stiffness = 1.4 * STOP_FREQUENCY**2
+    damping = 1.4 * 2 * STOP_DAMPING * STOP_FREQUENCY
 
     def force(offset: Scalar, rate: Scalar, ball_mass: Scalar) -> Scalar:
         xp = offset.__array_namespace__()
-        friction = -motion.rolling_friction * plant.gravity * xp.tanh(rate / CREEP)
+        friction = -ROLLING_FRICTION * plant.gravity * xp.tanh(rate / CREEP)
         beyond = xp.maximum(offset - end, 0.0)
         below = xp.maximum(-end - offset, 0.0)
         upper = xp.where(beyond > 0, xp.minimum(-stiffness * beyond - damping * rate, 0.0), 0.0)

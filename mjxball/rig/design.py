@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.config import Autopilot, Config
+from mjxball.control.crazyflie import RATE_LIMITS
 from mjxball.rig.attitude import Axis, axes
 
 Array = np.ndarray
@@ -137,7 +138,7 @@ def design_axis(axis: Axis, config: Config, required: Requirements = REQUIREMENT
         )
     held = max(axis.trim, required.unloaded_share * axis.headroom)
     number = ("roll", "pitch", "yaw").index(axis.name)
-    integral = held / config.autopilot.rate_limits[number]
+    integral = held / RATE_LIMITS[number]
     lag = config.plant.rotor_lag
     for attitude, rate, lead in candidates(axis, lag, required):
         gains = rounded(Gains((attitude, 0.0, 0.0), (rate, integral, lead * rate)))

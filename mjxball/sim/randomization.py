@@ -27,6 +27,7 @@ CANDIDATES = 8  # drives (battery, thrust of each drone) from which a world take
 LIFT, PULL = 0.06, 0.05  # shares of its weight that every drone must lift more, at most 60 000 units and at full power
 DRAWN_BACK = 8  # times at most that a world's thrust is drawn back by three tenths
 CEILING = float(crazyflie.THRUST_CEILING)
+MASS_CHANGE_TIME = (5.0, 15.0)  # [s]
 PLACES = 16  # that a CG visits, where it does, before it begins again
 
 
@@ -79,7 +80,7 @@ class ResetDistribution:
             cg_speed=between(*shortened(scenario.cg_speed, difficulty)),
             cg_phase=between(0.0, 2 * jnp.pi),
             mass_change=between(*scenario.mass_change)[None],
-            mass_change_time=between(*scenario.mass_change_time)[None],
+            mass_change_time=between(*MASS_CHANGE_TIME)[None],
         )
         if self.varies:
             load = self._varied(load, jax.random.fold_in(rng, 2))

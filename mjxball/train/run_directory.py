@@ -174,7 +174,7 @@ def differences(recorded: Mapping[str, Any]) -> list[str]:
     return found
 
 
-UNSWEPT = ("sac.curriculum", "sac.max_grad_norm")  # the program branches on whether they are 0
+UNSWEPT = ("sac.curriculum",)  # the program branches on whether it is 0
 # Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
 SWEEPABLE = (
     *(
