@@ -44,7 +44,7 @@ Action = Callable[[Twin, Runner, int], None]  # twin, runner, drone
 
 def link(**faults: float) -> Action:
     """A fault of one drone's link."""
-    return lambda twin, runner, drone: twin.set_link(drone, LinkFaults(**faults))
+    return lambda twin, runner, drone: twin.inject(Injection(LinkFaults(**faults), drone, 0.0))
 
 
 def injected(kind: str) -> Action:

@@ -35,10 +35,7 @@ from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import (
     FAULT_KINDS,
-    BodyFault,
     Conditions,
-    DroneFaults,
-    LinkFaults,
     Surroundings,
     drone_kind,
 )
@@ -66,7 +63,12 @@ def world_of(path: Path, seconds: float, curve: str = "linear", record: bool = T
     drone = drone_kind("2.1", curve)
     surroundings = Surroundings(**around)
     return World(
-        policy, settings_of(policy, seconds), kind=drone, around=surroundings, log=MemoryLog(record), settle=SETTLE
+        policy,
+        settings_of(policy, seconds),
+        kind=drone,
+        surroundings=surroundings,
+        log=MemoryLog(record),
+        settle=SETTLE,
     )
 
 
@@ -162,7 +164,7 @@ def stand_start(path: Path, number: int) -> list[Row]:
         policy,
         settings_of(policy, 60.0),
         conditions=conditions,
-        around=Surroundings(seed=number),
+        surroundings=Surroundings(seed=number),
         log=MemoryLog(False),
         settle=SETTLE,
     )
@@ -194,25 +196,7 @@ Injection = Callable[[World, int], None]
 
 def injected(kind: str) -> Injection:
     """A fault of `FAULT_KINDS` in virtual time."""
-    what = FAULT_KINDS[kind]
-
-    def inject(world: World, drone: int) -> None:
-        one = world.drones[drone]
-        if isinstance(what, LinkFaults):
-            one.link = what
-        elif isinstance(what, DroneFaults):
-            one.faults = what
-        elif isinstance(what, BodyFault):
-            world.pair.disturb(drone, what.what, what.value)
-        elif what == "crash":
-            one.firmware.supervisor.crash()
-        elif what == "kill":
-            one.firmware.dead = True
-            one.link = LinkFaults(silent_up=True, silent_down=True)
-        elif what == "reboot":
-            one.reboot()
-
-    return inject
+    return lambda world, drone: world.drones[drone].inject(FAULT_KINDS[kind])
 
 
 def both(kind: str) -> Injection:

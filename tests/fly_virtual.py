@@ -14,7 +14,7 @@ from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin import virtual
-from mjxball.fly.twin.conditions import DELIVERED, QUIET, DroneKind, Surroundings
+from mjxball.fly.twin.conditions import DELIVERED, DroneKind
 from mjxball.fly.twin.physics import Pair, StandIn, StandInPlant
 from mjxball.fly.twin.virtual import MemoryLog, VirtualLink
 from mjxball.policy import Policy, PolicyFile
@@ -34,16 +34,13 @@ class World(virtual.World):
         contents: PolicyFile | None = None,
         physics: Pair | None = None,
         log: Any = None,
-        around: Surroundings = QUIET,
     ):
         policy = Policy(contents, "given") if contents else Policy.load(TRANSPORT)
         rig = Rig.of_card(policy.card)
         plant = StandInPlant(mass=MASS, mounts=(rig.leader_mount, rig.follower_mount))
         maps = None if contents else (CommandMap(carried_mass=MASS / 2),) * 2
         settings = settings or FlightSettings(seconds=2.0)
-        super().__init__(
-            policy, settings, kind=kind, around=around, physics=physics or StandIn(plant), maps=maps, log=log
-        )
+        super().__init__(policy, settings, physics=physics or StandIn(plant, kind), maps=maps, log=log)
 
 
 def log_header(contents: PolicyFile, name: str = "nobody") -> dict[str, Any]:

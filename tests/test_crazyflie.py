@@ -182,7 +182,7 @@ class TestSent:
         config = dataclasses.replace(STOCK, thrust_law=law, motor_curve=curve)
         simulated = crazyflie.setpoints(config, np.array(command), np.array(mass), 9.81)
         free = CommandMap(law, carried_mass=mass, curve=ForceCurve(*curve))
-        flown = to_setpoint(np.array(command), 0.0, free).setpoint
+        flown = to_setpoint(np.array(command), free).setpoint
         # float32 on the wire: 1e-7 of 15 degrees. A thrust half way between two units may round either way.
         np.testing.assert_allclose(simulated[:3], packets.unpack_setpoint(packets.pack_setpoint(flown))[:3], atol=2e-6)
         assert abs(simulated[3] - flown.thrust) <= (0 if law == "paper" and command[2] == round(command[2]) else 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -46,7 +45,7 @@ def test_the_calibrated_law_lifts_what_was_asked(roll: float, pitch: float, vert
     st.sampled_from([PAPER, CALIBRATED]),
 )
 def test_every_setpoint_is_within_bounds(law: tuple[float, ...], constants: CommandMap) -> None:
-    sent = command.to_setpoint(np.array(law), 0.0, constants).setpoint
+    sent = command.to_setpoint(np.array(law), constants).setpoint
     assert THRUST_FLOOR <= sent.thrust <= THRUST_CEILING
     assert abs(sent.roll) <= 15 + 1e-9
     assert abs(sent.pitch) <= 15 + 1e-9
@@ -58,21 +57,20 @@ def test_a_number_that_is_not_finite_is_refused(slot: int, value: float) -> None
     law = np.zeros(3)
     law[slot] = value
     with pytest.raises(PacketError):
-        command.to_setpoint(law, 0.0, CALIBRATED)
+        command.to_setpoint(law, CALIBRATED)
 
 
 def test_saturation_is_told() -> None:
-    assert command.to_setpoint(np.array([0.0, 0.0, 30.0]), 0.0, PAPER).saturated
-    assert not command.to_setpoint(np.array([0.0, 0.0, 1.0]), 0.0, PAPER).saturated
+    assert command.to_setpoint(np.array([0.0, 0.0, 30.0]), PAPER).saturated
+    assert not command.to_setpoint(np.array([0.0, 0.0, 1.0]), PAPER).saturated
 
 
 def test_signs_on_the_wire() -> None:
-    free = dataclasses.replace(PAPER, yaw_gain=1.0)
-    sent = command.to_setpoint(np.array([0.1, 0.2, 0.0]), 0.3, free).setpoint
-    # Nose down (pitch > 0) goes out negative; a drone turned to the left is sent clockwise, which is positive.
+    sent = command.to_setpoint(np.array([0.1, 0.2, 0.0]), PAPER).setpoint
+    # Nose down (pitch > 0) goes out negative; the firmware keeps the heading.
     assert sent.roll == pytest.approx(math.degrees(0.1))
     assert sent.pitch == pytest.approx(-math.degrees(0.2))
-    assert sent.yaw_rate == pytest.approx(math.degrees(0.3))
+    assert sent.yaw_rate == 0
 
 
 def test_nothing_lifts_without_force() -> None:

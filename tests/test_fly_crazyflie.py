@@ -97,7 +97,7 @@ def test_what_is_sent_is_what_was_simulated(preset: str, roll: float, pitch: flo
     command = np.array([[roll, pitch, lift]] * 2)
     expected = crazyflie.setpoints(config.autopilot, command, carried, config.plant.gravity)
     for row, known in zip(expected, card.command_maps(config), strict=True):
-        sent = to_setpoint(command[0], 0.3, known).setpoint
+        sent = to_setpoint(command[0], known).setpoint
         np.testing.assert_allclose(sent[:3], row[:3], atol=1e-9)
         assert abs(sent.thrust - row[3]) <= 1  # a cut of tilt comes before the thrust there as here; rounding
 

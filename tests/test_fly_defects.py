@@ -22,7 +22,7 @@ from mjxball.policy.file import shipped_policy
 pytest.importorskip("mujoco")
 
 
-def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, **around) -> World:
+def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, **surroundings) -> World:
     policy = Policy.load(shipped_policy(name))
     config = Controller(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
@@ -32,7 +32,7 @@ def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, 
         policy,
         settings,
         kind=drone_kind(curve=curve),
-        around=Surroundings(**around),
+        surroundings=Surroundings(**surroundings),
         conditions=conditions,
         log=MemoryLog(),
         settle=1.0,
@@ -43,7 +43,7 @@ def error_of(world: World, after: float) -> np.ndarray:
     """(T, 3) of O from its goal, from `after` [s] of the flight on [m]."""
     flown = [moment for moment in world.track if moment.state == "fly"]
     late = np.array([moment.position for moment in flown if moment.time - flown[0].time >= after])
-    return late - (world.flight._origin + np.array(world.settings.goal))
+    return late - (world.flight._monitor.origin + np.array(world.settings.goal))
 
 
 def test_two_flights_in_a_row_need_no_reboot() -> None:

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from command_line import environment
 
-from mjxball.fly.display import RED, Display, lines
-from mjxball.fly.flight import View
+from mjxball.fly.display import RED, Display, View, lines
 from mjxball.fly.limits import Limits
 from mjxball.fly.packets import ZERO, DroneState
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor

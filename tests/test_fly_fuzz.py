@@ -115,7 +115,7 @@ def test_cflib_still_connects_after_a_storm() -> None:
 def test_the_runner_survives_a_hostile_twin() -> None:
     with Twin(StandIn()) as twin:
         link = opened(twin)
-        twin.set_faults(0, DroneFaults(garbage=4.0))  # 800 datagrams a second
+        twin.drones[0].faults = DroneFaults(garbage=4.0)  # 800 datagrams a second
         end = time.monotonic() + 1.5
         while time.monotonic() < end:
             link.send(packets.setpoint_packet(packets.ZERO))
@@ -134,7 +134,7 @@ def test_the_runner_survives_a_hostile_twin() -> None:
 @pytest.mark.alone
 def test_connecting_to_a_hostile_twin_ends_one_way_or_the_other() -> None:
     with Twin(StandIn()) as twin:
-        twin.set_faults(0, DroneFaults(garbage=2.0))
+        twin.drones[0].faults = DroneFaults(garbage=2.0)
         started = time.monotonic()
         with contextlib.suppress(LinkError):
             opened(twin).close()

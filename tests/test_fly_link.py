@@ -19,7 +19,7 @@ from mjxball.fly.link import Link
 from mjxball.fly.packets import Setpoint
 from mjxball.fly.preflight import Preflight, reset_estimator
 from mjxball.fly.telemetry import WRAP, FirmwareClock
-from mjxball.fly.twin.conditions import DroneFaults, LinkFaults
+from mjxball.fly.twin.conditions import DroneFaults, Injection, LinkFaults
 from mjxball.fly.twin.physics import StandIn
 from mjxball.fly.twin.server import HOST, Twin
 
@@ -151,7 +151,7 @@ def test_a_parameter_that_does_not_stick_is_found(twin: Twin, link: Link) -> Non
 
 
 def test_a_parameter_that_is_never_confirmed_has_a_deadline(twin: Twin, link: Link) -> None:
-    twin.set_link(0, LinkFaults(silent_down=True))
+    twin.drones[0].link = LinkFaults(silent_down=True)
     with pytest.raises(LinkError, match="did not confirm"):
         link.write_parameters({"pid_rate.roll_kp": 100.0})
 
@@ -186,28 +186,28 @@ def test_somebody_who_never_answers() -> None:
 
 
 def test_lost_parameter_packets_are_repeated(twin: Twin, link: Link) -> None:
-    twin.set_link(0, LinkFaults(loss=0.3))
+    twin.drones[0].link = LinkFaults(loss=0.3)
     values = {f"pid_rate.{axis}_kp": 7.0 + place for place, axis in enumerate(("roll", "pitch", "yaw"))}
     link.write_parameters(values)
     assert {name: twin.drones[0].peer.values[name] for name in values} == values
 
 
 def test_a_reply_that_is_lost_while_connecting_has_a_deadline(twin: Twin, links: Callable[..., Link]) -> None:
-    twin.set_link(0, LinkFaults(loss=0.3))  # of two hundred exchanges: one is lost for certain
+    twin.drones[0].link = LinkFaults(loss=0.3)  # of two hundred exchanges: one is lost for certain
     with pytest.raises(LinkError, match="cannot be reached"):
         links(twin.uris[0]).open()
 
 
 def test_silence_makes_the_state_old(twin: Twin, link: Link) -> None:
-    twin.set_link(0, LinkFaults(silent_down=True))
+    twin.drones[0].link = LinkFaults(silent_down=True)
     assert wait_for(lambda: link.telemetry.age(time.monotonic()) > 0.2)
     assert link.lost is None  # a silent peer gives no error at all: only the age tells
-    twin.set_link(0, LinkFaults())
+    twin.drones[0].link = LinkFaults()
     assert wait_for(lambda: link.telemetry.age(time.monotonic()) < 0.1)
 
 
 def test_delay_shows_in_the_firmwares_clock(twin: Twin, link: Link) -> None:
-    twin.set_link(0, LinkFaults(delay=0.3))
+    twin.drones[0].link = LinkFaults(delay=0.3)
     assert wait_for(lambda: link.telemetry.age(time.monotonic()) < 0.1)
     time.sleep(0.5)
     newest = link.telemetry.newest
@@ -218,12 +218,12 @@ def test_delay_shows_in_the_firmwares_clock(twin: Twin, link: Link) -> None:
 
 
 def test_a_stopped_clock_makes_the_state_old(twin: Twin, link: Link) -> None:
-    twin.set_faults(0, DroneFaults(clock_stopped=True))
+    twin.drones[0].faults = DroneFaults(clock_stopped=True)
     assert wait_for(lambda: link.telemetry.age(time.monotonic()) > 0.3)
 
 
 def test_a_refused_datagram_ends_the_link_and_nothing_hangs(twin: Twin, link: Link) -> None:
-    twin.close_port(0)
+    twin.inject(Injection("port", 0, 0.0))
     for _ in range(30):
         link.send(packets.setpoint_packet(packets.ZERO))
         time.sleep(0.01)
@@ -234,7 +234,7 @@ def test_a_refused_datagram_ends_the_link_and_nothing_hangs(twin: Twin, link: Li
 
 
 def test_loss_and_jitter_leave_states_in_order(twin: Twin, link: Link) -> None:
-    twin.set_link(0, LinkFaults(loss=0.2, jitter=0.03))
+    twin.drones[0].link = LinkFaults(loss=0.2, jitter=0.03)
     stamps = []
     end = time.monotonic() + 1.0
     while time.monotonic() < end:

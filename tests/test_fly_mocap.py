@@ -34,7 +34,7 @@ from mjxball.fly.supervisor import Event, State
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import QUIET, Surroundings
 from mjxball.fly.twin.physics import make_pair
-from mjxball.fly.twin.server import Twin, TwinSettings
+from mjxball.fly.twin.server import Twin
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
 
@@ -375,7 +375,7 @@ class Flown:
     ):
         self.heard: list[list[tuple[float, np.ndarray]]] = [[], []]
         self.errors: list[float] = []
-        with Twin(make_pair(load_file(policy).card, around=around), TwinSettings(around=around)) as twin:
+        with Twin(make_pair(load_file(policy).card, surroundings=around)) as twin:
             for number, drone in enumerate(twin.drones):
                 drone.receive = functools.partial(self._hear, twin, number, drone.receive)  # type: ignore[method-assign]
 

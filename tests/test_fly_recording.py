@@ -38,7 +38,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Journal(path, **log_header(contents)) as notes:
         settings = FlightSettings(seconds=4.0, goal=(0.1, 0.0, 0.4))
         physics = make_pair(contents.card, OLDER, EXACT)
-        world = World(settings, OLDER, contents, physics, notes, EXACT)
+        world = World(settings, contents=contents, physics=physics, log=notes)
         world.fly_until(State.DONE)
     return path
 

@@ -10,14 +10,13 @@ import pytest
 from mjxball.control import motors, rotations
 from mjxball.control.motors import MOTORS
 from mjxball.fly import command, spin
-from mjxball.fly.limits import EstimatorWatch, UplinkWatch, WatchLimits
+from mjxball.fly.monitor import VARIANCE, EstimatorWatch, UplinkWatch
 from mjxball.fly.packets import MOTORS as MOTOR_VARIABLES
 from mjxball.fly.packets import VARIANCES, DroneState, Health, health_of
 from mjxball.fly.supervisor import Event
 from mjxball.fly.telemetry import Rig, Sample, object_of_one, object_state
 
 RIG = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
-LIMITS = WatchLimits()
 WELL = Health((1e-5, 1e-5, 1e-5), (40000,) * 4, 40000.0)
 
 
@@ -71,7 +70,7 @@ def test_a_jump_is_found_at_once_and_the_other_drone_is_flown_by() -> None:
 def test_a_variance_that_grows_is_found() -> None:
     watch = EstimatorWatch(RIG)
     seen = [sample(n, 0.0) for n in range(2)]
-    blind = WELL._replace(variance=(1e-5, 1e-5, 1.1 * LIMITS.variance))
+    blind = WELL._replace(variance=(1e-5, 1e-5, 1.1 * VARIANCE))
     assert [fault.event for fault in watch.update(seen, [WELL, blind], 0.0)] == [Event.ESTIMATOR]
     assert watch.trusted == [True, False]
     sideways = WELL._replace(variance=(1.0, 1.0, 1e-5))

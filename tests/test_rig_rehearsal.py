@@ -68,7 +68,7 @@ def rehearse(path: Path, case: Case) -> None:
     pair = CoupledPair(configs.apply_overrides(CONFIG, case.rig), conditions, kind, around)
     settings, random = FlightSettings(seconds=case.seconds), np.random.default_rng(3)
     with Journal(path, **log_header(CONTENTS, "flight")) as journal:
-        world = World(settings, kind, CONTENTS, pair, journal, around)
+        world = World(settings, contents=CONTENTS, physics=pair, log=journal)
         world.fly_until(State.FLY)
         while case.goals and world.flight.supervisor.state is State.FLY:
             goal = np.array(settings.goal) + random.uniform(-1, 1, 3) * REACH

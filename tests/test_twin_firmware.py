@@ -545,7 +545,7 @@ def test_row_without_a_deck_the_complementary_filter_knows_no_position() -> None
     assert (state.report.variance == 0).all()  # which pass for converged ones
     assert (state.report.position[:, :2] == 0).all()
     assert abs(state.report.position[0, 2]) > 1  # above the sea
-    drone = TwinDrone(pair, 0, DELIVERED, Surroundings(deck=False))
+    drone = TwinDrone(pair, 0)
     assert drone.peer.values["stabilizer.estimator"] == 1
     found = swayed(pair, RISING, 3.0, 4.0)
     assert np.abs(found["attitude"][:, :2]).max() < 0.06  # it still knows its attitude, within 3 degrees
@@ -553,7 +553,7 @@ def test_row_without_a_deck_the_complementary_filter_knows_no_position() -> None
 
 def test_row_poses_come_from_the_laptop_as_well() -> None:
     pair = flying_pair("flight", Surroundings(deck=False))
-    drone = TwinDrone(pair, 1, DELIVERED, Surroundings(deck=False))
+    drone = TwinDrone(pair, 1)
     assert written(drone.peer, "stabilizer.estimator", 2, 0.0) == 2
     pose = struct.pack("<B7f", 8, 0.0, -0.15, 0.25, 0.0, 0.0, 0.0, 1.0)
     for number in range(100):
@@ -586,8 +586,8 @@ def test_row_the_cascade_flies_the_estimate_not_the_truth() -> None:
 
 
 def flown(kind: DroneKind = DELIVERED) -> tuple[StandIn, tuple[TwinDrone, TwinDrone], list[float]]:
-    pair = StandIn()
-    return pair, (TwinDrone(pair, 0, kind), TwinDrone(pair, 1, kind)), [0.0]
+    pair = StandIn(kind=kind)
+    return pair, (TwinDrone(pair, 0), TwinDrone(pair, 1)), [0.0]
 
 
 def test_row_a_dead_stabilizer_logs_on_with_frozen_values() -> None:
@@ -714,8 +714,8 @@ def test_parameters_that_cannot_be_written() -> None:
 
 @pytest.mark.parametrize("delay", [0.0, 0.005, 0.0125])
 def test_row_round_trips_hold_from_the_first_packet(delay: float) -> None:
-    pair = StandIn()
-    drone = TwinDrone(pair, 0, DELIVERED, Surroundings(delay=delay))
+    pair = StandIn(surroundings=Surroundings(delay=delay))
+    drone = TwinDrone(pair, 0)
     drone.receive(b"\xfd\x00", 1.0)
     arrived = []
     for number in range(300):

@@ -40,7 +40,7 @@ def zeros(world: World, seconds: float) -> None:
 @pytest.mark.parametrize("delay", [0.0, 0.01])
 def test_setpoints_and_states_are_late_by_the_links_delay(delay: float) -> None:
     policy = policy_of("flight")
-    world = World(policy, around=Surroundings(delay=delay))
+    world = World(policy, surroundings=Surroundings(delay=delay))
     world.advance(0.2)
     states = [record for record in world.log.records if record["kind"] == "state"]
     stamps = [int.from_bytes(bytes.fromhex(record["raw"])[1:4], "little") / 1000 for record in states]

@@ -1,4 +1,9 @@
-"""From a law's command to thrust units, and what both drones are sent in states in which no law is in command. Pure."""
+"""What drones are sent: from a law's command to thrust units, and level flight where no law is in command.
+
+Firmware with battery compensation (2025.12.1 and later by default) makes the force proportional to the thrust command:
+`linear`. Firmware without it takes the command as the motors' PWM: `older`. No parameter says which, but the PWM does
+that the firmware makes of a small thrust: `spin` looks at it. Pure.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +17,17 @@ import numpy as np
 from mjxball.control import crazyflie, leader, motors
 from mjxball.control.crazyflie import Gains
 from mjxball.fly.limits import Times
-from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, Setpoint, setpoint
+from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, PacketError, Setpoint, setpoint
 
 CurveName = Literal["linear", "older"]
 CURVE_NAMES: tuple[CurveName, ...] = ("linear", "older")
 SPIN_THRUST = 16000  # [thrust units] a third of hover: the motors turn, the pair does not lift
+GRAVITY = 9.81
+BRAKE_TILT = math.radians(8)  # of a descent that brakes sideways
+BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
+BLIND_LIMIT = 2.5  # [s] that it lasts at most
+BRISK, GENTLE = 3.0, 0.7  # [m/s2] downward at most: where both drones hear, and where one may not
+Array = Any
 
 
 @dataclass(frozen=True)
@@ -39,9 +50,6 @@ LINEAR = ForceCurve()
 OLDER = ForceCurve(*motors.OLDER)  # firmware without battery compensation, 2.1 motors
 
 
-Array = Any
-
-
 @dataclass(frozen=True)
 class CommandMap:
     """How a drone's command becomes thrust units, and the bounds of every setpoint.
@@ -54,15 +62,24 @@ class CommandMap:
     hover: float = 46000.0  # thr_hov [thrust units], of the paper; calibrate it for every rig
     per_acceleration: float = 1000.0  # k_pz [thrust units per m/s2], of the paper
     carried_mass: float = 0.035  # the drone and its share of the object [kg]
-    gravity: float = 9.81  # [m/s2]
+    gravity: float = GRAVITY  # [m/s2]
     curve: ForceCurve = LINEAR
     tilt_limit: float = math.radians(15)  # of every commanded roll and pitch [rad]
-    yaw_gain: float = 0.0  # yaw rate command per yaw error [1/s]; the firmware integrates the yaw rate itself
 
     @property
     def hover_thrust(self) -> float:
         """Thrust units at level hover."""
         return self.hover if self.law == "paper" else self.curve.thrust(self.carried_mass * self.gravity)
+
+
+class Variant(NamedTuple):
+    """How one drone is flown if its firmware has a certain force curve."""
+
+    map: CommandMap
+    gains: Gains
+
+
+Variants = Mapping[CurveName, Variant]  # of one drone, by the curve of its firmware
 
 
 class Mapped(NamedTuple):
@@ -81,48 +98,16 @@ def raw_thrust(command: Array, constants: CommandMap) -> float:
     return constants.curve.thrust(constants.carried_mass * (constants.gravity + vertical) / level)
 
 
-def to_setpoint(command: Array, yaw: float, constants: CommandMap) -> Mapped:
-    """The bounded setpoint of `command` (3,); `yaw` is the drone's own [rad].
-
-    Raises packets.PacketError if a number is not finite.
-    """
+def to_setpoint(command: Array, constants: CommandMap) -> Mapped:
+    """The bounded setpoint of `command` (3,), without yaw. Raises packets.PacketError if a number is not finite."""
     roll, pitch, vertical = (float(value) for value in command)
     if not all(map(math.isfinite, (roll, pitch, vertical))):
-        return Mapped(setpoint(roll, pitch, 0.0, vertical), True)  # raises
+        raise PacketError("a command is not finite")
     limit = constants.tilt_limit
     roll, pitch = (min(max(value, -limit), limit) for value in (roll, pitch))
     wanted = raw_thrust((roll, pitch, vertical), constants)
     thrust = min(max(wanted, THRUST_FLOOR), THRUST_CEILING)
-    return Mapped(setpoint(roll, pitch, -constants.yaw_gain * yaw, thrust), thrust != wanted)
-
-
-class Variant(NamedTuple):
-    """How one drone is flown if its firmware has a certain force curve."""
-
-    map: CommandMap
-    gains: Gains
-
-
-Variants = Mapping[CurveName, Variant]  # of one drone, by the curve of its firmware
-
-
-GRAVITY = 9.81
-
-
-def ramp(elapsed: float, times: Times, constants: CommandMap) -> Setpoint:
-    """Level, thrust rising in a straight line to hover."""
-    share = min(elapsed / times.ramp, 1.0)
-    return level(THRUST_FLOOR + share * (constants.hover_thrust - THRUST_FLOOR))
-
-
-def sink(trim: float, climb: float | None, elapsed: float, times: Times) -> float:
-    """Thrust [units] that lets a drone sink, from the `trim` that hovered; `climb` is its vertical speed [m/s].
-
-    With a known speed it is held; without one (None) thrust falls from 95 to 70 % of the trim.
-    """
-    if climb is None:
-        return trim * (0.95 - 0.25 * min(elapsed / times.descend_limit, 1.0))
-    return trim * (1 + min(max(-0.4 * (climb + times.descend_speed), -0.3), 0.1))
+    return Mapped(setpoint(roll, pitch, 0.0, thrust), thrust != wanted)
 
 
 def level(thrust: float, tilt: tuple[float, float] = (0.0, 0.0)) -> Setpoint:
@@ -131,7 +116,15 @@ def level(thrust: float, tilt: tuple[float, float] = (0.0, 0.0)) -> Setpoint:
     return setpoint(*tilt, 0.0, bounded)
 
 
-BRAKE_TILT = math.radians(8)  # of a descent that brakes sideways
+def ramp(elapsed: float, times: Times, constants: CommandMap) -> Setpoint:
+    """Level, thrust rising in a straight line to hover."""
+    share = min(elapsed / times.ramp, 1.0)
+    return level(THRUST_FLOOR + share * (constants.hover_thrust - THRUST_FLOOR))
+
+
+def sinking_share(climb: float, times: Times) -> float:
+    """Share of the thrust that hovers by which a drone of vertical speed `climb` [m/s] comes to sink as wanted."""
+    return 1 + min(max(-0.4 * (climb + times.descend_speed), -0.3), 0.1)
 
 
 def brake(velocity: np.ndarray) -> tuple[float, float]:
@@ -159,21 +152,16 @@ class LastKnownState(NamedTuple):
     lift: float  # its vertical acceleration under the setpoints that were sent last [m/s2]
 
 
-BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
-BLIND_LIMIT = 2.5  # [s] that it lasts at most
-BRISK, GENTLE = 3.0, 0.7  # [m/s2] downward at most: where both drones hear, and where one may not
-
-
 def blind_shares(seen: LastKnownState, unheard: float, period: float, hardest: float = BRISK) -> list[float]:
     """Shares of the trim for a descent that is flown blind, one per `period` [s], all below 1.
 
     The first `unheard` seconds went by under the last setpoints. From there the pair's height is computed, not
     measured: sink at `BLIND_SPEED`, gained with at most `hardest` [m/s2], until it must stand, and 0.1 s more.
     """
-    known = [value if math.isfinite(value) else 0.0 for value in (seen.height, seen.climb, seen.lift)]
-    lift = min(max(known[2], -3.0), 3.0)
-    height = known[0] + known[1] * unheard + 0.5 * lift * unheard**2
-    climb = known[1] + lift * unheard
+    height, climb, lift = (value if math.isfinite(value) else 0.0 for value in seen[1:])
+    lift = min(max(lift, -3.0), 3.0)
+    height += climb * unheard + 0.5 * lift * unheard**2
+    climb += lift * unheard
     shares: list[float] = []
     while height > 0 and len(shares) * period < BLIND_LIMIT:
         wanted = min(max(3 * (-BLIND_SPEED - climb), -hardest), -0.15)

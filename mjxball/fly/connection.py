@@ -162,14 +162,6 @@ class Element:
     code: str  # of `struct`, little-endian
     read_only: bool
 
-    def pack(self, value: float) -> bytes:
-        """`value` as the wire carries it. Raises struct.error or ValueError if the type cannot hold it."""
-        return struct.pack(self.code, value if self.code[-1] in "efd" else int(value))
-
-    def unpack(self, data: bytes) -> float:
-        """The value in `data`. Raises struct.error for another length."""
-        return float(struct.unpack(self.code, data)[0])
-
 
 class Parameters:
     """The parameters of one drone. `received` is called by the thread that receives, the rest by any other."""
@@ -188,21 +180,14 @@ class Parameters:
                 self._answers[packet.channel, struct.unpack("<H", data[:2])[0]] = data[2:]
                 self._changed.notify_all()
 
-    def has(self, name: str) -> bool:
-        """True if the firmware lists `name`."""
-        return self._find(name) is not None
-
     def read(self, names: Iterable[str]) -> dict[str, float]:
         """Values by name. Raises LinkError for an unknown one, or one that is not answered."""
         elements = {name: self._element(name) for name in names}
         answers = self._ask({name: Packet(PORT, READ, struct.pack("<H", e.ident)) for name, e in elements.items()})
-        found = {}
-        for name, element in elements.items():
-            try:
-                found[name] = element.unpack(answers[name][1:])  # a status byte precedes the value
-            except struct.error:
-                raise LinkError(f"parameter {name} of the {self._drone} cannot be read") from None
-        return found
+        try:  # a status byte precedes the value
+            return {name: float(struct.unpack(e.code, answers[name][1:])[0]) for name, e in elements.items()}
+        except struct.error:
+            raise LinkError(f"a parameter of the {self._drone} cannot be read: {', '.join(elements)}") from None
 
     def write(self, values: Mapping[str, float], check: bool = True) -> None:
         """Write `values`, and read them back unless the firmware may change them itself (`check` false).
@@ -229,16 +214,15 @@ class Parameters:
         if element.read_only:
             raise LinkError(f"parameter {name} of the {self._drone} cannot be written: it is read-only")
         try:
-            return struct.pack("<H", element.ident) + element.pack(value)
+            number = value if element.code[-1] in "efd" else int(value)
+            return struct.pack("<H", element.ident) + struct.pack(element.code, number)
         except (struct.error, ValueError, OverflowError):
             text = f"parameter {name} of the {self._drone} cannot be written: {value:g} does not fit its type"
             raise LinkError(text) from None
 
     def _ask(self, requests: Mapping[str, Packet]) -> dict[str, bytes]:
         """Send all `requests`, a few at a time, and return their answers. Raises LinkError at the deadline."""
-        waiting = list(requests)
-        found: dict[str, bytes] = {}
-        sent: dict[str, float] = {}
+        waiting, found, sent = list(requests), dict[str, bytes](), dict[str, float]()
         keys = {name: (packet.channel, struct.unpack("<H", packet.data[:2])[0]) for name, packet in requests.items()}
         with self._changed:
             for key in keys.values():
@@ -251,10 +235,8 @@ class Parameters:
                     sent[name] = now
                     self._send(requests[name])
             with self._changed:
+                self._changed.wait_for(lambda: any(keys[name] in self._answers for name in waiting), 0.02)  # noqa: B023
                 answered = [name for name in waiting if keys[name] in self._answers]
-                if not answered:
-                    self._changed.wait(0.02)
-                    answered = [name for name in waiting if keys[name] in self._answers]
                 found |= {name: self._answers.pop(keys[name]) for name in answered}
             waiting = [name for name in waiting if name not in found]
             latest = time.monotonic() if answered else latest

@@ -12,18 +12,31 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import TextIO
+from typing import NamedTuple, TextIO
 
 import numpy as np
 
 from mjxball.control import rotations
-from mjxball.fly.flight import View
 from mjxball.fly.limits import NAMES, Limits
+from mjxball.fly.packets import DroneState, Setpoint
 from mjxball.fly.process import Child
-from mjxball.fly.supervisor import ENDED, GUIDED, State
+from mjxball.fly.supervisor import ENDED, GUIDED, State, Supervisor
 
 RED, YELLOW, GREEN, PLAIN = "\x1b[1;37;41m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
 PERIOD = 0.2  # [s]
+
+
+class View(NamedTuple):
+    """What a display may show; replaced as a whole at every tick."""
+
+    time: float  # [s] since the start
+    supervisor: Supervisor
+    states: list[DroneState]
+    ages: list[float]
+    goal: np.ndarray
+    wanted: tuple[Setpoint, Setpoint]
+    late: float  # [s]
+    missed: int
 
 
 def lines(view: View, bounds: Limits, colour: bool = True) -> list[str]:

@@ -6,11 +6,12 @@ cflib is imported when a link is opened, so that all else here works without it.
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from mjxball.fly import packets
@@ -80,8 +81,7 @@ class Link:
             self._request(request)
         both.wait(self._deadlines.version)
         self._crazyflie.remove_port_callback(packets.VERSION.port, told)
-        names = [name for name in REVISION if self.parameters.has(name)]
-        began = time.monotonic()
+        names, began = [name for name in REVISION if self._element(name) is not None], time.monotonic()
         revision = self.parameters.read(names)
         trip = (time.monotonic() - began) if names else math.nan
         self.identity = Identity(
@@ -94,8 +94,8 @@ class Link:
         self._note("connected", drone=self.name, uri=self.uri, seconds=seconds, latency_ms=1000 * trip, **found)
         if self.identity.protocol < PROTOCOL:
             self.close()
-            found_version = self.identity.protocol
-            raise LinkError(f"{self.name} speaks protocol {found_version}, {PROTOCOL} is needed; update its firmware")
+            spoken = self.identity.protocol
+            raise LinkError(f"{self.name} speaks protocol {spoken}, {PROTOCOL} is needed; update its firmware")
 
     def _element(self, name: str) -> Element | None:
         found = self._crazyflie.param.toc.get_element_by_complete_name(name)
@@ -173,22 +173,18 @@ class Link:
 
     def send(self, packet: Packet) -> None:
         """Put `packet` out as the newest setpoint; one that was not sent yet is dropped."""
-        with self._wake:
+        with self._queue():
             self.overwritten += self._setpoint is not None
             self._setpoint = packet
-            self._waiting_since = self._waiting_since or time.monotonic()
-            self._wake.notify()
 
     def command(self, packet: Packet) -> None:
         """Queue `packet` before any setpoint; an older setpoint that still waits is dropped."""
-        with self._wake:
+        with self._queue():
             self._setpoint = None
             if packet == packets.EMERGENCY_STOP:
                 self._commands.clear()  # nothing may be before it, or in its place
             if len(self._commands) < 20:
                 self._commands.append(packet)
-            self._waiting_since = self._waiting_since or time.monotonic()
-            self._wake.notify()
 
     def pose(self, packet: Packet) -> None:
         """Put `packet` out as the newest measured pose, once no command and no setpoint waits; an older one is dropped.
@@ -201,8 +197,14 @@ class Link:
 
     def _request(self, packet: Packet) -> None:
         """Queue `packet` behind the commands that wait; a setpoint that waits stays."""
-        with self._wake:
+        with self._queue():
             self._commands.append(packet)
+
+    @contextlib.contextmanager
+    def _queue(self) -> Iterator[None]:
+        """Change what waits to be sent, and wake the sender."""
+        with self._wake:
+            yield
             self._waiting_since = self._waiting_since or time.monotonic()
             self._wake.notify()
 
@@ -228,14 +230,13 @@ class Link:
                     self._wake.wait(QUIET)
                 if self._closing and not self._commands:
                     return
-                packet: Packet | None = packets.PING  # the firmware stops its logs if it hears nothing for 1 s
+                packet = packets.PING  # the firmware stops its logs if it hears nothing for 1 s
                 if self._commands:
                     packet = self._commands.popleft()
-                elif self._setpoint:
+                elif self._setpoint is not None:
                     packet, self._setpoint = self._setpoint, None
-                elif self._pose:
+                elif self._pose is not None:
                     packet, self._pose = self._pose, None
-            assert packet is not None
             wire = CRTPPacket()
             wire.set_header(packet.port, packet.channel)
             wire.data = packet.data
@@ -259,8 +260,7 @@ class Link:
         except PacketError:
             self.telemetry.damaged += 1
             return
-        sample = self.telemetry.take(state, int.from_bytes(data[1:4], "little"), arrival)
-        if sample is not None:
+        if self.telemetry.take(state, int.from_bytes(data[1:4], "little"), arrival):
             self._note("state", t=arrival, drone=self.name, raw=data.hex())
 
     def _take_health(self, values: Mapping[str, float]) -> None:

@@ -7,6 +7,7 @@ added.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -35,8 +36,8 @@ class Field(NamedTuple):
     """One field of a kind of record."""
 
     type: Type
-    text: str  # what it is, with its unit
-    required: bool
+    text: str = ""  # what it is, with its unit
+    required: bool = True
 
 
 class Kind(NamedTuple):
@@ -53,35 +54,18 @@ class StatePacket(NamedTuple):
     state: packets.DroneState
 
 
-def _number(value: Any) -> float:
+def _number(value: Any, finite: bool = False) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError
+    if finite and not math.isfinite(value):
+        raise ValueError
     return float(value)
 
 
-def _finite(value: Any) -> float:
-    if not math.isfinite(number := _number(value)):
-        raise ValueError
-    return number
-
-
-def _exactly(kind: type) -> Callable[[Any], Any]:
-    def decode(value: Any) -> Any:
-        if type(value) is not kind:
-            raise TypeError
-        return value
-
-    return decode
-
-
-def _drone(value: Any) -> str:
-    return NAMES[NAMES.index(value)]
-
-
-def _texts(value: Any) -> tuple[str, ...]:
-    if not (isinstance(value, list) and all(isinstance(text, str) for text in value)):
+def _exactly(kind: type, value: Any) -> Any:
+    if type(value) is not kind:
         raise TypeError
-    return tuple(value)
+    return value
 
 
 def _state(value: Any) -> StatePacket:
@@ -97,38 +81,25 @@ def array(*shape: int | None, finite: bool = True) -> Type:
         found = np.array(value)
         if found.dtype.kind not in "if" or len(found.shape) != len(shape):
             raise TypeError
-        if any(wanted not in (None, length) for wanted, length in zip(shape, found.shape, strict=True)):
-            raise ValueError
-        if finite and not np.isfinite(found).all():
+        fits = all(wanted in (None, length) for wanted, length in zip(shape, found.shape, strict=True))
+        if not fits or (finite and not np.isfinite(found).all()):
             raise ValueError
         return found.astype(float)
 
     return Type("×".join("n" if length is None else str(length) for length in shape) + " numbers", decode)
 
 
-NUMBER, COUNT, TEXT, FLAG = (
-    Type("number", _finite),
-    Type("integer", _exactly(int)),
-    Type("text", _exactly(str)),
-    Type("true or false", _exactly(bool)),
-)
+NUMBER = Type("number", lambda value: _number(value, finite=True))
 ANY_NUMBER = Type("number or NaN", _number)
-TEXTS = Type("texts", _texts)
-DRONE = Type("leader or follower", _drone)
+COUNT = Type("integer", functools.partial(_exactly, int))
+TEXT = Type("text", functools.partial(_exactly, str))
+FLAG = Type("true or false", functools.partial(_exactly, bool))
+TEXTS = Type("texts", lambda value: tuple(_exactly(str, text) for text in _exactly(list, value)))
+DRONE = Type("leader or follower", lambda value: NAMES[NAMES.index(value)])
 STATE = Type("30 bytes as hex", _state)
 CONFIG = Type("settings by name", lambda value: configs.validate(configs.from_record(value)))
 GAINS = Type("parameters of both drones", read_pair_gains)
 JSON = Type("any JSON", lambda value: value)
-
-
-def need(kind: Type, text: str = "") -> Field:
-    """A field that every record of its kind has."""
-    return Field(kind, text, True)
-
-
-def may(kind: Type, text: str = "") -> Field:
-    """A field that a record of its kind may have."""
-    return Field(kind, text, False)
 
 
 def record(text: str, /, **fields: Field) -> Kind:
@@ -136,6 +107,7 @@ def record(text: str, /, **fields: Field) -> Kind:
     return Kind(text, fields)
 
 
+need, may = Field, functools.partial(Field, required=False)
 SETPOINTS = "leader's and follower's roll, pitch [deg], yaw rate [deg/s] and thrust [units] with the wire's signs"
 COMMAND = "roll, pitch [rad], vertical acceleration [m/s²] of its law, while it is in command"
 KINDS: dict[str, Kind] = {

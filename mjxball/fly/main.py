@@ -46,64 +46,39 @@ def make_parser() -> cli.Parser:
     """The flags; what None stands for is the policy card's."""
     about = "Fly a policy with two Crazyflies, or rehearse it with their software twin."
     parser = cli.make_parser("python -m mjxball.fly", about)
-    parser.add_argument("policy", type=Path, metavar="POLICY.npz", help="the follower")
-    parser.add_argument("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
-    parser.add_argument("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")
-    parser.add_argument(
-        "--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given"
-    )
+    add = parser.add_argument
+    add("policy", type=Path, metavar="POLICY.npz", help="the follower")
+    add("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
+    add("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")
+    add("--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given")
     for name, _, high in LINK[1:]:
-        parser.add_argument(f"--{name}", type=float, metavar="X", help=f"--rehearse: {WORSE[name]}, up to {high:g}")
-    parser.add_argument(
-        "--fault", action="append", default=[], metavar="KIND:DRONE@S", help=f"--rehearse: {', '.join(FAULT_KINDS)}"
-    )
+        add(f"--{name}", type=float, metavar="X", help=f"--rehearse: {WORSE[name]}, up to {high:g}")
+    kinds = ", ".join(FAULT_KINDS)
+    add("--fault", action="append", default=[], metavar="KIND:DRONE@S", help=f"--rehearse: {kinds}")
     add_twin_options(parser)
-    parser.add_argument("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
-    parser.add_argument("--dry-run", action="store_true", help="connect, log, and send zeros only")
-    parser.add_argument("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
-    parser.add_argument(
-        "--log",
-        type=Path,
-        metavar="FILE",
-        help="write everything to this new file (flight-DATE.jsonl; none for --rehearse)",
-    )
-    parser.add_argument(
-        "--view",
-        type=int,
-        nargs="?",
-        const=0,
-        metavar="PORT",
-        help="a live page of the log, for a browser on this machine (a free port)",
-    )
-    parser.add_argument(
-        "--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help="m from the start (0 0 0.4; a stand: 0 0 0.08)"
-    )
-    parser.add_argument(
-        "--gains",
-        type=Path,
-        metavar="FILE",
-        help="JSON of firmware parameters to upload, for both drones or each, over the card's",
-    )
-    parser.add_argument("--thrust", choices=("calibrated", "paper"), help="law from az to thrust (the card's)")
-    parser.add_argument("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
-    parser.add_argument("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
-    parser.add_argument("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
-    add_mocap_options(parser)
+    add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
+    add("--dry-run", action="store_true", help="connect, log, and send zeros only")
+    add("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
+    about = "write everything to this new file (flight-DATE.jsonl; none for --rehearse)"
+    add("--log", type=Path, metavar="FILE", help=about)
+    about = "a live page of the log, for a browser on this machine (a free port)"
+    add("--view", type=int, nargs="?", const=0, metavar="PORT", help=about)
+    about = "m from the start (0 0 0.4; a stand: 0 0 0.08)"
+    add("--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help=about)
+    about = "JSON of firmware parameters to upload, for both drones or each, over the card's"
+    add("--gains", type=Path, metavar="FILE", help=about)
+    add("--thrust", choices=("calibrated", "paper"), help="law from az to thrust (the card's)")
+    add("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
+    add("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
+    add("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
+    add("--mocap", choices=KINDS, metavar="KIND", help=f"forward poses from: {', '.join(KINDS)}")
+    add("--mocap-host", metavar="HOST", help="--mocap: its server; optitrack: as numbers")
+    add("--bodies", nargs=2, metavar=("LEADER", "FOLLOWER"), help="--mocap: names of the rigid bodies")
+    add("--mocap-rate", type=float, metavar="HZ", help="--mocap: poses to each drone, 50 to 100")
+    add("--mocap-std", type=float, nargs=2, metavar=("M", "RAD"), help="--mocap: deviations told the estimators")
+    about = "--mocap: more, such as port=22222"
+    add("--mocap-option", action="append", default=[], metavar="KEY=VALUE", help=about)
     return parser
-
-
-def add_mocap_options(parser: argparse.ArgumentParser) -> None:
-    """The flags of motion capture."""
-    parser.add_argument("--mocap", choices=KINDS, metavar="KIND", help=f"forward poses from: {', '.join(KINDS)}")
-    parser.add_argument("--mocap-host", metavar="HOST", help="--mocap: its server; optitrack: as numbers")
-    parser.add_argument("--bodies", nargs=2, metavar=("LEADER", "FOLLOWER"), help="--mocap: names of the rigid bodies")
-    parser.add_argument("--mocap-rate", type=float, metavar="HZ", help="--mocap: poses to each drone, 50 to 100")
-    parser.add_argument(
-        "--mocap-std", type=float, nargs=2, metavar=("M", "RAD"), help="--mocap: deviations told the estimators"
-    )
-    parser.add_argument(
-        "--mocap-option", action="append", default=[], metavar="KEY=VALUE", help="--mocap: more, such as port=22222"
-    )
 
 
 def mocap_settings(options: argparse.Namespace) -> MocapSettings | None:

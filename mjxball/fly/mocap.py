@@ -70,7 +70,7 @@ class MocapSettings:
 
 
 class Source:
-    """The child process and the thread that reads it. A context manager; `take` is called in that thread."""
+    """The child process and the thread that reads it, in which `take` is called."""
 
     def __init__(self, settings: MocapSettings, take: Callable[[Frame], None]):
         """Start both. Raises MocapError if the package is missing."""
@@ -79,7 +79,6 @@ class Source:
         self._take = take
         self.names: list[str] = []  # of all bodies that were seen
         self.failure = ""  # why no more frames will come
-        self.frames = self.damaged = 0
         self._stopping = False
         arguments = [settings.kind, f"{settings.rate}", *settings.bodies, json.dumps(settings.given())]
         self._process = subprocess.Popen(
@@ -91,17 +90,6 @@ class Source:
         )
         self._thread = threading.Thread(target=self._read_all, name="mocap", daemon=True)
         self._thread.start()
-
-    @property
-    def pid(self) -> int:
-        """Of the child."""
-        return self._process.pid
-
-    def __enter__(self) -> Source:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the child and its thread."""
@@ -119,13 +107,11 @@ class Source:
         pipe, waiting = self._process.stdout.fileno(), b""
         while not self._stopping:
             readable, _, _ = select.select([pipe], [], [], 0.1)
-            if not readable:
-                continue
-            received = os.read(pipe, 65536)
-            if not received:
+            received = os.read(pipe, 65536) if readable else None
+            if received == b"":
                 self.failure = self.failure or "its reader ended"
                 return
-            *lines, waiting = (waiting + received).split(b"\n")
+            *lines, waiting = (waiting + (received or b"")).split(b"\n")
             for line in lines:
                 self._line(json.loads(line))
 
@@ -135,8 +121,6 @@ class Source:
             self.failure = what.get("error", self.failure)
             return
         poses = [None if one is None else clean(one[0], one[1:]) for one in what]
-        self.damaged += sum(one is not None and pose is None for one, pose in zip(what, poses, strict=True))
-        self.frames += 1
         self._take((poses[0], poses[1]))
 
 
@@ -147,7 +131,6 @@ class Mocap:
         """`span` (3,) [m] is leader from follower in body axes."""
         self.settings, self.limits = settings, limits
         self.tracks: Tracks = (Track(), Track())  # replaced as a whole, by the reader's thread alone
-        self.sent = [0, 0]
         self._span = span
         self._links: list[Link | None] = [None, None]
         self.note: Note = lambda kind, t=None, **fields: None  # the log's, of gaps and of what is forwarded
@@ -169,9 +152,9 @@ class Mocap:
 
     def wait_ready(self) -> None:
         """Return once both bodies stand where they may be flown from. Raises MocapError, within about 6 s."""
-        where, bounds = self._where(), self.limits
-        source = self._source
+        source, bounds, host = self._source, self.limits, self.settings.host
         assert source is not None
+        where = f"the motion capture ({self.settings.kind}{' at ' + host if host else ''})"
         wait_until(lambda: bool(source.names or source.failure), bounds.answer)
         wait_until(lambda: all(track.received for track in self.tracks) or not source.names, bounds.appear)
         if source.failure:
@@ -184,25 +167,19 @@ class Mocap:
             if not track.received:
                 known = ", ".join(source.names)
                 raise MocapError(f"{where} sends no body named {name}, or does not see it; it sends: {known}")
-        fault = self._watch()
-        if fault:
+        if fault := self._watch():
             raise MocapError(f"{where} cannot be flown on: {fault}")
-
-    def _where(self) -> str:
-        kind, host = self.settings.kind, self.settings.host
-        return f"the motion capture ({kind}{' at ' + host if host else ''})"
 
     def _watch(self) -> str:
         """Why the pair cannot be flown on what comes within `limits.measure`, empty if it can."""
         before, bounds = self.tracks, self.limits
         time.sleep(bounds.measure)
-        after = self.tracks
-        moved = [dataclasses.replace(new, jumps=new.jumps - old.jumps) for old, new in zip(before, after, strict=True)]
-        fault = supervision.standing_fault((moved[0], moved[1]), time.monotonic(), bounds, self._span)
+        both = list(zip(before, self.tracks, strict=True))
+        one, other = (dataclasses.replace(new, jumps=new.jumps - old.jumps) for old, new in both)
+        fault = supervision.standing_fault((one, other), time.monotonic(), bounds, self._span)
         if fault:
             return fault
-        rates = [(new.received - old.received) / bounds.measure for old, new in zip(before, after, strict=True)]
-        slow = min(rates)
+        slow = min((new.received - old.received) / bounds.measure for old, new in both)
         return f"its poses come at {slow:.0f} Hz, {bounds.rate:.0f} are needed" if slow < bounds.rate else ""
 
     # Once a drone's link is open.
@@ -250,11 +227,9 @@ class Mocap:
                 self._forward(number, new.good, now)
 
     def _forward(self, number: int, pose: Pose, now: float) -> None:
-        link = self._links[number]
-        if link is None:
+        if (link := self._links[number]) is None:
             return
         link.pose(packets.pose_packet(pose.position, pose.quaternion))
-        self.sent[number] += 1
         if now - self._noted[number] >= 0.75 * NOTE_PERIOD:
             self._noted[number] = now
             age, where = now - pose.time, pose.position

@@ -14,13 +14,14 @@ import numpy as np
 
 from mjxball.control.crazyflie import PairGains, read_pair_gains
 from mjxball.errors import InputError
-from mjxball.fly import limits, packets
+from mjxball.fly import packets
 from mjxball.fly.command import CurveName, Variants
 from mjxball.fly.connection import LinkError
 from mjxball.fly.limits import Check, Limits
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import KALMAN, Mocap
-from mjxball.fly.process import together
+from mjxball.fly.monitor import down_reason, stick_faults, tilt_angle
+from mjxball.fly.process import together, wait_until
 from mjxball.fly.spin import curve_of_version
 from mjxball.fly.telemetry import Rig, yaw_of
 
@@ -139,15 +140,12 @@ def _ready(info: int) -> bool:
 
 def _wait_until_ready(links: Sequence[Link], seconds: float) -> None:
     """Wait for firmwares that still count as flying, or disarm and arm again, as they do 3 s after a landing."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        newest = [link.telemetry.newest for link in links]
-        if all(
-            sample is None or _ready(sample.state.info) or limits.down_reason(sample.state.info, False)
-            for sample in newest
-        ):
-            return
-        time.sleep(0.02)
+
+    def settled() -> bool:
+        infos = [link.telemetry.newest.state.info for link in links if link.telemetry.newest is not None]
+        return all(_ready(info) or down_reason(info, armed=False) for info in infos)
+
+    wait_until(settled, seconds)
 
 
 def check(links: Sequence[Link], rig: Rig, bounds: Limits, asked: Preflight) -> list[Check]:
@@ -164,9 +162,9 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, asked: Preflight) -> 
         assert sample is not None
         state, age = sample.state, link.telemetry.age(now)
         states.append(state)
-        refusal = limits.down_reason(state.info, armed=False)
+        refusal = down_reason(state.info, armed=False)
         can = _ready(state.info)
-        tilt, yaw = limits.tilt_of(state), yaw_of(state)
+        tilt, yaw = tilt_angle(state.quaternion), yaw_of(state)
         checks += [
             Check(f"{link.name} states", rate >= asked.rate, f"{rate:.0f} Hz, {asked.rate:.0f} needed"),
             Check(f"{link.name} state age", age <= bounds.state_age, f"{1000 * age:.0f} ms"),
@@ -175,7 +173,7 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, asked: Preflight) -> 
             Check(f"{link.name} level", tilt <= asked.tilt, f"{math.degrees(tilt):.1f} degrees"),
             Check(f"{link.name} heading", abs(yaw) <= asked.yaw, f"{math.degrees(yaw):.0f} degrees from +x"),
         ]
-    faults = limits.stick_faults(states, rig.span, bounds)
+    faults = stick_faults(states, rig.span, bounds)
     line = states[0].position - states[1].position
     beside = float(np.linalg.norm(line - rig.span))
     text = faults[0].detail if faults else f"{np.linalg.norm(line):.3f} m long, {beside:.3f} m from where it should be"

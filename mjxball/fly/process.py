@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 from mjxball.errors import InputError
 
@@ -36,8 +36,8 @@ class Metronome:
         self.missed = 0
         self._late: list[float] = []
         self._misses: collections.deque[float] = collections.deque()
-        self._deadline = time.monotonic()
-        self._before = self._deadline
+        self.lateness = self.gap = 0.0  # of the last tick, and between the last two [s]
+        self.start()
 
     def start(self) -> None:
         """The first deadline is one period from now."""
@@ -49,26 +49,20 @@ class Metronome:
         while (left := self._deadline - time.monotonic()) > 0:
             time.sleep(left)
         now = time.monotonic()
-        self._late.append(now - self._deadline)
-        passed = int((now - self._deadline) / self.period)
+        self.lateness = now - self._deadline
+        self._late.append(self.lateness)
+        passed = int(self.lateness / self.period)
         self.missed += passed
         self._misses.extend([now] * min(passed, 100))
         self._deadline += (passed + 1) * self.period
         self.gap, self._before = now - self._before, now
         return now
 
-    gap = 0.0  # [s] between the last two ticks
-
     def missed_lately(self, now: float) -> int:
         """Deadlines missed in the last second."""
         while self._misses and now - self._misses[0] > 1:
             self._misses.popleft()
         return len(self._misses)
-
-    @property
-    def lateness(self) -> float:
-        """Of the last tick [s]."""
-        return self._late[-1] if self._late else 0.0
 
     def timing(self) -> Timing:
         """Statistics of all ticks so far."""
@@ -85,23 +79,21 @@ def urgent() -> Iterator[str]:
 
     Yields what was granted: real time (root, or a limit on rtprio), a better nice value, or nothing.
     """
-    granted, before = "nothing", None
+    granted, undo = "nothing", contextlib.ExitStack()
     with contextlib.suppress(OSError, AttributeError):
         before = (os.sched_getscheduler(0), os.sched_getparam(0))
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REAL_TIME))
         granted = "real time"
+        undo.callback(os.sched_setscheduler, 0, *before)
     if granted == "nothing":
         with contextlib.suppress(OSError):
             granted = f"nice {os.nice(-10)}"
+            undo.callback(os.nice, 10)
     try:
         yield granted
     finally:
-        if granted == "real time" and before is not None:
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(0, *before)
-        elif granted.startswith("nice"):
-            with contextlib.suppress(OSError):
-                os.nice(10)
+        with contextlib.suppress(OSError):
+            undo.close()
 
 
 def bounded(action: Callable[[], Any], seconds: float) -> bool:
@@ -166,7 +158,7 @@ class Child:
             self.close()
             raise InputError(failure)
 
-    def __enter__(self) -> Child:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -53,16 +53,16 @@ def fly(
 
     Prints the checks and how it ended. `command` goes into the log's header.
     """
-    header: dict[str, Any] = {
-        "command": list(command),
-        "version": __version__,
-        "uris": list(uris),
+    policy, gains = setup.controller.policy, [own[setup.curve].gains for own in setup.variants]
+    header: dict[str, Any] = {"command": list(command), "version": __version__, "uris": list(uris)}
+    header |= {
         "settings": dataclasses.asdict(settings),
+        "policy": policy.name,
+        "config_hash": policy.card["config_hash"],
     }
-    header |= {"policy": setup.controller.policy.name, "config_hash": setup.controller.policy.card["config_hash"]}
     header |= {"mocap": str(setup.mocap.settings)} if setup.mocap else {}
-    gains = (setup.variants[0][setup.curve].gains, setup.variants[1][setup.curve].gains)
-    header |= {"config": configs.to_dict(setup.controller.config), "gains": gains_to_json(gains), "curve": setup.curve}
+    header |= {"config": configs.to_dict(setup.controller.config), "gains": gains_to_json((gains[0], gains[1]))}
+    header |= {"curve": setup.curve}
     before = sys.getswitchinterval()
     with Journal(log, **header) as journal:
         links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]
@@ -73,17 +73,8 @@ def fly(
                 if setup.mocap is not None:
                     setup.mocap.note = journal.note
                 curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
-                flight = Flight(
-                    links,
-                    setup.controller,
-                    setup.variants,
-                    curves,
-                    setup.rig,
-                    settings,
-                    journal.note,
-                    watchdog,
-                    setup.mocap,
-                )
+                pair = (links, setup.controller, setup.variants, curves, setup.rig)
+                flight = Flight(*pair, settings, journal.note, watchdog, setup.mocap)
                 flight.ready = _checked(links, setup, settings, journal)
                 flight.refusal = "" if flight.ready else "see the checks"
                 timing = run(flight)

@@ -19,7 +19,7 @@ from mjxball.fly.telemetry import DroneLink, Note
 COMPENSATES_SINCE = (2025, 12)  # version of the firmware, as delivered
 LIKELY = 0.12  # of ln(PWM / expected PWM): half of what lies between the two firmwares at a full battery
 WANTED = 3  # health packets in a row that agree
-RESERVE = 0.97  # of the largest thrust command, above which nobody hovers
+RESERVE = 0.97  # of the largest thrust command, above which a pair has no reserve to hover
 
 
 def curve_of_version(version: str) -> CurveName | None:
@@ -30,22 +30,16 @@ def curve_of_version(version: str) -> CurveName | None:
     return "linear" if (int(found[1]), int(found[2])) >= COMPENSATES_SINCE else "older"
 
 
-def expected_pwm(name: CurveName, motor: Motor, thrust: float, battery: float) -> float:
-    """PWM of every motor at `thrust` units on level ground, by a firmware of this kind at `battery` [V]."""
-    if name == "older":
-        return thrust
-    return float(motors.compensated(motor, np.float64(thrust), np.float64(battery)))
-
-
 def recognise(seen: Health, battery: float, motor: Motor) -> CurveName | None:
     """Which firmware makes the PWM that was `seen` of the thrust that it reports; None if neither does.
 
-    The mean of the four motors counts, in which roll, pitch and yaw cancel.
+    The mean of the four motors counts, in which roll, pitch and yaw cancel. `battery` in V.
     """
     pwm, thrust = float(np.mean(seen.motors)), seen.thrust
     if not (pwm > 0 and thrust > 0 and battery > 0):
         return None
-    expected = {name: expected_pwm(name, motor, thrust, battery) for name in CURVE_NAMES}
+    compensated = float(motors.compensated(motor, np.float64(thrust), np.float64(battery)))
+    expected = {"linear": compensated, "older": thrust}
     off = {name: abs(math.log(pwm / value)) if value > 0 else math.inf for name, value in expected.items()}
     best = min(CURVE_NAMES, key=lambda name: off[name])
     return best if off[best] < LIKELY else None
@@ -77,32 +71,31 @@ class SpinCheck:
         failed = [link.busy for link in self._links if isinstance(link.busy, str)]
         if failed or self._unfit:
             return [Fault(Event.CURVE_UNKNOWN, text) for text in (*failed, *self._unfit)]
-        heavy = [
-            Fault(Event.CURVE_UNKNOWN, _too_heavy(name, curve, variant))
-            for name, curve, variant in zip(NAMES, self.curves, self.chosen(), strict=True)
-            if variant.map.hover_thrust > RESERVE * THRUST_CEILING
-        ]
-        if all(self._decided) and (heavy or not any(link.busy for link in self._links)):
-            return heavy or [Fault(Event.CURVE_KNOWN, ", ".join(self.curves))]
-        return []
+        if not all(self._decided):
+            return []
+        heavy = []
+        for name, curve, variant in zip(NAMES, self.curves, self.chosen(), strict=True):
+            if variant.map.hover_thrust > RESERVE * THRUST_CEILING:
+                units = f"{variant.map.hover_thrust:.0f} of {THRUST_CEILING} thrust units on the {curve} force curve"
+                heavy.append(Fault(Event.CURVE_UNKNOWN, f"the {name} would hover at {units}"))
+        if heavy or any(link.busy for link in self._links):
+            return heavy
+        return [Fault(Event.CURVE_KNOWN, ", ".join(self.curves))]
 
     def _look(self, number: int, since: float, now: float, note: Note) -> None:
-        sample, link = self._links[number].telemetry.health, self._links[number]
-        state = link.telemetry.newest
+        telemetry, seen = self._links[number].telemetry, self._seen[number]
+        sample, state = telemetry.health, telemetry.newest
         if sample is None or state is None or sample.arrival <= max(since, self._last[number]):
             return
         self._last[number] = sample.arrival
-        seen = self._seen[number]
         if not any(sample.health.motors) and len(seen) < 2 * WANTED:
             seen.append(None)  # not listed by this firmware, or not turning yet
             return
         found = recognise(sample.health, state.state.battery, self._motor)
         seen.append(found)
-        latest = seen[-WANTED:]
-        unknown = len(seen) >= 4 * WANTED  # neither fits: what was assumed stands
-        if len(latest) == WANTED and len(set(latest)) == 1 and (found is not None or unknown):
-            self._decide(number, found or self.curves[number], now, note, found is not None)
-        elif unknown:
+        if found is not None and seen[-WANTED:] == [found] * WANTED:
+            self._decide(number, found, now, note, True)
+        elif len(seen) >= 4 * WANTED:  # neither fits: what was assumed stands
             self._decide(number, self.curves[number], now, note, False)
 
     def _decide(self, number: int, curve: CurveName, now: float, note: Note, recognised: bool) -> None:
@@ -114,8 +107,3 @@ class SpinCheck:
             self.curves[number] = curve
             self._links[number].write_later(self._variants[number][curve].gains)
         note("thrust", now, drone=NAMES[number], curve=curve, recognised=recognised, changed=changed)
-
-
-def _too_heavy(name: str, curve: CurveName, variant: Variant) -> str:
-    hover = variant.map.hover_thrust
-    return f"the {name} would hover at {hover:.0f} of {THRUST_CEILING} thrust units on the {curve} force curve"

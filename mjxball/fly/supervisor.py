@@ -166,6 +166,12 @@ class Supervisor:
         held = (self.state, self.since) if best is State.HOLD else None
         return Supervisor(best, now, first, held)
 
+    @property
+    def may_resume(self) -> bool:
+        """True in a hold that a gap in the states began while the laws were in command."""
+        guided = self.held is not None and self.held[0] in GUIDED
+        return guided and self.cause is not None and self.cause.event is Event.STALE
+
     def _resumed(self, now: float) -> Supervisor:
         """Back to what HOLD interrupted; a gap that closed is no cause. A ramp is not taken up again."""
         state, since = self.held or (State.DESCEND, now)

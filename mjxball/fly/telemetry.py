@@ -51,8 +51,7 @@ class FirmwareClock:
         """Time of `stamp` [ms] in seconds, None if it is older than one already seen or its clock started anew."""
         if self._last is not None:
             step = (stamp - self._last + WRAP // 2) % WRAP - WRAP // 2
-            if abs(step) > LONGEST_STEP:
-                self.restarted = True
+            self.restarted = self.restarted or abs(step) > LONGEST_STEP
             if step < 0 or self.restarted:
                 return None
             self._time += step
@@ -76,16 +75,15 @@ class Telemetry:
         self.health: HealthSample | None = None
         self.received = self.damaged = self.late = 0
 
-    def take(self, state: DroneState, stamp: int, arrival: float) -> Sample | None:
-        """A state came with time stamp `stamp` [ms] at `arrival` [s]; None if a newer one came before."""
+    def take(self, state: DroneState, stamp: int, arrival: float) -> bool:
+        """A state came with time stamp `stamp` [ms] at `arrival` [s]; false if a newer one came before."""
         self.received += 1
         seconds = self.clock.update(stamp, arrival)
         if seconds is None:
             self.late += 1
-            return None
-        sample = Sample(state, arrival, seconds)
-        self.newest = sample
-        return sample
+            return False
+        self.newest = Sample(state, arrival, seconds)
+        return True
 
     def age(self, now: float) -> float:
         """The worse of both ages [s]; infinite before the first state."""
@@ -96,20 +94,20 @@ class Telemetry:
 
 
 class DroneLink(Protocol):
-    """What a flight needs of `link.Link`."""
+    """What a flight needs of `link.Link`. Nothing here blocks."""
 
     telemetry: Telemetry
     lost: str | None
     busy: bool | str  # with `write_later`: True while writing, else why it failed
 
     def send(self, packet: Packet) -> None:
-        """Newest setpoint, without blocking."""
+        """Newest setpoint."""
 
     def command(self, packet: Packet) -> None:
-        """Before any setpoint, without blocking."""
+        """Before any setpoint."""
 
     def write_later(self, values: Mapping[str, float]) -> None:
-        """Write firmware parameters, without blocking; see `busy`."""
+        """Write firmware parameters; see `busy`."""
 
     def stuck_for(self, now: float) -> float:
         """How long something has waited to be sent [s]."""
@@ -140,13 +138,12 @@ class Rig:
     @classmethod
     def of_card(cls, card: Mapping[str, Any]) -> Rig:
         """The rig that a policy was trained for."""
-        plant = card["plant"]
-        return cls(tuple(plant["leader_mount"]), tuple(plant["follower_mount"]))
+        return cls(tuple(card["plant"]["leader_mount"]), tuple(card["plant"]["follower_mount"]))
 
     @property
-    def mounts(self) -> tuple[np.ndarray, np.ndarray]:
-        """(3,) of leader and follower from O [m]."""
-        return np.array(self.leader_mount), np.array(self.follower_mount)
+    def mounts(self) -> np.ndarray:
+        """(2, 3) of leader and follower from O [m]."""
+        return np.array([self.leader_mount, self.follower_mount])
 
     @property
     def span(self) -> np.ndarray:

@@ -12,7 +12,6 @@ import os
 import select
 import signal
 import struct
-import subprocess
 import sys
 import threading
 import time
@@ -23,6 +22,7 @@ from mjxball.cli import make_parser
 from mjxball.fly import packets
 from mjxball.fly.command import LastKnownState, blind_shares
 from mjxball.fly.packets import Packet, Setpoint
+from mjxball.fly.process import Child
 
 FRAME = struct.Struct("<BHHfff")  # what is going on, then `LastKnownState`
 IDLE, FLYING, GOODBYE = 0, 1, 2
@@ -31,8 +31,6 @@ PERIOD = 0.02  # [s] of the setpoints on the way down
 STOPPING = 0.5  # [s] for which stops are repeated
 ZEROS = 2.3  # [s] of zeros after that: a firmware that counts as flying and hears nothing for 2 s locks itself
 OPENING = 2.0  # [s] for which a link is tried: then the firmware has stopped by itself
-
-
 NOTHING = LastKnownState((0, 0), 0.0, 0.0, 0.0)
 
 
@@ -41,64 +39,36 @@ def packed(state: int, seen: LastKnownState) -> bytes:
     return FRAME.pack(state, *seen.trims, seen.height, seen.climb, seen.lift)
 
 
-class Watchdog:
+class Watchdog(Child):
     """The runner's end. A context manager; `beat` never blocks."""
 
     def __init__(self, uris: Sequence[str], start_limit: float = 15.0):
-        """Start the process and wait until it is ready. Raises OSError if it is not within `start_limit` [s]."""
-        arguments = [sys.executable, "-m", "mjxball.fly.watchdog", str(os.getpid()), *uris]
-        # A session of its own: Ctrl-C and a closing terminal are for the runner.
-        self._process = subprocess.Popen(
-            arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True, bufsize=0
-        )
+        """Start the process. Raises InputError if it is not ready within `start_limit` [s]."""
+        failure = f"the watchdog process was not ready within {start_limit:g} s"
+        super().__init__(["mjxball.fly.watchdog", str(os.getpid()), *uris], failure, start_limit)
         assert self._process.stdin is not None
-        assert self._process.stdout is not None
         self._pipe = self._process.stdin.fileno()
-        readable, _, _ = select.select([self._process.stdout], [], [], start_limit)
-        if not readable or not self._process.stdout.read(1):
-            self._process.kill()
-            raise OSError(f"the watchdog process was not ready within {start_limit:g} s")
         os.set_blocking(self._pipe, False)
 
-    @property
-    def pid(self) -> int:
-        """Of the watchdog process."""
-        return self._process.pid
-
     def beat(self, flying: bool, seen: LastKnownState) -> bool:
-        """We live, and this is what it would take over; false if the watchdog has ended."""
+        """We live, and this is what it would take over; false if the watchdog has ended, or does not read."""
         return self._write(packed(FLYING if flying else IDLE, seen))
 
     def _write(self, frame: bytes) -> bool:
         try:
-            os.write(self._pipe, frame)
-        except BlockingIOError:  # it does not read: its pipe holds 64 KiB, a minute of frames
+            return os.write(self._pipe, frame) > 0
+        except OSError:  # also if its pipe is full, which holds 64 KiB: a minute of frames
             return False
-        except OSError:
-            return False
-        return True
-
-    def __enter__(self) -> Watchdog:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._write(packed(GOODBYE, NOTHING))
-        with contextlib.suppress(OSError):
-            assert self._process.stdin is not None
-            self._process.stdin.close()
-        try:
-            self._process.wait(timeout=5)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait(timeout=5)
-        assert self._process.stdout is not None
-        self._process.stdout.close()
+        self.close()
 
 
 def watch(pipe: int, runner: int) -> tuple[LastKnownState, float] | None:
     """Read frames from `pipe` until the runner is gone; None if all is well, else what to take over with.
 
-    That is the last last_known and how long ago it was taken [s].
+    That is the last one and how long ago it was taken [s].
     """
     state, seen, waiting = IDLE, NOTHING, b""
     while True:
@@ -171,7 +141,7 @@ def main(arguments: Sequence[str]) -> int:
     import cflib.crtp
 
     cflib.crtp.init_drivers()
-    os.write(sys.stdout.fileno(), b"\n")
+    os.write(sys.stdout.fileno(), b"ready\n")
     left = watch(sys.stdin.fileno(), options.runner)
     if left is None:
         return 0

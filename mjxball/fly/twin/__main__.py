@@ -16,7 +16,7 @@ from mjxball.cli import make_parser, run_command
 from mjxball.fly.process import urgent
 from mjxball.fly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
 from mjxball.fly.twin.physics import make_pair
-from mjxball.fly.twin.server import Twin, TwinSettings
+from mjxball.fly.twin.server import Twin
 from mjxball.policy import load_file
 
 
@@ -36,9 +36,8 @@ def main() -> int:
 def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` ask for until standard input ends."""
     card = load_file(options.policy).card if options.policy else None
-    kind, around = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear"), surroundings(options)
-    settings = TwinSettings(ports=tuple(options.ports), kind=kind, around=around)
-    with urgent(), Twin(make_pair(card, kind, around), settings) as twin:
+    kind = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear")
+    with urgent(), Twin(make_pair(card, kind, surroundings(options)), tuple(options.ports)) as twin:
         worse = LinkFaults(options.loss, options.delay, options.jitter)
         links = [Injection(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
         for one in (*links, *options.fault):

@@ -179,7 +179,7 @@ class DroneFaults:
 
 
 class BodyFault(NamedTuple):
-    """What happens to the body of a drone, see `body.Pair.disturb`."""
+    """What happens to the body of a drone, see `Pair.disturb`."""
 
     what: str  # "frozen", "lost", "jump": of its poses; "battery", "gain"
     value: float
@@ -198,8 +198,8 @@ FAULT_KINDS: dict[str, What] = {
     "battery": DroneFaults(battery=-1.2),
     "garbage": DroneFaults(garbage=3.0),
     "crash": "crash",
-    "power": "kill",
-    "port": "close_port",
+    "power": "power",
+    "port": "port",
     "reboot": "reboot",
     "stabilizer": DroneFaults(stabilizer_dead=True),
     "imu": DroneFaults(stabilizer_dead=True),  # the stabilizer waits for it

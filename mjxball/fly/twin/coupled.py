@@ -70,10 +70,10 @@ class CoupledPair:
         config: Config,
         conditions: Conditions | None = None,
         kind: DroneKind = DELIVERED,
-        around: Surroundings = QUIET,
+        surroundings: Surroundings = QUIET,
     ):
         self.config, self.conditions = config, conditions or Conditions.of(config)
-        self.kind, self.around = kind, around
+        self.kind, self.surroundings = kind, surroundings
         plant = dataclasses.replace(config.plant, object_mass=self.conditions.object_mass)
         self.model = grounded_model(config, self.conditions.object_mass)
         self.data = mujoco.MjData(self.model)
@@ -95,11 +95,11 @@ class CoupledPair:
         lag = plant.rotor_lag * self.conditions.rotor_lag
         self._keep = math.exp(-STEP / lag)
         self._mean = lag / STEP * (1 - self._keep)
-        self.onboard = Onboard(kind, around, with_stock_gains(config.autopilot), self._new_power())
+        self.onboard = Onboard(kind, surroundings, with_stock_gains(config.autopilot), self._new_power())
         self.start()
 
     def _new_power(self) -> Power:
-        one, other = (a * b for a, b in zip(self.conditions.thrust, self.around.gains, strict=True))
+        one, other = (a * b for a, b in zip(self.conditions.thrust, self.surroundings.gains, strict=True))
         return Power(self.kind, self.conditions.battery, (one, other))
 
     def start(self) -> PairState:
@@ -184,7 +184,7 @@ class CoupledPair:
         self._steps += 1
         self._flown += STEP * self._moving
         self._place_ball()
-        if not self.around.exact:
+        if not self.surroundings.exact:
             self.onboard.sense(self._steps, self._sensed(), self._pose)
 
     def _lagged(self) -> tuple[np.ndarray, np.ndarray]:
@@ -194,7 +194,7 @@ class CoupledPair:
 
     def _fly(self) -> None:
         """Both cascades, once: what the motors are to give from here on."""
-        if self.around.exact:
+        if self.surroundings.exact:
             pwm = self.onboard.control(*self._seen())
         else:
             pwm = self.onboard.control()
@@ -291,7 +291,7 @@ class CoupledPair:
         position, quaternion, matrix = self._pose()
         velocity, rates = self._velocity(matrix)
         both, turning = np.stack([quaternion] * 2), np.stack([rates] * 2)
-        if self.around.exact:
+        if self.surroundings.exact:
             report = self.onboard.reported(position, velocity, both, turning, np.full((2, 9), 1e-5))
         else:
             report = self.onboard.report()

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from mjxball.fly.twin import protocol
-from mjxball.fly.twin.conditions import DELIVERED, QUIET, DroneFaults, DroneKind, LinkFaults, Surroundings
+from mjxball.fly.twin.conditions import BodyFault, DroneFaults, LinkFaults, What
 from mjxball.fly.twin.firmware import Firmware, Motors, Order
 from mjxball.fly.twin.logs import Readings, Snapshot
 from mjxball.fly.twin.physics import Modes, Pair, PairState
@@ -28,14 +28,13 @@ SUPERVISOR = {
 class TwinDrone:
     """What answers at one address. `receive`, `step` and `send` are called by one thread."""
 
-    def __init__(self, pair: Pair, number: int, kind: DroneKind = DELIVERED, around: Surroundings = QUIET):
+    def __init__(self, pair: Pair, number: int):
         """Drone `number` (0 leader, 1 follower) of `pair`."""
         self._pair, self.number = pair, number
-        self._random = np.random.default_rng([around.seed, number])
-        self.firmware = Firmware(kind, phase=float(self._random.random()))
-        self._estimator = 2 if around.deck else 1
+        self._random = np.random.default_rng([pair.surroundings.seed, number])
+        self.firmware = Firmware(pair.kind, phase=float(self._random.random()))
+        self._estimator = 2 if pair.surroundings.deck else 1
         self.peer = self._new_peer()
-        self.delay = around.delay
         self.link, self.faults = LinkFaults(), DroneFaults()
         self.up, self.down = Channel(self._random), Channel(self._random)
         self._now = self._stamp = self._booted = 0.0  # [s]
@@ -58,27 +57,45 @@ class TwinDrone:
 
     def receive(self, datagram: bytes, now: float) -> None:
         """A datagram came from the laptop."""
-        self.up.push(datagram, now, self.link, self.link.silent_up, self.delay)
+        self.up.push(datagram, now, self.link, self.link.silent_up, self._pair.surroundings.delay)
 
     @property
     def next_arrival(self) -> float:
         """When `answer` has something to do again [s]."""
         return min(self.up.next, self.down.next)
 
+    @property
+    def _silent(self) -> bool:
+        return self.faults.stopped or self.firmware.dead or self.firmware.booting
+
+    def inject(self, what: What) -> None:
+        """Have a fault come to pass; "port" is the socket's, not the drone's."""
+        match what:
+            case LinkFaults():
+                self.link = what
+            case DroneFaults():
+                self.faults = what
+            case BodyFault(part, value):
+                self._pair.disturb(self.number, part, value)
+            case "crash":  # the firmware finds that it has crashed: its motors stop
+                self.firmware.supervisor.crash()
+            case "power":  # its motors stop and its address answers nothing, not even that it is closed
+                self.firmware.dead = True
+                self.link = LinkFaults(silent_up=True, silent_down=True)
+            case "reboot":  # its power fails for a moment
+                self.reboot()
+
     def answer(self, now: float) -> None:
         """Handle what has arrived by `now` [s]."""
-        for due, datagram in self.up.timed(now):
-            if self.faults.stopped or self.firmware.dead or self.firmware.booting:
-                continue
-            for reply in self.peer.receive(datagram, due):
+        for due, datagram in self.up.due(now):
+            for reply in [] if self._silent else self.peer.receive(datagram, due):
                 self._reply(reply, due)
 
     def step(self, state: PairState, now: float) -> Order:
         """Handle what has arrived, and return what the firmware lets through."""
         self._now = now
         self.answer(now)
-        report, mine = state.report, self.number
-        wrong = self.faults
+        report, mine, wrong = state.report, self.number, self.faults
         hung = wrong.stopped or wrong.stabilizer_dead
         before = self.firmware.supervisor
         acceleration = (report.acceleration[mine] / GRAVITY).tolist()
@@ -91,32 +108,31 @@ class TwinDrone:
         if not frozen or self._readings is None:
             self._readings = Readings(self._snapshot(state))
         elif not hung:
-            kept = self._readings.snapshot._replace(info=self.firmware.info)
-            self._readings = Readings(kept)
+            self._readings = Readings(self._readings.snapshot._replace(info=self.firmware.info))
         return order
 
     def _snapshot(self, state: PairState) -> Snapshot:
-        position = state.report.position[self.number]
-        if self.faults.offset != (0.0, 0.0, 0.0):
-            position = position + np.array(self.faults.offset)
+        position = state.report.position[self.number] + np.array(self.faults.offset)
         voltage = float(state.battery[self.number]) + self.faults.battery
         setpoint = self.firmware.order.setpoint
         return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, self._pose)
 
     def send(self, now: float) -> list[bytes]:
         """Datagrams that leave for the laptop at `now`."""
-        silent = self.faults.stopped or self.firmware.dead or self.firmware.booting
-        if self._readings is not None and not silent and self.peer.logs.is_due(now):
+        if self._readings is not None and not self._silent and self.peer.logs.is_due(now):
             for datagram in self.peer.log_data(self._readings, now):
                 stamp = (int(self._stamp * 1000 + 1e-6) & 0xFFFFFF).to_bytes(3, "little")
                 self._reply(datagram[:2] + stamp + datagram[5:], now)
-        junk = int(self._random.poisson(self.faults.garbage)) if self.faults.garbage else 0
-        for _ in range(junk):
+        for _ in range(int(self._random.poisson(self.faults.garbage)) if self.faults.garbage else 0):
             self._reply(garbage(self._random), now)
-        return self.down.due(now)
+        return self.transmit(now)
+
+    def transmit(self, now: float) -> list[bytes]:
+        """What has passed the link to the laptop by `now`."""
+        return [datagram for _, datagram in self.down.due(now)]
 
     def _reply(self, datagram: bytes, now: float) -> None:
-        self.down.push(datagram, now, self.link, self.link.silent_down, self.delay)
+        self.down.push(datagram, now, self.link, self.link.silent_down, self._pair.surroundings.delay)
 
     def reboot(self) -> None:
         """Power off and on: log blocks and parameters are forgotten."""
@@ -149,12 +165,8 @@ class Channel:
             due += faults.jitter * self._random.random()
         heapq.heappush(self._waiting, (due, next(self._count), datagram))
 
-    def due(self, now: float) -> list[bytes]:
-        """Datagrams that come out by `now` [s], in order."""
-        return [datagram for _, datagram in self.timed(now)]
-
-    def timed(self, now: float) -> list[tuple[float, bytes]]:
-        """The same, each with its time [s]."""
+    def due(self, now: float) -> list[tuple[float, bytes]]:
+        """Datagrams that come out by `now` [s], in order, each with its time [s]."""
         out = []
         while self._waiting and self._waiting[0][0] <= now + 1e-9:
             due, _, datagram = heapq.heappop(self._waiting)
@@ -177,20 +189,12 @@ def garbage(random: np.random.Generator) -> bytes:
     return bytes(data)
 
 
-def modes_of(orders: tuple[Order, Order]) -> Modes:
-    """What the physics is told of both drones' orders."""
-    run, held, flying = (
-        (part[0], part[1])
-        for part in (
-            [order.motors is not Motors.OFF for order in orders],
-            [order.motors is Motors.HELD for order in orders],
-            [order.flying for order in orders],
-        )
-    )
-    return Modes(run, held, flying)
-
-
 def advance(pair: Pair, drones: tuple[TwinDrone, TwinDrone], state: PairState, now: float, dt: float) -> PairState:
     """Step both drones at `now` [s] and the physics `dt` [s] on."""
-    orders = drones[0].step(state, now), drones[1].step(state, now)
-    return pair.advance(np.array([order.setpoint for order in orders], float), dt, modes_of(orders))
+    one, other = drones[0].step(state, now), drones[1].step(state, now)
+    modes = Modes(
+        run=(one.motors is not Motors.OFF, other.motors is not Motors.OFF),
+        held=(one.motors is Motors.HELD, other.motors is Motors.HELD),
+        flying=(one.flying, other.flying),
+    )
+    return pair.advance(np.array([one.setpoint, other.setpoint], float), dt, modes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -51,54 +51,52 @@ class Snapshot(NamedTuple):
     position: np.ndarray  # (3,) that is reported [m]
     pose: tuple[float, ...]  # last pose from the laptop: x, y, z, qx, qy, qz, qw
 
+    @property
+    def quaternion(self) -> np.ndarray:
+        """(4,) estimated (w, x, y, z)."""
+        return np.asarray(self.report.quaternion[self.drone])
 
-Group = Callable[[Snapshot], dict[str, float]]
+    @property
+    def acceleration(self) -> np.ndarray:
+        """(3,) measured, body axes [g]."""
+        return np.asarray(self.report.acceleration[self.drone]) / GRAVITY
+
+    @property
+    def world_acceleration(self) -> np.ndarray:
+        """(3,) [g], gravity included."""
+        return np.asarray(matrix_of(self.quaternion) @ self.acceleration)
 
 
-def _named(names: str, values: object) -> dict[str, float]:
-    return {name: float(value) for name, value in zip(names.split(), values, strict=True)}  # type: ignore[call-overload]
-
-
-def _quaternion(one: Snapshot) -> np.ndarray:
-    found: np.ndarray = one.report.quaternion[one.drone]
-    return found
+def _named(names: str, values: Iterable[float]) -> dict[str, float]:
+    return {name: float(value) for name, value in zip(names.split(), values, strict=True)}
 
 
 def _attitude(one: Snapshot) -> dict[str, float]:
-    roll, pitch, yaw = map(math.degrees, euler_of(_quaternion(one)))
+    roll, pitch, yaw = map(math.degrees, euler_of(one.quaternion))
     return {"roll": roll, "pitch": -pitch, "yaw": yaw}
 
 
-def _world_acceleration(one: Snapshot) -> np.ndarray:
-    """(3,) [g], gravity included."""
-    turned: np.ndarray = matrix_of(_quaternion(one)) @ one.report.acceleration[one.drone] / GRAVITY
-    return turned
-
-
 def _estimate(one: Snapshot) -> dict[str, float]:
-    w, x, y, z = _quaternion(one).tolist()
-    acceleration = _world_acceleration(one) - np.array([0.0, 0.0, 1.0])
     values = _named("x y z", one.position) | _named("vx vy vz", one.report.velocity[one.drone])
-    values |= _named("ax ay az", acceleration) | {"qw": w, "qx": x, "qy": y, "qz": z}
-    return values | _attitude(one)
+    values |= _named("ax ay az", one.world_acceleration - np.array([0.0, 0.0, 1.0]))
+    return values | _named("qw qx qy qz", one.quaternion) | _attitude(one)
 
 
 def _compressed(one: Snapshot) -> dict[str, float]:
     values = _named("x y z", 1000 * one.position) | _named("vx vy vz", 1000 * one.report.velocity[one.drone])
-    values |= _named("ax ay az", 1000 * GRAVITY * _world_acceleration(one))
+    values |= _named("ax ay az", 1000 * GRAVITY * one.world_acceleration)
     turning = 1000 * one.report.rates[one.drone] * np.array([1.0, -1.0, 1.0])
     values |= _named("rateRoll ratePitch rateYaw", turning)
-    return values | {"quat": packets.compress_quaternion(_quaternion(one))}
+    return values | {"quat": packets.compress_quaternion(one.quaternion)}
 
 
 def _kalman(one: Snapshot) -> dict[str, float]:
-    variance = one.report.variance[one.drone]
-    values = _named("varX varY varZ varPX varPY varPZ varD0 varD1 varD2", variance)
+    values = _named("varX varY varZ varPX varPY varPZ varD0 varD1 varD2", one.report.variance[one.drone])
     if one.report.estimator[one.drone] != 2:
         return values
-    body = matrix_of(_quaternion(one)).T @ one.report.velocity[one.drone]
+    body = matrix_of(one.quaternion).T @ one.report.velocity[one.drone]
     values |= _named("stateX stateY stateZ", one.position) | _named("statePX statePY statePZ", body)
-    return values | _named("q0 q1 q2 q3", _quaternion(one)) | {"rtPred": 100.0, "rtUpdate": 1000.0}
+    return values | _named("q0 q1 q2 q3", one.quaternion) | {"rtPred": 100.0, "rtUpdate": 1000.0}
 
 
 def _motors(one: Snapshot) -> dict[str, float]:
@@ -111,44 +109,27 @@ def _power(one: Snapshot) -> dict[str, float]:
     return {"vbat": one.voltage, "vbatMV": 1000 * one.voltage, "state": 3 * low, "batteryLevel": 10.0 * (1 - low)}
 
 
-def _stabilizer(one: Snapshot) -> dict[str, float]:
-    return {"thrust": float(one.report.thrust[one.drone]), "rtStab": 1000.0, **_attitude(one)}
-
-
 def _controller(one: Snapshot) -> dict[str, float]:
-    thrust = float(one.report.thrust[one.drone])
-    roll, pitch, yaw = one.report.rates[one.drone].tolist()
-    wanted = {"roll": one.setpoint.roll, "pitch": one.setpoint.pitch}
-    return {"cmd_thrust": thrust, "actuatorThrust": thrust, "r_roll": roll, "r_pitch": -pitch, "r_yaw": yaw, **wanted}
+    thrust, rates = float(one.report.thrust[one.drone]), one.report.rates[one.drone] * np.array([1.0, -1.0, 1.0])
+    values = {"cmd_thrust": thrust, "actuatorThrust": thrust, "roll": one.setpoint.roll, "pitch": one.setpoint.pitch}
+    return values | _named("r_roll r_pitch r_yaw", rates)
 
 
-def _target(one: Snapshot) -> dict[str, float]:
-    value = one.setpoint
-    return {"roll": value.roll, "pitch": value.pitch, "yaw": -value.yaw_rate, "thrust": value.thrust}
-
-
-def _supervisor(one: Snapshot) -> dict[str, float]:
-    size = float(np.linalg.norm(one.report.acceleration[one.drone])) / GRAVITY
-    return {"info": one.info, "accNorm": size}
-
-
-def _flags(one: Snapshot) -> dict[str, float]:
-    known = {"canfly": packets.CAN_FLY, "isFlying": packets.FLYING, "isTumbled": packets.TUMBLED}
-    return {name: float(bool(one.info & bit)) for name, bit in known.items()}
-
-
-GROUPS: dict[str, Group] = {
+GROUPS: dict[str, Callable[[Snapshot], dict[str, float]]] = {
     "stateEstimate": _estimate,
     "stateEstimateZ": _compressed,
     "kalman": _kalman,
     "motor": _motors,
     "pm": _power,
-    "stabilizer": _stabilizer,
+    "stabilizer": lambda one: {"thrust": float(one.report.thrust[one.drone]), "rtStab": 1000.0, **_attitude(one)},
     "controller": _controller,
-    "ctrltarget": _target,
-    "supervisor": _supervisor,
-    "sys": _flags,
-    "acc": lambda one: _named("x y z", one.report.acceleration[one.drone] / GRAVITY),
+    "ctrltarget": lambda one: _named("roll pitch yaw thrust", one.setpoint) | {"yaw": -one.setpoint.yaw_rate},
+    "supervisor": lambda one: {"info": one.info, "accNorm": float(np.linalg.norm(one.acceleration))},
+    "sys": lambda one: {
+        name: float(bool(one.info & bit))
+        for name, bit in (("canfly", packets.CAN_FLY), ("isFlying", packets.FLYING), ("isTumbled", packets.TUMBLED))
+    },
+    "acc": lambda one: _named("x y z", one.acceleration),
     "gyro": lambda one: _named("x y z", np.degrees(one.report.rates[one.drone])),
     "ext_pos": lambda one: _named("X Y Z", one.pose[:3]),
     "locSrv": lambda one: _named("x y z qx qy qz qw", one.pose),
@@ -156,7 +137,7 @@ GROUPS: dict[str, Group] = {
 }
 
 
-class Readings(Mapping[str, float]):
+class Readings:
     """Log variables of one drone at one moment, by their full names; what the twin does not have is 0."""
 
     def __init__(self, snapshot: Snapshot):
@@ -169,12 +150,6 @@ class Readings(Mapping[str, float]):
             make = GROUPS.get(group)
             self._groups[group] = make(self.snapshot) if make else {}
         return self._groups[group].get(variable, 0.0)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(GROUPS)
-
-    def __len__(self) -> int:
-        return len(GROUPS)
 
 
 MAX_BLOCKS, MAX_VARIABLES, MAX_BLOCK_BYTES = 16, 128, 26
@@ -191,10 +166,9 @@ class Block:
     due: float = 0.0  # [s]
     once: bool = False  # send one packet only
 
-    @property
-    def size(self) -> int:
-        """Bytes of its values."""
-        return sum(struct.calcsize("<" + code) for _, code in self.variables)
+    def is_due(self, now: float) -> bool:
+        """True if a packet leaves at `now` [s]."""
+        return bool(self.period or self.once) and now >= self.due
 
 
 class Blocks:
@@ -205,15 +179,14 @@ class Blocks:
 
     def is_due(self, now: float) -> bool:
         """True if `take` has something at `now` [s]."""
-        return any((block.period or block.once) and now >= block.due for block in self.by_number.values())
+        return any(block.is_due(now) for block in self.by_number.values())
 
-    def take(self, readings: Mapping[str, float], now: float) -> list[bytes]:
+    def take(self, readings: Readings | Mapping[str, float], now: float) -> list[bytes]:
         """Payloads of all blocks that are due at `now`; their time stamp is `now` in ms."""
         sent = []
         for number, block in self.by_number.items():
-            if (block.period or block.once) and now >= block.due:
-                late = now - block.due
-                block.due = now + block.period if late > block.period else block.due + block.period
+            if block.is_due(now):
+                block.due = now + block.period if now - block.due > block.period else block.due + block.period
                 block.once = False
                 stamp = struct.pack("<I", int(now * 1000 + 1e-6) & 0xFFFFFF)[:3]
                 values = b"".join(pack(code, readings[name]) for name, code in block.variables)
@@ -259,7 +232,7 @@ class Blocks:
             if kind not in LOG_CODES:
                 return UNKNOWN
             code = LOG_CODES[kind]
-            if block.size + struct.calcsize("<" + code) > MAX_BLOCK_BYTES:
+            if struct.calcsize("<" + "".join([*(own for _, own in block.variables), code])) > MAX_BLOCK_BYTES:
                 return TOO_BIG
             if sum(len(one.variables) for one in self.by_number.values()) >= MAX_VARIABLES:
                 return NO_MEMORY

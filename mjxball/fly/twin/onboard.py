@@ -80,14 +80,14 @@ COMPLEMENTARY, KALMAN = 1, 2  # numbers of the parameter stabilizer.estimator
 class Onboard:
     """Both drones' sensors, estimators and controllers. Times in whole milliseconds since the start."""
 
-    def __init__(self, kind: DroneKind, around: Surroundings, autopilot: Autopilot, power: Power):
-        self.kind, self.around, self.power = kind, around, power
-        random = np.random.default_rng([around.seed, 7])
-        self.imu = Imu(random, around.noise)
+    def __init__(self, kind: DroneKind, surroundings: Surroundings, autopilot: Autopilot, power: Power):
+        self.kind, self.surroundings, self.power = kind, surroundings, power
+        random = np.random.default_rng([surroundings.seed, 7])
+        self.imu = Imu(random, surroundings.noise)
         self.filters = [Kalman(), Kalman()]
         self.plain = [Complementary(random), Complementary(random)]
-        self.positioning = [Positioning(around, random, phase) for phase in range(2)]
-        self.estimators = [KALMAN if around.deck else COMPLEMENTARY] * 2
+        self.positioning = [Positioning(surroundings, random, phase) for phase in range(2)]
+        self.estimators = [KALMAN if surroundings.deck else COMPLEMENTARY] * 2
         self.deviations = [[0.01, 4.5e-3], [0.01, 4.5e-3]]  # of poses [m, rad]: locSrv.extPosStdDev, extQuatStdDev
         self.idle = [float(kind.idle)] * 2
         self._autopilots = [autopilot] * 2
@@ -137,7 +137,7 @@ class Onboard:
             self._look(drone)
 
     def _switch(self, drone: int, kind: int) -> None:
-        kind = {0: KALMAN if self.around.deck else COMPLEMENTARY}.get(kind, kind)
+        kind = {0: KALMAN if self.surroundings.deck else COMPLEMENTARY}.get(kind, kind)
         if kind in (COMPLEMENTARY, KALMAN) and kind != self.estimators[drone]:
             self.estimators[drone] = kind
             if kind == KALMAN:

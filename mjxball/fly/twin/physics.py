@@ -62,6 +62,9 @@ class Pair(Protocol):
     The firmware's supervisor is not part of it: setpoints come after thrust lock, watchdog and stops.
     """
 
+    kind: DroneKind
+    surroundings: Surroundings
+
     @property
     def cg_offset(self) -> float:
         """Where the CG is, from O along the stick [m]; NaN if there is none that moves."""
@@ -121,8 +124,13 @@ class StandIn:
     cg_offset = math.nan
     rotor_force = np.zeros((2, 4))  # not modelled
 
-    def __init__(self, plant: StandInPlant = StandInPlant()):
-        self.plant = plant
+    def __init__(
+        self,
+        plant: StandInPlant = StandInPlant(),
+        kind: DroneKind = DELIVERED,
+        surroundings: Surroundings = QUIET,
+    ):
+        self.plant, self.kind, self.surroundings = plant, kind, surroundings
         self._mounts = np.array(plant.mounts)
         self._span = self._mounts[1] - self._mounts[0]
         self.start()
@@ -218,15 +226,19 @@ class StandIn:
         )
 
 
-def make_pair(card: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, around: Surroundings = QUIET) -> Pair:
+def make_pair(
+    card: Mapping[str, Any] | None = None, kind: DroneKind = DELIVERED, surroundings: Surroundings = QUIET
+) -> Pair:
     """Physics of the rig that a policy's `card` describes; without one, the stand-in's own rig."""
-    return StandIn() if card is None else pair_of(config_of(card), kind, around)
+    return (
+        StandIn(kind=kind, surroundings=surroundings) if card is None else pair_of(config_of(card), kind, surroundings)
+    )
 
 
 def pair_of(
     config: Config,
     kind: DroneKind = DELIVERED,
-    around: Surroundings = QUIET,
+    surroundings: Surroundings = QUIET,
     conditions: Conditions | None = None,
 ) -> Pair:
     """Physics of the rig of `config`; whatever is heavy is imported here, not above.
@@ -234,10 +246,10 @@ def pair_of(
     Raises InputError if the coupled model is needed and MuJoCo is not installed.
     """
     if not is_crazyflie(config):
-        plant = config.plant
-        return StandIn(StandInPlant(mounts=(plant.leader_mount, plant.follower_mount)))
+        mounts = (config.plant.leader_mount, config.plant.follower_mount)
+        return StandIn(StandInPlant(mounts=mounts), kind, surroundings)
     try:
         from mjxball.fly.twin.coupled import CoupledPair
     except ModuleNotFoundError as error:
         raise InputError(f"the twin of a Crazyflie pair needs {error.name}; pip install 'mjxball[fly]'") from None
-    return CoupledPair(config, conditions, kind, around)
+    return CoupledPair(config, conditions, kind, surroundings)

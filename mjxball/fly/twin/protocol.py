@@ -17,7 +17,7 @@ from mjxball.fly import packets
 from mjxball.fly.packets import PacketError
 from mjxball.fly.twin.conditions import DroneKind
 from mjxball.fly.twin.firmware import Firmware
-from mjxball.fly.twin.logs import LOG_ITEMS, MAX_BLOCKS, MAX_VARIABLES, UNKNOWN, Blocks, item, listed
+from mjxball.fly.twin.logs import LOG_ITEMS, MAX_BLOCKS, MAX_VARIABLES, UNKNOWN, Blocks, Readings, item, listed
 
 VERSION = 12
 MAX_DATA = 30
@@ -127,8 +127,8 @@ class Peer:
         self.logs = Blocks()
         self._estimator = estimator
         self._on_parameter, self._on_pose = on_parameter, on_pose
-        self._handlers = {
-            (LINK, 0): self._echo,
+        self._handlers: dict[tuple[int, int], Callable[[bytes, float], list[bytes] | None]] = {
+            (LINK, 0): lambda data, now: [data],
             (LINK, 1): lambda data, now: [GREETING] if data[:1] == b"\0" else [],
             (PLATFORM, 0): self._platform,
             (PLATFORM, 1): self._version,
@@ -140,8 +140,8 @@ class Peer:
             (LOG, 1): self.logs.control,
             (MEMORY, 0): lambda data, now: [b"\x01\x00"] if data[:1] == b"\x01" else [],
             (COMMANDER, 0): self._setpoint,
-            (GENERIC, 0): self._stop,
-            (GENERIC, 1): self._relax,
+            (GENERIC, 0): lambda data, now: firmware.commander.stop(now) if data[:1] == b"\0" else None,
+            (GENERIC, 1): lambda data, now: firmware.commander.relax() if data[:1] == b"\0" else None,
             (LOCALIZATION, 0): self._position,
             (LOCALIZATION, 1): self._localization,
             (LOCALIZATION, 2): self._positions,
@@ -159,20 +159,13 @@ class Peer:
         handler = self._handlers.get((port, channel))
         if handler is None:
             return []
-        return [bytes([header(port, channel)]) + answer for answer in handler(datagram[1:], now)]
+        return [bytes([header(port, channel)]) + answer for answer in handler(datagram[1:], now) or ()]
 
-    def console(self, text: str) -> bytes:
-        """A datagram that prints `text` on the laptop."""
-        return bytes([header(CONSOLE, 0)]) + text.encode()[:MAX_DATA]
-
-    def log_data(self, readings: Mapping[str, float], now: float) -> list[bytes]:
+    def log_data(self, readings: Readings | Mapping[str, float], now: float) -> list[bytes]:
         """The datagrams of all log blocks that are due at `now`."""
         return [bytes([header(LOG, 2)]) + data for data in self.logs.take(readings, now)]
 
     # Handlers: payload -> payloads of the answers.
-
-    def _echo(self, data: bytes, now: float) -> list[bytes]:
-        return [data]
 
     def _version(self, data: bytes, now: float) -> list[bytes]:
         kind = self.firmware.kind
@@ -196,9 +189,7 @@ class Peer:
         return []
 
     def _parameter(self, data: bytes) -> Parameter | None:
-        if len(data) < 2:
-            return None
-        index = struct.unpack("<H", data[:2])[0]
+        index = int.from_bytes(data[:2], "little") if len(data) >= 2 else len(PARAMETERS)
         return PARAMETERS[index] if index < len(PARAMETERS) else None
 
     def _read_parameter(self, data: bytes, now: float) -> list[bytes]:
@@ -232,33 +223,20 @@ class Peer:
         default = defaults_of(self.firmware.kind, self._estimator)[known.name]
         return [data[:3] + b"\0" + known.pack(default)] if data[0] == 0x08 else []
 
-    def _setpoint(self, data: bytes, now: float) -> list[bytes]:
+    def _setpoint(self, data: bytes, now: float) -> None:
         if len(data) == packets.SETPOINT_SIZE:
             self.firmware.commander.receive(packets.unpack_setpoint(data), now)
-        return []
 
-    def _stop(self, data: bytes, now: float) -> list[bytes]:
-        if data[:1] == b"\0":
-            self.firmware.commander.stop(now)
-        return []
-
-    def _relax(self, data: bytes, now: float) -> list[bytes]:
-        if data[:1] == b"\0":
-            self.firmware.commander.relax()
-        return []
-
-    def _position(self, data: bytes, now: float) -> list[bytes]:
+    def _position(self, data: bytes, now: float) -> None:
         if len(data) >= 12:
             self._pose(struct.unpack("<fff", data[:12]))
-        return []
 
-    def _positions(self, data: bytes, now: float) -> list[bytes]:
+    def _positions(self, data: bytes, now: float) -> None:
         for number, *millimetres in struct.iter_unpack("<Bhhh", data[: len(data) // 7 * 7]):
             if number == ADDRESS:
                 self._pose([value / 1000 for value in millimetres])
-        return []
 
-    def _localization(self, data: bytes, now: float) -> list[bytes]:
+    def _localization(self, data: bytes, now: float) -> None:
         supervisor = self.firmware.supervisor
         if data[:1] == bytes([EMERGENCY]):
             supervisor.emergency = True
@@ -269,7 +247,6 @@ class Peer:
             self._pose((x, y, z), turned)
         elif data[:1] == bytes([POSES]):
             self._packed_poses(data[1:])
-        return []
 
     def _packed_poses(self, data: bytes) -> None:
         for number, x, y, z, turned in struct.iter_unpack("<BhhhI", data[: len(data) // 11 * 11]):

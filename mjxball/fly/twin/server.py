@@ -10,31 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mjxball.fly.twin.conditions import (
-    DELIVERED,
-    QUIET,
-    BodyFault,
-    DroneFaults,
-    DroneKind,
-    Injection,
-    LinkFaults,
-    Surroundings,
-)
+from mjxball.fly.twin.conditions import Injection
 from mjxball.fly.twin.drone import TwinDrone, advance
 from mjxball.fly.twin.physics import Pair, PairState
 
 HOST = "127.0.0.1"
+PERIOD = 0.005  # of physics, firmware and sockets [s]
 MOST_BEHIND = 0.1  # [s] of physics that a twin that was held up makes good; the rest of the time it stands still
-
-
-@dataclass(frozen=True)
-class TwinSettings:
-    """How the twin runs."""
-
-    period: float = 0.005  # of physics, firmware and sockets [s]
-    ports: tuple[int, int] = (0, 0)  # of leader and follower, 0: any free one
-    kind: DroneKind | None = None  # None: that of the physics
-    around: Surroundings | None = None
 
 
 @dataclass(frozen=True)
@@ -52,19 +34,14 @@ class Truth:
 class Twin:
     """Two drones that answer at `uris`. A context manager; `inject` works while it runs."""
 
-    def __init__(self, pair: Pair, settings: TwinSettings = TwinSettings()):
-        self._pair, self._settings = pair, settings
-        self._state = pair.start()
-        kind, around = settings.kind, settings.around
-        if kind is None:
-            kind = getattr(pair, "kind", DELIVERED)
-        if around is None:
-            around = getattr(pair, "around", QUIET)
-        self.drones = TwinDrone(pair, 0, kind, around), TwinDrone(pair, 1, kind, around)
-        self._sockets = [self._bound(port) for port in settings.ports]
+    def __init__(self, pair: Pair, ports: tuple[int, int] = (0, 0)):
+        """`ports` of leader and follower, 0: any free one."""
+        self._pair, self._state = pair, pair.start()
+        self.drones = TwinDrone(pair, 0), TwinDrone(pair, 1)
+        self._sockets = [self._bound(port) for port in ports]
         self._clients: list[tuple[str, int] | None] = [None, None]
         self.uris = tuple(f"udp://{HOST}:{sock.getsockname()[1]}" for sock in self._sockets)
-        self._dead = [False, False]
+        self._closed = [False, False]
         self._stop = threading.Event()
         self._lock = threading.Lock()
         self._begun = time.monotonic()
@@ -90,46 +67,13 @@ class Twin:
         for sock in self._sockets:
             sock.close()
 
-    def set_link(self, drone: int, faults: LinkFaults) -> None:
-        """Replace the `LinkFaults` of a drone's link."""
-        self.drones[drone].link = faults
-
-    def set_faults(self, drone: int, faults: DroneFaults) -> None:
-        """Replace the `DroneFaults` of a drone."""
-        self.drones[drone].faults = faults
-
     def inject(self, one: Injection) -> None:
         """Have a fault come to pass now."""
-        if isinstance(one.what, LinkFaults):
-            self.set_link(one.drone, one.what)
-        elif isinstance(one.what, DroneFaults):
-            self.set_faults(one.drone, one.what)
-        elif isinstance(one.what, BodyFault):
-            with self._lock:
-                self._pair.disturb(one.drone, one.what.what, one.what.value)
-        else:
-            getattr(self, one.what)(one.drone)
-
-    def crash(self, drone: int) -> None:
-        """The firmware of a drone finds that it has crashed: its motors stop."""
-        self.drones[drone].firmware.supervisor.crash()
-
-    def kill(self, drone: int) -> None:
-        """A drone loses its power: its motors stop and its address answers nothing, not even that it is closed."""
         with self._lock:
-            self._dead[drone] = True
-            self.drones[drone].firmware.dead = True
-
-    def close_port(self, drone: int) -> None:
-        """A drone's radio task ends while its motors run on: the laptop's datagrams are refused."""
-        with self._lock:
-            self._dead[drone] = True
-            self._sockets[drone].close()
-
-    def reboot(self, drone: int) -> None:
-        """A drone's power fails for a moment."""
-        with self._lock:
-            self.drones[drone].reboot()
+            if one.what == "port":  # the radio task ends while the motors run on: the laptop's datagrams are refused
+                self._closed[one.drone] = True
+                self._sockets[one.drone].close()
+            self.drones[one.drone].inject(one.what)
 
     def _run(self) -> None:
         try:
@@ -143,12 +87,10 @@ class Twin:
         return time.monotonic() - self._begun
 
     def _loop(self) -> None:
-        period = self._settings.period
         self._begun = time.monotonic()
         step = 0
         while not self._stop.is_set():
-            now = self._now()
-            due = (step + 1) * period
+            now, due = self._now(), (step + 1) * PERIOD
             if now < due:
                 self._wait(min(due, *(drone.next_arrival for drone in self.drones)) - now)
                 continue
@@ -156,7 +98,7 @@ class Twin:
                 self._begun += now - due
             step += 1
             with self._lock:
-                self._step(step * period)
+                self._step(step * PERIOD)
             if step % 10 == 0:
                 self.history.append(self.truth)
 
@@ -165,11 +107,11 @@ class Twin:
 
         Requests are answered between the steps: a table of contents is a hundred of them, one after the other.
         """
-        alive = [n for n in range(2) if not self._dead[n]]
+        alive = [n for n in range(2) if not self._closed[n]]
         try:
             readable, _, _ = select.select([self._sockets[n] for n in alive], [], [], max(seconds, 0.0))
         except (OSError, ValueError):
-            if not any(self._dead[n] for n in alive):
+            if not any(self._closed[n] for n in alive):
                 raise
             return  # a port was closed just now
         with self._lock:
@@ -177,11 +119,11 @@ class Twin:
                 if self._sockets[number] in readable:
                     self._receive(number)
                 self.drones[number].answer(self._now())
-                self._transmit(number, self.drones[number].down.due(self._now()))
+                self._transmit(number, self.drones[number].transmit(self._now()))
 
     def _receive(self, number: int) -> None:
         for _ in range(50):
-            if self._dead[number]:
+            if self._closed[number]:
                 return
             try:
                 datagram, client = self._sockets[number].recvfrom(2048)
@@ -191,14 +133,14 @@ class Twin:
             self.drones[number].receive(datagram, self._now())
 
     def _step(self, now: float) -> None:
-        self._state = advance(self._pair, self.drones, self._state, now, self._settings.period)
+        self._state = advance(self._pair, self.drones, self._state, now, PERIOD)
         self.truth = self._seen(now)
         for number, drone in enumerate(self.drones):
             self._transmit(number, drone.send(now))
 
     def _transmit(self, number: int, datagrams: list[bytes]) -> None:
         client = self._clients[number]
-        if client is None or self._dead[number]:
+        if client is None or self._closed[number]:
             return
         for datagram in datagrams:
             try:
@@ -207,8 +149,7 @@ class Twin:
                 return
 
     def _seen(self, now: float) -> Truth:
-        one, other = self.drones
-        first, second = one.firmware, other.firmware
-        thrust = first.order.setpoint.thrust, second.order.setpoint.thrust
-        last = first.commander.wire_thrust, second.commander.wire_thrust
-        return Truth(now, self._state, thrust, self._state.report.pwm, last, (first.info, second.info))
+        one, other = (drone.firmware for drone in self.drones)
+        thrust = one.order.setpoint.thrust, other.order.setpoint.thrust
+        last = one.commander.wire_thrust, other.commander.wire_thrust
+        return Truth(now, self._state, thrust, self._state.report.pwm, last, (one.info, other.info))

@@ -3,7 +3,6 @@
 For tests and for benchmarks of hundreds of flights: a second of flight takes about a quarter of a second. What a real
 connection does before a flight, gains, estimator reset and time for it, is done here by packets to the drones' own
 protocol; the link's delay holds for setpoints and states alike.
-
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from mjxball.fly.card import Controller, motor_of, times_of, variants
 from mjxball.fly.command import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
 from mjxball.fly.flight import Flight
 from mjxball.fly.limits import NAMES, FlightSettings
+from mjxball.fly.monitor import down_reason, tilt_angle
 from mjxball.fly.packets import Packet
 from mjxball.fly.supervisor import State, Supervisor
 from mjxball.fly.telemetry import HealthSample, Note, Rig, Telemetry
@@ -32,6 +32,8 @@ from mjxball.fly.twin.protocol import header
 from mjxball.fly.twin.supervisor import PERIOD
 from mjxball.policy import Policy
 
+STEP = 0.005  # [s] between two steps of the drones; delays are a whole number of them
+GROUNDED = 3e-3  # [m] above its rest below which the pair has touched down
 BLOCK, HEALTH_BLOCK = 1, 2  # log blocks of the state and of health
 HEALTH = (*packets.VARIANCES, *packets.MOTORS[0], packets.ACTING_THRUST)
 _HEALTH = struct.Struct("<3f4Hf")
@@ -48,13 +50,11 @@ class VirtualLink:
         self.stuck = 0.0
         self.busy: bool | str = False
         self.packets: list[tuple[float, Packet]] = []
-        self.keep_packets = True
 
     def send(self, packet: Packet) -> None:
         """Send `packet`, with the link's delay."""
         now = self._clock()
-        if self.keep_packets:
-            self.packets.append((now, packet))
+        self.packets.append((now, packet))
         self.drone.receive(bytes([header(packet.port, packet.channel)]) + packet.data, now)
 
     command = send
@@ -121,10 +121,6 @@ class MemoryLog:
         return [record["after"] for record in self.records if record["kind"] == "transition"]
 
 
-STEP = 0.005  # [s] between two steps of the drones; delays are a whole number of them
-GROUNDED = 3e-3  # [m] above its rest below which the pair has touched down
-
-
 class Moment(NamedTuple):
     """The truth at one moment."""
 
@@ -139,12 +135,6 @@ class Moment(NamedTuple):
     battery: float  # the lower one's [V]
 
 
-def fit(info: int) -> bool:
-    """True if a drone whose supervisor says `info` may be flown."""
-    wrong = packets.TUMBLED | packets.LOCKED | packets.CRASHED
-    return not info & wrong and bool(info & (packets.CAN_ARM | packets.CAN_FLY))
-
-
 class World:
     """A pair, its two drones, and flights of them one after the other."""
 
@@ -154,69 +144,53 @@ class World:
         settings: FlightSettings | None = None,
         *,
         kind: DroneKind = DELIVERED,
-        around: Surroundings = QUIET,
+        surroundings: Surroundings = QUIET,
         conditions: Conditions | None = None,
         physics: Pair | None = None,
         maps: Sequence[CommandMap] | None = None,
         log: Any = None,
-        step: float = STEP,
         settle: float = 0.05,
-        record: bool = True,
         checks: bool = False,
     ):
         """Put the pair on the ground and begin a flight, `settle` [s] after the states have started.
 
-        Without `physics` it is that of the policy's card, without `maps` the card's by force curve. With `record` the
-        truth is kept in `track`. With `checks` a
-        drone that cannot fly refuses the flight, as the check before a real one does.
+        Without `physics` it is that of the policy's card, without `maps` the card's by force curve. `log` is what
+        `MemoryLog` is, or a `flight_log.Journal`. With `checks` a drone that cannot fly refuses the flight, as the
+        check before a real one does.
         """
-        self.policy, self.kind, self.around = policy, kind, around
-        self.rig = Rig.of_card(policy.card)
-        controller = Controller(policy)
-        self.config = controller.config
-        self.pair: Pair = physics or pair_of(self.config, kind, around, conditions)
+        self.policy, self.rig, self._checks = policy, Rig.of_card(policy.card), checks
+        self.config = Controller(policy).config
+        self.pair: Pair = physics or pair_of(self.config, kind, surroundings, conditions)
         self.state: PairState = self.pair.start()
         self.rest = float(self.state.position[:, 2].mean())
-        self.now, self.step = 0.0, step
-        self._count = 0
-        self.drones = TwinDrone(self.pair, 0, kind, around), TwinDrone(self.pair, 1, kind, around)
-        self.log: Any = log or MemoryLog(record)
+        self.now, self._count = 0.0, 0
+        self.drones = TwinDrone(self.pair, 0), TwinDrone(self.pair, 1)
+        self.log: Any = log or MemoryLog()
         named = zip(NAMES, self.drones, strict=True)
         self.links = [VirtualLink(drone, lambda: self.now, name, self.log.note) for name, drone in named]
         self.variants: Sequence[Variants] = variants(self.config)
         if maps is not None:
             self.variants = [{name: Variant(one, {}) for name in CURVE_NAMES} for one in maps]
-        self.settings = settings or FlightSettings(
-            seconds=2.0, stand=self.config.plant.stand != "free", times=times_of(self.config)
-        )
-        self.settings = dataclasses.replace(self.settings, motor=motor_of(self.config))
+        stand, times = self.config.plant.stand != "free", times_of(self.config)
+        settings = settings or FlightSettings(seconds=2.0, stand=stand, times=times)
+        self.settings = dataclasses.replace(settings, motor=motor_of(self.config))
         self.track: list[Moment] = []
-        self._record, self._checks = record, checks
-        self.flight = self.make_flight(controller)
-        self.prepare(settle)
-        self.begin()
+        self._start_flight(settle)
 
-    def make_flight(self, controller: Controller) -> Flight:
-        """The runner's flight over the virtual links."""
-        return Flight(self.links, controller, self.variants, [self.assumed] * 2, self.rig, self.settings, self.log.note)
-
-    @property
-    def assumed(self) -> CurveName:
-        """The force curve that firmwares are taken to have until their motors turn."""
-        return "linear" if "linear" in self.variants[0] else "older"
-
-    def prepare(self, settle: float) -> None:
-        """What is done before a flight: gains, estimator reset, states; then `settle` [s] of waiting."""
+    def _start_flight(self, settle: float) -> None:
+        """Prepare the drones, wait `settle` [s], and begin a flight as one whose checks have passed, if they would."""
+        curve: CurveName = "linear" if "linear" in self.variants[0] else "older"
+        controller, curves = Controller(self.policy), [curve, curve]
+        self.flight = Flight(self.links, controller, self.variants, curves, self.rig, self.settings, self.log.note)
         for link, own in zip(self.links, self.variants, strict=True):
             link.telemetry = Telemetry()
-            link.write_parameters(own[self.assumed].gains)
+            link.write_parameters(own[curve].gains)
             link.write_parameters({"kalman.resetEstimation": 1.0})
             link.start_states()
-        self.advance(max(settle, 4 * self.step) + 2 * self.around.delay)
-
-    def begin(self) -> None:
-        """Begin the flight as one whose checks have passed, if they would."""
-        unfit = [name for name, drone in zip(NAMES, self.drones, strict=True) if not fit(drone.firmware.info)]
+        self.advance(max(settle, 4 * STEP) + 2 * self.pair.surroundings.delay)
+        infos = [drone.firmware.info for drone in self.drones]
+        can = [info & (packets.CAN_ARM | packets.CAN_FLY) and not down_reason(info, armed=False) for info in infos]
+        unfit = [name for name, able in zip(NAMES, can, strict=True) if not able]
         self.flight.ready = not (unfit and self._checks)
         self.flight.refusal = f"{unfit[0]} cannot fly" if unfit else ""
         self.flight.begin(self.now)
@@ -226,36 +200,31 @@ class World:
 
         Only the coupled pair can be put there. Height and position are those above the place where the pair rests.
         """
+        late = 2 * self.pair.surroundings.delay
         self.advance(2 * PERIOD)
-        for link in self.links:
-            link.send(packets.setpoint_packet(packets.ZERO))
-        self.advance(self.step + 2 * self.around.delay)
-        hover = [packets.Setpoint(0.0, 0.0, 0.0, round(one.hover_thrust)) for one in self.flight.maps]
-        for link, value in zip(self.links, hover, strict=True):
-            link.send(packets.setpoint_packet(value))
-        self.advance(self.step + 2 * self.around.delay)
+        for thrusts in ((0.0, 0.0), (one.hover_thrust for one in self.flight.maps)):
+            for link, thrust in zip(self.links, thrusts, strict=True):
+                link.send(packets.setpoint_packet(packets.Setpoint(0.0, 0.0, 0.0, round(thrust))))
+            self.advance(STEP + late)
         self.state = getattr(self.pair, "place")(start)  # noqa: B009 - not every pair has it
-        self.advance(max(self.step, 0.02) + 2 * self.around.delay)
+        self.advance(0.02 + late)
         self.flight.supervisor = Supervisor(State.FLY, self.now)
 
-    def next_flight(self, settings: FlightSettings | None = None, pause: float = 3.0, settle: float = 1.0) -> Flight:
-        """A further flight of the same drones without reboot, `pause` [s] of a silent link after the one before.
+    def next_flight(self, pause: float = 3.0, settle: float = 1.0) -> Flight:
+        """A further flight of the same drones without reboot, after `pause` [s] of a silent link.
 
         In between the laptop disconnects, connects anew and prepares the drones, which takes `settle` [s].
         """
         self.advance(pause)
-        self.settings = settings or self.settings
-        self.flight = self.make_flight(Controller(self.policy))
-        self.prepare(settle)
-        self.begin()
+        self._start_flight(settle)
         return self.flight
 
     def advance(self, seconds: float) -> None:
         """Let the twin live on for `seconds`."""
-        for _ in range(round(seconds / self.step)):
+        for _ in range(round(seconds / STEP)):
             self._count += 1
-            self.now = self._count * self.step
-            self.state = advance(self.pair, self.drones, self.state, self.now, self.step)
+            self.now = self._count * STEP
+            self.state = advance(self.pair, self.drones, self.state, self.now, STEP)
             for drone, link in zip(self.drones, self.links, strict=True):
                 for datagram in drone.send(self.now):
                     link.take(datagram, self.now)
@@ -264,15 +233,12 @@ class World:
         """One period of twin and flight; false once the flight is done."""
         self.advance(self.flight.settings.period)
         going = self.flight.tick(self.now)
-        if self._record:
-            self.track.append(self.moment())
+        self.track.append(self.moment())
         return going
 
     def run(self, limit: float = 120.0) -> str:
         """Tick to the end of the flight, at most `limit` [s]; the last state of its supervisor."""
-        end = self.now + limit
-        while self.now < end and self.tick():
-            pass
+        self.fly_for(limit)
         return self.flight.supervisor.state.value
 
     def fly_until(self, wanted: State, limit: float = 30.0) -> None:
@@ -294,13 +260,17 @@ class World:
         """The truth, now."""
         state = self.state
         line = state.position[0] - state.position[1]
-        tilt = math.acos(min(max(packets.level_share(state.quaternion[0]), -1.0), 1.0))
-        origin = state.position.mean(axis=0)
-        ball = self.pair.cg_offset
-        roll = math.atan2(float(line[2]), float(line[1]))
-        value = self.flight.supervisor.state.value
-        low, pwm = float(state.battery.min()), state.report.pwm
-        return Moment(self.now, value, origin, state.velocity.mean(axis=0), tilt, roll, pwm, ball, low)
+        return Moment(
+            time=self.now,
+            state=self.flight.supervisor.state.value,
+            position=state.position.mean(axis=0),
+            velocity=state.velocity.mean(axis=0),
+            tilt=tilt_angle(state.quaternion[0]),
+            roll=math.atan2(float(line[2]), float(line[1])),
+            pwm=state.report.pwm,
+            ball=self.pair.cg_offset,
+            battery=float(state.battery.min()),
+        )
 
     def running(self) -> list[bool]:
         """Whose motors turn."""
