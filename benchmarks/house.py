@@ -1,0 +1,94 @@
+"""What a newcomer meets, and what a run costs, in two checkouts side by side: sizes, imports, cold and warm training.
+
+    git worktree add ../before COMMIT
+    python benchmarks/house.py ../before . --repeats 3 --json benchmarks/results/house.json
+
+Both are timed in turn with the same interpreter, each training in a process of its own with README's command; cold:
+an empty cache of compiled programs, warm: the cache that the cold run left. Seconds are medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+SETTINGS = "from mjxball import config; from dataclasses import fields, is_dataclass as d; c = config.Config();" \
+    "print(sum(len(fields(getattr(c, f.name))) for f in fields(c) if d(getattr(c, f.name))))"  # fmt: skip
+IMPORTS = {"import of a policy [s]": "import mjxball.policy", "import of training [s]": "import mjxball.train.program"}
+
+
+def sizes(tree: Path) -> dict[str, float]:
+    """Counts of what there is to read."""
+    modules = list((tree / "mjxball").rglob("*.py"))
+    pages = [path for path in (tree / "docs").rglob("*.md") if "archive" not in path.parts]
+    archived = (tree / "docs" / "archive").rglob("*.md")
+
+    def words(paths: object) -> int:
+        return sum(len(path.read_text(encoding="utf-8").split()) for path in paths)  # type: ignore[attr-defined]
+
+    return {
+        "lines of the package": sum(len(path.read_text(encoding="utf-8").splitlines()) for path in modules),
+        "modules": len(modules),
+        "words of README": words([tree / "README.md"]),
+        "words of the docs": words(pages),
+        "words of the docs' archive": words(archived),
+        "settings": int(run(tree, ["-c", SETTINGS])[1]),
+    }
+
+
+def run(tree: Path, arguments: list[str], **variables: str) -> tuple[float, str]:
+    """(seconds, standard output) of `python ARGUMENTS` on the package of `tree`. Raises CalledProcessError."""
+    environment = {**os.environ, "PYTHONPATH": str(tree), "JAX_PLATFORMS": "cpu", **variables}
+    began = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, *arguments], cwd=tree, env=environment, check=True, capture_output=True, text=True
+    )
+    return time.perf_counter() - began, done.stdout
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("before", type=Path)
+    parser.add_argument("after", type=Path)
+    parser.add_argument("--repeats", type=int, default=3, help="of each timing; 0: sizes alone")
+    parser.add_argument("--json", type=Path, default=None, metavar="FILE")
+    options = parser.parse_args()
+    trees = {"before": options.before.resolve(), "after": options.after.resolve()}
+    found = {name: sizes(tree) for name, tree in trees.items()}
+    times: dict[str, dict[str, list[float]]] = {name: {} for name in trees}
+    for _ in range(options.repeats):
+        for name, tree in trees.items():
+            for what, code in IMPORTS.items():
+                times[name].setdefault(what, []).append(run(tree, ["-c", code])[0])
+            with tempfile.TemporaryDirectory() as place:
+                for what in ("training, cold [s]", "training, warm [s]"):
+                    command = ["train.py", "--seed", "0", "--out", f"{place}/{what[10:14]}"]
+                    times[name].setdefault(what, []).append(run(tree, command, MJXBALL_CACHE=f"{place}/cache")[0])
+            print(name, {what: round(values[-1], 1) for what, values in times[name].items()}, flush=True)
+    rows = {
+        name: {**found[name], **{w: round(statistics.median(v), 2) for w, v in times[name].items()}} for name in trees
+    }
+    print(f"{'':28} {'before':>10} {'after':>10}")
+    for what in rows["before"]:
+        print(f"{what:28} {rows['before'][what]:>10} {rows['after'][what]:>10}")
+    if options.json:
+        commits = {name: run_git(tree) for name, tree in trees.items()}
+        options.json.write_text(json.dumps({"commits": commits, "medians": rows, "all": times}, indent=1) + "\n")
+
+
+def run_git(tree: Path) -> str:
+    """The commit that is checked out in `tree`."""
+    asked = ["git", "-C", str(tree), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(asked, check=True, capture_output=True, text=True).stdout.strip()
+
+
+if __name__ == "__main__":
+    main()
