@@ -11,7 +11,7 @@ from plants import copying
 from mjxball.config import preset
 from mjxball.errors import InputError
 from mjxball.sim import rollout
-from mjxball.sim.disturbances import NOISE, Disturbance, Sample, record, sensors_of
+from mjxball.sim.disturbances import NOISE, RESOLUTION, Disturbance, Sample, record, sensors_of
 from mjxball.sim.rollout import simulate, simulate_batch
 from mjxball.sim.scenario import Scenario, check_scenario
 
@@ -33,6 +33,15 @@ def seen_by(disturbance: Disturbance, steps: int) -> np.ndarray:
 
 def test_nothing_is_disturbed_by_default() -> None:
     np.testing.assert_array_equal(seen_by(Disturbance(), 5), np.arange(6.0)[:, None] * np.ones(18))
+
+
+def test_quantized_measurements_are_the_nearest_multiples_of_the_resolution() -> None:
+    sensors, delays = sensors_of([Disturbance(quantize=True)], PERIOD)
+    truth = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 18))
+    _, seen = sensors.start(truth, record([Disturbance(quantize=True)], 1, PERIOD).at(0), delays)
+    # The nearest: half a step at most.
+    assert (np.abs(seen - truth) <= RESOLUTION / 2 * (1 + 1e-9)).all()
+    np.testing.assert_allclose(seen / RESOLUTION, np.round(seen / RESOLUTION), atol=1e-9)
 
 
 def test_noise_has_its_deviation() -> None:
