@@ -35,8 +35,9 @@ def run(arguments: Sequence[object], cwd: Path, timeout: float = 300) -> subproc
 
 
 def environment() -> dict[str, str]:
-    """The environment of a child: CPU only, unbuffered."""
-    return {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+    """The environment of a child: CPU only, unbuffered, without the level of messages that JAX sets in this process."""
+    inherited = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    return {**inherited, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
 
 
 def script(name: str) -> Path:
