@@ -34,7 +34,7 @@ from mjxball.evaluate.policies import load_policy
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.policy import NetworkLaw, Policy
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.rollout import make_brief, simulate_batch
+from mjxball.sim.rollout import make_privileged_info, simulate_batch
 from mjxball.sim.scenario import Scenario
 
 SECONDS, SETTLED = 20.0, 5.0
@@ -78,7 +78,7 @@ def stand(path: Path, starts: int) -> list[dict[str, Any]]:
 
 def fly_rigs(env: CoupledPairEnv, starts: Any, follower: Follower) -> tuple[np.ndarray, ...]:
     """e_o (T, n, 3) [m], tilt [rad] and divergence (T, n) of `follower` in the worlds that begin as `starts`."""
-    brief = jax.vmap(make_brief(env.config))
+    privileged = jax.vmap(make_privileged_info(env.config))
     policy = isinstance(follower, Policy)
     law = NetworkLaw(follower) if policy else follower.law
 
@@ -88,7 +88,7 @@ def fly_rigs(env: CoupledPairEnv, starts: Any, follower: Follower) -> tuple[np.n
         if policy:
             state = jax.vmap(env.step)(state, law.scaled(world.history, seen))
         else:
-            memory, command = law.step(memory, seen, brief(world.plant, world.load))
+            memory, command = law.step(memory, seen, privileged(world.plant, world.load))
             state = jax.vmap(env.step_with_command)(state, command)
         plant = state.pipeline_state.plant
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))

@@ -11,7 +11,8 @@ import numpy as np
 
 from mjxball import rewards
 from mjxball.config import Config, Reward, ball_limit
-from mjxball.control import crazyflie, observation, rotations
+from mjxball.control import crazyflie, rotations
+from mjxball.control import observation as layout
 from mjxball.control.observation import observation_history
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
@@ -80,7 +81,7 @@ class CoupledPairEnv(Env):
         self._history = observation_history(config)
         self._resets = ResetDistribution(config)
         self._cg = make_cg_offset(config)
-        self._commanded = np.array(observation.commanded(config.follower.load_axis_only, config.plant.cg_axis))
+        self._commanded = np.array(layout.commanded(config.follower.load_axis_only, config.plant.cg_axis))
         self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # of roll and pitch the one that no load turns
         self._privileged_size = 0
         if config.sac.privileged_critic:
@@ -92,9 +93,9 @@ class CoupledPairEnv(Env):
         return len(self.input_mask)
 
     @property
-    def seen_size(self) -> int:
+    def policy_input_size(self) -> int:
         """How many numbers of the observation the follower sees and remembers; only critics are told the rest."""
-        return observation.OBSERVATION_SIZE + self._history.size
+        return layout.OBSERVATION_SIZE + self._history.size
 
     @property
     def input_mask(self) -> list[float]:
@@ -109,7 +110,7 @@ class CoupledPairEnv(Env):
     @property
     def action_size(self) -> int:
         """Roll, pitch, vertical acceleration."""
-        return observation.ACTION_SIZE
+        return layout.ACTION_SIZE
 
     @property
     def backend(self) -> str:
@@ -123,11 +124,11 @@ class CoupledPairEnv(Env):
 
     def reset(self, rng: Array, difficulty: Float[Array, ""] | float = 1.0) -> State:
         """A fresh world at rest or nearly so; `difficulty` as in `ResetDistribution.draw`."""
-        world, seen = self._fresh_world(rng, difficulty)
+        world, observation = self._fresh_world(rng, difficulty)
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
-        return State(world, self._input(seen, world), zero, zero, metrics, {"truncation": zero})
+        return State(world, self._input(observation, world), zero, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Float[Array, "3"]) -> State:
         """Apply the network's `action` in [-1, 1] for one control period."""
@@ -135,7 +136,7 @@ class CoupledPairEnv(Env):
 
     def step_with_command(self, state: State, follower_command: Float[Array, "3"]) -> State:
         """`step` of a follower that is no network: `follower_command` is flown as it is."""
-        applied, load = self.command(state, jnp.zeros(observation.ACTION_SIZE))
+        applied, load = self.command(state, jnp.zeros(layout.ACTION_SIZE))
         commands = applied.commands._replace(follower=follower_command)
         return self._step(state, applied._replace(commands=commands), load, 0.0)
 
@@ -148,8 +149,8 @@ class CoupledPairEnv(Env):
         world: World = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
-        seen = state.obs[: observation.OBSERVATION_SIZE]
-        commands = self._loop.commands(world.loop, seen, self._follower_command(action, seen), world.goal)
+        observation = state.obs[: layout.OBSERVATION_SIZE]
+        commands = self._loop.commands(world.loop, observation, self._follower_command(action, observation), world.goal)
         disturbed = self._disturbances.present
         load = world.load._replace(external_force=world.disturbances.force) if disturbed else world.load
         return Applied(commands, action, finite), load
@@ -161,15 +162,15 @@ class CoupledPairEnv(Env):
         """
         world: World = state.pipeline_state
         commands, action, finite = applied
-        seen = state.obs[: observation.OBSERVATION_SIZE]
+        observation = state.obs[: layout.OBSERVATION_SIZE]
         disturbances, sample = self._disturbances.step(world.disturbances)
         before = world.loop._replace(diverged=world.loop.diverged | ~finite)
         goals = (world.goal, world.goal)
-        loop, after = self._loop.after_physics(before, seen, commands, plant, goals, sample, shares)
+        loop, after = self._loop.after_physics(before, observation, commands, plant, goals, sample, shares)
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
-            history=self._history.next(world.history, seen, action) if self._history.size else (),
+            history=self._history.next(world.history, observation, action) if self._history.size else (),
             action=action,
             steps=world.steps + 1,
         )
@@ -203,21 +204,21 @@ class CoupledPairEnv(Env):
         delay = disturbances.delay if self._disturbances.present else 0
         begins = self._resets.powered and self.config.follower.shares_integrals
         integral = self._resets.initial_integrals(load, jax.random.fold_in(rng, 5)) if begins else None
-        loop, seen = self._loop.start(plant, goal, sample, delay, integral)
+        loop, observation = self._loop.start(plant, goal, sample, delay, integral)
         world = World(
             loop=loop,
             load=load,
             goal=goal,
             disturbances=disturbances,
-            history=self._history.start(seen) if self._history.size else (),
+            history=self._history.start(observation) if self._history.size else (),
             action=jnp.zeros(3),
             steps=jnp.zeros((), jnp.int32),
         )
-        return world, seen
+        return world, observation
 
-    def _input(self, seen: Float[Array, "18"], world: World) -> Float[Array, " input"]:
+    def _input(self, observation: Float[Array, "18"], world: World) -> Float[Array, " input"]:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
-        shown = self._history.network_input(seen, world.history) if self._history.size else seen
+        shown = self._history.network_input(observation, world.history) if self._history.size else observation
         return jnp.concatenate([shown, self._privileged(world)]) if self.config.sac.privileged_critic else shown
 
     def _first_privileged(self, rng: Array) -> Float[Array, " privileged"]:
@@ -247,11 +248,11 @@ class CoupledPairEnv(Env):
             parts += [jnp.stack([battery, uncompensated])]
         return jnp.concatenate(parts)
 
-    def _follower_command(self, action: Float[Array, "3"], seen: Float[Array, "18"]) -> Float[Array, "3"]:
+    def _follower_command(self, action: Float[Array, "3"], observation: Float[Array, "18"]) -> Float[Array, "3"]:
         follower, law = self.config.follower, self.config.leader
-        return observation.follower_command(
+        return layout.follower_command(
             action,
-            seen,
+            observation,
             follower.action == "residual",
             (follower.action_scale_tilt, follower.action_scale_vertical),
             law.kp,

@@ -9,7 +9,7 @@ import pytest
 
 from mjxball.config import PRESETS, Config, apply_overrides, preset
 from mjxball.control import rotations
-from mjxball.sim.closed_loop import MAX_LIFT_DIFFERENCE, BodyState, ClosedLoop
+from mjxball.sim.laws import MAX_LIFT_DIFFERENCE, BodyState, Laws
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 PERIOD = 0.01
@@ -24,8 +24,8 @@ def body(position=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), euler=(0.0, 0.0, 0.
     )
 
 
-def started(config: Config) -> tuple[ClosedLoop, np.ndarray]:
-    loop = ClosedLoop(config)
+def started(config: Config) -> tuple[Laws, np.ndarray]:
+    loop = Laws(config)
     return loop, loop.zero_integral(np.zeros(3))
 
 
@@ -37,10 +37,10 @@ class TestSharedIntegrals:
         integral = integral + np.array([0.1, -0.2, 0.3, 0.0, 0.0, 0.0, 0.0])
         state, goal = body((0.1, -0.1, 0.05), (0.02, 0.0, 0.01)), np.zeros(3)
         pd = loop.leader_command(state, goal, np.zeros(7))
-        led = loop.leader_command(state, goal, integral)
-        followed = loop.follower_command(pd, integral)
-        np.testing.assert_allclose(followed, led, atol=1e-12)
-        assert np.abs(led - pd).max() > 0.01
+        leader_command = loop.leader_command(state, goal, integral)
+        follower_command = loop.follower_command(pd, integral)
+        np.testing.assert_allclose(follower_command, leader_command, atol=1e-12)
+        assert np.abs(leader_command - pd).max() > 0.01
 
     def test_a_stick_that_hangs_is_lifted_apart(self) -> None:
         """Rolled against what is asked, the drone that hangs lifts more and the other less by the same amount."""
@@ -48,11 +48,11 @@ class TestSharedIntegrals:
         hanging, goal = body(euler=(-0.02, 0.0, 0.0)), np.zeros(3)  # the leader, at +y, is low
         for _ in range(50):
             integral = loop.integrate(integral, hanging, goal, PERIOD)
-        led = loop.leader_command(hanging, goal, integral)[2]
-        followed = loop.follower_command(np.zeros(3), integral)[2]
+        leader_command = loop.leader_command(hanging, goal, integral)[2]
+        follower_command = loop.follower_command(np.zeros(3), integral)[2]
         gain = preset("flight").leader.level_gain
-        assert led == pytest.approx(gain * 0.02 * 0.5, rel=1e-6)
-        assert followed == pytest.approx(-led, rel=1e-6)
+        assert leader_command == pytest.approx(gain * 0.02 * 0.5, rel=1e-6)
+        assert follower_command == pytest.approx(-leader_command, rel=1e-6)
 
     def test_lift_apart_has_a_limit(self) -> None:
         loop, integral = started(preset("flight"))
@@ -68,8 +68,8 @@ class TestSharedIntegrals:
         tau = config.follower.washout_time
         for share in (1, 3):
             for _ in range(round(share * tau / PERIOD)):
-                followed = loop.follower_command(added, integral)
-                integral = loop.integrate(integral, state, goal, PERIOD, followed=followed)
+                follower_command = loop.follower_command(added, integral)
+                integral = loop.integrate(integral, state, goal, PERIOD, follower_command=follower_command)
             left = loop.follower_command(added, integral)[0] / added[0]
             # The washed out command itself is followed by the level integral's asked roll of 0.
             assert left == pytest.approx(math.exp(-1) if share == 1 else math.exp(-4), rel=0.02)
@@ -109,9 +109,9 @@ class TestStand:
         np.testing.assert_allclose(loop.observe(felt, goal), loop.observe(true, goal), atol=1e-12)
         for state in (true, felt):
             integral = loop.integrate(integral, state, goal, PERIOD)
-        led = loop.leader_command(felt, goal, integral)
-        np.testing.assert_allclose(led, loop.leader_command(true, goal, integral), atol=1e-12)
-        assert led[0] == led[1] == 0
+        leader_command = loop.leader_command(felt, goal, integral)
+        np.testing.assert_allclose(leader_command, loop.leader_command(true, goal, integral), atol=1e-12)
+        assert leader_command[0] == leader_command[1] == 0
         locked = [0, 1, 4, 5, 6, 7, 10, 11, 12, 13, 15, 16]
         seen = loop.observe(felt, goal)
         assert not seen[locked].any()
@@ -119,12 +119,12 @@ class TestStand:
 
     def test_in_free_flight_everything_is_seen(self) -> None:
         felt = body((0.023, -0.023, 0.05), (0.165, 0.1, 0.02), (0.03, 0.01, 0.5), (0.1, 0.05, 0.2))
-        assert np.abs(ClosedLoop(preset("flight")).observe(felt, np.ones(3))).min() > 0
+        assert np.abs(Laws(preset("flight")).observe(felt, np.ones(3))).min() > 0
 
 
 @pytest.mark.parametrize("error", ["object", "leader"])
 def test_an_observation_tells_the_body_that_it_was_made_of(error: str) -> None:
-    loop = ClosedLoop(apply_overrides(preset("flight"), {"follower.error": error}))
+    loop = Laws(apply_overrides(preset("flight"), {"follower.error": error}))
     goal = np.array([0.3, -0.2, 0.4])
     state = body((0.1, 0.2, 0.3), (0.1, -0.2, 0.05), (0.05, -0.03, 0.4), (0.3, 0.2, -0.1))
     again = loop.body_from_observation(loop.observe(state, goal), goal)

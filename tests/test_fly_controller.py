@@ -18,7 +18,7 @@ from mjxball.fly.process import Metronome
 from mjxball.fly.telemetry import Rig, object_state
 from mjxball.physics.engine import PlantState
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.sim.closed_loop import ClosedLoop
+from mjxball.sim.laws import Laws
 
 small = st.floats(-0.5, 0.5)
 triples = st.tuples(small, small, small)
@@ -73,9 +73,7 @@ def test_a_flight_of_the_pilot_is_a_flight_of_the_simulation() -> None:
         np.testing.assert_allclose(flown.observation, seen, atol=1e-12)
         zero = np.zeros(())
         simulated = PlantState(*(zero for _ in PlantState._fields))._replace(position=position, velocity=velocity)
-        np.testing.assert_allclose(
-            flown.leader, ClosedLoop(config).leader_command(simulated, goal, integral), atol=1e-10
-        )
+        np.testing.assert_allclose(flown.leader, Laws(config).leader_command(simulated, goal, integral), atol=1e-10)
         np.testing.assert_allclose(flown.follower, follower(seen), atol=1e-5)  # float32 inference
         integral = integral + config.timing.control_period * (goal - position)
 

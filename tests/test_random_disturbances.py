@@ -182,7 +182,7 @@ def test_no_world_is_drawn_whose_thrust_nobody_could_trim() -> None:
     load = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 2000)).pipeline_state.load
     assert float(jax.vmap(env._resets.trimmed)(load).min()) > -1e-3
     # The follower's own rotors keep most of their range; a leader that lifts too much or too little does not.
-    led, followed = load.thrust_scale.T
-    assert float(followed.min()) < 0.83
-    assert float(followed.max()) > 1.17
-    assert float(led[load.object_mass > 0.3].min()) > 0.83
+    leader, follower = load.thrust_scale.T
+    assert float(follower.min()) < 0.83
+    assert float(follower.max()) > 1.17
+    assert float(leader[load.object_mass > 0.3].min()) > 0.83

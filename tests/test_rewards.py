@@ -20,11 +20,12 @@ def task(weights=ERROR_ONLY, **parts):
 
 
 def test_paper_reward_is_ten_times_the_absolute_differences():
-    led, followed = np.array([0.1, -0.2, 1.0]), np.array([0.15, 0.1, 0.4])
-    assert paper_reward(led, followed) == pytest.approx(-10 * (0.05 + 0.3 + 0.6), rel=1e-15)
-    assert paper_reward(led, led) == 0
+    leader, follower = np.array([0.1, -0.2, 1.0]), np.array([0.15, 0.1, 0.4])
+    assert paper_reward(leader, follower) == pytest.approx(-10 * (0.05 + 0.3 + 0.6), rel=1e-15)
+    assert paper_reward(leader, leader) == 0
     np.testing.assert_array_equal(
-        paper_reward(np.stack([led, led]), np.stack([followed, led])), [paper_reward(led, followed), 0]
+        paper_reward(np.stack([leader, leader]), np.stack([follower, leader])),
+        [paper_reward(leader, follower), 0],
     )
 
 

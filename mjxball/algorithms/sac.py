@@ -96,7 +96,7 @@ def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = N
 def _normaliser(mask: Any) -> Callable[[Array, Any], Array]:
     """Normalisation of an observation by running statistics, with zeros where `mask` (n,) has them."""
     shown = np.asarray(mask, np.float32)
-    return lambda seen, statistics: brax.running_statistics.normalize(seen, statistics) * shown
+    return lambda observation, statistics: brax.running_statistics.normalize(observation, statistics) * shown
 
 
 def create(networks: Networks, config: Sac, observation_size: int, key: Array) -> Learner:
@@ -133,8 +133,8 @@ def make_update(
     distribution = networks.parametric_action_distribution
     target_entropy = config.target_entropy * action_size
 
-    def entropy_of(learner: Learner, seen: Float[Array, "batch n"], key: Array) -> Float[Array, ""]:
-        parameters = networks.policy_network.apply(learner.normaliser, learner.policy, seen)
+    def entropy_of(learner: Learner, observation: Float[Array, "batch n"], key: Array) -> Float[Array, ""]:
+        parameters = networks.policy_network.apply(learner.normaliser, learner.policy, observation)
         return -jnp.mean(distribution.log_prob(parameters, distribution.sample_no_postprocessing(parameters, key)))
 
     def value_step(
@@ -280,12 +280,17 @@ class SoftActorCritic:
         """One step of all environments into the replay and the normaliser."""
         learner, (*act_keys, reset_key) = state.learner, keys
         action = self._act(learner, envs.states.obs, act_keys, phase)
-        envs, seen = self._environments.step(envs, action, reset_key)
+        envs, transition = self._environments.step(envs, action, reset_key)
         transitions = Transitions(
-            seen.observation, action, seen.reward, 1 - seen.terminated, seen.next_observation, seen.done
+            transition.observation,
+            action,
+            transition.reward,
+            1 - transition.terminated,
+            transition.next_observation,
+            transition.done,
         )
         normaliser = brax.running_statistics.update(
-            learner.normaliser, seen.observation, pmap_axis_name=self._shards.axis
+            learner.normaliser, transition.observation, pmap_axis_name=self._shards.axis
         )
         normaliser = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), normaliser, learner.normaliser)
         buffer = replay.insert(state.replay, transitions, phase.recording)

@@ -89,7 +89,7 @@ def load_axis(config: Config, name: str) -> LoadAxis:
         loop = drone_loop(config, axis)
         kp, kd, surplus = loop.kp, loop.kd, loop.surplus
     roll, pitch, _ = attitude.natural_frequency
-    led, followed = map(float, constants.share)
+    leader_share, follower_share = map(float, constants.share)
     along = "xy".index(plant.cg_axis)
     return LoadAxis(
         axis=axis,
@@ -99,7 +99,7 @@ def load_axis(config: Config, name: str) -> LoadAxis:
         inertia=float(inertia[axis]),
         half_length=0.5 * (plant.leader_mount[along] - plant.follower_mount[along]),
         drone_mass=(plant.leader_mass, plant.follower_mass),
-        share=(led, followed),
+        share=(leader_share, follower_share),
         gravity=plant.gravity,
         slope=thrust_slopes(config)[1],
         surplus=surplus,

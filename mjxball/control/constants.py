@@ -78,11 +78,12 @@ def trim_limit(
     believed = object_mass if believed_mass is None else believed_mass
     ahead, behind = (getattr(plant, name)["xy".index(plant.cg_axis)] for name in ("leader_mount", "follower_mount"))
     strong, own = thrust
-    led = strong * (plant.leader_mass - behind / (ahead - behind) * believed) - plant.leader_mass  # beyond its own mass
-    lifted = object_mass - led  # by the follower
-    asked = (plant.follower_mass + lifted) * plant.gravity / 4  # of each rotor, times `own`
+    # What each drone lifts beyond its own mass.
+    leader_lift = strong * (plant.leader_mass - behind / (ahead - behind) * believed) - plant.leader_mass
+    follower_lift = object_mass - leader_lift
+    asked = (plant.follower_mass + follower_lift) * plant.gravity / 4  # of each rotor, times `own`
     torque = (1 - margin) * torque_per_force(plant.arm, plant.layout) * (own * plant.rotor_force_max - asked)
-    uneven = abs(ahead * led + behind * lifted) * plant.gravity  # moment about O of both lifts
+    uneven = abs(ahead * leader_lift + behind * follower_lift) * plant.gravity  # moment about O of both lifts
     return (torque - uneven) / (object_mass * plant.gravity)
 
 
@@ -116,8 +117,8 @@ def thrust_slopes(config: Config) -> tuple[float, float]:
     if law.kind == "crazyflie" and law.thrust_law == "paper":
         slope = 4 * hover(config)[1] * law.thrust_per_acceleration
         return slope, slope
-    led, followed = map(float, constants.drone_mass + constants.share * config.plant.object_mass)
-    return led, followed
+    leader, follower = map(float, constants.drone_mass + constants.share * config.plant.object_mass)
+    return leader, follower
 
 
 def drone_loop(config: Config, axis: int) -> DroneLoop:

@@ -59,7 +59,7 @@ class Batch:
         make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
         step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
         self._physics = jax.vmap(step)
-        self._brief = rollout.make_brief(config)
+        self._privileged = rollout.make_privileged_info(config)
         self._shares = np.float32(not isinstance(follower, Baseline))
         self._compiled: dict[Any, Any] = {}
 
@@ -105,17 +105,17 @@ class Batch:
         first: Sample,
         inputs: Inputs,
     ) -> metrics.RunningMetrics:
-        state, seen = loop.start(start, goal, first, delays)
+        state, observation = loop.start(start, goal, first, delays)
         running = metrics.begin(start.position, goal, start.rotor_force)
-        carry = Carry(state, seen, self._law.start(seen), running)
+        carry = Carry(state, observation, self._law.start(observation), running)
         return jax.lax.scan(lambda c, i: (self._step(loop, load, c, i), None), carry, inputs)[0].running
 
     def _step(self, loop: ClosedLoop, load: Load, carry: Carry, inputs: Inputs) -> Carry:
-        config, state, seen = self._config, carry.loop, carry.observation
+        config, state, observation = self._config, carry.loop, carry.observation
         plant, goals = state.plant, inputs.goals
-        follower, answer = self._law.step(carry.follower, seen, self._brief(plant, load))
+        follower, answer = self._law.step(carry.follower, observation, self._privileged(plant, load))
         acting = load._replace(external_force=inputs.force)
-        moved, after, commands = loop.step(state, seen, answer, acting, goals, inputs.sample, self._shares)
+        moved, after, commands = loop.step(state, observation, answer, acting, goals, inputs.sample, self._shares)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         time = inputs.number * jnp.float32(config.timing.control_period)
         flown = (time, plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)

@@ -180,10 +180,12 @@ def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | No
             axis.plot(time, result.flight.cg_offset, color=colour, linewidth=1.2)
         else:
             factor = 1.0 if index == 2 else 57.29577951308232
-            led, followed = result.flight.leader_command, result.flight.follower_command
-            axis.plot(time, factor * followed[:, index], color=colour, linewidth=1.1, label=f"{result.follower}")
-            name = None if number else "dashed: leader"
-            axis.plot(time, factor * led[:, index], color=colour, linewidth=0.8, linestyle="--", label=name, alpha=0.7)
+            flight, name = result.flight, None if number else "dashed: leader"
+            axis.plot(
+                time, factor * flight.follower_command[:, index], color=colour, linewidth=1.1, label=result.follower
+            )
+            dashed: dict[str, Any] = {"linewidth": 0.8, "linestyle": "--", "alpha": 0.7, "label": name}
+            axis.plot(time, factor * flight.leader_command[:, index], color=colour, **dashed)
     low, high = axis.get_ylim()
     if high - low < LEAST_SPAN:  # rounding errors must not look like motion
         axis.set_ylim((low + high - LEAST_SPAN) / 2, (low + high + LEAST_SPAN) / 2)

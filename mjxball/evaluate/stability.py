@@ -18,7 +18,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from mjxball.config import Config
-from mjxball.control import observation, rotations
+from mjxball.control import observation as layout
+from mjxball.control import rotations
 from mjxball.control.followers import Law
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Load, PlantState
@@ -96,7 +97,7 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
     """
     period = config.timing.control_period
     physics = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), mjx.jax_repeat)
-    brief, loop = rollout.make_brief(config), ClosedLoop(config, physics, SensorModel(delay))
+    privileged, loop = rollout.make_privileged_info(config), ClosedLoop(config, physics, SensorModel(delay))
     goal, still, zero = jnp.zeros(3), jnp.zeros(3), jnp.zeros(())
 
     def flat(plant: PlantState, memory: Any, past: Array) -> tuple[Array, Any]:
@@ -105,8 +106,8 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
 
     def first(load: Load) -> tuple[PlantState, Any, Array]:
         plant = start_state(config, still, still, still, load.believed_mass, zero)
-        seen = loop.observe(plant, goal)
-        return plant, law.start(seen), jnp.broadcast_to(seen, (delay, observation.OBSERVATION_SIZE))
+        observation = loop.observe(plant, goal)
+        return plant, law.start(observation), jnp.broadcast_to(observation, (delay, layout.OBSERVATION_SIZE))
 
     def start(load: Load) -> Array:
         return flat(*first(load))[0]
@@ -118,7 +119,7 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
         past = jnp.concatenate([loop.observe(plant, goal)[None], older])
         sensors = SensorState(delay, (), past) if delay else SensorState()
         state = LoopState(plant, loop.zero_integral(still), sensors, jnp.zeros((), bool))
-        memory, answer = law.step(memory, past[-1], brief(plant, load))
+        memory, answer = law.step(memory, past[-1], privileged(plant, load))
         moved, _, _ = loop.step(state, past[-1], answer, load, (goal, goal), Sample(), 0.0)
         older = moved.sensors.past[1:] if delay else older
         # A flight that diverged stays where it was, which is no hover.

@@ -17,7 +17,7 @@ from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, Force
 from mjxball.fly.limits import Times
 from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.policy import Policy
-from mjxball.sim.closed_loop import ClosedLoop
+from mjxball.sim.laws import Laws
 
 GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
 STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
@@ -143,7 +143,7 @@ class Controller:
     def __init__(self, policy: Policy):
         config = config_of(policy.card)
         self.policy, self.config, self.period = policy, config, policy.control_period
-        self._loop = ClosedLoop(config)
+        self._loop = Laws(config)
         self.reset()
 
     def reset(self) -> None:
@@ -156,5 +156,5 @@ class Controller:
         seen = self._loop.observe(state, goal)
         led = self._loop.leader_command(state, goal, self._integral)
         followed = self._loop.follower_command(np.asarray(self.policy(seen), float), self._integral)
-        self._integral = self._loop.integrate(self._integral, state, goal, self.period, followed=followed)
+        self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=followed)
         return Commands(led, followed, seen)

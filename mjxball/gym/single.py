@@ -117,7 +117,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._plant = plant
         truncated = bool(self._state.info["truncation"])
         terminated = bool(self._state.done) and not truncated
-        info = {name: float(value) for name, value in worlds.told(self._state).items()}
+        info = {name: float(value) for name, value in worlds.info_of(self._state).items()}
         return self._seen(), float(self._state.reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
@@ -141,7 +141,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._scene = None
 
     def _seen(self) -> np.ndarray:
-        return np.array(self._state.obs[: self._laws.pair.seen_size])
+        return np.array(self._state.obs[: self._laws.pair.policy_input_size])
 
     def _view(self) -> tuple[np.ndarray, np.ndarray]:
         """Goal (3,), and what the camera looks at (3,): half way to it."""

@@ -129,12 +129,12 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         if ended.any():
             last = np.full(self.num_envs, None, object)
             for world in np.flatnonzero(ended):
-                last[world] = np.array(moved.obs[world, : self._program.pair.seen_size])
+                last[world] = np.array(moved.obs[world, : self._program.pair.policy_input_size])
             info |= {"final_obs": last, "_final_obs": ended, "final_info": _told(moved, ended), "_final_info": ended}
         return info
 
     def _seen(self) -> np.ndarray:
-        return np.array(self._state.obs[:, : self._program.pair.seen_size])
+        return np.array(self._state.obs[:, : self._program.pair.policy_input_size])
 
     def _numbers(self, seed: int | list[int | None] | None) -> list[int]:
         """One number for each world, drawn as `FollowerEnv` would."""
@@ -150,6 +150,6 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
 def _told(state: Any, where: np.ndarray) -> dict[str, np.ndarray]:
     """Gymnasium's vector `info`: arrays (N,), 0 but `where` (N,) there is a value, and that mask."""
     info = {}
-    for name, value in worlds.told(state).items():
+    for name, value in worlds.info_of(state).items():
         info[name], info[f"_{name}"] = np.where(where, value, 0.0), where.copy()
     return info

@@ -23,8 +23,8 @@ def settings(preset: str, config: Config | None) -> Config:
 
 def spaces(pair: CoupledPairEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Spaces of observation (n,) and action (3,): what the follower sees and remembers, and [-1, 1]."""
-    seen = gymnasium.spaces.Box(-np.inf, np.inf, (pair.seen_size,), np.float32)
-    return seen, gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+    observations = gymnasium.spaces.Box(-np.inf, np.inf, (pair.policy_input_size,), np.float32)
+    return observations, gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 
 
 def seed_number(random: np.random.Generator) -> int:
@@ -38,6 +38,6 @@ def next_world(chain: Array) -> tuple[Array, Array]:
     return chain, key
 
 
-def told(state: Any) -> dict[str, Array]:
+def info_of(state: Any) -> dict[str, Array]:
     """What `info` holds of a state: |e_o| [m], the squared command errors, and whether the world has diverged."""
     return {name: state.metrics[name] for name in ("error", "tilt_error", "vertical_error", "diverged")}

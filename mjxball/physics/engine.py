@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from mjxball.config import Plant
 from mjxball.control import mixer, rotations
 from mjxball.control.constants import PlantConstants
 
 Array = Any  # NumPy's or JAX's
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
     Scalar = Float[Array, "..."]
     Vector = Float[Array, "... 3"]
     Matrix = Float[Array, "... 3 3"]
+# A flight beyond one of these has diverged: the physics no longer holds, and no flight came back from there.
+MAX_POSITION, MAX_RATE = 1e3, 50.0  # [m] each coordinate, [rad/s] norm
 
 
 class PlantState(NamedTuple):
@@ -111,3 +115,15 @@ def contact_wrenches(
         forces.append(push - mass * (plant.gravity * down + body + lever))
         torques.append(rotors[..., drone, 1:] - rotations.cross(rates, own * rates) - own * angular)
     return xp.stack(forces, axis=-2), xp.stack(torques, axis=-2)
+
+
+def has_diverged(plant: PlantState) -> Bool[Array, "..."]:
+    """(...) true where a value of `plant` is not finite, or position or rates are beyond what the physics is for."""
+    xp, batch = plant.position.__array_namespace__(), plant.position.ndim - 1
+    with np.errstate(invalid="ignore", over="ignore"):
+        far = (xp.abs(plant.position) > MAX_POSITION).any(axis=-1)
+        far = far | ((plant.rates * plant.rates).sum(axis=-1) > MAX_RATE**2)
+    for leaf in plant:
+        if leaf is not None:
+            far = far | ~xp.isfinite(leaf).all(axis=tuple(range(batch, leaf.ndim)))
+    return far

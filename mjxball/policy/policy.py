@@ -15,14 +15,16 @@ from mjxball.policy.file import PolicyFile, history_of, load_file
 Array = Any
 
 
-def mean_action(weights: Sequence[Array], biases: Sequence[Array], mean: Array, scale: Array, seen: Array) -> Array:
-    """tanh of the network's mean output (..., 3) in [-1, 1] for an input `seen` (..., n).
+def mean_action(
+    weights: Sequence[Array], biases: Sequence[Array], mean: Array, scale: Array, observation: Array
+) -> Array:
+    """tanh of the network's mean output (..., 3) in [-1, 1] for an input `observation` (..., n).
 
     ReLU layers on (seen - mean) * scale; the last layer's first half is the mean, its second half belongs
     to the exploration noise and is not computed.
     """
-    xp = seen.__array_namespace__()
-    hidden = (seen - mean) * scale
+    xp = observation.__array_namespace__()
+    hidden = (observation - mean) * scale
     for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
         hidden = xp.maximum(hidden @ weight + bias, 0.0)
     return xp.tanh(hidden @ weights[-1] + biases[-1])
@@ -70,16 +72,18 @@ class Policy:
 
     def scaled(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
-        seen = np.asarray(observation, self._dtype)
-        if seen.shape[-1:] != (layout.OBSERVATION_SIZE,):
-            raise ValueError(f"observation must have {layout.OBSERVATION_SIZE} numbers last, not shape {seen.shape}")
+        observation = np.asarray(observation, self._dtype)
+        if observation.shape[-1:] != (layout.OBSERVATION_SIZE,):
+            raise ValueError(
+                f"observation must have {layout.OBSERVATION_SIZE} numbers last, not shape {observation.shape}"
+            )
         if not self._history.size:
-            return mean_action(self._weights, self._biases, self._mean, self._scale, seen)
+            return mean_action(self._weights, self._biases, self._mean, self._scale, observation)
         if self._memory is None:
-            self._memory = self._history.start(seen)
-        full = self._history.network_input(seen, self._memory)
+            self._memory = self._history.start(observation)
+        full = self._history.network_input(observation, self._memory)
         action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
-        self._memory = self._history.next(self._memory, seen, action)
+        self._memory = self._history.next(self._memory, observation, action)
         return action
 
     def __call__(self, observation: Array) -> Array:

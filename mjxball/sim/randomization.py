@@ -193,7 +193,7 @@ class ResetDistribution:
         return 4 * asked / believed - gravity
 
     def initial_integrals(self, load: Load, key: Array) -> Float[Array, "7"]:
-        """(7,) integrals (see `ClosedLoop`) with which a world begins, in the air: nearly those that hover it."""
+        """(7,) integrals (see `Laws`) with which a world begins, in the air: nearly those that hover it."""
         law = self.config.leader
         battery: Scalar = load.battery
         uncompensated: Scalar = load.uncompensated

@@ -151,12 +151,12 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     for follower in followers:
         follower.reset()
 
-    def act(seen: np.ndarray, brief: PrivilegedInfo) -> np.ndarray:
+    def act(observation: np.ndarray, privileged: PrivilegedInfo) -> np.ndarray:
         commands = []
         for follower, part in zip(followers, parts, strict=True):
             if isinstance(follower, Baseline):
-                follower.privileged = PrivilegedInfo(*(leaf[part] for leaf in brief))
-            commands.append(np.asarray(follower(seen[part]), float))
+                follower.privileged = PrivilegedInfo(*(leaf[part] for leaf in privileged))
+            commands.append(np.asarray(follower(observation[part]), float))
         return np.concatenate(commands)
 
     return scenarios, act
@@ -175,25 +175,27 @@ def fly(
     `shares` as from `shares_of`; None: all of them policies.
     """
     shares = np.ones(len(scenarios)) if shares is None else shares
-    cg_offset, brief, period = make_cg_offset(config), make_brief(config), config.timing.control_period
+    cg_offset, privileged, period = make_cg_offset(config), make_privileged_info(config), config.timing.control_period
     count = round(scenarios[0].seconds / period)
     load, target = load_of(scenarios), targets(scenarios, count + 1, period)
     disturbances = [scenario.disturbance for scenario in scenarios]
     samples = record(disturbances, count + 2, period)
     sensors, delays = sensors_of(disturbances, period)
     loop = ClosedLoop(config, make_stepper(config, physics), sensors)
-    state, seen = loop.start(start_of(config, scenarios), target[0], samples.at(0), delays)
+    state, observation = loop.start(start_of(config, scenarios), target[0], samples.at(0), delays)
     for number in range(count + 1):
         plant, goals = state.plant, (target[number], target[number + 1])
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
-        commands = loop.commands(state, seen, act(seen, brief(plant, load)), goals[0], shares)
+        commands = loop.commands(state, observation, act(observation, privileged(plant, load)), goals[0], shares)
         # The time is exact, so that a mass change falls on the same row for every engine.
         flown = (plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)
-        yield Tick(number * period, *flown, plant, seen, cg_offset(plant, load))
+        yield Tick(number * period, *flown, plant, observation, cg_offset(plant, load))
         if number < count:
             acting = load._replace(external_force=samples.at(number).force)
             moved = loop.physics(plant, loop.stack(commands), acting)
-            state, seen = loop.after_physics(state, seen, commands, moved, goals, samples.at(number + 1), shares)
+            state, observation = loop.after_physics(
+                state, observation, commands, moved, goals, samples.at(number + 1), shares
+            )
 
 
 def _record(
@@ -203,7 +205,7 @@ def _record(
     grid = np.array([tick.time for tick in ticks])
     load, count = load_of(scenarios), len(ticks)
     force = record([s.disturbance for s in scenarios], count, config.timing.control_period).force
-    target, euler, led, followed, seen, offset = (
+    target, euler, leader_command, follower_command, observation, offset = (
         np.stack([getattr(tick, name) for tick in ticks])
         for name in ("target", "euler", "leader_command", "follower_command", "observation", "cg_offset")
     )
@@ -221,9 +223,9 @@ def _record(
         rates=flown.rates,
         quaternion=flown.quaternion,
         rotor_force=flown.rotor_force,
-        leader_command=led,
-        follower_command=followed,
-        observation=seen,
+        leader_command=leader_command,
+        follower_command=follower_command,
+        observation=observation,
         cg_offset=offset,
         object_mass=object_mass(flown.time, load),
         contact_force=force,
@@ -234,8 +236,8 @@ def _record(
     )
 
 
-def make_brief(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
-    """Return `brief(state, load)`: what a classical follower is told, the truth half a step and a rotor lag ahead.
+def make_privileged_info(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
+    """Return `privileged(state, load)`: what a classical follower is told, the truth half a step and a rotor lag ahead.
 
     Of a rolling ball nobody can know the future: the oracle is told where it is.
     """
@@ -244,7 +246,7 @@ def make_brief(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
     drones = plant.leader_mass + plant.follower_mass
     prescribed = None if config.motion.kind == "rolling" else make_prescribed(config)
 
-    def brief(state: PlantState, load: Load) -> PrivilegedInfo:
+    def privileged(state: PlantState, load: Load) -> PrivilegedInfo:
         xp = state.time.__array_namespace__()
         mass = object_mass(state.time, load)
         if prescribed is None:
@@ -253,7 +255,7 @@ def make_brief(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
             offset, _, acceleration = prescribed(state.time + ahead, load)
         return PrivilegedInfo(load.believed_mass, mass * offset, mass * acceleration, drones + mass)
 
-    return brief
+    return privileged
 
 
 def flown_contact_wrenches(

@@ -112,8 +112,8 @@ class Environments:
             totals={name: total + metrics[name].sum() for name, total in statistics.totals.items()},
             peaks={name: jnp.maximum(peak, metrics[name]) for name, peak in statistics.peaks.items()},
         )
-        seen = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
-        return Envs(states, statistics, envs.difficulty), seen
+        transition = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
+        return Envs(states, statistics, envs.difficulty), transition
 
     def over_shards(self, statistics: Statistics) -> Statistics:
         """Statistics of all shards together; `peaks` stay each shard's own environments."""

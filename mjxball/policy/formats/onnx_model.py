@@ -148,14 +148,14 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m).
     """
     graph, history = Graph(), history_of(contents.card)
-    seen = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
+    observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
-    memory = history.start(seen)
+    memory = history.start(observation)
     if history.size:
         inputs += [_value("memory", TensorProto.FLOAT, history.size), _value("start", TensorProto.BOOL, 1)]
         start, given = TracedArray(graph, "start", 1), TracedArray(graph, "memory", history.size)
         memory = TracedArray(graph, graph.add("Where", start, memory, given), history.size)
-    results = dict(zip(("action", "command", "next_memory"), _answers(contents, seen, memory), strict=True))
+    results = dict(zip(("action", "command", "next_memory"), _answers(contents, observation, memory), strict=True))
     if not history.size:
         del results["next_memory"]
     for label, value in results.items():
@@ -170,12 +170,12 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
 
 
 def _answers(
-    contents: PolicyFile, seen: TracedArray, memory: TracedArray
+    contents: PolicyFile, observation: TracedArray, memory: TracedArray
 ) -> tuple[TracedArray, TracedArray, TracedArray]:
     """Action, command and next memory, by the laws that fly."""
     law = NetworkLaw(Policy(contents, "traced", np.float32))
-    action = law.scaled(memory, seen)
-    return action, law.command(action, seen), law.next_memory(memory, seen, action)
+    action = law.scaled(memory, observation)
+    return action, law.command(action, observation), law.next_memory(memory, observation, action)
 
 
 def _value(name: str, kind: int, size: int | None) -> Any:

@@ -1,0 +1,222 @@
+"""Laws of both drones, which simulation and flight call alike: the leader's PID, shared integrals, stands.
+
+Importing it needs NumPy alone.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from mjxball.config import Config
+from mjxball.control import leader, rotations
+from mjxball.control import observation as layout
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from mjxball.physics.engine import Array, Vector
+    from mjxball.sim.disturbances import Observation
+
+    Integral = Float[Array, "... integrals"]  # 3, or 7 where the follower shares the integrals
+
+# Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
+MAX_LIFT_DIFFERENCE = 1.5
+
+
+class BodyState(NamedTuple):
+    """A body put together from an observation; see `Body`."""
+
+    position: Vector
+    velocity: Vector
+    quaternion: Float[Array, "... 4"]
+    rates: Vector
+
+
+class Body(Protocol):
+    """What both drones' laws need of a state: a simulated one, or one that was put together from two drones'."""
+
+    @property
+    def position(self) -> Vector:
+        """Of O in the world [m]."""
+
+    @property
+    def velocity(self) -> Vector:
+        """Of O in the world [m/s]."""
+
+    @property
+    def quaternion(self) -> Float[Array, "... 4"]:
+        """Body -> world (w, x, y, z)."""
+
+    @property
+    def rates(self) -> Vector:
+        """About the body axes [rad/s]."""
+
+
+class Laws:
+    """Laws of both drones for one configuration, on arrays of any batch shape and namespace.
+
+    On a stand, where a drone's estimator invents motion along what is locked, neither law is fed it: position and
+    velocity across, pitch, yaw and their rates are 0.
+
+    `integral` (..., 3) of the leader's error [m s] is followed by that of the stick's angle error [rad s] where the
+    follower shares the integrals: two drones with integrals of their own wind up against each other, for only the
+    whole lift and the whole moment show in the motion. The leader's PID is then both drones' base, and what keeps
+    turning the stick is lifted away, one drone more, the other less, instead of being held by a lasting roll command.
+    Behind them stands the average (..., 3) of what the network adds to that base (`follower.washout_time`): it is taken
+    off, for a lasting command of one drone is undone by the other's integrals and only costs both of them range.
+    """
+
+    def __init__(self, config: Config):
+        self._law, self._gravity = config.leader, config.plant.gravity
+        self._shares = config.follower.shares_integrals
+        self._level = config.leader.level_gain
+        self._washout = config.follower.washout_time
+        self._axis = 0 if config.plant.cg_axis == "y" else 1  # roll or pitch, which the load turns
+        # A leader at +y that lifts more rolls the stick up, one at +x pitches it down.
+        self._apart = (1.0, -1.0)[self._axis]
+        # On a pivot height stays: a drone's own follows from roll, and flies on that.
+        self._free = None if config.plant.stand == "free" else (0.0, 0.0, 1.0)
+        self._follower_sees = config.follower.error
+        self._leader_mount, self._follower_mount = config.plant.leader_mount, config.plant.follower_mount
+
+    def observe(self, state: Body, goal: Vector) -> Observation:
+        """The follower's observation; `goal` of O."""
+        xp = state.position.__array_namespace__()
+        state, goal = self._unlocked(state), self._freed(goal)
+        matrix = rotations.matrix_from_quaternion(state.quaternion)
+        mount = xp.asarray(self._follower_mount, dtype=state.position.dtype)
+        observation = layout.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
+        if self._free is not None:
+            # The tilted mount's way across is locked as well: it is seen in roll.
+            observation = xp.concat(
+                [
+                    self._freed(observation[..., 0:3]),
+                    observation[..., 3:6],
+                    self._freed(observation[..., 6:9]),
+                    observation[..., 9:],
+                ],
+                axis=-1,
+            )
+        if self._follower_sees == "object":
+            return observation
+        return xp.concat([observation[..., : layout.ERROR.start], *self._own_error(state, goal)], axis=-1)
+
+    def body_from_observation(self, observation: Observation, goal: Vector) -> BodyState:
+        """The body that `observation` tells of, e_o or e_l in it; `goal` of O."""
+        euler, rates = observation[..., 3:6], observation[..., 9:12]
+        position = self._freed(goal) - observation[..., layout.ERROR]
+        quaternion = rotations.quaternion_from_euler(euler)
+        velocity = -observation[..., layout.ERROR_RATE]
+        if self._follower_sees == "leader":
+            arm, sweep = self._swept(quaternion, rates, goal)
+            mount = goal.__array_namespace__().asarray(self._leader_mount, dtype=goal.dtype)
+            position, velocity = self._freed(position + mount - arm), self._freed(velocity - sweep)
+        return BodyState(position, velocity, quaternion, rates)
+
+    def leader_error(self, state: Body, goal: Vector) -> tuple[Vector, Vector]:
+        """(error, its rate) on which the leader flies."""
+        if self._free is not None:
+            state, goal = self._unlocked(state), self._freed(goal)
+        if self._law.error == "object":
+            return goal - state.position, -state.velocity
+        error, rate = self._own_error(state, goal)
+        return self._freed(error), self._freed(rate)
+
+    def zero_integral(self, position: Vector) -> Integral:
+        """The integral before a flight that begins at `position`."""
+        xp = position.__array_namespace__()
+        still = xp.zeros_like(position)
+        return xp.concat([still, still[..., :1], still], axis=-1) if self._shares else still
+
+    def integrate(
+        self,
+        integral: Integral,
+        state: Body,
+        goal: Vector,
+        period: float,
+        shares: Float[Array, "... 1"] | None = None,
+        follower_command: Vector | None = None,
+    ) -> Integral:
+        """`integral` one `period` [s] on, in which its error was that at `state`.
+
+        `shares`, if given: 1 where the follower shares it, 0 where it flies a law of its own. `follower_command`: the
+        command that a network's follower flew.
+        """
+        xp = goal.__array_namespace__()
+        band = xp.asarray(self._law.integral_band, dtype=goal.dtype)
+        error, rate = self.leader_error(state, goal)
+        lead = self._law.integral_lead
+        error = error + lead * rate if lead else error
+        own = integral[..., :3] + period * xp.clip(error, -band, band)
+        if not self._shares:
+            return own
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
+        axis = slice(self._axis, self._axis + 1)
+        off = self._wanted(state, goal, integral)[..., axis] - euler[..., axis]
+        most = MAX_LIFT_DIFFERENCE / self._level if self._level else 0.0
+        level = xp.clip(integral[..., 3:4] + period * off, -most, most)
+        average = integral[..., 4:]
+        if self._washout and follower_command is not None:
+            # What was added is what was flown above the base, which is the leader's law, and what was taken off.
+            base = self._lifted(self._wanted(state, goal, integral), integral, -self._apart)
+            average = average + period / self._washout * (follower_command - base)
+        if shares is not None:
+            level, average = level * shares, average * shares
+        return xp.concat([own, level, average], axis=-1)
+
+    def leader_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
+        """The leader's command at `state`; `integral` of its error so far, see `Laws`."""
+        wanted = self._wanted(state, goal, integral)
+        return wanted if not self._shares else self._clipped(self._lifted(wanted, integral, self._apart))
+
+    def follower_command(self, command: Vector, integral: Integral) -> Vector:
+        """A network's `command`, which holds the PD law, with its share of the integrals if it shares them."""
+        if not self._shares:
+            return command
+        xp, law = command.__array_namespace__(), self._law
+        ki = xp.asarray(law.ki, dtype=command.dtype)
+        more = leader.command(ki * integral[..., :3], 0.0, self._gravity, law.tilt_limit, law.vertical_limit)
+        return self._clipped(self._lifted(command + more - integral[..., 4:], integral, -self._apart))
+
+    def _wanted(self, state: Body, goal: Vector, integral: Integral) -> Vector:
+        xp, law = goal.__array_namespace__(), self._law
+        gains = (xp.asarray(gain, dtype=goal.dtype) for gain in (law.kp, law.kd, law.ki))
+        wanted = leader.desired_acceleration(*self.leader_error(state, goal), integral[..., :3], *gains)
+        return leader.command(wanted, 0.0, self._gravity, law.tilt_limit, law.vertical_limit)
+
+    def _lifted(self, command: Vector, integral: Integral, side: float) -> Vector:
+        """`command` with what this drone lifts more than the other to turn the stick."""
+        xp = command.__array_namespace__()
+        return xp.concat([command[..., :2], command[..., 2:] + side * self._level * integral[..., 3:4]], axis=-1)
+
+    def _clipped(self, command: Vector) -> Vector:
+        return leader.clip_command(command, self._law.tilt_limit, self._law.vertical_limit)
+
+    def _freed(self, vector: Vector) -> Vector:
+        """`vector` in the world without what the stand locks."""
+        if self._free is None:
+            return vector
+        return vector * vector.__array_namespace__().asarray(self._free, dtype=vector.dtype)
+
+    def _unlocked(self, state: Body) -> Body:
+        """`state` without motion along what the stand locks."""
+        if self._free is None:
+            return state
+        xp = state.rates.__array_namespace__()
+        rolls = xp.asarray([1.0, 0.0, 0.0], dtype=state.rates.dtype)
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
+        quaternion = rotations.quaternion_from_euler(euler * rolls)
+        return BodyState(self._freed(state.position), self._freed(state.velocity), quaternion, state.rates * rolls)
+
+    def _own_error(self, state: Body, goal: Vector) -> tuple[Vector, Vector]:
+        """e_l = goal + mount - p_l and its rate: 0 where the object is level and at its goal (paper, V-B)."""
+        xp = goal.__array_namespace__()
+        mount = xp.asarray(self._leader_mount, dtype=goal.dtype)
+        arm, sweep = self._swept(state.quaternion, state.rates, goal)
+        return goal + mount - state.position - arm, -state.velocity - sweep
+
+    def _swept(self, quaternion: Float[Array, "... 4"], rates: Vector, like: Array) -> tuple[Vector, Vector]:
+        """The leader's mount from O in the world and how fast it moves about it."""
+        mount = like.__array_namespace__().asarray(self._leader_mount, dtype=like.dtype)
+        matrix = rotations.matrix_from_quaternion(quaternion)
+        return rotations.rotate(matrix, mount), rotations.rotate(matrix, rotations.cross(rates, mount))
