@@ -53,7 +53,6 @@ class BraxTraining(NamedTuple):
     """The parts of Brax's training library that work on current JAX."""
 
     networks: ModuleType
-    sac_networks: ModuleType
     losses: ModuleType
     running_statistics: ModuleType
     specs: ModuleType
@@ -65,7 +64,6 @@ def import_brax_training() -> BraxTraining:
     """Return Brax's networks, SAC losses, running statistics and types, imported silently."""
     names = (
         "brax.training.networks",
-        "brax.training.agents.sac.networks",
         "brax.training.agents.sac.losses",
         "brax.training.acme.running_statistics",
         "brax.training.acme.specs",

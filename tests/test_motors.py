@@ -23,12 +23,12 @@ def test_compensated_thrust_does_not_depend_on_the_battery(name):
     for supply in (3.4, 3.8, 4.2):
         pwm = motors.compensated(motor, command, np.float64(supply))
         assert pwm.max() < motors.FULL
-        np.testing.assert_allclose(motors.force(motor, pwm, supply), command / motors.FULL * motor.most, rtol=1e-9)
+        np.testing.assert_allclose(motors.force(motor, pwm, supply), command / motors.FULL * motor.max_force, rtol=1e-9)
 
 
 def test_small_commands_and_dead_batteries_stop_the_motor():
     motor = MOTORS["2.1"]
-    least = motor.least / motor.most * motors.FULL
+    least = motor.min_force / motor.max_force * motors.FULL
     commands = np.array([0.0, least - 1, least + 1])
     assert list(motors.compensated(motor, commands, np.float64(4.0)) > 0) == [False, False, True]
     assert not motors.compensated(motor, np.array([5e4]), np.float64(1.9)).any()

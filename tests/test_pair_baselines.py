@@ -49,7 +49,7 @@ def test_loop_of_one_drone_by_hand() -> None:
     torque = 4 * 0.046 / math.sqrt(2) / 2 * (2 * 0.0915 * p + 0.0677) / 65_535 * DEGREES
     loop = drone_loop(FLIGHT, 0)
     expected = (torque * 937 * 3.25, torque * 937, torque * 28.1, torque * 454)
-    assert (loop.kp, loop.kd, loop.kdd, loop.slow) == pytest.approx(expected, rel=1e-4)
+    assert (loop.kp, loop.kd, loop.kdd, loop.integral_gain) == pytest.approx(expected, rel=1e-4)
     gains = load_axis(FLIGHT, "adaptive")
     assert (gains.axis, gains.sign, gains.kp) == (0, -1.0, loop.kp)
     assert gains.inertia == pytest.approx(2 * 1.66e-5 + 2 * 0.029 * 0.15**2 + 0.01 * (0.3**2 + 0.01**2) / 12, rel=1e-3)
@@ -62,8 +62,8 @@ def test_motors_that_work_apart_lift_besides() -> None:
     more = crazyflie.motor_force(curve, motors).sum() - 4 * crazyflie.motor_force(curve, np.array(command))
     loop = drone_loop(FLIGHT, 0)
     torque = loop.kd / 937 / DEGREES * output
-    assert loop.surplus * torque**2 == pytest.approx(more, rel=1e-9)
-    assert drone_loop(replace(FLIGHT, "autopilot.motor_curve", (0.0, 0.18)), 0).surplus == 0
+    assert loop.thrust_surplus * torque**2 == pytest.approx(more, rel=1e-9)
+    assert drone_loop(replace(FLIGHT, "autopilot.motor_curve", (0.0, 0.18)), 0).thrust_surplus == 0
 
 
 def test_thrust_per_acceleration() -> None:

@@ -43,9 +43,9 @@ class TestAxes:
         assert math.radians(ROLL.gain) * ROLL.inertia == pytest.approx(torque, rel=1e-3)
 
     def test_the_stick_makes_roll_and_yaw_heavy_and_leaves_pitch(self) -> None:
-        assert ROLL.scale == pytest.approx(2 * 0.029 * 0.15**2 / (2 * 1.66e-5) + 3, rel=0.1)
-        assert YAW.scale > 20
-        assert PITCH.scale == pytest.approx(1, abs=0.05)
+        assert ROLL.inertia_ratio == pytest.approx(2 * 0.029 * 0.15**2 / (2 * 1.66e-5) + 3, rel=0.1)
+        assert YAW.inertia_ratio > 20
+        assert PITCH.inertia_ratio == pytest.approx(1, abs=0.05)
 
     def test_trim_holds_the_ball_at_its_stop(self) -> None:
         assert ROLL.trim * math.radians(ROLL.gain) * ROLL.inertia == pytest.approx(0.0075 * 9.81 * 0.08)

@@ -31,7 +31,7 @@ from mjxball.fly.recording import read_recording
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.physics import make_pair
 from mjxball.view.command import main
-from mjxball.view.live import Board, Server
+from mjxball.view.live import LiveView, Server
 from mjxball.view.live_log import COLUMNS, STEP, LiveLog, columns
 
 LIMIT = 20.0  # [s] that anything may take here on a busy machine
@@ -146,10 +146,10 @@ def server(lines: list[bytes], tmp_path: Path) -> Iterator[Server]:
     """Serves a log that has ended."""
     path = tmp_path / "log.jsonl"
     path.write_bytes(b"".join(lines))
-    board = Board(LiveLog(path))
-    while board.update():
+    view = LiveView(LiveLog(path))
+    while view.update():
         pass
-    result = Server(0, board)
+    result = Server(0, view)
     threading.Thread(target=result.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
     yield result
     result.shutdown()
@@ -174,7 +174,7 @@ def test_this_machine_alone_is_served(server: Server) -> None:
 
 
 def test_nothing_but_the_page_and_its_rows_is_served(server: Server) -> None:
-    rows = f"/rows?token={server.board.token}&after="
+    rows = f"/rows?token={server.view.token}&after="
     for path, code in (
         ("/log.jsonl", 404),
         ("/../../etc/passwd", 404),

@@ -30,21 +30,21 @@ class Replay(NamedTuple):
     inserted: Int[Array, ""]  # transitions ever recorded, folded at twice the capacity
 
 
-def create(capacity: int, worlds: int, observation_size: int, action_size: int) -> Replay:
-    """An empty buffer; `capacity` must be a multiple of `worlds`."""
+def create(capacity: int, num_envs: int, observation_size: int, action_size: int) -> Replay:
+    """An empty buffer; `capacity` must be a multiple of `num_envs`."""
     width = 2 * observation_size + action_size + 3
-    return Replay(jnp.zeros((capacity + worlds, width), jnp.float32), jnp.zeros((), jnp.int32))
+    return Replay(jnp.zeros((capacity + num_envs, width), jnp.float32), jnp.zeros((), jnp.int32))
 
 
 def insert(replay: Replay, transitions: Transitions, record: Bool[Array, ""]) -> Replay:
     """Write one step of all worlds (worlds, ...) over the oldest rows, or to scratch unless `record`."""
     columns = [column if column.ndim == 2 else column[:, None] for column in transitions]
     rows = jnp.concatenate(columns, axis=-1)
-    worlds = rows.shape[0]
-    capacity = replay.rows.shape[0] - worlds
+    num_envs = rows.shape[0]
+    capacity = replay.rows.shape[0] - num_envs
     slot = jnp.where(record, replay.inserted % capacity, capacity)
     # A counter past 2 x capacity is folded back, so that int32 never overflows and `% capacity` is unchanged.
-    count = replay.inserted + jnp.where(record, worlds, 0)
+    count = replay.inserted + jnp.where(record, num_envs, 0)
     count = jnp.where(count >= 2 * capacity, count - capacity, count)
     return Replay(jax.lax.dynamic_update_slice_in_dim(replay.rows, rows, slot, axis=0), count)
 
@@ -52,7 +52,7 @@ def insert(replay: Replay, transitions: Transitions, record: Bool[Array, ""]) ->
 def sample(
     replay: Replay,
     draws: UInt[Array, " batch"],
-    worlds: int,
+    num_envs: int,
     observation_size: int,
     action_size: int,
     steps: int,
@@ -63,16 +63,16 @@ def sample(
     Rewards are summed with `discount` (gamma) until `steps` or the episode's end, whichever comes first.
     The buffer must hold at least `steps` steps of all worlds.
     """
-    capacity = replay.rows.shape[0] - worlds
+    capacity = replay.rows.shape[0] - num_envs
     size = jnp.minimum(replay.inserted, capacity)
     oldest = jnp.where(replay.inserted < capacity, 0, replay.inserted)
-    found = jnp.maximum(size - (steps - 1) * worlds, 1)
+    found = jnp.maximum(size - (steps - 1) * num_envs, 1)
     age = (draws % found.astype(draws.dtype)).astype(found.dtype)  # uneven by less than `found` / 2^32
     first = oldest + age
     rows = _unpack(replay.rows[first % capacity], observation_size, action_size)
     reward, factor, last, bootstrap = rows.reward, jnp.ones(len(draws)), rows.last, rows
     for step in range(1, steps):
-        rows_k = _unpack(replay.rows[(first + step * worlds) % capacity], observation_size, action_size)
+        rows_k = _unpack(replay.rows[(first + step * num_envs) % capacity], observation_size, action_size)
         going = last == 0
         factor = jnp.where(going, factor * discount, factor)
         reward = reward + jnp.where(going, factor * rows_k.reward, 0.0)

@@ -87,7 +87,7 @@ def linear_model(config: Config, delay: float) -> LinearModel:
     thrust_torque = half * (row["leader_thrust"] - row["follower_thrust"])
     a[at["rate"]] = (row["torque"] + thrust_torque + row["load"]) / pair.inertia
     commanded = loop.kp * (leader_roll - 2 * row["roll"]) - 2 * loop.kd * row["rate"] - 2 * loop.kdd * a[at["rate"]]
-    a[at["torque"]] = (commanded + loop.slow * row["rate_integral"] - row["torque"]) / lag
+    a[at["torque"]] = (commanded + loop.integral_gain * row["rate_integral"] - row["torque"]) / lag
     b[at["torque"], 0] = loop.kp / lag
     a[at["rate_integral"]] = loop.stiffness * (leader_roll - row["roll"]) - row["rate"]
 

@@ -29,7 +29,7 @@ class LoadAxis(NamedTuple):
     share: tuple[float, float]  # of the object's weight that each drone carries
     gravity: float  # [m/s2]
     slope: float  # thrust of the follower per commanded vertical acceleration [kg]
-    surplus: float  # see `DroneLoop`; 0 of an ideal loop [1/(N m2)]
+    thrust_surplus: float  # see `DroneLoop`; 0 of an ideal loop [1/(N m2)]
     lag: float  # of the rotors [s]
     period: float  # between two commands [s]
     natural_frequency: tuple[float, float]  # of the closed roll and pitch loops of `Attitude` [rad/s]
@@ -37,7 +37,7 @@ class LoadAxis(NamedTuple):
 
     def less_extra_lift(self, vertical: Array, trim: Array) -> Array:
         """`vertical` (...) [m/s2] less the extra lift of motors that hold the torque kp `trim` (...) [rad]."""
-        return vertical - self.surplus / self.slope * (self.kp * trim) ** 2
+        return vertical - self.thrust_surplus / self.slope * (self.kp * trim) ** 2
 
 
 class CopiedPid:
@@ -84,10 +84,10 @@ def load_axis(config: Config, name: str) -> LoadAxis:
     axis = "yx".index(plant.cg_axis)
     constants = plant_constants(plant, attitude)
     inertia = np.diag(constants.drone_inertia) + plant.object_mass * constants.object_inertia_per_mass
-    kp, kd, surplus = constants.gains.kp[axis], constants.gains.kd[axis], 0.0
+    kp, kd, thrust_surplus = constants.gains.kp[axis], constants.gains.kd[axis], 0.0
     if config.autopilot.kind == "crazyflie":
         loop = drone_loop(config, axis)
-        kp, kd, surplus = loop.kp, loop.kd, loop.surplus
+        kp, kd, thrust_surplus = loop.kp, loop.kd, loop.thrust_surplus
     roll, pitch, _ = attitude.natural_frequency
     leader_share, follower_share = map(float, constants.share)
     along = "xy".index(plant.cg_axis)
@@ -102,7 +102,7 @@ def load_axis(config: Config, name: str) -> LoadAxis:
         share=(leader_share, follower_share),
         gravity=plant.gravity,
         slope=thrust_slopes(config)[1],
-        surplus=surplus,
+        thrust_surplus=thrust_surplus,
         lag=plant.rotor_lag,
         period=config.timing.control_period,
         natural_frequency=(roll, pitch),

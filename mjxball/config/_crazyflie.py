@@ -115,7 +115,8 @@ PAIR = Config(
 )
 
 
-SAC = Sac(
+# For a GPU.
+LARGE_SAC = Sac(
     total_steps=2_560_000,
     num_envs=512,
     batch_size=512,
@@ -176,7 +177,7 @@ def stand() -> Config:
             error_scale=0.05, velocity=2.0, tilt=5.0, rates=0.2, ball=10.0, tilt_disagreement=20.0, termination=200.0
         ),
         bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.05),
-        sac=replace(SAC, discount=0.99, reward_scale=0.1),
+        sac=replace(LARGE_SAC, discount=0.99, reward_scale=0.1),
     )
 
 
@@ -219,5 +220,5 @@ def flight() -> Config:
         ),
         reward=Reward(error_scale=0.02, velocity=8.0, steady_action=0.2),
         bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.2),
-        sac=replace(SAC, discount=0.985),
+        sac=replace(LARGE_SAC, discount=0.985),
     )

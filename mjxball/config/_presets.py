@@ -6,7 +6,7 @@ import types
 from dataclasses import replace
 from typing import Any
 
-from mjxball.config._crazyflie import flight, rig_settings, stand
+from mjxball.config._crazyflie import LARGE_SAC, flight, rig_settings, stand
 from mjxball.config._settings import Bounds, Config, Follower, Reward, Sac, Scenario
 from mjxball.errors import InputError
 
@@ -81,20 +81,7 @@ def _transport_large() -> Config:
         bounds=Bounds(x_peak=0.015, settling_time=2.8, rmse=0.345),
         # Speed is dear so that the goal is not overshot, changes of the command so that noise ends before the rotors.
         reward=Reward(error_scale=0.02, velocity=6.0, smoothness=1.5),
-        sac=Sac(
-            total_steps=2_048_000,
-            num_envs=512,
-            batch_size=512,
-            updates_per_step=16,
-            replay_size=512_000,
-            policy_layers=(128, 128),
-            critic_layers=(128, 128),
-            privileged_critic=True,
-            discount=0.97,
-            n_step=5,
-            learning_rate=3e-3,
-            learning_rate_end=0.02,
-        ),
+        sac=replace(LARGE_SAC, total_steps=2_048_000, discount=0.97, n_step=5, learning_rate=3e-3),
     )
 
 

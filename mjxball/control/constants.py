@@ -96,10 +96,10 @@ class DroneLoop(NamedTuple):
     kp: float  # [N m/rad]
     kd: float  # [N m s/rad]
     kdd: float  # [kg m2]
-    slow: float  # [N m/rad]
+    integral_gain: float  # [N m/rad]
     stiffness: float  # kp of the attitude loop [1/s]
     integral_limit: float  # largest |z| [rad]
-    surplus: float  # thrust that a curved motor gives besides a torque, over its square [1/(N m2)]
+    thrust_surplus: float  # thrust that a curved motor gives besides a torque, over its square [1/(N m2)]
 
 
 def hover(config: Config) -> tuple[float, float]:
@@ -131,9 +131,9 @@ def drone_loop(config: Config, axis: int) -> DroneLoop:
         kp=torque * rate[0] * attitude[0],
         kd=torque * rate[0],
         kdd=torque * rate[2],
-        slow=torque * rate[1],
+        integral_gain=torque * rate[1],
         stiffness=attitude[0],
         integral_limit=math.radians(crazyflie.RATE_LIMITS[axis]),
         # Two motors p up and two p down give 4 a p^2 more than none, p = output / 2 / FULL.
-        surplus=law.motor_curve[0] * (math.degrees(1) / (torque * crazyflie.FULL)) ** 2,
+        thrust_surplus=law.motor_curve[0] * (math.degrees(1) / (torque * crazyflie.FULL)) ** 2,
     )

@@ -1,7 +1,7 @@
 """Brushed and brushless motors of the Crazyflies: force from voltage, and the firmware's battery compensation.
 
 The force follows the voltage at the motor, duty cycle times battery voltage. With battery compensation the firmware
-takes a thrust command as a share of `Motor.most` and computes the duty cycle (PWM) that gives this force at the
+takes a thrust command as a share of `Motor.max_force` and computes the duty cycle (PWM) that gives this force at the
 battery's present voltage. Without it, the thrust command is the PWM. NumPy and JAX arrays of any shape.
 """
 
@@ -28,9 +28,9 @@ LARGEST_HOVER = 60000.0  # of the paper's law, as the firmware caps it
 class Motor:
     """One motor with its propeller. Source: the platform defaults of bitcraze/crazyflie-firmware 2026.08."""
 
-    volts: tuple[float, float, float, float]  # force = c0 + c1 V + c2 V^2 + c3 V^3 [N], V at the motor
-    least: float  # [N] a smaller commanded force stops the motor
-    most: float  # [N] at thrust command 65535
+    force_polynomial: tuple[float, float, float, float]  # force = c0 + c1 V + c2 V^2 + c3 V^3 [N], V at the motor
+    min_force: float  # [N] a smaller commanded force stops the motor
+    max_force: float  # [N] at thrust command 65535
     yaw_per_thrust: float  # [m]
 
 
@@ -66,7 +66,7 @@ def force(motor: Motor, pwm: Array, supply: Array) -> Array:
     """Steady force (...) [N] at `pwm` (...) 0 .. 65535 and a battery of `supply` (...) [V]; never negative."""
     xp = pwm.__array_namespace__()
     volts = pwm / FULL * supply
-    c0, c1, c2, c3 = motor.volts
+    c0, c1, c2, c3 = motor.force_polynomial
     found = c0 + (c1 + (c2 + c3 * volts) * volts) * volts
     return xp.where(pwm > 0, xp.maximum(found, xp.zeros_like(found)), xp.zeros_like(found))
 
@@ -74,7 +74,7 @@ def force(motor: Motor, pwm: Array, supply: Array) -> Array:
 def voltage(motor: Motor, wanted: Array) -> Array:
     """Voltage (...) [V] at which the motor gives `wanted` (...) [N]: the real root of the cubic (Cardano)."""
     xp = wanted.__array_namespace__()
-    c0, c1, c2, c3 = motor.volts
+    c0, c1, c2, c3 = motor.force_polynomial
     centre = -c2 / (3 * c3)
     # V = centre + u turns the cubic into u^3 + 3 p u = 2 q, solved by two cube roots.
     p = c1 / (3 * c3) - centre * centre
@@ -87,9 +87,9 @@ def voltage(motor: Motor, wanted: Array) -> Array:
 def compensated(motor: Motor, command: Array, supply: Array) -> Array:
     """PWM (...), uncapped above, for a thrust `command` (...) 0 .. 65535 at a battery of `supply` (...) [V]."""
     xp = command.__array_namespace__()
-    wanted = command / FULL * motor.most
+    wanted = command / FULL * motor.max_force
     found = FULL * voltage(motor, wanted) / supply
-    return xp.where((wanted < motor.least) | (supply < 2.0), xp.zeros_like(found), found)
+    return xp.where((wanted < motor.min_force) | (supply < 2.0), xp.zeros_like(found), found)
 
 
 def compensates(curve: Curve) -> bool:

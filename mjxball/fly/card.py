@@ -81,7 +81,7 @@ def motor_of(config: Config) -> Motor:
 
 def curve_of(config: Config, name: CurveName) -> ForceCurve:
     """Force of a motor from the thrust command, by a firmware with (`linear`) or without battery compensation."""
-    return ForceCurve(0.0, motor_of(config).most) if name == "linear" else OLDER
+    return ForceCurve(0.0, motor_of(config).max_force) if name == "linear" else OLDER
 
 
 def with_curve(config: Config, name: CurveName) -> Config:

@@ -1,4 +1,4 @@
-"""The container of a policy file: a zip of NPY arrays, read within bounds whatever its bytes claim.
+"""The container of a policy file or a recorded flight: a zip of NPY arrays, read within bounds whatever it claims.
 
 Nothing is unpickled, and no size that the file states is believed before it was compared with what is there.
 """
@@ -30,16 +30,19 @@ class _DamagedError(Exception):
     """What is wrong with an entry, in a few words."""
 
 
-def read_arrays(name: str) -> dict[str, np.ndarray]:
-    """The arrays of the `.npz` file `name` by their names; PolicyFileError with one sentence on anything unsound."""
-    content = _read_file(name)
+def read_arrays(name: str, kind: str = "policy file", limit: int = MAX_BYTES) -> dict[str, np.ndarray]:
+    """The arrays of the `.npz` file `name` by their names, `limit` bytes at most.
+
+    Raises PolicyFileError with one sentence on anything unsound; `kind` says in it what the file should be.
+    """
+    content = _read_file(name, kind, limit)
     if content.count(DIRECTORY_ENTRY) > MAX_ENTRIES:
-        raise PolicyFileError(f"{name} is not a policy file: it has more than {MAX_ENTRIES} entries")
+        raise PolicyFileError(f"{name} is not a {kind}: it has more than {MAX_ENTRIES} entries")
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = archive.infolist()
-            if sum(entry.file_size for entry in entries) > MAX_BYTES:
-                raise PolicyFileError(f"{name} is not a policy file: it unpacks to more than {MAX_BYTES >> 20} MiB")
+            if sum(entry.file_size for entry in entries) > limit:
+                raise PolicyFileError(f"{name} is not a {kind}: it unpacks to more than {limit >> 20} MiB")
             names = [entry.filename.removesuffix(".npy") for entry in entries]
             twice = next((key for key in names if names.count(key) > 1), None)
             if twice is not None:
@@ -48,30 +51,30 @@ def read_arrays(name: str) -> dict[str, np.ndarray]:
     except PolicyFileError:
         raise
     except _DamagedError as error:
-        raise PolicyFileError(f"policy file {name} cannot be read: {error}") from None
+        raise PolicyFileError(f"{kind} {name} cannot be read: {error}") from None
     except Exception:  # zipfile, zlib and NumPy raise a dozen kinds for damaged bytes
-        raise PolicyFileError(f"policy file {name} cannot be read: it is damaged or not an .npz") from None
+        raise PolicyFileError(f"{kind} {name} cannot be read: it is damaged or not an .npz") from None
 
 
-def _read_file(name: str) -> bytes:
+def _read_file(name: str, kind: str, limit: int) -> bytes:
     try:
         status = Path(name).stat()
         if stat.S_ISDIR(status.st_mode):
-            raise PolicyFileError(f"policy file {name} is a directory")
+            raise PolicyFileError(f"{kind} {name} is a directory")
         if not stat.S_ISREG(status.st_mode):  # a pipe would wait for ever
-            raise PolicyFileError(f"policy file {name} is not a regular file")
-        if status.st_size > MAX_BYTES:
-            raise PolicyFileError(f"{name} is not a policy file: it is larger than {MAX_BYTES >> 20} MiB")
+            raise PolicyFileError(f"{kind} {name} is not a regular file")
+        if status.st_size > limit:
+            raise PolicyFileError(f"{name} is not a {kind}: it is larger than {limit >> 20} MiB")
         with Path(name).open("rb") as stream:
             return stream.read(status.st_size)
     except PolicyFileError:
         raise
     except FileNotFoundError:
-        raise PolicyFileError(f"policy file {name} does not exist") from None
+        raise PolicyFileError(f"{kind} {name} does not exist") from None
     except OSError as error:
-        raise PolicyFileError(f"policy file {name} cannot be read: {error.strerror or error}") from None
+        raise PolicyFileError(f"{kind} {name} cannot be read: {error.strerror or error}") from None
     except ValueError:
-        raise PolicyFileError(f"policy file {name!r} has an impossible name") from None
+        raise PolicyFileError(f"{kind} {name!r} has an impossible name") from None
 
 
 def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:

@@ -22,7 +22,7 @@ class Axis(NamedTuple):
     name: str
     inertia: float  # about O, ball at O [kg m2]
     gain: float  # angular acceleration per unit of the rate loops' output [deg/s2]
-    scale: float  # inertia that each drone turns over `DRONE`
+    inertia_ratio: float  # inertia that each drone turns over `DRONE`
     trim: float  # output that holds the heaviest lasting moment: the ball at an end stop [1]
     headroom: float  # output at which a motor of the hovering pair reaches full power [1]
 

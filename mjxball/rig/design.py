@@ -130,7 +130,7 @@ def design_axis(axis: Axis, config: Config, required: Requirements = REQUIREMENT
     integrals of two drones that see it differently run apart, and what they fight with must stay bounded.
     An axis that both turn as each does alone keeps the delivered gains, which are flown everywhere.
     """
-    if axis.scale < required.keep_below:
+    if axis.inertia_ratio < required.keep_below:
         return Design(
             axis,
             delivered_gains(axis),

@@ -85,7 +85,7 @@ def motor_model(config: Config, log: Log) -> MotorModel:
     if curve[0] > 0:
         return MotorModel(None, lambda command: crazyflie.motor_force(curve, command))
     volts = np.float64(USUAL_BATTERY if log.volts is None else log.volts)
-    share = curve[1] / motor.most
+    share = curve[1] / motor.max_force
     return MotorModel(
         lambda thrust: motors.compensated(motor, thrust, volts),
         lambda pwm: share * motors.force(motor, pwm, volts),

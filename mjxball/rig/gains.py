@@ -106,7 +106,7 @@ def report(designs: Sequence[Design], lag: float) -> str:
 
 def _row(one: Design, whose: str, gains: Gains, nominal: Margins, worst: Margins) -> tuple[str, ...]:
     numbers = (" ".join(f"{value:g}" for value in row) for row in gains)
-    inertia = f"{one.axis.scale:.1f} x"
+    inertia = f"{one.axis.inertia_ratio:.1f} x"
     if not nominal.phase:
         return (one.axis.name, inertia, whose, *numbers, "unstable", "", "", "unstable")
     gain = f"x {nominal.gain_up:.1f}, / {nominal.gain_down:.1f}"
@@ -121,7 +121,7 @@ def _ms(seconds: float) -> str:
 def draw(config: Config, designs: Sequence[Design], path: Path) -> None:
     """Steps, CG torque, root locus and loop gain about the axis that the stick makes heaviest, to `path`."""
     plt = pyplot()
-    worst = max(designs, key=lambda one: one.axis.scale)
+    worst = max(designs, key=lambda one: one.axis.inertia_ratio)
     figure, places = plt.subplots(2, 2, figsize=(11, 7.6), layout="constrained")
     autopilots = {"delivered": _delivered(config), "designed": apply(config.autopilot, tuple(designs))}
     gains = {"delivered": delivered_gains(worst.axis), "designed": worst.gains}
@@ -129,7 +129,7 @@ def draw(config: Config, designs: Sequence[Design], path: Path) -> None:
     _torque(places[0, 1], config, autopilots, worst)
     _locus(places[1, 0], config, gains, worst)
     _bode(places[1, 1], config, gains, worst)
-    ratio = f"{worst.axis.name}: {worst.axis.scale:.0f} times the inertia of the drones alone"
+    ratio = f"{worst.axis.name}: {worst.axis.inertia_ratio:.0f} times the inertia of the drones alone"
     figure.suptitle(f"Attitude loop of the coupled pair, {ratio}")
     figure.savefig(path, dpi=80)
     plt.close(figure)
@@ -177,7 +177,7 @@ def _locus(place: Any, config: Config, gains: dict[str, Gains], worst: Design) -
     """Closed-loop poles while the inertia grows from the drones' own to twice the pair's."""
     axis, lag = worst.axis, config.plant.rotor_lag
     for name, one in gains.items():
-        for scale in np.geomspace(1 / axis.scale, 2.0, 60):
+        for scale in np.geomspace(1 / axis.inertia_ratio, 2.0, 60):
             poles = closed_poles(one, axis.gain / scale, lag, DELAY)
             place.plot(poles.real, poles.imag, ".", color=COLOURS[name], ms=2, alpha=0.6)
         poles = closed_poles(one, axis.gain, lag, DELAY)

@@ -76,8 +76,8 @@ class ResetDistribution:
         load = Load(
             object_mass=mass,
             believed_mass=believed,
-            cg_amplitude=between(*shortened(scenario.cg_amplitude, difficulty)),
-            cg_speed=between(*shortened(scenario.cg_speed, difficulty)),
+            cg_amplitude=between(*lower_part(scenario.cg_amplitude, difficulty)),
+            cg_speed=between(*lower_part(scenario.cg_speed, difficulty)),
             cg_phase=between(0.0, 2 * jnp.pi),
             mass_change=between(*scenario.mass_change)[None],
             mass_change_time=between(*MASS_CHANGE_TIME)[None],
@@ -225,7 +225,7 @@ class ResetDistribution:
         return load._replace(cg_path=places, follows_path=visits.astype(jnp.float32))
 
 
-def shortened(ends: tuple[float, float], share: Scalar | float) -> tuple[float, Scalar | float]:
+def lower_part(ends: tuple[float, float], share: Scalar | float) -> tuple[float, Scalar | float]:
     """The lower `share` () of the range between `ends`."""
     low, high = ends
     return low, high if isinstance(share, float) and share == 1.0 else low + share * (high - low)

@@ -22,6 +22,7 @@ from mjxball import config as configs
 from mjxball.config import Plant, preset
 from mjxball.control import rotations
 from mjxball.errors import InputError
+from mjxball.policy.container import read_arrays
 from mjxball.policy.file import write_whole
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def save_flight(path: str | os.PathLike[str], flight: Flight) -> None:
 
 def load_flight(path: str | os.PathLike[str]) -> Flight:
     """Read and verify a flight; raise InputError with one sentence on anything unsound."""
-    arrays = _read(str(path))
+    arrays: dict[str, Any] = dict(read_arrays(str(path), "flight", MAX_BYTES))
     try:
         about = json.loads(str(arrays.pop("about")))
         if about["format"] != FORMAT:
@@ -110,21 +111,6 @@ def is_flight(path: Path) -> bool:
             return "about.npy" in archive.namelist()
     except (OSError, zipfile.BadZipFile):
         return False
-
-
-def _read(name: str) -> dict[str, Any]:
-    try:
-        with zipfile.ZipFile(name) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-                raise InputError(f"{name} is not a flight: it unpacks to more than {MAX_BYTES >> 20} MiB")
-        with np.load(name, allow_pickle=False) as data:
-            return {key: data[key] for key in data.files}
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"flight {name} cannot be read: {error.strerror or error}") from None
-    except Exception:  # zipfile, zlib and NumPy raise a dozen kinds for damaged bytes
-        raise InputError(f"flight {name} cannot be read: it is damaged or not an .npz") from None
 
 
 def flight_from(source: str, changes: Mapping[str, Any], physics: str) -> Flight:

@@ -31,7 +31,7 @@ PATIENCE = 10.0  # [s] with a browser that does not go on
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; connect-src 'self'"
 
 
-class Board:
+class LiveView:
     """What the pages are told: written by the loop, read by the server's threads."""
 
     def __init__(self, log: LiveLog):
@@ -73,9 +73,9 @@ class Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, port: int, board: Board):
+    def __init__(self, port: int, view: LiveView):
         """Listen on `port` of the loopback, 0 for a free one. Raises InputError if it is taken."""
-        self.board = board
+        self.view = view
         try:
             super().__init__((HOST, port), Handler)
         except OSError as error:
@@ -103,27 +103,27 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer, or refuse whatever is neither the page nor its rows."""
-        port, board = self.server.server_port, self.server.board
+        port, view = self.server.server_port, self.server.view
         # A page of elsewhere whose name was made to lead here carries that name.
         if self.headers.get("Host") not in (f"{HOST}:{port}", f"localhost:{port}"):
             self._send(403, "text/plain", b"this page is for this machine alone\n")
             return
         asked = urlsplit(self.path)
         if asked.path == "/":
-            self._send(200, "text/html; charset=utf-8", board.page)
+            self._send(200, "text/html; charset=utf-8", view.page)
         elif asked.path == "/rows":
-            self._rows(board, parse_qs(asked.query))
+            self._rows(view, parse_qs(asked.query))
         else:
             self._send(404, "text/plain", b"there is only the page\n")
 
-    def _rows(self, board: Board, query: dict[str, list[str]]) -> None:
+    def _rows(self, view: LiveView, query: dict[str, list[str]]) -> None:
         after = query.get("after", [""])[0]
-        if query.get("token") != [board.token]:
+        if query.get("token") != [view.token]:
             self._send(409, "text/plain", b"that was another viewer\n")
         elif not (after.isascii() and after.isdigit() and len(after) < 10):
             self._send(400, "text/plain", b"after is no number of rows\n")
         else:
-            self._send(200, "application/json", json.dumps(board.answer(int(after))).encode())
+            self._send(200, "application/json", json.dumps(view.answer(int(after))).encode())
 
     def _send(self, code: int, kind: str, body: bytes) -> None:
         self.send_response(code)
@@ -146,21 +146,21 @@ def follow(path: Path, port: int = 0, attached: bool = False) -> int:
     log = LiveLog(path)
     with contextlib.suppress(OSError, AttributeError):
         os.nice(10)  # whatever flies comes first
-    board, leave = Board(log), threading.Event()
-    with contextlib.closing(log), _serving(Server(port, board)) as address, _until(leave, attached):
-        begun = board.update()
+    view, leave = LiveView(log), threading.Event()
+    with contextlib.closing(log), _serving(Server(port, view)) as address, _until(leave, attached):
+        begun = view.update()
         waits = "" if begun else f", and waits for {path}"
         print(f"the live view is at {address}{waits}", flush=True)  # noqa: T201
-        _watch(board, log, leave, attached)
-        _linger(board)
+        _watch(view, log, leave, attached)
+        _linger(view)
     return 0
 
 
-def _watch(board: Board, log: LiveLog, leave: threading.Event, attached: bool) -> None:
+def _watch(view: LiveView, log: LiveLog, leave: threading.Event, attached: bool) -> None:
     """Read on until it is time to leave."""
     told = False
     while True:
-        busy = board.update()
+        busy = view.update()
         if log.ended and not told and not attached:
             told = True
             print(f"{log.text}; Ctrl-C ends the view", flush=True)  # noqa: T201
@@ -168,14 +168,14 @@ def _watch(board: Board, log: LiveLog, leave: threading.Event, attached: bool) -
             return
 
 
-def _linger(board: Board) -> None:
+def _linger(view: LiveView) -> None:
     """Let an open page fetch the rest."""
     until = time.monotonic() + LINGER
-    while board.update():
+    while view.update():
         pass
-    while board.asked is not None and not board.all_sent and time.monotonic() < min(until, board.asked + LINGER):
+    while view.asked is not None and not view.all_sent and time.monotonic() < min(until, view.asked + LINGER):
         time.sleep(0.02)
-    time.sleep(0.1 if board.asked is not None else 0.0)  # the last answer is on its way
+    time.sleep(0.1 if view.asked is not None else 0.0)  # the last answer is on its way
 
 
 @contextlib.contextmanager

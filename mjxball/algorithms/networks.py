@@ -1,0 +1,64 @@
+"""The networks of soft actor-critic, Brax's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax import Array
+
+from mjxball.config import Sac
+from mjxball.quiet import import_brax_training
+
+brax = import_brax_training()
+
+
+class Networks(NamedTuple):
+    """Brax's `SACNetworks` and a state-value network, None unless `state_value`."""
+
+    policy_network: Any
+    q_network: Any
+    value_network: Any
+    parametric_action_distribution: Any
+
+
+def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = None) -> Networks:
+    """Brax's SAC networks: tanh-squashed Gaussian policy and critics, ReLU, on normalised observations.
+
+    `mask` (n,) of 0 and 1 hides slots of the observation from the policy, `critic_mask` from critics and value
+    (None: the same).
+    """
+    distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
+    observation_size = len(mask)
+    normalise, normalise_all = _normaliser(mask), _normaliser(mask if critic_mask is None else critic_mask)
+    value_network = brax.networks.make_value_network(
+        observation_size, preprocess_observations_fn=normalise_all, hidden_layer_sizes=config.critic_layers
+    )
+    return Networks(
+        policy_network=brax.networks.make_policy_network(
+            distribution.param_size,
+            observation_size,
+            preprocess_observations_fn=normalise,
+            hidden_layer_sizes=config.policy_layers,
+            activation=jax.nn.relu,
+        ),
+        q_network=brax.networks.make_q_network(
+            observation_size,
+            action_size,
+            preprocess_observations_fn=normalise_all,
+            hidden_layer_sizes=config.critic_layers,
+            activation=jax.nn.relu,
+            layer_norm=config.critic_layer_norm,
+            n_critics=config.num_critics,
+        ),
+        value_network=value_network if config.state_value else None,
+        parametric_action_distribution=distribution,
+    )
+
+
+def _normaliser(mask: Any) -> Callable[[Array, Any], Array]:
+    """Normalisation of an observation by running statistics, with zeros where `mask` (n,) has them."""
+    shown = np.asarray(mask, np.float32)
+    return lambda observation, statistics: brax.running_statistics.normalize(observation, statistics) * shown
