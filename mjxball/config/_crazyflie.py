@@ -85,13 +85,13 @@ STRONG: dict[str, Any] = {"scenario.cg_amplitude": (0.0, 0.034), "scenario.uncom
 def rig_settings(drone: str) -> dict[str, Any]:
     """What a plant file of the pair of `DRONES` says: every setting of plant and autopilot that a 2.1 has otherwise."""
     parts: dict[str, list[Any]] = {"plant": [rig(drone), rig()], "autopilot": [autopilot(drone), autopilot()]}
-    told = {
+    changed = {
         f"{part}.{item.name}": getattr(mine, item.name)
         for part, (mine, usual) in parts.items()
         for item in fields(mine)
         if getattr(mine, item.name) != getattr(usual, item.name)
     }
-    return told if drone.startswith("2.1") else {**told, **STRONG}
+    return changed if drone.startswith("2.1") else {**changed, **STRONG}
 
 
 PAIR = Config(

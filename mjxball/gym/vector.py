@@ -120,17 +120,22 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
             moved = self._state
         truncated = np.asarray(moved.info["truncation"]) > 0
         terminated = (np.asarray(moved.done) > 0) & ~truncated
-        info = self._ended(moved, terminated | truncated) if self._same_step else _told(moved, going)
+        info = self._ended(moved, terminated | truncated) if self._same_step else _vector_info(moved, going)
         return self._seen(), np.array(moved.reward, np.float64), terminated, truncated, info
 
     def _ended(self, moved: Any, ended: np.ndarray) -> dict[str, Any]:
         """`info` of a step after which the worlds that `ended` (N,) have been started anew."""
-        info: dict[str, Any] = dict(_told(moved, ~ended))
+        info: dict[str, Any] = dict(_vector_info(moved, ~ended))
         if ended.any():
             last = np.full(self.num_envs, None, object)
             for world in np.flatnonzero(ended):
                 last[world] = np.array(moved.obs[world, : self._program.pair.policy_input_size])
-            info |= {"final_obs": last, "_final_obs": ended, "final_info": _told(moved, ended), "_final_info": ended}
+            info |= {
+                "final_obs": last,
+                "_final_obs": ended,
+                "final_info": _vector_info(moved, ended),
+                "_final_info": ended,
+            }
         return info
 
     def _seen(self) -> np.ndarray:
@@ -147,7 +152,7 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         return [worlds.seed_number(gymnasium.utils.seeding.np_random(each)[0]) for each in seeds]
 
 
-def _told(state: Any, where: np.ndarray) -> dict[str, np.ndarray]:
+def _vector_info(state: Any, where: np.ndarray) -> dict[str, np.ndarray]:
     """Gymnasium's vector `info`: arrays (N,), 0 but `where` (N,) there is a value, and that mask."""
     info = {}
     for name, value in worlds.info_of(state).items():

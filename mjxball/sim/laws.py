@@ -69,11 +69,11 @@ class Laws:
     def __init__(self, config: Config):
         self._law, self._gravity = config.leader, config.plant.gravity
         self._shares = config.follower.shares_integrals
-        self._level = config.leader.level_gain
+        self._level_gain = config.leader.level_gain
         self._washout = config.follower.washout_time
         self._axis = 0 if config.plant.cg_axis == "y" else 1  # roll or pitch, which the load turns
         # A leader at +y that lifts more rolls the stick up, one at +x pitches it down.
-        self._apart = (1.0, -1.0)[self._axis]
+        self._lift_sign = (1.0, -1.0)[self._axis]
         # On a pivot height stays: a drone's own follows from roll, and flies on that.
         self._free = None if config.plant.stand == "free" else (0.0, 0.0, 1.0)
         self._follower_sees = config.follower.error
@@ -82,7 +82,7 @@ class Laws:
     def observe(self, state: Body, goal: Vector) -> Observation:
         """The follower's observation; `goal` of O."""
         xp = state.position.__array_namespace__()
-        state, goal = self._unlocked(state), self._freed(goal)
+        state, goal = self._without_locked_motion(state), self._along_free_axes(goal)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         mount = xp.asarray(self._follower_mount, dtype=state.position.dtype)
         observation = layout.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
@@ -90,37 +90,37 @@ class Laws:
             # The tilted mount's way across is locked as well: it is seen in roll.
             observation = xp.concat(
                 [
-                    self._freed(observation[..., 0:3]),
+                    self._along_free_axes(observation[..., 0:3]),
                     observation[..., 3:6],
-                    self._freed(observation[..., 6:9]),
+                    self._along_free_axes(observation[..., 6:9]),
                     observation[..., 9:],
                 ],
                 axis=-1,
             )
         if self._follower_sees == "object":
             return observation
-        return xp.concat([observation[..., : layout.ERROR.start], *self._own_error(state, goal)], axis=-1)
+        return xp.concat([observation[..., : layout.ERROR.start], *self._leader_place_error(state, goal)], axis=-1)
 
     def body_from_observation(self, observation: Observation, goal: Vector) -> BodyState:
         """The body that `observation` tells of, e_o or e_l in it; `goal` of O."""
         euler, rates = observation[..., 3:6], observation[..., 9:12]
-        position = self._freed(goal) - observation[..., layout.ERROR]
+        position = self._along_free_axes(goal) - observation[..., layout.ERROR]
         quaternion = rotations.quaternion_from_euler(euler)
         velocity = -observation[..., layout.ERROR_RATE]
         if self._follower_sees == "leader":
-            arm, sweep = self._swept(quaternion, rates, goal)
+            arm, sweep = self._leader_mount_motion(quaternion, rates, goal)
             mount = goal.__array_namespace__().asarray(self._leader_mount, dtype=goal.dtype)
-            position, velocity = self._freed(position + mount - arm), self._freed(velocity - sweep)
+            position, velocity = self._along_free_axes(position + mount - arm), self._along_free_axes(velocity - sweep)
         return BodyState(position, velocity, quaternion, rates)
 
     def leader_error(self, state: Body, goal: Vector) -> tuple[Vector, Vector]:
         """(error, its rate) on which the leader flies."""
         if self._free is not None:
-            state, goal = self._unlocked(state), self._freed(goal)
+            state, goal = self._without_locked_motion(state), self._along_free_axes(goal)
         if self._law.error == "object":
             return goal - state.position, -state.velocity
-        error, rate = self._own_error(state, goal)
-        return self._freed(error), self._freed(rate)
+        error, rate = self._leader_place_error(state, goal)
+        return self._along_free_axes(error), self._along_free_axes(rate)
 
     def zero_integral(self, position: Vector) -> Integral:
         """The integral before a flight that begins at `position`."""
@@ -152,13 +152,13 @@ class Laws:
             return own
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         axis = slice(self._axis, self._axis + 1)
-        off = self._wanted(state, goal, integral)[..., axis] - euler[..., axis]
-        most = MAX_LIFT_DIFFERENCE / self._level if self._level else 0.0
+        off = self._pid_command(state, goal, integral)[..., axis] - euler[..., axis]
+        most = MAX_LIFT_DIFFERENCE / self._level_gain if self._level_gain else 0.0
         level = xp.clip(integral[..., 3:4] + period * off, -most, most)
         average = integral[..., 4:]
         if self._washout and follower_command is not None:
             # What was added is what was flown above the base, which is the leader's law, and what was taken off.
-            base = self._lifted(self._wanted(state, goal, integral), integral, -self._apart)
+            base = self._with_lift_difference(self._pid_command(state, goal, integral), integral, -self._lift_sign)
             average = average + period / self._washout * (follower_command - base)
         if shares is not None:
             level, average = level * shares, average * shares
@@ -166,8 +166,8 @@ class Laws:
 
     def leader_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
         """The leader's command at `state`; `integral` of its error so far, see `Laws`."""
-        wanted = self._wanted(state, goal, integral)
-        return wanted if not self._shares else self._clipped(self._lifted(wanted, integral, self._apart))
+        wanted = self._pid_command(state, goal, integral)
+        return wanted if not self._shares else self._clip(self._with_lift_difference(wanted, integral, self._lift_sign))
 
     def follower_command(self, command: Vector, integral: Integral) -> Vector:
         """A network's `command`, which holds the PD law, with its share of the integrals if it shares them."""
@@ -176,29 +176,29 @@ class Laws:
         xp, law = command.__array_namespace__(), self._law
         ki = xp.asarray(law.ki, dtype=command.dtype)
         more = leader.command(ki * integral[..., :3], 0.0, self._gravity, law.tilt_limit, law.vertical_limit)
-        return self._clipped(self._lifted(command + more - integral[..., 4:], integral, -self._apart))
+        return self._clip(self._with_lift_difference(command + more - integral[..., 4:], integral, -self._lift_sign))
 
-    def _wanted(self, state: Body, goal: Vector, integral: Integral) -> Vector:
+    def _pid_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
         xp, law = goal.__array_namespace__(), self._law
         gains = (xp.asarray(gain, dtype=goal.dtype) for gain in (law.kp, law.kd, law.ki))
         wanted = leader.desired_acceleration(*self.leader_error(state, goal), integral[..., :3], *gains)
         return leader.command(wanted, 0.0, self._gravity, law.tilt_limit, law.vertical_limit)
 
-    def _lifted(self, command: Vector, integral: Integral, side: float) -> Vector:
+    def _with_lift_difference(self, command: Vector, integral: Integral, side: float) -> Vector:
         """`command` with what this drone lifts more than the other to turn the stick."""
         xp = command.__array_namespace__()
-        return xp.concat([command[..., :2], command[..., 2:] + side * self._level * integral[..., 3:4]], axis=-1)
+        return xp.concat([command[..., :2], command[..., 2:] + side * self._level_gain * integral[..., 3:4]], axis=-1)
 
-    def _clipped(self, command: Vector) -> Vector:
+    def _clip(self, command: Vector) -> Vector:
         return leader.clip_command(command, self._law.tilt_limit, self._law.vertical_limit)
 
-    def _freed(self, vector: Vector) -> Vector:
+    def _along_free_axes(self, vector: Vector) -> Vector:
         """`vector` in the world without what the stand locks."""
         if self._free is None:
             return vector
         return vector * vector.__array_namespace__().asarray(self._free, dtype=vector.dtype)
 
-    def _unlocked(self, state: Body) -> Body:
+    def _without_locked_motion(self, state: Body) -> Body:
         """`state` without motion along what the stand locks."""
         if self._free is None:
             return state
@@ -206,16 +206,23 @@ class Laws:
         rolls = xp.asarray([1.0, 0.0, 0.0], dtype=state.rates.dtype)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         quaternion = rotations.quaternion_from_euler(euler * rolls)
-        return BodyState(self._freed(state.position), self._freed(state.velocity), quaternion, state.rates * rolls)
+        return BodyState(
+            self._along_free_axes(state.position),
+            self._along_free_axes(state.velocity),
+            quaternion,
+            state.rates * rolls,
+        )
 
-    def _own_error(self, state: Body, goal: Vector) -> tuple[Vector, Vector]:
+    def _leader_place_error(self, state: Body, goal: Vector) -> tuple[Vector, Vector]:
         """e_l = goal + mount - p_l and its rate: 0 where the object is level and at its goal (paper, V-B)."""
         xp = goal.__array_namespace__()
         mount = xp.asarray(self._leader_mount, dtype=goal.dtype)
-        arm, sweep = self._swept(state.quaternion, state.rates, goal)
+        arm, sweep = self._leader_mount_motion(state.quaternion, state.rates, goal)
         return goal + mount - state.position - arm, -state.velocity - sweep
 
-    def _swept(self, quaternion: Float[Array, "... 4"], rates: Vector, like: Array) -> tuple[Vector, Vector]:
+    def _leader_mount_motion(
+        self, quaternion: Float[Array, "... 4"], rates: Vector, like: Array
+    ) -> tuple[Vector, Vector]:
         """The leader's mount from O in the world and how fast it moves about it."""
         mount = like.__array_namespace__().asarray(self._leader_mount, dtype=like.dtype)
         matrix = rotations.matrix_from_quaternion(quaternion)

@@ -155,8 +155,8 @@ class Run:
 
     def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Any]]:
         """See `Program.advance`; statistics and metrics come back whole, as NumPy."""
-        state, *told = self._compiled.advance(state, self.population.mode(mode))
-        return state, *processes.gather(told)
+        state, *results = self._compiled.advance(state, self.population.mode(mode))
+        return state, *processes.gather(results)
 
     def _loop(self, stop: Stop) -> None:
         total, first = self.population.program.total_rounds, self.population.program.warmup_rounds

@@ -38,7 +38,7 @@ class LiveView:
         self.page = live_page(f"{log.path.name}, live", token := secrets.token_hex(8)).encode()
         self.token = token
         self.lock = threading.Lock()
-        self.asked: float | None = None  # when a page last asked for rows [s]
+        self.last_request: float | None = None  # when a page last asked for rows [s]
         self.all_sent = False
         self._log, self._last_news = log, time.monotonic()
 
@@ -58,7 +58,7 @@ class LiveView:
             total = len(log.rows) if len(log.rows) > 1 else 0  # a plot needs two
             rows = log.rows[after : min(total, after + BATCH)]
             text, level, ended, plant = log.text, log.level, log.ended, log.plant
-            self.asked, self.all_sent = now, ended and after + len(rows) >= total
+            self.last_request, self.all_sent = now, ended and after + len(rows) >= total
         silent = now - self._last_news
         if plant and not ended and silent > SILENCE:
             text, level = f"nothing new for {silent:.0f} s; last: {text}", "bad"
@@ -158,11 +158,11 @@ def follow(path: Path, port: int = 0, attached: bool = False) -> int:
 
 def _watch(view: LiveView, log: LiveLog, leave: threading.Event, attached: bool) -> None:
     """Read on until it is time to leave."""
-    told = False
+    announced = False
     while True:
         busy = view.update()
-        if log.ended and not told and not attached:
-            told = True
+        if log.ended and not announced and not attached:
+            announced = True
             print(f"{log.text}; Ctrl-C ends the view", flush=True)  # noqa: T201
         if leave.wait(0 if busy and not log.ended else PERIOD):
             return
@@ -173,9 +173,13 @@ def _linger(view: LiveView) -> None:
     until = time.monotonic() + LINGER
     while view.update():
         pass
-    while view.asked is not None and not view.all_sent and time.monotonic() < min(until, view.asked + LINGER):
+    while (
+        view.last_request is not None
+        and not view.all_sent
+        and time.monotonic() < min(until, view.last_request + LINGER)
+    ):
         time.sleep(0.02)
-    time.sleep(0.1 if view.asked is not None else 0.0)  # the last answer is on its way
+    time.sleep(0.1 if view.last_request is not None else 0.0)  # the last answer is on its way
 
 
 @contextlib.contextmanager
