@@ -26,7 +26,7 @@ from mjxball.physics.engine import Load, PlantState
 
 STEP = 0.001  # [s] of MuJoCo, the sensors and the motors
 LEG = 0.03  # [m] from a drone's centre down to what it stands on
-REACH = 0.03  # [m] from a drone's centre sideways to each of its legs
+FOOT_OFFSET = 0.03  # [m] from a drone's centre sideways to each of its legs
 FOOT = 0.003  # [m] radius
 
 
@@ -42,18 +42,13 @@ def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
     floor.contype, floor.conaffinity = 1, 2
     for name in (LEADER, FOLLOWER):
         drone = spec.body(name)
-        places = [(x, y, -LEG) for x in (-REACH, REACH) for y in (-REACH, REACH)]
+        places = [(x, y, -LEG) for x in (-FOOT_OFFSET, FOOT_OFFSET) for y in (-FOOT_OFFSET, FOOT_OFFSET)]
         for place in (*places, (0.0, 0.0, LEG)):
             leg = drone.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[FOOT, 0, 0], pos=place, mass=0.0)
             leg.contype, leg.conaffinity, leg.solref = 2, 1, [0.008, 1.0]
         drone.add_site(name=f"{name}_imu", pos=[0, 0, 0], size=[0.001, 0.001, 0.001])
-        for sensed, sensor in (
-            ("force", mujoco.mjtSensor.mjSENS_ACCELEROMETER),
-            ("rates", mujoco.mjtSensor.mjSENS_GYRO),
-        ):
-            spec.add_sensor(
-                name=f"{name}_{sensed}", type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{name}_imu"
-            )
+        for sensor in (mujoco.mjtSensor.mjSENS_ACCELEROMETER, mujoco.mjtSensor.mjSENS_GYRO):
+            spec.add_sensor(type=sensor, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=f"{name}_imu")
     model = spec.compile()
     model.actuator_ctrllimited[:] = False  # what a motor can give is `Power`'s to say, which knows the battery
     return model
@@ -63,7 +58,7 @@ SENSED = 6  # numbers of one drone's accelerometer and gyroscope
 
 
 class CoupledPair:
-    """See `body.Pair`. One instance is one pair; `start` begins anew and keeps the parameters."""
+    """See `physics.Pair`. One instance is one pair; `start` begins anew and keeps the parameters."""
 
     def __init__(
         self,
@@ -74,10 +69,11 @@ class CoupledPair:
     ):
         self.config, self.conditions = config, conditions or Conditions.of(config)
         self.kind, self.surroundings = kind, surroundings
-        plant = dataclasses.replace(config.plant, object_mass=self.conditions.object_mass)
+        plant = config.plant
         self.model = grounded_model(config, self.conditions.object_mass)
         self.data = mujoco.MjData(self.model)
-        self._free = plant.stand == "free"
+        self._free, self._heaves = plant.stand == "free", plant.stand == "heave"
+        self._roll = 1 if self._heaves else 0  # joint of a stand's roll
         self._mounts = np.array([plant.leader_mount, plant.follower_mount])
         self._slide = self.model.joint(BALL_JOINT).dofadr[0]
         self._slide_position = self.model.joint(BALL_JOINT).qposadr[0]
@@ -86,9 +82,8 @@ class CoupledPair:
         self._rolling = config.motion.kind == "rolling"
         self._roll_force = motion.make_rolling_force(config)
         self._prescribed = None if self._rolling else motion.make_prescribed(config)
-        mass, amplitude, speed, zero = map(
-            np.float64, (self.conditions.object_mass, self.conditions.cg_amplitude, self.conditions.cg_speed, 0.0)
-        )
+        met = self.conditions
+        mass, amplitude, speed, zero = map(np.float64, (met.object_mass, met.cg_amplitude, met.cg_speed, 0.0))
         self._load = Load(mass, mass, amplitude, speed, zero, np.zeros(0), np.zeros(0))
         self._unit = np.zeros((1, self.model.nv))
         self._unit[0, self._slide] = 1.0
@@ -134,7 +129,7 @@ class CoupledPair:
         """Let sensors and estimators know where the pair is."""
         mujoco.mj_forward(self.model, self.data)
         position, _, matrix = self._pose()
-        velocity, _ = self._velocity(matrix)
+        velocity = self._velocity(matrix)
         self.onboard.imu.settle(self._sensed())
         self.onboard.start(position, self._quaternion(), velocity)
         return self._state()
@@ -177,8 +172,9 @@ class CoupledPair:
         mujoco.mj_step1(model, data)
         if self._steps % TICK == 0:
             self._fly()
-        self._rotors, acting = self._lagged()
-        data.ctrl[:] = acting.ravel()
+        gap = self._rotors - self._targets  # of the motors' lag, from the step's begin to its end and in the mean
+        self._rotors = self._targets + self._keep * gap
+        data.ctrl[:] = (self._targets + self._mean * gap).ravel()
         data.qfrc_applied[self._slide] = self._push_ball()
         mujoco.mj_step2(model, data)
         self._steps += 1
@@ -187,33 +183,20 @@ class CoupledPair:
         if not self.surroundings.exact:
             self.onboard.sense(self._steps, self._sensed(), self._pose)
 
-    def _lagged(self) -> tuple[np.ndarray, np.ndarray]:
-        """Forces of the motors after one step, and their mean over it."""
-        gap = self._rotors - self._targets
-        return self._targets + self._keep * gap, self._targets + self._mean * gap
-
     def _fly(self) -> None:
         """Both cascades, once: what the motors are to give from here on."""
         if self.surroundings.exact:
-            pwm = self.onboard.control(*self._seen())
+            euler = rotations.euler_from_matrix(self.data.xmat[self._body].reshape(3, 3))
+            pwm = self.onboard.control(np.stack([euler] * 2), np.stack([self._rates()] * 2))
         else:
             pwm = self.onboard.control()
         self._moving = self._moving or bool((self.onboard.thrust >= crazyflie.IDLE).any())
         self.power.drain(pwm, TICK * STEP)
         self._targets = self.power.force(pwm)
 
-    def _seen(self) -> tuple[np.ndarray, np.ndarray]:
-        """Euler angles and body rates (2, 3) of both drones, which are the assembly's."""
-        euler = rotations.euler_from_matrix(self.data.xmat[self._body].reshape(3, 3))
-        return np.stack([euler] * 2), np.stack([self._rates()] * 2)
-
     def _rates(self) -> np.ndarray:
         velocity = self.data.qvel
-        return velocity[3:6].copy() if self._free else np.array([velocity[1 if self._heaves else 0], 0.0, 0.0])
-
-    @property
-    def _heaves(self) -> bool:
-        return self.config.plant.stand == "heave"
+        return velocity[3:6].copy() if self._free else np.array([velocity[self._roll], 0.0, 0.0])
 
     # The ball.
 
@@ -263,44 +246,30 @@ class CoupledPair:
 
     def _quaternion(self) -> np.ndarray:
         q = self.data.qpos
-        if self._free:
-            return q[3:7].copy()
-        half = q[1 if self._heaves else 0] / 2
-        return np.array([math.cos(half), math.sin(half), 0.0, 0.0])
+        half = 0.0 if self._free else q[self._roll] / 2
+        return q[3:7].copy() if self._free else np.array([math.cos(half), math.sin(half), 0.0, 0.0])
+
+    def _of_origin(self, numbers: np.ndarray) -> np.ndarray:
+        """O's (3,) in the world, from the joints' positions or velocities."""
+        return numbers[:3] if self._free else np.array([0.0, 0.0, numbers[0] if self._heaves else 0.0])
 
     def _pose(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Both drones' positions (2, 3), the quaternion (4,) and the rotation matrix of all."""
-        quaternion, q = self._quaternion(), self.data.qpos
+        quaternion = self._quaternion()
         matrix = matrix_of(quaternion)
-        if self._free:
-            origin = q[:3]
-        else:
-            origin = np.array([0.0, 0.0, q[0] if self._heaves else 0.0])
-        return origin + self._mounts @ matrix.T, quaternion, matrix
+        return self._of_origin(self.data.qpos) + self._mounts @ matrix.T, quaternion, matrix
 
-    def _velocity(self, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Velocities (2, 3) of both drones in the world, and the body rates (3,)."""
-        v, rates = self.data.qvel, self._rates()
-        if self._free:
-            origin = v[:3]
-        else:
-            origin = np.array([0.0, 0.0, v[0] if self._heaves else 0.0])
-        return origin - self._mounts @ skew(rates) @ matrix.T, rates
+    def _velocity(self, matrix: np.ndarray) -> np.ndarray:
+        """Velocities (2, 3) of both drones in the world."""
+        return self._of_origin(self.data.qvel) - self._mounts @ skew(self._rates()) @ matrix.T
 
     def _state(self) -> PairState:
         position, quaternion, matrix = self._pose()
-        velocity, rates = self._velocity(matrix)
-        both, turning = np.stack([quaternion] * 2), np.stack([rates] * 2)
+        velocity = self._velocity(matrix)
+        both, turning = np.stack([quaternion] * 2), np.stack([self._rates()] * 2)
         if self.surroundings.exact:
             report = self.onboard.reported(position, velocity, both, turning, np.full((2, 9), 1e-5))
         else:
             report = self.onboard.report()
-        return PairState(
-            position=position,
-            velocity=velocity,
-            quaternion=both,
-            rates=turning,
-            specific_force=self._sensed()[:, :3].copy(),
-            battery=self.power.voltage.copy(),
-            report=report,
-        )
+        force, battery = self._sensed()[:, :3].copy(), self.power.voltage.copy()
+        return PairState(position, velocity, both, turning, force, battery, report)

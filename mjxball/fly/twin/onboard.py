@@ -27,34 +27,30 @@ class Power:
         self._filtered = np.full((2, 1), FIRST)
         self.requested = np.zeros((2, 4))
         self.voltage = self._charge.copy()
-        self.compensate: Callable[[np.ndarray], np.ndarray] = self._compensate
 
     def sag_to(self, drone: int, volts: float) -> None:
         """The battery of `drone` holds `volts` [V] without load from here on."""
         self._charge[drone] = volts
 
-    def _compensate(self, thrust: np.ndarray) -> np.ndarray:
+    def compensate(self, thrust: np.ndarray) -> np.ndarray:
         """Uncapped PWM (2, 4) of `thrust` commands (2, 4)."""
-        if self.kind.compensated:
-            found = motors.compensated(self.kind.constants, thrust, self._filtered)
-        else:
-            found = thrust
-        self.requested = np.trunc(found)
+        self.requested = self._compensated(thrust, self._filtered)
         return self.requested
 
     def one(self, drone: int) -> Callable[[np.ndarray], np.ndarray]:
         """`compensate` for one drone's thrust commands (4,)."""
 
         def compensate(thrust: np.ndarray) -> np.ndarray:
-            found = thrust
-            if self.kind.compensated:
-                found = motors.compensated(self.kind.constants, thrust, self._filtered[drone])
-            found = np.trunc(found)
+            found = self._compensated(thrust, self._filtered[drone])
             self.requested = self.requested.copy()
             self.requested[drone] = found
             return found
 
         return compensate
+
+    def _compensated(self, thrust: np.ndarray, voltage: np.ndarray) -> np.ndarray:
+        found = motors.compensated(self.kind.constants, thrust, voltage) if self.kind.compensated else thrust
+        return np.asarray(np.trunc(found))
 
     def drain(self, pwm: np.ndarray, seconds: float) -> None:
         """Time goes on by `seconds` [s] at `pwm` (2, 4); the voltage follows the load at once."""
@@ -210,12 +206,8 @@ class Onboard:
         if self._alike:
             loops, pwm = crazyflie.cascade(laws[0], self._loops, orders, *seen, self._shares, self.power.compensate)
         else:
-            rows = [
-                crazyflie.cascade(
-                    laws[n], self._loops[n], orders[n], seen[0][n], seen[1][n], compensate=self.power.one(n)
-                )
-                for n in range(2)
-            ]
+            given = [(laws[n], self._loops[n], orders[n], seen[0][n], seen[1][n]) for n in range(2)]
+            rows = [crazyflie.cascade(*one, compensate=self.power.one(n)) for n, one in enumerate(given)]
             loops, pwm = (np.stack(part) for part in zip(*rows, strict=True))
         run, held, _ = self._modes
         pwm = np.maximum(np.trunc(pwm), np.array(self.idle)[:, None])
@@ -243,25 +235,10 @@ class Onboard:
         return self.reported(position, velocity, attitude, self.imu.filtered[:, 3:], variance)
 
     def reported(
-        self,
-        position: np.ndarray,
-        velocity: np.ndarray,
-        attitude: np.ndarray,
-        rates: np.ndarray,
-        variance: np.ndarray,
+        self, position: np.ndarray, velocity: np.ndarray, attitude: np.ndarray, rates: np.ndarray, variance: np.ndarray
     ) -> Report:
         """A report of these estimates."""
         acceleration = self.imu.filtered[:, :3].copy()
-        known = tuple(self.estimators)
-        power = self.power.requested, self.thrust
-        return Report(
-            position,
-            velocity,
-            attitude,
-            rates.copy(),
-            acceleration,
-            variance,
-            (known[0], known[1]),
-            self.pwm,
-            *power,
-        )
+        known = (self.estimators[0], self.estimators[1])
+        drive = self.pwm, self.power.requested, self.thrust
+        return Report(position, velocity, attitude, rates.copy(), acceleration, variance, known, *drive)
