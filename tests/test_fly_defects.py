@@ -12,7 +12,7 @@ from mjxball.control.rotations import roll_of_quaternion
 from mjxball.fly.card import Controller, goal_of, times_of
 from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.packets import FLYING, LOCKED
-from mjxball.fly.spin import curve_of_version
+from mjxball.fly.preflight import curve_of_version
 from mjxball.fly.supervisor import Event, State
 from mjxball.fly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
 from mjxball.fly.twin.virtual import MemoryLog, World

@@ -9,7 +9,7 @@ import pytest
 
 from mjxball.control import motors, rotations
 from mjxball.control.motors import MOTORS
-from mjxball.fly import command, spin
+from mjxball.fly import command, preflight
 from mjxball.fly.monitor import VARIANCE, EstimatorWatch, UplinkWatch
 from mjxball.fly.packets import MOTORS as MOTOR_VARIABLES
 from mjxball.fly.packets import VARIANCES, DroneState, Health, health_of
@@ -132,11 +132,11 @@ def test_both_firmwares_are_told_apart_by_their_pwm(name: str, battery: float) -
     turned = np.array([1.0, -1.0, 1.0, -1.0]) * 800  # yaw and roll at work do not matter
     compensates = Health((0, 0, 0), tuple((pwm + turned).astype(int)), sent)
     plain = Health((0, 0, 0), tuple((sent + turned).astype(int)), sent)
-    assert spin.recognise(compensates, battery, motor) == "linear"
-    assert spin.recognise(plain, battery, motor) == "older"
+    assert preflight.recognise(compensates, battery, motor) == "linear"
+    assert preflight.recognise(plain, battery, motor) == "older"
     # A voltmeter that is 3 % off changes nothing.
-    assert spin.recognise(compensates, 1.03 * battery, motor) == "linear"
-    assert spin.recognise(Health((0, 0, 0), (0, 0, 0, 0), sent), battery, motor) is None
+    assert preflight.recognise(compensates, 1.03 * battery, motor) == "linear"
+    assert preflight.recognise(Health((0, 0, 0), (0, 0, 0, 0), sent), battery, motor) is None
 
 
 def test_health_is_read_from_whichever_variables_there_are() -> None:

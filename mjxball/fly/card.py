@@ -50,7 +50,7 @@ def gains_of(config: Config) -> PairGains:
 
 
 def goal_of(config: Config) -> tuple[float, float, float]:
-    """Where to fly if nobody says."""
+    """Default goal of O, from where it stands at the start [m]."""
     return GOAL if config.plant.stand == "free" else STAND_GOAL
 
 

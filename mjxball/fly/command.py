@@ -2,7 +2,7 @@
 
 Firmware with battery compensation (2025.12.1 and later by default) makes the force proportional to the thrust command:
 `linear`. Firmware without it takes the command as the motors' PWM: `older`. No parameter says which, but the PWM does
-that the firmware makes of a small thrust: `spin` looks at it. Pure.
+that the firmware makes of a small thrust: `preflight.SpinCheck` looks at it. Pure.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Opening a link with cflib: tables cached, silence noticed and tried again, progress told.
+"""Opening a link with cflib: tables cached, a silent link tried again, progress shown.
 
 cflib asks for every entry of its tables once and waits for ever for a lost answer; a link that falls silent is
 therefore closed and opened anew. What was listed by then is not lost if the tables were complete: they are cached by

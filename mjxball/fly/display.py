@@ -102,7 +102,7 @@ class Display:
 def live_view(log: Path, port: int = 0) -> Child:
     """A running `python -m mjxball.view --live` of the flight log `log`, whose `line` says where its page is.
 
-    Nothing waits for it while flying: it reads the log and nobody reads what it writes. Raises InputError.
+    Nothing waits for it while flying: it reads the log, and its output is not read. Raises InputError.
     """
     flags = ["--live", "--attached", "--port", str(port), "--", str(log)]
     return Child(["mjxball.view", *flags], "the live view did not start; is the port of --view free?")

@@ -15,7 +15,7 @@ from mjxball.fly.limits import FlightSettings
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.monitor import Monitor, Sustained, link_faults
 from mjxball.fly.packets import ZERO, PacketError, Setpoint
-from mjxball.fly.spin import SpinCheck
+from mjxball.fly.preflight import SpinCheck
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
 from mjxball.fly.watchdog import Watchdog

@@ -164,7 +164,7 @@ class Tail:
         return self._known(header)
 
     def _known(self, record: Record | None) -> Record | None:
-        """`record` itself, unless what flew cannot be told by it."""
+        """`record` itself, unless its force curve is not known."""
         if record is not None and record["kind"] in ("header", "thrust"):
             curve = record.get("curve", CURVE_NAMES[0])
             if curve not in CURVE_NAMES:
@@ -178,7 +178,7 @@ class Tail:
 def read(path: Path, remark: Callable[[str], None] | None = None) -> Iterator[Record]:
     """Every record of a whole log, the header first; a torn last one is left out, as is any line that is no record.
 
-    What is left out is told to `remark`. Raises InputError with one sentence if there is no log.
+    `remark` is called with what is left out. Raises InputError with one sentence if there is no log.
     """
     if not path.exists():
         raise InputError(f"flight log {path} cannot be read: No such file or directory")

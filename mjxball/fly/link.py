@@ -53,7 +53,7 @@ class Link:
     # Before flight; these may block up to their deadlines.
 
     def open(self, progress: Callable[[str], None] = lambda text: None) -> None:
-        """Connect, with both tables of contents, which are cached; `progress` is told how far. Raises LinkError."""
+        """Connect, with both tables of contents, which are cached; `progress` is called on the way. Raises LinkError."""
         started = time.monotonic()
         self._crazyflie = connect(self.uri, self.name, self._deadlines, progress, self._end, self._console)
         self._driver = self._crazyflie.link
@@ -69,18 +69,18 @@ class Link:
         answers: dict[int, str] = {}
         both = threading.Event()
 
-        def told(packet: Any) -> None:
+        def answered(packet: Any) -> None:
             data = bytes(packet.data)
             if packet.channel == 1 and data[:1] in (b"\x01", b"\x02"):
                 answers[data[0]] = data[1:].split(b"\0")[0].decode("ascii", "replace").strip()
                 if len(answers) == 2:
                     both.set()
 
-        self._crazyflie.add_port_callback(packets.VERSION.port, told)
+        self._crazyflie.add_port_callback(packets.VERSION.port, answered)
         for request in (packets.VERSION, packets.DEVICE):
             self._request(request)
         both.wait(self._deadlines.version)
-        self._crazyflie.remove_port_callback(packets.VERSION.port, told)
+        self._crazyflie.remove_port_callback(packets.VERSION.port, answered)
         names, began = [name for name in REVISION if self._element(name) is not None], time.monotonic()
         revision = self.parameters.read(names)
         trip = (time.monotonic() - began) if names else math.nan

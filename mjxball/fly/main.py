@@ -148,7 +148,7 @@ def check_options(options: argparse.Namespace) -> None:
 
 
 def check_twin_options(options: argparse.Namespace) -> None:
-    """Raise InputError for what no rehearsal can be asked for."""
+    """Raise InputError for options of a rehearsal that are unsound."""
     asked = [name for name in (*WORSE, "fault") if getattr(options, name)]
     if asked and not options.rehearse:
         raise InputError(f"--{asked[0]} is for --rehearse only")
@@ -160,7 +160,7 @@ def check_twin_options(options: argparse.Namespace) -> None:
 
 
 def twin_options(options: argparse.Namespace) -> list[str]:
-    """What the twin is told of the link and of faults."""
+    """The twin's options: link, faults, drones, surroundings."""
     worse = [f"--{name}={getattr(options, name)}" for name in WORSE if getattr(options, name) is not None]
     return [*worse, *(f"--fault={fault}" for fault in options.fault), *asked_of_twin(options)]
 

@@ -185,7 +185,7 @@ class Mocap:
     # Once a drone's link is open.
 
     def parameters(self) -> dict[str, float]:
-        """What each drone's firmware must be told: Kalman estimator, deviations of poses."""
+        """Parameters that each drone's firmware needs: Kalman estimator, deviations of poses."""
         position, attitude = self.settings.deviation
         return {"stabilizer.estimator": KALMAN, "locSrv.extPosStdDev": position, "locSrv.extQuatStdDev": attitude}
 

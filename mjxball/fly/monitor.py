@@ -138,7 +138,7 @@ class EstimatorWatch:
         self._before: list[Sample | None] = [None, None]
         self._height, self._climb = Sustained(LASTING), Sustained(LASTING)
         self.trusted = [True, True]
-        self.contradiction = False  # of the two drones; nobody knows which one is wrong
+        self.contradiction = False  # of the two drones: it is not known which one is wrong
 
     def update(self, samples: Sequence[Sample], healths: Sequence[Health | None], now: float) -> list[Fault]:
         """What is wrong with the estimates at `now` [s]; a distrust lasts until the flight ends."""

@@ -1,10 +1,15 @@
-"""Before the motors may turn: connect, gains, estimators, states, and a list of checks with its numbers."""
+"""Before the pair may lift: connect, gains, estimators, states, checks; and which force curve each firmware has.
+
+The curve is found while the motors turn slowly, and the gains for it are then written.
+
+"""
 
 from __future__ import annotations
 
 import functools
 import json
 import math
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,23 +17,26 @@ from pathlib import Path
 
 import numpy as np
 
+from mjxball.control import motors
 from mjxball.control.crazyflie import PairGains, read_pair_gains
+from mjxball.control.motors import Motor
 from mjxball.errors import InputError
 from mjxball.fly import packets
-from mjxball.fly.command import CurveName, Variants
+from mjxball.fly.command import CURVE_NAMES, CurveName, Variant, Variants
 from mjxball.fly.connection import LinkError
-from mjxball.fly.limits import Check, Limits
+from mjxball.fly.limits import NAMES, Check, Limits
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import KALMAN, Mocap
 from mjxball.fly.monitor import down_reason, stick_faults, tilt_angle
+from mjxball.fly.packets import THRUST_CEILING, Health
 from mjxball.fly.process import together, wait_until
-from mjxball.fly.spin import curve_of_version
-from mjxball.fly.telemetry import Rig, yaw_of
+from mjxball.fly.supervisor import Event, Fault
+from mjxball.fly.telemetry import DroneLink, Note, Rig, yaw_of
 
 
 @dataclass(frozen=True)
 class Preflight:
-    """What is asked of a pair on the ground."""
+    """What is required of a pair on the ground."""
 
     rate: float = 90.0  # states per second of each drone
     measure: float = 1.0  # time over which the rate is measured [s]
@@ -61,7 +69,7 @@ def read_gains(path: Path) -> PairGains:
 def prepare(
     links: Sequence[Link],
     variants: Sequence[Variants],
-    asked: Preflight,
+    required: Preflight,
     say: Callable[[str], None],
     mocap: Mocap | None = None,
 ) -> list[CurveName]:
@@ -74,14 +82,14 @@ def prepare(
 
     def one(link: Link, own: Variants) -> None:
         link.open(say)
-        check_kind(link, asked, mocap is not None)
+        check_kind(link, required, mocap is not None)
         curves[link.name] = promised_curve(link, own)
         link.write_parameters(own[curves[link.name]].gains)
         if mocap is not None:
             link.write_parameters(mocap.parameters())
             mocap.feed(links.index(link), link)
         link.start_states()
-        reset_estimator(link, asked)
+        reset_estimator(link, required)
 
     together([functools.partial(one, *each) for each in zip(links, variants, strict=True)])
     return [curves[link.name] for link in links]
@@ -98,14 +106,14 @@ def promised_curve(link: Link, own: Variants) -> CurveName:
     )
 
 
-def check_kind(link: Link, asked: Preflight, measured: bool = False) -> None:
+def check_kind(link: Link, required: Preflight, measured: bool = False) -> None:
     """The drone is of the kind that the policy was trained for, and knows its position, unless that is `measured` here.
 
     Raises LinkError.
     """
     device, brushless = link.identity.device, "brushless" in link.identity.device.lower()
-    if device.startswith("Crazyflie 2") and brushless != (asked.drone == "brushless"):
-        raise LinkError(f"the {link.name} is a {device}, and the policy was trained for the {asked.drone}")
+    if device.startswith("Crazyflie 2") and brushless != (required.drone == "brushless"):
+        raise LinkError(f"the {link.name} is a {device}, and the policy was trained for the {required.drone}")
     if not measured and link.parameters.read(["stabilizer.estimator"])["stabilizer.estimator"] != KALMAN:
         raise LinkError(
             f"the estimator of the {link.name} is not the Kalman filter (stabilizer.estimator is not {KALMAN}): "
@@ -113,17 +121,17 @@ def check_kind(link: Link, asked: Preflight, measured: bool = False) -> None:
         )
 
 
-def reset_estimator(link: Link, asked: Preflight) -> None:
+def reset_estimator(link: Link, required: Preflight) -> None:
     """Reset the Kalman filter and wait until its position has converged. Raises LinkError."""
     link.write_parameters({"kalman.resetEstimation": 1.0}, check=False)  # the firmware clears it by itself
-    time.sleep(asked.reset)
+    time.sleep(required.reset)
     link.write_parameters({"kalman.resetEstimation": 0.0}, check=False)
     started, good, judged, found = time.monotonic(), 0, 0.0, math.inf
     while good < 5:
-        if time.monotonic() - started > asked.converge:
+        if time.monotonic() - started > required.converge:
             raise LinkError(
-                f"the estimator of the {link.name} has not converged after {asked.converge:g} s: "
-                f"position variance {found:.2g} m2, {asked.variance:g} needed; does it get its position?"
+                f"the estimator of the {link.name} has not converged after {required.converge:g} s: "
+                f"position variance {found:.2g} m2, {required.variance:g} needed; does it get its position?"
             )
         time.sleep(0.01)
         sample = link.telemetry.health
@@ -131,7 +139,7 @@ def reset_estimator(link: Link, asked: Preflight) -> None:
             continue
         judged, found = sample.arrival, max(sample.health.variance)
         # A filter that does not run reports 0.
-        good = good + 1 if min(sample.health.variance) > 0 and found < asked.variance else 0
+        good = good + 1 if min(sample.health.variance) > 0 and found < required.variance else 0
 
 
 def _ready(info: int) -> bool:
@@ -148,13 +156,13 @@ def _wait_until_ready(links: Sequence[Link], seconds: float) -> None:
     wait_until(settled, seconds)
 
 
-def check(links: Sequence[Link], rig: Rig, bounds: Limits, asked: Preflight) -> list[Check]:
-    """All checks, with what was found; takes `asked.measure` seconds, more while a firmware re-arms after a landing."""
-    _wait_until_ready(links, asked.rearm)
+def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) -> list[Check]:
+    """All checks, with what was found; takes `required.measure` seconds, more while a firmware re-arms after a landing."""
+    _wait_until_ready(links, required.rearm)
     began = time.monotonic()
     before = [link.telemetry.received for link in links]
-    time.sleep(asked.measure)
-    _wait_until_ready(links, asked.rearm)
+    time.sleep(required.measure)
+    _wait_until_ready(links, required.rearm)
     checks, now = [], time.monotonic()
     states = []
     for link, count in zip(links, before, strict=True):
@@ -166,12 +174,12 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, asked: Preflight) -> 
         can = _ready(state.info)
         tilt, yaw = tilt_angle(state.quaternion), yaw_of(state)
         checks += [
-            Check(f"{link.name} states", rate >= asked.rate, f"{rate:.0f} Hz, {asked.rate:.0f} needed"),
+            Check(f"{link.name} states", rate >= required.rate, f"{rate:.0f} Hz, {required.rate:.0f} needed"),
             Check(f"{link.name} state age", age <= bounds.state_age, f"{1000 * age:.0f} ms"),
             Check(f"{link.name} battery", state.battery > bounds.battery, f"{state.battery:.2f} V"),
             Check(f"{link.name} firmware", can and not refusal, refusal or ("can fly" if can else "cannot arm")),
-            Check(f"{link.name} level", tilt <= asked.tilt, f"{math.degrees(tilt):.1f} degrees"),
-            Check(f"{link.name} heading", abs(yaw) <= asked.yaw, f"{math.degrees(yaw):.0f} degrees from +x"),
+            Check(f"{link.name} level", tilt <= required.tilt, f"{math.degrees(tilt):.1f} degrees"),
+            Check(f"{link.name} heading", abs(yaw) <= required.yaw, f"{math.degrees(yaw):.0f} degrees from +x"),
         ]
     faults = stick_faults(states, rig.span, bounds)
     line = states[0].position - states[1].position
@@ -179,3 +187,96 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, asked: Preflight) -> 
     text = faults[0].detail if faults else f"{np.linalg.norm(line):.3f} m long, {beside:.3f} m from where it should be"
     placed = not faults and beside <= bounds.stick_error
     return [*checks, Check("stick", placed, text)]
+
+
+COMPENSATES_SINCE = (2025, 12)  # version of the firmware, as delivered
+LIKELY = 0.12  # of ln(PWM / expected PWM): half of what lies between the two firmwares at a full battery
+WANTED = 3  # health packets in a row that agree
+RESERVE = 0.97  # of the largest thrust command, above which a pair has no reserve to hover
+
+
+def curve_of_version(version: str) -> CurveName | None:
+    """What a firmware of this `version`, such as 2026.08, has as delivered; None if it does not say."""
+    found = re.match(r"(20\d\d)\.(\d\d)", version)
+    if found is None:
+        return None
+    return "linear" if (int(found[1]), int(found[2])) >= COMPENSATES_SINCE else "older"
+
+
+def recognise(seen: Health, battery: float, motor: Motor) -> CurveName | None:
+    """Which firmware makes the PWM that was `seen` of the thrust that it reports; None if neither does.
+
+    The mean of the four motors counts, in which roll, pitch and yaw cancel. `battery` in V.
+    """
+    pwm, thrust = float(np.mean(seen.motors)), seen.thrust
+    if not (pwm > 0 and thrust > 0 and battery > 0):
+        return None
+    compensated = float(motors.compensated(motor, np.float64(thrust), np.float64(battery)))
+    expected = {"linear": compensated, "older": thrust}
+    off = {name: abs(math.log(pwm / value)) if value > 0 else math.inf for name, value in expected.items()}
+    best = min(CURVE_NAMES, key=lambda name: off[name])
+    return best if off[best] < LIKELY else None
+
+
+class SpinCheck:
+    """Decides for both drones. `update` once a tick in State.SPIN."""
+
+    def __init__(
+        self, links: Sequence[DroneLink], variants: Sequence[Variants], assumed: Sequence[CurveName], motor: Motor
+    ):
+        self._links, self._variants, self._motor = links, variants, motor
+        self.curves: list[CurveName] = list(assumed)
+        self._seen: list[list[CurveName | None]] = [[], []]
+        self._last = [0.0, 0.0]
+        self._decided = [False, False]
+        self._unfit: list[str] = []
+
+    def chosen(self) -> tuple[Variant, Variant]:
+        """How leader and follower are flown, by what is known so far."""
+        leader, follower = (own[curve] for own, curve in zip(self._variants, self.curves, strict=True))
+        return leader, follower
+
+    def update(self, since: float, now: float, note: Note) -> list[Fault]:
+        """Judge what came after `since` [s], when the motors had settled; events once both are known."""
+        for number in range(2):
+            if not self._decided[number]:
+                self._look(number, since, now, note)
+        failed = [link.busy for link in self._links if isinstance(link.busy, str)]
+        if failed or self._unfit:
+            return [Fault(Event.CURVE_UNKNOWN, text) for text in (*failed, *self._unfit)]
+        if not all(self._decided):
+            return []
+        heavy = []
+        for name, curve, variant in zip(NAMES, self.curves, self.chosen(), strict=True):
+            if variant.map.hover_thrust > RESERVE * THRUST_CEILING:
+                units = f"{variant.map.hover_thrust:.0f} of {THRUST_CEILING} thrust units on the {curve} force curve"
+                heavy.append(Fault(Event.CURVE_UNKNOWN, f"the {name} would hover at {units}"))
+        if heavy or any(link.busy for link in self._links):
+            return heavy
+        return [Fault(Event.CURVE_KNOWN, ", ".join(self.curves))]
+
+    def _look(self, number: int, since: float, now: float, note: Note) -> None:
+        telemetry, seen = self._links[number].telemetry, self._seen[number]
+        sample, state = telemetry.health, telemetry.newest
+        if sample is None or state is None or sample.arrival <= max(since, self._last[number]):
+            return
+        self._last[number] = sample.arrival
+        if not any(sample.health.motors) and len(seen) < 2 * WANTED:
+            seen.append(None)  # not listed by this firmware, or not turning yet
+            return
+        found = recognise(sample.health, state.state.battery, self._motor)
+        seen.append(found)
+        if found is not None and seen[-WANTED:] == [found] * WANTED:
+            self._decide(number, found, now, note, True)
+        elif len(seen) >= 4 * WANTED:  # neither fits: what was assumed stands
+            self._decide(number, self.curves[number], now, note, False)
+
+    def _decide(self, number: int, curve: CurveName, now: float, note: Note, recognised: bool) -> None:
+        self._decided[number] = True
+        changed = curve != self.curves[number]
+        if curve not in self._variants[number]:
+            self._unfit.append(f"the {NAMES[number]} has the {curve} force curve, which this flight has no gains for")
+        elif changed:
+            self.curves[number] = curve
+            self._links[number].write_later(self._variants[number][curve].gains)
+        note("thrust", now, drone=NAMES[number], curve=curve, recognised=recognised, changed=changed)

@@ -99,7 +99,7 @@ class Outage(NamedTuple):
 
 
 class FlightLog(NamedTuple):
-    """A log that holds a flight, from where its motors are first told to turn to its last tick."""
+    """A log that holds a flight, from where its motors first turn to its last tick."""
 
     path: Path
     policy: str
@@ -196,7 +196,7 @@ class Recording:
     follower: np.ndarray  # (T, 3) likewise
     observation: np.ndarray  # (T, 18) NaN where no law was in command
     rotor_force: np.ndarray  # (T, 2, 4) [N]; of a log: what the thrust that was sent gives, without lag and cascade
-    cg_offset: np.ndarray  # (T,) [m]; NaN where nobody measured it
+    cg_offset: np.ndarray  # (T,) [m]; NaN where it was not measured
     remarks: tuple[str, ...] = ()  # what a reader of the log should know, a line each
 
 

@@ -43,7 +43,7 @@ class FlightSetup:
     curve: CurveName  # that the firmwares are taken to have until their motors turn
     rig: Rig
     preflight: Preflight
-    mocap: Mocap | None = None  # already found to be ready; whoever made it ends it
+    mocap: Mocap | None = None  # ready; the caller ends it
 
 
 def fly(

@@ -1,6 +1,6 @@
 """`python -m mjxball.fly.twin`: the twin as a process of its own. Prints its two URIs as one line of JSON.
 
-It ends when its standard input closes, so that it never outlives whoever started it.
+It ends when its standard input closes, so that it never outlives the process that started it.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def drone_kind(drone: str = "2.1", curve: str = "linear") -> DroneKind:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a rehearsal meets around the drones and the laptop is not told."""
+    """Conditions around the drones in a rehearsal, which the laptop does not know."""
 
     noise: float = 1.0  # factor on the noise of IMU and pose
     pose_hz: float = 100.0  # poses of the positioning system [Hz]
@@ -77,7 +77,7 @@ RANGES = {"noise": (0.0, 100.0), "pose_hz": (1.0, 1000.0), "delay": (0.0, 0.5)}
 
 
 def add_twin_options(parser: argparse.ArgumentParser) -> None:
-    """Add --twin-drone and the others to `parser`; None where nothing is asked for."""
+    """Add --twin-drone and the others to `parser`; None by default."""
     about = "--rehearse: "
     add = parser.add_argument
     add("--twin-drone", choices=tuple(DRONES), help=f"{about}what drones the twin is (2.1)")
@@ -115,7 +115,7 @@ def asked_of_twin(options: argparse.Namespace) -> list[str]:
 
 
 def surroundings(options: argparse.Namespace) -> Surroundings:
-    """The `Surroundings` that were asked for. Raises InputError."""
+    """The `Surroundings` of `options`. Raises InputError."""
     check_twin(options)
     given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed")}
     given = {name: value for name, value in given.items() if value is not None and math.isfinite(value)}
@@ -135,7 +135,7 @@ class Battery:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a rehearsal meets that the laptop is not told. The CG moves from when the first motor turns."""
+    """Load, motors and batteries in a rehearsal, which the laptop does not know. The CG moves once a motor turns."""
 
     object_mass: float  # [kg]
     cg_amplitude: float = 0.0  # of a prescribed sine [m]

@@ -82,8 +82,8 @@ class CoupledPair:
         self._rolling = config.motion.kind == "rolling"
         self._roll_force = motion.make_rolling_force(config)
         self._prescribed = None if self._rolling else motion.make_prescribed(config)
-        met = self.conditions
-        mass, amplitude, speed, zero = map(np.float64, (met.object_mass, met.cg_amplitude, met.cg_speed, 0.0))
+        load = self.conditions
+        mass, amplitude, speed, zero = map(np.float64, (load.object_mass, load.cg_amplitude, load.cg_speed, 0.0))
         self._load = Load(mass, mass, amplitude, speed, zero, np.zeros(0), np.zeros(0))
         self._unit = np.zeros((1, self.model.nv))
         self._unit[0, self._slide] = 1.0

@@ -13,7 +13,7 @@ from mjxball.fly.twin.supervisor import AIRBORNE, PERIOD, Phase, Supervisor
 
 THRUST_FLOOR, THRUST_CEILING = 1000, 60000  # [thrust units] below: motors stand still; above: cut
 PLANNER_PERIOD = 0.01  # [s] of the high-level commander, whose planner never flies here: it asks for motors off
-NOBODY, PLANNER, LAPTOP = 0, 1, 2  # priorities of who sent the setpoint
+UNSET, PLANNER, LAPTOP = 0, 1, 2  # priorities of who sent the setpoint
 WORST_ANGLE = 30.0  # [deg] in place of a number that is not finite: the real controller takes such a one as a kick
 
 
@@ -22,14 +22,14 @@ class Commander:
 
     def __init__(self, now: float = 0.0) -> None:
         self.setpoint, self.time = ZERO, now
-        self.priority = NOBODY
+        self.priority = UNSET
         self._locked = True
         self._planned = -math.inf
         self.wire_thrust = 0  # of the last setpoint received, whatever became of it
 
     def receive(self, value: Setpoint, now: float) -> None:
         """Port 3: a setpoint of any values. After boot, thrust is 0 until a setpoint of thrust 0 came."""
-        if self.priority == NOBODY:
+        if self.priority == UNSET:
             self._locked = True
         if value.thrust == 0:
             self._locked = False

@@ -78,7 +78,7 @@ class Twin:
     def _run(self) -> None:
         try:
             self._loop()
-        except BaseException as failure:  # kept, so that a test that looks sees what ended the twin
+        except BaseException as failure:  # for tests, which look at what ended the twin
             self.failure = failure
             raise
 
@@ -145,7 +145,7 @@ class Twin:
         for datagram in datagrams:
             try:
                 self._sockets[number].sendto(datagram, client)
-            except OSError:  # nobody listens any more, or the buffer is full: the radio forgets it too
+            except OSError:  # no one listens any more, or the buffer is full: the radio forgets it too
                 return
 
     def _seen(self, now: float) -> Truth:

@@ -94,7 +94,7 @@ TRANSITIONS: dict[Phase, tuple[tuple[Test, Phase], ...]] = {
         (lambda now: now.flying, Phase.FLYING),
     ),
     Phase.RESET: ((lambda now: True, Phase.CHECKS_FAILED),),
-    # Motors that are off do not end it: whoever falls silent within 2 s of the last thrust is locked.
+    # Motors that are off do not end it: a laptop that falls silent within 2 s of the last thrust is locked.
     Phase.LEVEL_OUT: (
         (lambda now: now.timed_out or now.tumbled or now.emergency, Phase.STOPPED),
         (lambda now: not now.silent, Phase.FLYING),
@@ -146,7 +146,7 @@ class Supervisor:
 
     @property
     def flying(self) -> bool:
-        """What the estimator is told."""
+        """True in the air, which the estimator uses."""
         return self.phase in AIRBORNE
 
     def request_arming(self, wanted: bool) -> bool:

@@ -105,7 +105,7 @@ class VirtualLink:
 
 
 class MemoryLog:
-    """In the place of the flight log; `keep` says whether ticks and states are kept as well."""
+    """In the place of the flight log; with `keep` ticks and states as well."""
 
     def __init__(self, keep: bool = True) -> None:
         self.records: list[dict[str, Any]] = []
