@@ -9,11 +9,12 @@ import pytest
 from command_line import TRANSPORT
 from hypothesis import given
 from hypothesis import strategies as st
+from wire import pack_state
 
 from mjxball.control import observation, rotations
 from mjxball.fly import process
 from mjxball.fly.card import Controller, config_of
-from mjxball.fly.packets import DroneState, pack_state, unpack_state
+from mjxball.fly.packets import DroneState, unpack_state
 from mjxball.fly.process import Metronome
 from mjxball.fly.telemetry import Rig, object_state
 from mjxball.physics.engine import PlantState

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import REPOSITORY, assert_one_line, call, environment
+from wire import pack_state
 
 from mjxball import config as configs
 from mjxball.commands import evaluate
@@ -34,7 +35,7 @@ ZEROS = [[0.0] * 4] * 2
 
 def packet(state: DroneState, stamp: int = 0) -> str:
     """The field `raw` of a state."""
-    return (b"\x01" + stamp.to_bytes(3, "little") + packets.pack_state(state)).hex()
+    return (b"\x01" + stamp.to_bytes(3, "little") + pack_state(state)).hex()
 
 
 def drone(x: float, rates: float = 0.0) -> DroneState:

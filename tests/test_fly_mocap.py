@@ -19,6 +19,7 @@ import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment
 from fly_virtual import World
 from vrpn_server import Poses, VrpnServer
+from wire import unpack_pose
 
 from mjxball.fly import mocap as motion_capture
 from mjxball.fly import packets, process
@@ -270,7 +271,7 @@ class Seen:
         self._noise, self._spoil, self._begin = np.random.default_rng(0), spoil, 0.0
         self.mocap.note = self.world.log.note
         for number, link in enumerate(self.world.links):
-            link.pose = lambda packet, number=number: self.heard[number].append(packets.unpack_pose(packet.data))
+            link.pose = lambda packet, number=number: self.heard[number].append(unpack_pose(packet.data))
             self.mocap.feed(number, link)
         self.world.flight._mocap = self
         self.mocap.take(self._frame(), self.world.now)
@@ -412,7 +413,7 @@ class Flown:
 
     def _hear(self, twin: Twin, number: int, onward: Callable[..., None], datagram: bytes, now: float) -> None:
         if datagram[:1] and datagram[0] >> 4 == packets.POSE_PORT:
-            position, _ = packets.unpack_pose(datagram[1:])
+            position, _ = unpack_pose(datagram[1:])
             self.heard[number].append((time.monotonic(), position))
             self.errors.append(float(np.abs(position - twin.truth.state.position[number]).max()))
         onward(datagram, now)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from wire import unpack_pose
 
 from mjxball.fly import packets
 from mjxball.fly.mocap_supervision import (
@@ -174,7 +175,7 @@ def test_what_is_cleaned_can_be_sent_and_nothing_else_is(numbers: list[float]) -
     pose = clean(0.0, numbers)
     if pose is None:
         return
-    position, quaternion = packets.unpack_pose(packets.pose_packet(pose.position, pose.quaternion).data)
+    position, quaternion = unpack_pose(packets.pose_packet(pose.position, pose.quaternion).data)
     np.testing.assert_allclose(position, numbers[:3], rtol=1e-6)
     assert quaternion[0] >= 0
     assert np.linalg.norm(quaternion) == pytest.approx(1, abs=1e-6)
@@ -204,4 +205,4 @@ def test_the_packet_is_the_firmwares() -> None:
         with pytest.raises(PacketError):
             packets.pose_packet(position, quaternion)
     with pytest.raises(PacketError):
-        packets.unpack_pose(packet.data[:-1])
+        unpack_pose(packet.data[:-1])

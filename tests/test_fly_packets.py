@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from wire import pack_state
 
 from mjxball.control import rotations
 from mjxball.fly import packets
@@ -126,7 +127,7 @@ def test_states_survive_the_wire(
     position: tuple[float, ...], rest: tuple[float, ...], quaternion: np.ndarray, info: int
 ) -> None:
     state = DroneState(np.array(position), np.array(rest[:3]), quaternion, np.array(rest[3:]), info, 3.7)
-    data = packets.pack_state(state)
+    data = pack_state(state)
     assert len(data) == 26  # the protocol's limit for a log packet (crazyflie.md)
     back = packets.unpack_state(data)
     for ours, theirs in zip(back[:2] + back[3:4], state[:2] + state[3:4], strict=True):
@@ -137,12 +138,12 @@ def test_states_survive_the_wire(
 def test_the_wire_has_pitch_rate_nose_up() -> None:
     state = DroneState(np.zeros(3), np.zeros(3), np.array([1.0, 0, 0, 0]), np.array([0.0, 0.2, 0.0]), 0, 4.0)
     # int16 number 8 of the packet: after x y z vx vy vz, four bytes of quaternion, and the roll rate.
-    assert struct.unpack_from("<h", packets.pack_state(state), 18) == (-200,)
+    assert struct.unpack_from("<h", pack_state(state), 18) == (-200,)
 
 
 def test_a_far_away_drone_saturates_and_does_not_wrap() -> None:
     state = DroneState(np.array([100.0, -100.0, 0.0]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), 0, 4.0)
-    np.testing.assert_allclose(packets.unpack_state(packets.pack_state(state)).position, [32.767, -32.768, 0.0])
+    np.testing.assert_allclose(packets.unpack_state(pack_state(state)).position, [32.767, -32.768, 0.0])
 
 
 def test_variables_fill_the_packet_in_order() -> None:
@@ -151,6 +152,6 @@ def test_variables_fill_the_packet_in_order() -> None:
     euler = np.array([0.1, -0.2, 0.3])
     quaternion = rotations.quaternion_from_euler(euler)
     state = DroneState(np.zeros(3), np.zeros(3), quaternion, np.zeros(3), 0, 4.0)
-    back = packets.unpack_state(packets.pack_state(state)).quaternion
+    back = packets.unpack_state(pack_state(state)).quaternion
     found = rotations.euler_from_matrix(rotations.matrix_from_quaternion(back))
     np.testing.assert_allclose(found, euler, atol=3e-3)  # the wire's resolution of an angle

@@ -53,7 +53,7 @@ class Link:
     # Before flight; these may block up to their deadlines.
 
     def open(self, progress: Callable[[str], None] = lambda text: None) -> None:
-        """Connect, with both tables of contents, which are cached; `progress` is called on the way. Raises LinkError."""
+        """Connect, with both tables of contents, which are cached; `progress` gets lines to show. Raises LinkError."""
         started = time.monotonic()
         self._crazyflie = connect(self.uri, self.name, self._deadlines, progress, self._end, self._console)
         self._driver = self._crazyflie.link

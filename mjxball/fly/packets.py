@@ -27,8 +27,8 @@ STATE_VARIABLES: tuple[tuple[str, str], ...] = (
     ("supervisor.info", "uint16_t"),
     ("pm.vbatMV", "uint16_t"),  # [mV]
 )
-_STATE = struct.Struct("<6hI3hHH")
-STATE_SIZE = _STATE.size
+STATE = struct.Struct("<6hI3hHH")
+STATE_SIZE = STATE.size
 _SETPOINT = struct.Struct("<fffH")
 SETPOINT_SIZE = _SETPOINT.size
 MILLI = 1e-3
@@ -116,20 +116,11 @@ def unpack_setpoint(data: bytes) -> Setpoint:
     return Setpoint(*_SETPOINT.unpack(data))
 
 
-def pack_state(state: DroneState) -> bytes:
-    """The 26 bytes of `STATE_VARIABLES`; values beyond their range saturate, as far as 16 bits reach."""
-    rates = state.rates * np.array([1.0, -1.0, 1.0])
-    counts = [_int16(value / MILLI) for value in (*state.position, *state.velocity, *rates)]
-    battery = min(max(round(state.battery / MILLI), 0), 0xFFFF)
-    quaternion = compress_quaternion(state.quaternion)
-    return _STATE.pack(*counts[:6], quaternion, *counts[6:], state.info & 0xFFFF, battery)
-
-
 def unpack_state(data: bytes) -> DroneState:
     """The drone's state in 26 bytes. Raises PacketError for another length or a quaternion that is none."""
     if len(data) != STATE_SIZE:
         raise PacketError(f"a state has {STATE_SIZE} bytes, not {len(data)}")
-    x, y, z, vx, vy, vz, compressed, roll, pitch, yaw, info, battery = _STATE.unpack(data)
+    x, y, z, vx, vy, vz, compressed, roll, pitch, yaw, info, battery = STATE.unpack(data)
     position, velocity = MILLI * np.array([x, y, z], float), MILLI * np.array([vx, vy, vz], float)
     rates = MILLI * np.array([roll, -pitch, yaw], float)
     return DroneState(position, velocity, decompress_quaternion(compressed), rates, info, MILLI * battery)
@@ -164,7 +155,7 @@ EMERGENCY_STOP = Packet(9, 1, b"\x03")  # motors off and locked until reboot
 ARM, DISARM = Packet(9, 1, b"\x01\x01"), Packet(9, 1, b"\x01\x00")
 
 POSE = struct.Struct("<B7f")  # of the localization port: kind of packet, x, y, z [m], quaternion (x, y, z, w)
-POSE_PORT, _EXTERNAL_POSE = 6, 8
+POSE_PORT, EXTERNAL_POSE = 6, 8
 
 
 def pose_packet(position: Sequence[float], quaternion: Sequence[float]) -> Packet:
@@ -176,15 +167,7 @@ def pose_packet(position: Sequence[float], quaternion: Sequence[float]) -> Packe
     numbers = (*map(float, position), x, y, z, w)
     if not all(map(math.isfinite, numbers)) or abs(w * w + x * x + y * y + z * z - 1) > 1e-3:
         raise PacketError("a pose is not finite or its quaternion is not one of unit length")
-    return Packet(POSE_PORT, 1, POSE.pack(_EXTERNAL_POSE, *numbers))
-
-
-def unpack_pose(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) [m] and quaternion (4,) (w, x, y, z) of a pose packet's bytes. Raises PacketError if it is none."""
-    if len(data) != POSE.size or data[0] != _EXTERNAL_POSE:
-        raise PacketError(f"a pose has {POSE.size} bytes, of which the first is {_EXTERNAL_POSE}")
-    _, px, py, pz, x, y, z, w = POSE.unpack(data)
-    return np.array([px, py, pz]), np.array([w, x, y, z])
+    return Packet(POSE_PORT, 1, POSE.pack(EXTERNAL_POSE, *numbers))
 
 
 _STEPS = 511  # a component takes 9 bits and a sign
@@ -227,7 +210,3 @@ def decompress_quaternion(packed: int) -> np.ndarray:
 def level_share(quaternion: np.ndarray) -> float:
     """Cosine of the angle between body z and up, of a unit `quaternion` (w, x, y, z)."""
     return 1.0 - 2.0 * (float(quaternion[1]) ** 2 + float(quaternion[2]) ** 2)
-
-
-def _int16(value: float) -> int:
-    return min(max(round(value), -0x8000), 0x7FFF) if math.isfinite(value) else 0

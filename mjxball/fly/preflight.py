@@ -157,7 +157,7 @@ def _wait_until_ready(links: Sequence[Link], seconds: float) -> None:
 
 
 def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) -> list[Check]:
-    """All checks, with what was found; takes `required.measure` seconds, more while a firmware re-arms after a landing."""
+    """All checks, with what was found; takes `required.measure` seconds, more if a firmware re-arms after a landing."""
     _wait_until_ready(links, required.rearm)
     began = time.monotonic()
     before = [link.telemetry.received for link in links]

@@ -179,12 +179,6 @@ class Supervisor:
         return Supervisor(state, since, cause) if state in GUIDED else Supervisor(State.DESCEND, now, self.cause)
 
 
-def table_rows() -> list[tuple[str, str, str]]:
-    """(state, event, next state) of every transition, in the order of the enumerations: what the docs print."""
-    order = [(state, event) for state in State for event in Event]
-    return [(s.value, e.value, TRANSITIONS[s, e].value) for s, e in order if (s, e) in TRANSITIONS]
-
-
 def markdown() -> str:
     """The table as Markdown, an event a line and a state a column; an empty cell keeps the state."""
     states = [state for state in State if state is not State.DONE]
