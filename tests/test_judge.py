@@ -131,7 +131,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of two followers on one suite, through the command line."""
     out = tmp_path_factory.mktemp("judged") / "report"
     flags = ["--followers", "copy", "adaptive", "policies/transport.npz", "--suite", "delay", "start-errors"]
-    assert evaluate([*flags, "--seeds", "2", "--physics", "newton-euler", "--out", str(out)]) == 0
+    assert evaluate([*flags, "--num-seeds", "1", "--physics", "newton-euler", "--out", str(out)]) == 0
     return out
 
 
@@ -144,7 +144,7 @@ def test_scores_are_json_without_infinities(report: Path) -> None:
     assert len(found) == 6 * 3
     assert {row["follower"] for row in found} == {"copy", "adaptive", "transport"}
     assert {"paper_return", "settling_time_10", "y_peak", "action_error"} <= set(found[0])
-    assert all(row["seeds"] == 2 and len(row["rmse"]) == 3 for row in found)
+    assert all(row["seeds"] == 1 and len(row["rmse"]) == 3 for row in found)
     never = next(row for row in found if row["follower"] == "copy")["settling_time"]
     assert never == [None, None, None]
 

@@ -24,7 +24,7 @@ UNITS |= {"smoothness": "rad"}
 COUNTED = {"peak": "steady-state peak", "rmse": "RMSE", "settling_time": "settling time", "overshoot": "overshoot"}
 RIVALS = ("adaptive", "lqg", "lqg-slow")  # that followers are compared with one by one
 CARD_HIDES = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
-LEAD_START, LEAD_SECONDS, LEAD_SPEED = 15.0, 20.0, 2.0  # of the lead picture: steady state, where flights are long
+LEAD_START, LEAD_SECONDS, LEAD_SPEED = 15.0, 20.0, 3.0  # of the lead picture: steady state, where flights are long
 
 Row = dict[str, Any]
 
