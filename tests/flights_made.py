@@ -53,7 +53,7 @@ def fly(truth: Truth, seconds: float, flights: int, seed: int = 0) -> list[dict[
             home = velocity[:, 1::-1] + 0.5 * place[:, 1::-1]
             goal = np.pad(np.clip(5 * rng.normal(size=(flights, 2)) + 6 * home, -15, 15), ((0, 0), (0, 1)))
         wanted = wanted + PERIOD / 0.05 * (goal - wanted)  # smooth, as from a position controller
-        level = (GRAVITY - 2 * velocity[:, 2:] - 2 * place[:, 2:]) / truth.force_over_mass / 4 / MOTOR.most
+        level = (GRAVITY - 2 * velocity[:, 2:] - 2 * place[:, 2:]) / truth.force_over_mass / 4 / MOTOR.max_force
         thrust = FULL * np.clip(level, 0.3, 0.95) * flying
         seen = rates + truth.noise * rng.normal(size=(flights, 3))
         setpoint = np.concatenate([wanted, thrust], axis=1)
