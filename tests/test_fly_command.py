@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from mjxball.fly import command
 from mjxball.fly.command import LINEAR, OLDER, CommandMap, ForceCurve
+from mjxball.fly.limits import Times
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR, PacketError
 
 PAPER = CommandMap(law="paper")
@@ -71,6 +72,23 @@ def test_signs_on_the_wire() -> None:
     assert sent.roll == pytest.approx(math.degrees(0.1))
     assert sent.pitch == pytest.approx(-math.degrees(0.2))
     assert sent.yaw_rate == 0
+
+
+def test_a_descent_holds_its_speed() -> None:
+    """The trim at the speed asked for, more when it falls faster, less when it falls slower, between 70 and 110 %."""
+    times = Times(descend_speed=0.4)
+    thrusts = [command.sink(40000.0, climb, 1.0, times) for climb in (1.0, 0.0, -0.3, -0.4, -0.5, -2.0)]
+    assert thrusts == sorted(thrusts)
+    assert thrusts[3] == pytest.approx(40000)
+    assert thrusts[2] < 40000 < thrusts[4]
+    assert (thrusts[0], thrusts[-1]) == pytest.approx((28000, 44000))
+
+
+def test_a_descent_without_a_known_speed_loses_thrust() -> None:
+    times = Times(descend_limit=4.0)
+    assert [command.sink(40000.0, None, elapsed, times) for elapsed in (0.0, 2.0, 4.0, 9.0)] == pytest.approx(
+        [38000, 33000, 28000, 28000]
+    )
 
 
 def test_nothing_lifts_without_force() -> None:

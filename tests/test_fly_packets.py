@@ -102,6 +102,19 @@ def test_quaternions_are_cflibs(quaternion: np.ndarray) -> None:
         )
 
 
+def test_a_quaternion_whose_largest_component_is_not_the_largest_is_refused() -> None:
+    """Three components of 1/2 leave 1/2 for the fourth; three of 0.55 leave 0.3, which was not the one to leave out."""
+    for size, sound in ((0.3, True), (0.5, True), (0.55, False), (0.6, False)):
+        steps = round(size * math.sqrt(2) * 511)
+        packed = 3 << 30 | steps << 20 | steps << 10 | steps  # w is left out
+        if sound:
+            w = math.sqrt(1 - 3 * size**2)
+            np.testing.assert_allclose(packets.decompress_quaternion(packed), [w, size, size, size], atol=3e-3)
+        else:
+            with pytest.raises(PacketError):
+                packets.decompress_quaternion(packed)
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_any_32_bits_are_a_unit_quaternion_or_refused(packed: int) -> None:
     try:

@@ -10,7 +10,8 @@ import pytest
 from mjxball.control import motors, rotations
 from mjxball.control.motors import MOTORS
 from mjxball.fly import command, preflight
-from mjxball.fly.monitor import VARIANCE, EstimatorWatch, UplinkWatch
+from mjxball.fly.limits import Limits
+from mjxball.fly.monitor import JUMP, VARIANCE, EstimatorWatch, UplinkWatch, stick_faults
 from mjxball.fly.packets import MOTORS as MOTOR_VARIABLES
 from mjxball.fly.packets import VARIANCES, DroneState, Health, health_of
 from mjxball.fly.supervisor import Event
@@ -65,6 +66,35 @@ def test_a_jump_is_found_at_once_and_the_other_drone_is_flown_by() -> None:
     assert "leader" in faults[0].detail
     np.testing.assert_allclose(watch.object(after, [True, True]).position, [0.0, 0.0, 0.4], atol=1e-12)
     assert watch.object(after, [True, False]) is None  # the one that is heard is not believed
+
+
+def test_motion_at_the_reported_velocity_is_no_jump() -> None:
+    """1.2 m/s over a gap of 80 ms: 96 mm, more than a jump; but not for an estimate that claims the other way."""
+    assert 1.2 * 0.08 > JUMP
+    for velocity, trusted in ((1.2, True), (-1.2, False)):
+        watch = EstimatorWatch(RIG)
+        for time in (0.0, 0.08):
+            seen = [sample(n, time, (1.2 * time, 0.0, 0.4), (velocity, 0.0, 0.0)) for n in range(2)]
+            watch.update(seen, [WELL, WELL], time)
+        assert watch.trusted == [trusted, trusted]
+
+
+def test_two_drones_are_as_far_apart_as_their_stick_is_long() -> None:
+    """A stick of 0.3 m; 0.1 m and 30 degrees are allowed."""
+    for along, up, wrong in (
+        (0.30, 0.0, ""),
+        (0.21, 0.0, ""),
+        (0.39, 0.0, ""),
+        (0.19, 0.0, "0.19 m apart"),
+        (0.41, 0.0, "0.41 m apart"),
+        (0.25, 0.16, "tilts 32 degrees"),
+        (0.25, -0.16, "tilts 32 degrees"),
+    ):
+        states = [sample(number, 0.0).state for number in range(2)]
+        leader = states[1].position + np.array([0.0, along, up])
+        faults = stick_faults([states[0]._replace(position=leader), states[1]], RIG.span, Limits())
+        assert [fault.event for fault in faults] == ([Event.STICK] if wrong else []), (along, up)
+        assert all(wrong in fault.detail for fault in faults)
 
 
 def test_a_variance_that_grows_is_found() -> None:

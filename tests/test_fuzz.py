@@ -243,6 +243,22 @@ class TestCheckpoints:
         for mine, other in zip(self.state, found, strict=True):
             np.testing.assert_array_equal(mine, other)
 
+    def test_the_newest_sound_one_is_restored(self, tmp_path: Path) -> None:
+        steps, warnings = (7, 9), []
+        for step in steps:
+            with contextlib.closing(Checkpoints(tmp_path)) as checkpoints:
+                checkpoints.save(self.state._replace(steps=np.array(step)))
+        with contextlib.closing(Checkpoints(tmp_path)) as checkpoints:
+            assert checkpoints.steps() == [9, 7]
+        assert self.restored(tmp_path).steps == 9
+        for path in (tmp_path / "checkpoints" / "9").rglob("*"):
+            if path.is_file():
+                path.write_bytes(path.read_bytes()[:10])
+        with contextlib.closing(Checkpoints(tmp_path)) as checkpoints:
+            assert checkpoints.restore(self.state, warnings.append, discard=False).steps == 7
+        assert len(warnings) == 1
+        assert "checkpoint 9 cannot be read" in warnings[0]
+
     def test_every_file_damaged(self, fuzz: ModuleType, written: Path) -> None:
         import mutations
 

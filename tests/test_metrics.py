@@ -91,6 +91,11 @@ def test_commands_and_rotors() -> None:
     assert found.effort == pytest.approx(np.sqrt(3.5**2 * 751 / 1501 / 4))
 
 
+def test_the_first_command_is_no_change() -> None:
+    command = np.tile([0.1, -0.2, 0.0], (20, 1))
+    assert of(flight(approach()[:20], follower_command=command)).smoothness == 0
+
+
 def test_tilt_is_the_hypotenuse() -> None:
     euler = np.zeros((1501, 3))
     euler[10] = (0.3, -0.4, 2.0)

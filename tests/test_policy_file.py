@@ -65,8 +65,28 @@ class TestRoundTrip:
         assert [p.name for p in tmp_path.iterdir()] == (["follower.npz"] if existing else [])
         assert not existing or path.read_bytes() == b"old"
 
+    def test_arrays_stored_column_by_column_are_the_same_policy(self, saved, tmp_path):
+        """Fortran order, as `np.savez` keeps it of an array that has it."""
+        other = tmp_path / "columns.npz"
+        with np.load(saved) as data:
+            np.savez(
+                other, **{name: np.asfortranarray(array) if array.ndim == 2 else array for name, array in data.items()}
+            )
+        jax.tree.map(np.testing.assert_array_equal, load_file(other).weights, load_file(saved).weights)
+
 
 class TestInference:
+    def test_the_action_is_the_mean_and_not_the_deviation(self, trained):
+        """Of the last layer's six numbers the first three are the mean: without weights they are its biases."""
+        contents = trained.contents
+        biases = [np.zeros_like(bias) for bias in contents.biases]
+        biases[-1][:] = (0.1, -0.2, 0.3, 4.0, 5.0, 6.0)
+        still = dataclasses.replace(
+            contents, weights=tuple(np.zeros_like(weight) for weight in contents.weights), biases=tuple(biases)
+        )
+        found = Policy(still, "still", np.float64).scaled(OBSERVATIONS)
+        np.testing.assert_allclose(found, np.tile(np.tanh([0.1, -0.2, 0.3]), (40, 1)), rtol=1e-7)  # float32 biases
+
     def test_float32_agrees_with_flax(self, trained, saved):
         seen = np.asarray(3 * OBSERVATIONS, np.float32)
         with jax.default_matmul_precision("highest"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -108,7 +109,7 @@ class TestDamagedContainer:
         bomb = np.empty((), object)
         bomb[()] = Bomb(witness)
         rewrite(saved, lambda arrays: arrays.update({name: bomb}))
-        refused(saved, "pickle")
+        refused(saved, "it holds a pickle")
         assert not witness.exists()
 
     def test_entry_that_is_no_array(self, saved):
@@ -130,6 +131,15 @@ class TestDamagedContainer:
         header = io.BytesIO()
         np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (2**38,)})
         copy_zip(saved, {"weight_0.npy": header.getvalue()})
+        refused(saved)
+
+    def test_entry_shorter_than_its_directory_claims(self, saved):
+        """A sound array, whose checksum fits, behind a directory that promises one byte more."""
+        content = bytearray(saved.read_bytes())
+        entry = content.rindex(b"PK\x01\x02")
+        (size,) = struct.unpack_from("<I", content, entry + 24)  # of the entry, unpacked
+        struct.pack_into("<I", content, entry + 24, size + 1)
+        saved.write_bytes(content)
         refused(saved)
 
     def test_too_many_entries(self, saved):
@@ -188,6 +198,12 @@ class TestDamagedArrays:
     def test_impossible_scale(self, saved, name, value):
         rewrite(saved, lambda arrays: np.put(arrays[name], 0, value))
         refused(saved, name)
+
+    def test_action_without_range(self, saved):
+        """The card and the array agree that roll and pitch have a range of 0."""
+        rewrite_card(saved, lambda card: card.update(action_reach=[0.0, card["action_reach"][1]]))
+        rewrite(saved, lambda arrays: np.put(arrays["action_scale"], [0, 1], 0.0))
+        refused(saved, "action_scale must be positive")
 
     @pytest.mark.parametrize("card", [np.zeros(3), np.array(["{}"]), np.array(b"{}"), np.array("{"), np.array("[1]")])
     def test_card_is_not_one_json_object(self, saved, card):
@@ -260,6 +276,7 @@ class TestDamagedCard:
             ("plant", []),
             ("bounds", {"x_peak": None}),
             ("bounds", {"x_peak": HUGE}),
+            ("bounds", {"x_peak": -1e300}),
             ("bounds", [0.05]),
         ],
         ids=lambda value: "huge" if value == HUGE else repr(value)[:20],

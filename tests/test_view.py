@@ -89,6 +89,7 @@ def test_a_run_directory_and_a_baseline_are_flown(flight: Flight, tmp_path: Path
         (lambda arrays: arrays.pop("position"), "position is missing"),
         (lambda arrays: arrays.update(euler=arrays["euler"][:-1]), "euler is missing or not of shape"),
         (lambda arrays: arrays.update(time=arrays["time"][::-1]), "time must increase"),
+        (lambda arrays: arrays["time"].__setitem__(4, arrays["time"][3]), "time must increase"),
         (lambda arrays: arrays["target"].__setitem__((3, 1), np.nan), "target holds a value that is not finite"),
         (lambda arrays: arrays.update(time=np.zeros(1)), "at least two rows"),
     ],
