@@ -75,20 +75,12 @@ def test_signs_on_the_wire() -> None:
 
 
 def test_a_descent_holds_its_speed() -> None:
-    """The trim at the speed asked for, more when it falls faster, less when it falls slower, between 70 and 110 %."""
+    """Of the thrust that hovers: all at the speed asked for, more if it falls faster, less if slower; 70 to 110 %."""
     times = Times(descend_speed=0.4)
-    thrusts = [command.sink(40000.0, climb, 1.0, times) for climb in (1.0, 0.0, -0.3, -0.4, -0.5, -2.0)]
-    assert thrusts == sorted(thrusts)
-    assert thrusts[3] == pytest.approx(40000)
-    assert thrusts[2] < 40000 < thrusts[4]
-    assert (thrusts[0], thrusts[-1]) == pytest.approx((28000, 44000))
-
-
-def test_a_descent_without_a_known_speed_loses_thrust() -> None:
-    times = Times(descend_limit=4.0)
-    assert [command.sink(40000.0, None, elapsed, times) for elapsed in (0.0, 2.0, 4.0, 9.0)] == pytest.approx(
-        [38000, 33000, 28000, 28000]
-    )
+    shares = [command.sinking_share(climb, times) for climb in (1.0, 0.0, -0.3, -0.4, -0.5, -2.0)]
+    assert shares == sorted(shares)
+    assert shares[2] < 1 < shares[4]
+    assert (shares[0], shares[3], shares[5]) == pytest.approx((0.7, 1.0, 1.1))
 
 
 def test_nothing_lifts_without_force() -> None:
