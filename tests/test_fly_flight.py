@@ -39,9 +39,9 @@ def test_a_flight_from_start_to_end() -> None:
 
 def test_a_brushless_pair_is_armed_under_zeros() -> None:
     world = World(kind=ARMED_BY_HAND)
-    assert not world.drones[0].firmware.armed
+    assert not world.drones[0].firmware.supervisor.armed
     world.fly_until(State.SPIN)
-    assert all(drone.firmware.armed for drone in world.drones)
+    assert all(drone.firmware.supervisor.armed for drone in world.drones)
     assert {thrust for _, thrust in thrusts(world, 0)[:-1]} == {0}  # the last one is the first that turns
     world.fly_until(State.DONE)
     assert world.log.transitions() == NORMAL

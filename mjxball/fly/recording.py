@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -132,7 +133,9 @@ def load(path: Path) -> FlightLog:
     if not any(one["kind"] == "end" for one in records):
         remarks.append("it has no end: the runner was killed, or the log was cut")
     found = _outages(flown, turning[-1])
-    remarks += [_sentence(gap, turning[0]) for gap in found]
+    for gap in found:
+        what = f"the {gap.drone}'s estimate is frozen" if gap.frozen else f"there is no state of the {gap.drone}"
+        remarks.append(f"{what} for {gap.end - gap.begin:.2f} s from {max(gap.begin - turning[0], 0.0):.1f} s on")
     setup = FirmwareSetup.of_header(header)
     for one in records:
         setup = setup.after(one, header["config"])
@@ -170,11 +173,6 @@ def _outages(rows: tuple[Record, ...], stopped: float) -> tuple[Outage, ...]:
         if guided and (within := (time >= guided[0]) & (time <= guided[-1])).any():
             found += [gap for gap in outages(drone, time[within], states[within], guided[-1]) if gap.frozen]
     return tuple(sorted(found, key=lambda gap: gap.begin))
-
-
-def _sentence(gap: Outage, start: float) -> str:
-    what = f"the {gap.drone}'s estimate is frozen" if gap.frozen else f"there is no state of the {gap.drone}"
-    return f"{what} for {gap.end - gap.begin:.2f} s from {max(gap.begin - start, 0.0):.1f} s on"
 
 
 @dataclass(frozen=True)
@@ -281,15 +279,15 @@ def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
         sound = np.where(sent[:, 3:] >= crazyflie.IDLE, sent, 0.0)
         state = pair.advance(sound, step)
     position, velocity, quaternion, rates = (np.array(part, float) for part in zip(*seen, strict=True))
-    changed = {
-        "position": position - position[0] + recording.position[0],
-        "velocity": velocity,
-        "quaternion": quaternion,
-        "rates": rates,
-        "rotor_force": np.array(forces),
-        "cg_offset": np.array(offsets, float),
-    }
-    return Recording(**{**vars(recording), **changed})
+    return dataclasses.replace(
+        recording,
+        position=position - position[0] + recording.position[0],
+        velocity=velocity,
+        quaternion=quaternion,
+        rates=rates,
+        rotor_force=np.array(forces),
+        cg_offset=np.array(offsets, float),
+    )
 
 
 def drone_state(state: PairState, number: int) -> DroneState:

@@ -149,11 +149,8 @@ class Supervisor:
 
     def after(self, faults: list[Fault], now: float) -> Supervisor:
         """The supervisor after everything that happened in one tick ending at `now` [s]."""
-        led = [
-            (TRANSITIONS[self.state, fault.event], fault)
-            for fault in faults
-            if (self.state, fault.event) in TRANSITIONS
-        ]
+        known = [fault for fault in faults if (self.state, fault.event) in TRANSITIONS]
+        led = [(TRANSITIONS[self.state, fault.event], fault) for fault in known]
         # Whoever pressed the kill key wants nothing else.
         asked = [pair for pair in led if pair[1].event is Event.KEY_KILL]
         best, why = max(asked or led, key=lambda pair: pair[0].severity, default=(self.state, None))
@@ -183,13 +180,7 @@ def markdown() -> str:
     """The table as Markdown, an event a line and a state a column; an empty cell keeps the state."""
     states = [state for state in State if state is not State.DONE]
     lines = ["| event | " + " | ".join(state.value for state in states) + " |", "|---" * (len(states) + 1) + "|"]
+    cells = {key: state.value for key, state in TRANSITIONS.items()} | {(S.HOLD, E.RESUMED): "as before"}
     for event in Event:
-        cells = [_cell(state, event) for state in states]
-        lines.append(f"| {event.value} | " + " | ".join(cells) + " |")
+        lines.append(f"| {event.value} | " + " | ".join(cells.get((state, event), "") for state in states) + " |")
     return "\n".join(lines)
-
-
-def _cell(state: State, event: Event) -> str:
-    if event is Event.RESUMED and state is State.HOLD:
-        return "as before"
-    return TRANSITIONS[state, event].value if (state, event) in TRANSITIONS else ""

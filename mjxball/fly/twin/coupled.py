@@ -153,7 +153,7 @@ class CoupledPair:
             case "jump":
                 source.offset = np.array([0.0, 0.0, value])
             case "battery":
-                self.power.sag_to(drone, value)
+                self.power.charge[drone] = value
             case "gain":
                 self.power.strength[drone] *= value
 

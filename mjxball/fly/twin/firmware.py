@@ -120,13 +120,13 @@ class Firmware:
 
         `hung`: the stabilizer does not run. The microcontroller's watchdog ends that, and the program `restarts`.
         """
-        if self.dead:
-            return self._give(Order(ZERO, Motors.OFF))
-        if hung:
-            return self._hang(now, restarts)
+        self.order = self._hang(now, restarts) if hung and not self.dead else self._run(now, acceleration, pwm)
+        return self.order
+
+    def _run(self, now: float, acceleration: Sequence[float], pwm: Sequence[float]) -> Order:
         self._hung_since = None
-        if now < self.booting_until:
-            return self._give(Order(ZERO, Motors.OFF))
+        if self.dead or now < self.booting_until:
+            return Order(ZERO, Motors.OFF)
         self.commander.poll(now, self.supervisor.can_fly)
         while now >= self._next_look - 1e-9:
             self.supervisor.look(now, self.commander.age(now), pwm, acceleration)
@@ -136,32 +136,23 @@ class Firmware:
         if phase is Phase.LEVEL_OUT:
             flown = Setpoint(0.0, 0.0, 0.0, flown.thrust)
         motors = Motors.RUN if self.supervisor.motors_allowed else Motors.OFF
-        return self._give(Order(flown, motors, phase in AIRBORNE))
+        return Order(flown, motors, phase in AIRBORNE)
 
     def _hang(self, now: float, restarts: bool) -> Order:
         if self._hung_since is None:
             self._hung_since = now
         if now - self._hung_since < WATCHDOG:
-            return self._give(self.order._replace(motors=Motors.HELD))
+            return self.order._replace(motors=Motors.HELD)
         if restarts:
             self.reboot(now)
         else:
             self.dead = True
-        return self._give(Order(ZERO, Motors.OFF))
-
-    def _give(self, order: Order) -> Order:
-        self.order = order
-        return order
+        return Order(ZERO, Motors.OFF)
 
     @property
     def info(self) -> int:
         """Bits of supervisor.info."""
         return self.supervisor.info
-
-    @property
-    def armed(self) -> bool:
-        """True if the supervisor has armed it."""
-        return self.supervisor.armed
 
     @property
     def locked(self) -> bool:

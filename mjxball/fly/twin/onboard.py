@@ -23,14 +23,10 @@ class Power:
     def __init__(self, kind: DroneKind, battery: Battery, strength: tuple[float, float]):
         self.kind, self.strength = kind, np.array(strength, float)[:, None]
         self._battery = battery
-        self._charge = np.full(2, battery.full)  # [V] without load
+        self.charge = np.full(2, battery.full)  # [V] without load
         self._filtered = np.full((2, 1), FIRST)
         self.requested = np.zeros((2, 4))
-        self.voltage = self._charge.copy()
-
-    def sag_to(self, drone: int, volts: float) -> None:
-        """The battery of `drone` holds `volts` [V] without load from here on."""
-        self._charge[drone] = volts
+        self.voltage = self.charge.copy()
 
     def compensate(self, thrust: np.ndarray) -> np.ndarray:
         """Uncapped PWM (2, 4) of `thrust` commands (2, 4)."""
@@ -55,8 +51,8 @@ class Power:
     def drain(self, pwm: np.ndarray, seconds: float) -> None:
         """Time goes on by `seconds` [s] at `pwm` (2, 4); the voltage follows the load at once."""
         load = pwm.mean(axis=1) / motors.FULL
-        self._charge = self._charge - self._battery.drain * seconds * load
-        self.voltage = self._charge - self._battery.sag * load
+        self.charge = self.charge - self._battery.drain * seconds * load
+        self.voltage = self.charge - self._battery.sag * load
         share = 1 - (1 - TAKEN) ** round(1000 * seconds)
         self._filtered = self._filtered + share * (self.voltage[:, None] - self._filtered)
 

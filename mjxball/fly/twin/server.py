@@ -38,7 +38,10 @@ class Twin:
         """`ports` of leader and follower, 0: any free one."""
         self._pair, self._state = pair, pair.start()
         self.drones = TwinDrone(pair, 0), TwinDrone(pair, 1)
-        self._sockets = [self._bound(port) for port in ports]
+        self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in ports]
+        for sock, port in zip(self._sockets, ports, strict=True):
+            sock.bind((HOST, port))
+            sock.setblocking(False)
         self._clients: list[tuple[str, int] | None] = [None, None]
         self.uris = tuple(f"udp://{HOST}:{sock.getsockname()[1]}" for sock in self._sockets)
         self._closed = [False, False]
@@ -49,13 +52,6 @@ class Twin:
         self.truth = self._seen(0.0)
         self.history: list[Truth] = []  # one in ten steps
         self.failure: BaseException | None = None
-
-    @staticmethod
-    def _bound(port: int) -> socket.socket:
-        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        sock.bind((HOST, port))
-        sock.setblocking(False)
-        return sock
 
     def __enter__(self) -> Twin:
         self._thread.start()

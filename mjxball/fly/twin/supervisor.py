@@ -144,11 +144,6 @@ class Supervisor:
         """True where the motors turn, if only at idle."""
         return self.phase in MAY_RUN
 
-    @property
-    def flying(self) -> bool:
-        """True in the air, which the estimator uses."""
-        return self.phase in AIRBORNE
-
     def request_arming(self, wanted: bool) -> bool:
         """Arm or disarm; true if that is done or was so already."""
         if wanted and not self.armed and self.phase is not Phase.CHECKS_PASSED:
@@ -220,7 +215,7 @@ class Supervisor:
             packets.ARMED: self.armed,
             packets.AUTO_ARMED: self.kind.auto_arm,
             packets.CAN_FLY: self.can_fly,
-            packets.FLYING: self.flying,
+            packets.FLYING: self.phase in AIRBORNE,
             packets.TUMBLED: self.tumbled,
             packets.LOCKED: self.phase is Phase.LOCKED,
             packets.CRASHED: self.crashed,
