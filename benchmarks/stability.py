@@ -19,13 +19,13 @@ from typing import Any
 
 import numpy as np
 
+from hover_stability import delay_margins, linearised_hovers
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower
 from mjxball.evaluate.batch import Batch, law_of
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.stability import delay_margins, hovers
 from mjxball.plotting import pyplot
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario
@@ -48,7 +48,10 @@ def grid(config: Config, unknown: bool) -> list[tuple[float, float, float]]:
 
 def about_hover(config: Config, follower: Follower, cases: list[Any]) -> list[dict[str, Any]]:
     """One row for each case."""
-    found, margins = hovers(config, law_of(follower), cases), delay_margins(config, law_of(follower), cases, LONGEST)
+    found, margins = (
+        linearised_hovers(config, law_of(follower), cases),
+        delay_margins(config, law_of(follower), cases, LONGEST),
+    )
     period = config.timing.control_period
     return [
         {

@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from hover_stability import delay_margins, linearised_hovers
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
 from mjxball.evaluate.batch import law_of
-from mjxball.evaluate.stability import delay_margins, hovers
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario
@@ -29,7 +29,7 @@ def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: 
 
     Of a mass that is not believed each drone holds half: z = dm g / (2 m^ kp), m^ what one drone believes to lift.
     """
-    *known, mistaken = hovers(paper, law_of(make_baseline("copy", paper)), [*CASES, MISTAKEN])
+    *known, mistaken = linearised_hovers(paper, law_of(make_baseline("copy", paper)), [*CASES, MISTAKEN])
     for (offset, mass, _), hover in zip(CASES, known, strict=True):
         sway = 9.81 / 0.5 * mass * offset * 9.81 / (2 * 3.2196)
         assert hover.error == pytest.approx(sway, rel=1e-3, abs=1e-9)

@@ -118,62 +118,60 @@ class Design(NamedTuple):
     worst: Margins  # each the smallest of the corners
 
 
-def design(config: Config, required: Requirements = REQUIREMENTS) -> tuple[Design, ...]:
+def design(config: Config) -> tuple[Design, ...]:
     """Gains for roll, pitch and yaw of the pair in `config`. Raises ValueError if nothing keeps the margins."""
-    return tuple(design_axis(axis, config, required) for axis in axes(config))
+    return tuple(design_axis(axis, config) for axis in axes(config))
 
 
-def design_axis(axis: Axis, config: Config, required: Requirements = REQUIREMENTS) -> Design:
+def design_axis(axis: Axis, config: Config) -> Design:
     """The stiffest of a grid of gains: rate kp, its kd as a lead, attitude kp.
 
     The rate integral alone holds lasting moments, sized for `Axis.trim`: both drones turn one body, so that the
     integrals of two drones that see it differently run apart, and what they fight with must stay bounded.
     An axis that both turn as each does alone keeps the delivered gains, which are flown everywhere.
     """
-    if axis.inertia_ratio < required.keep_below:
+    if axis.inertia_ratio < REQUIREMENTS.keep_below:
         return Design(
             axis,
             delivered_gains(axis),
-            *nominal_and_worst(delivered_gains(axis), axis, config.plant.rotor_lag, required),
+            *nominal_and_worst(delivered_gains(axis), axis, config.plant.rotor_lag),
         )
-    held = max(axis.trim, required.unloaded_share * axis.headroom)
+    held = max(axis.trim, REQUIREMENTS.unloaded_share * axis.headroom)
     number = ("roll", "pitch", "yaw").index(axis.name)
     integral = held / RATE_LIMITS[number]
     lag = config.plant.rotor_lag
-    for attitude, rate, lead in candidates(axis, lag, required):
+    for attitude, rate, lead in candidates(axis, lag):
         gains = rounded(Gains((attitude, 0.0, 0.0), (rate, integral, lead * rate)))
-        nominal = margins(gains, axis.gain, lag, required.delay)
-        if nominal.phase < required.phase or min(nominal.gain_up, nominal.gain_down) < required.gain:
+        nominal = margins(gains, axis.gain, lag, REQUIREMENTS.delay)
+        if nominal.phase < REQUIREMENTS.phase or min(nominal.gain_up, nominal.gain_down) < REQUIREMENTS.gain:
             continue
-        nominal, worst = nominal_and_worst(gains, axis, lag, required)
-        if worst.phase >= required.worst_phase and min(worst.gain_up, worst.gain_down) >= required.worst_gain:
+        nominal, worst = nominal_and_worst(gains, axis, lag)
+        if worst.phase >= REQUIREMENTS.worst_phase and min(worst.gain_up, worst.gain_down) >= REQUIREMENTS.worst_gain:
             return Design(axis, gains, nominal, worst)
     raise ValueError(f"no gains keep the margins about {axis.name}")
 
 
-def candidates(axis: Axis, lag: float, required: Requirements) -> list[tuple[float, float, float]]:
+def candidates(axis: Axis, lag: float) -> list[tuple[float, float, float]]:
     """(attitude kp, rate kp, lead time) within authority and noise, the stiffest first."""
-    stiffest = 0.5 * axis.headroom / required.attitude_error
+    stiffest = 0.5 * axis.headroom / REQUIREMENTS.attitude_error
     rates, leads = np.geomspace(2.0, 60.0, 35) / axis.gain, np.linspace(0.0, lag, 6)
     grid = itertools.product(np.geomspace(0.8, 8.0, 24), rates, leads)
-    stable = ((a, r, d) for a, r, d in grid if required.bandwidth_ratio * a <= r * axis.gain)
-    kept = [(a, r, d) for a, r, d in stable if a * r <= stiffest and d * r <= required.largest_derivative]
+    stable = ((a, r, d) for a, r, d in grid if REQUIREMENTS.bandwidth_ratio * a <= r * axis.gain)
+    kept = [(a, r, d) for a, r, d in stable if a * r <= stiffest and d * r <= REQUIREMENTS.largest_derivative]
     # Among the equally stiff the one with less lead, which is less noise.
     return sorted(((float(a), float(r), float(d)) for a, r, d in kept), key=lambda c: (-c[0] * c[1], c[2]))
 
 
-def worst_margins(gains: Gains, axis: Axis, required: Requirements = REQUIREMENTS) -> Margins:
+def worst_margins(gains: Gains, axis: Axis) -> Margins:
     """Smallest margins over the corners of lag and inertia, at the longest delay."""
-    corners = itertools.product(required.lags, required.inertias)
-    found = [margins(gains, axis.gain / inertia, lag, required.worst_delay) for lag, inertia in corners]
+    corners = itertools.product(REQUIREMENTS.lags, REQUIREMENTS.inertias)
+    found = [margins(gains, axis.gain / inertia, lag, REQUIREMENTS.worst_delay) for lag, inertia in corners]
     return Margins(*(min(column) for column in zip(*found, strict=True)))
 
 
-def nominal_and_worst(
-    gains: Gains, axis: Axis, lag: float, required: Requirements = REQUIREMENTS
-) -> tuple[Margins, Margins]:
+def nominal_and_worst(gains: Gains, axis: Axis, lag: float) -> tuple[Margins, Margins]:
     """(nominal, worst) margins."""
-    return margins(gains, axis.gain, lag, required.delay), worst_margins(gains, axis, required)
+    return margins(gains, axis.gain, lag, REQUIREMENTS.delay), worst_margins(gains, axis)
 
 
 def rounded(gains: Gains) -> Gains:

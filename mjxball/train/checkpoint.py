@@ -31,7 +31,7 @@ logging.getLogger("absl").setLevel(logging.CRITICAL)  # what is wrong with a che
 class Checkpoints:
     """The checkpoints of one run directory, numbered by environment steps."""
 
-    def __init__(self, run: Path, keep: int = KEEP):
+    def __init__(self, run: Path):
         # Of several processes each acts for itself: process 0 writes, all read.
         alone = ocp.options.MultiprocessingOptions(
             primary_host=jax.process_index(),
@@ -39,7 +39,7 @@ class Checkpoints:
             barrier_sync_key_prefix=str(jax.process_index()),
         )
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=keep, enable_async_checkpointing=True, multiprocessing_options=alone, create=False
+            max_to_keep=KEEP, enable_async_checkpointing=True, multiprocessing_options=alone, create=False
         )
         place = (run / CHECKPOINTS).absolute()
         place.mkdir(parents=True, exist_ok=True)

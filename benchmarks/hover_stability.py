@@ -53,7 +53,9 @@ class Hover:
         return bool(self.residual < SOUND and self.radius < 1 + NEUTRAL)
 
 
-def hovers(config: Config, law: Law, cases: Sequence[tuple[float, float, float]], delay: int = 0) -> list[Hover]:
+def linearised_hovers(
+    config: Config, law: Law, cases: Sequence[tuple[float, float, float]], delay: int = 0
+) -> list[Hover]:
     """The hover of every case: (CG offset [m], object mass [kg], believed mass [kg])."""
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
         start, step = closed_loop(config, law, delay)
@@ -82,7 +84,7 @@ def delay_margins(
     """For every case the control steps of delay up to which its hover stays stable; -1 if it never is."""
     margins = [-1] * len(cases)
     for delay in range(longest + 1):
-        for number, hover in enumerate(hovers(config, law, cases, delay)):
+        for number, hover in enumerate(linearised_hovers(config, law, cases, delay)):
             if hover.stable and margins[number] == delay - 1:
                 margins[number] = delay
         if max(margins) < delay:
