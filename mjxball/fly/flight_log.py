@@ -144,7 +144,7 @@ class Tail:
         except ValueError as error:
             self.damaged.append(f"line {self._lines} is damaged: {error}")
             return None
-        return self._known(record)
+        return self._checked(record)
 
     def _header(self, raw: dict[str, Any]) -> Record | None:
         if raw.get("kind") != "header":
@@ -159,19 +159,18 @@ class Tail:
             header = decode(raw)
         except ValueError as error:
             raise InputError(f"flight log {self.path} cannot be read: {error}") from None
-        assert header is not None
         self._begun = True
-        return self._known(header)
+        return self._checked(header)
 
-    def _known(self, record: Record | None) -> Record | None:
-        """`record` itself, unless its force curve is not known."""
-        if record is not None and record["kind"] in ("header", "thrust"):
-            curve = record.get("curve", CURVE_NAMES[0])
-            if curve not in CURVE_NAMES:
-                raise InputError(
-                    f"flight log {self.path} is of a firmware with the force curve {curve[:20]!r}, which is not known; "
-                    f"this mjxball knows {' and '.join(CURVE_NAMES)}"
-                )
+    def _checked(self, record: Record | None) -> Record | None:
+        """`record` itself. Raises InputError if it names a force curve that is not known."""
+        named = record if record is not None and record["kind"] in ("header", "thrust") else {}
+        curve = named.get("curve", CURVE_NAMES[0])
+        if curve not in CURVE_NAMES:
+            raise InputError(
+                f"flight log {self.path} is of a firmware with the force curve {curve[:20]!r}, which is not known; "
+                f"this mjxball knows {' and '.join(CURVE_NAMES)}"
+            )
         return record
 
 

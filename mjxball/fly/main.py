@@ -27,7 +27,7 @@ from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.process import Child
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.telemetry import Rig
-from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, asked_of_twin, check_twin, read_fault
+from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
@@ -149,11 +149,9 @@ def check_options(options: argparse.Namespace) -> None:
 
 def check_twin_options(options: argparse.Namespace) -> None:
     """Raise InputError for options of a rehearsal that are unsound."""
-    asked = [name for name in (*WORSE, "fault") if getattr(options, name)]
-    if asked and not options.rehearse:
-        raise InputError(f"--{asked[0]} is for --rehearse only")
-    if asked_of_twin(options) and not options.rehearse:
-        raise InputError(f"{asked_of_twin(options)[0]} is for --rehearse only")
+    given = [*(f"--{name}" for name in (*WORSE, "fault") if getattr(options, name)), *given_twin_options(options)]
+    if given and not options.rehearse:
+        raise InputError(f"{given[0]} is for --rehearse only")
     check_twin(options)
     for fault in options.fault:
         read_fault(fault)
@@ -162,7 +160,7 @@ def check_twin_options(options: argparse.Namespace) -> None:
 def twin_options(options: argparse.Namespace) -> list[str]:
     """The twin's options: link, faults, drones, surroundings."""
     worse = [f"--{name}={getattr(options, name)}" for name in WORSE if getattr(options, name) is not None]
-    return [*worse, *(f"--fault={fault}" for fault in options.fault), *asked_of_twin(options)]
+    return [*worse, *(f"--fault={fault}" for fault in options.fault), *given_twin_options(options)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -87,7 +87,7 @@ ZERO = Setpoint(0.0, 0.0, 0.0, 0)
 def setpoint(roll: float, pitch: float, yaw_rate: float, thrust: float) -> Setpoint:
     """Setpoint for Z-X-Y `roll`, `pitch` [rad] and `yaw_rate` about +z [rad/s]; `thrust` is rounded to units.
 
-    Raises PacketError for a number that is not finite or a thrust beyond 16 bits: such a one is never packed.
+    Raises PacketError for a number that is not finite or a thrust beyond 16 bits.
     """
     if not all(map(math.isfinite, (roll, pitch, yaw_rate, thrust))):
         raise PacketError("a command is not finite")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -71,7 +70,6 @@ DELIVERED = DroneKind()
 QUIET = Surroundings()
 
 
-FLAGS = ("drone", "curve", "noise", "pose_hz", "deck", "delay", "gains", "seed")
 # Numbers with least and most.
 RANGES = {"noise": (0.0, 100.0), "pose_hz": (1.0, 1000.0), "delay": (0.0, 0.5)}
 
@@ -103,24 +101,21 @@ def check_twin(options: argparse.Namespace) -> None:
         raise InputError(f"--twin-seed must not be negative, not {options.twin_seed}")
 
 
-def asked_of_twin(options: argparse.Namespace) -> list[str]:
+def given_twin_options(options: argparse.Namespace) -> list[str]:
     """The flags that were given, as the twin's process takes them."""
     flags = []
-    for name in FLAGS:
-        value = getattr(options, f"twin_{name}")
-        if value is not None:
+    for name, value in vars(options).items():
+        if name.startswith("twin_") and value is not None:
             values = value if isinstance(value, list) else [value]
-            flags += [f"--twin-{name.replace('_', '-')}", *map(str, values)]
+            flags += [f"--{name.replace('_', '-')}", *map(str, values)]
     return flags
 
 
 def surroundings(options: argparse.Namespace) -> Surroundings:
     """The `Surroundings` of `options`. Raises InputError."""
     check_twin(options)
-    given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed")}
-    given = {name: value for name, value in given.items() if value is not None and math.isfinite(value)}
-    if options.twin_gains is not None:
-        given["gains"] = tuple(options.twin_gains)
+    given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed", "gains")}
+    given = {name: tuple(one) if name == "gains" else one for name, one in given.items() if one is not None}
     return Surroundings(deck=options.twin_deck != "no", **given)
 
 
