@@ -211,7 +211,7 @@ def both(kind: str) -> Injection:
 
 def link(**faults: float) -> Injection:
     """A fault of one drone's link."""
-    return lambda world, drone: world.disturb(drone, **faults)
+    return lambda world, drone: world.fault_link(drone, **faults)
 
 
 def gap(seconds: float) -> Injection:
@@ -219,9 +219,9 @@ def gap(seconds: float) -> Injection:
 
     def inject(world: World, drone: int) -> None:
         for number in range(2):
-            world.disturb(number, silent_down=True)
+            world.fault_link(number, silent_down=True)
         world.flight.note("gap", world.now)
-        world.later = (world.now + seconds, lambda: [world.disturb(n, silent_down=False) for n in range(2)])  # type: ignore[attr-defined]
+        world.later = (world.now + seconds, lambda: [world.fault_link(n, silent_down=False) for n in range(2)])  # type: ignore[attr-defined]
 
     return inject
 

@@ -15,40 +15,40 @@ from mjxball.fly.supervisor import Event, State
 
 
 def silence_down(world: World, number: int) -> None:
-    world.disturb(number, silent_down=True)
+    world.fault_link(number, silent_down=True)
 
 
 def silence_up(world: World, number: int) -> None:
-    world.disturb(number, silent_up=True)
+    world.fault_link(number, silent_up=True)
 
 
 def silence(world: World, number: int) -> None:
-    world.disturb(number, silent_up=True, silent_down=True)
+    world.fault_link(number, silent_up=True, silent_down=True)
 
 
 def frozen(world: World, number: int) -> None:
-    world.spoil(number, frozen=True)
+    world.fault_drone(number, frozen=True)
 
 
 def clock(world: World, number: int) -> None:
-    world.spoil(number, clock_stopped=True)
+    world.fault_drone(number, clock_stopped=True)
 
 
 def slow(world: World, number: int) -> None:
-    world.disturb(number, delay=0.25)
+    world.fault_link(number, delay=0.25)
 
 
 def jump(world: World, number: int) -> None:
-    world.spoil(number, offset=(0.0, 0.0, 0.4))
+    world.fault_drone(number, offset=(0.0, 0.0, 0.4))
 
 
 def away(world: World, number: int) -> None:
     for drone in range(2):
-        world.spoil(drone, offset=(3.0, 0.0, 0.0))
+        world.fault_drone(drone, offset=(3.0, 0.0, 0.0))
 
 
 def empty(world: World, number: int) -> None:
-    world.spoil(number, battery=-1.2)
+    world.fault_drone(number, battery=-1.2)
 
 
 def crash(world: World, number: int) -> None:
@@ -140,7 +140,7 @@ def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
     world.fly_for(2.5)
     fault(world, number)
     if fault is silence_up:
-        world.disturb(number, silent_up=True, silent_down=True)
+        world.fault_link(number, silent_up=True, silent_down=True)
     began = world.now
     world.fly_until(State.STOP)
     # The firmware of the lost drone stops it 2 s after its last setpoint; the other must not have stopped long before.
@@ -188,10 +188,10 @@ def test_a_gap_in_the_states_is_flown_through(seconds: float) -> None:
     world.fly_until(State.FLY)
     world.fly_for(2.0)
     for number in range(2):
-        world.disturb(number, silent_down=True)
+        world.fault_link(number, silent_down=True)
     world.fly_for(seconds)
     for number in range(2):
-        world.disturb(number, silent_down=False)
+        world.fault_link(number, silent_down=False)
     world.fly_until(State.DONE)
     assert world.log.transitions() == ["arm", "spin", "ramp", "fly", "hold", "fly", "land", "stop", "done"]
     assert world.flight.supervisor.cause is None
@@ -207,7 +207,7 @@ def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
     world.fly_until(state)
     world.fly_for(0.5)
     for number in range(2):
-        world.disturb(number, loss=0.95)
+        world.fault_link(number, loss=0.95)
     world.fly_for(15.0)
     assert world.flight.supervisor.state is State.DONE
     world.advance(2.5)
@@ -221,7 +221,7 @@ def test_states_that_break_off_again_and_again_end_the_flight() -> None:
         world.fly_for(0.5)
         silence_down(world, 1)
         world.fly_for(0.15)
-        world.disturb(1, silent_down=False)
+        world.fault_link(1, silent_down=False)
     world.fly_until(State.LAND)
     world.fly_until(State.DONE)
     assert world.flight.supervisor.cause.event is Event.GAPS

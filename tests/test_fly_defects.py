@@ -162,7 +162,7 @@ def test_a_gap_in_the_states_costs_nothing() -> None:
     before = world.state.position.mean(axis=0)
     for silent in (True, False):
         for number in range(2):
-            world.disturb(number, silent_down=silent)
+            world.fault_link(number, silent_down=silent)
         world.fly_for(0.13)
     assert world.flight.supervisor.state is State.FLY
     world.fly_for(1.0)

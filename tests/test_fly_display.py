@@ -27,7 +27,7 @@ LIMITS = Limits()
 
 def view(state: State = State.FLY, cause: Fault | None = None, battery: float = 4.0, age: float = 0.01) -> View:
     drone = DroneState(np.array([0.1, -0.2, 0.3]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3), 0, battery)
-    return View(1.0, Supervisor(state, 0.0, cause), [drone] * 2, [age] * 2, np.zeros(3), (ZERO, ZERO), 0.0, 0)
+    return View(1.0, Supervisor(state, 0.0, cause), [drone] * 2, [age] * 2, (ZERO, ZERO), 0.0, 0)
 
 
 def test_a_good_flight_has_no_red() -> None:

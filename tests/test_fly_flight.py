@@ -132,7 +132,7 @@ def test_an_abort_during_the_ramp_does_not_jump_to_hover() -> None:
     world.fly_until(State.RAMP)
     world.fly_for(0.3)
     highest = max(thrust for _, thrust in thrusts(world, 0))
-    world.disturb(1, silent_down=True)
+    world.fault_link(1, silent_down=True)
     world.fly_until(State.DONE)
     # The abort holds a running average of the ramp, and the ramp goes on for the 100 ms that it takes to see the fault.
     assert max(thrust for _, thrust in thrusts(world, 0)) < highest + 6000

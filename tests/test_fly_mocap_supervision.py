@@ -18,10 +18,10 @@ from mjxball.fly.mocap_supervision import (
     Pose,
     Track,
     Tracks,
-    clean,
     faults,
     follow,
     pair_fault,
+    pose_of,
     standing_fault,
 )
 from mjxball.fly.packets import PacketError
@@ -172,7 +172,7 @@ NUMBERS = st.floats(allow_nan=True, allow_infinity=True, width=32)
 
 @given(st.lists(NUMBERS, min_size=7, max_size=7))
 def test_what_is_cleaned_can_be_sent_and_nothing_else_is(numbers: list[float]) -> None:
-    pose = clean(0.0, numbers)
+    pose = pose_of(0.0, numbers)
     if pose is None:
         return
     position, quaternion = unpack_pose(packets.pose_packet(pose.position, pose.quaternion).data)
@@ -183,12 +183,12 @@ def test_what_is_cleaned_can_be_sent_and_nothing_else_is(numbers: list[float]) -
 
 def test_poses_that_are_none() -> None:
     good = [0.1, 0.2, 0.3, -0.5, 0.5, -0.5, 0.5]
-    pose = clean(1.0, good)
+    pose = pose_of(1.0, good)
     assert pose == Pose(1.0, (0.1, 0.2, 0.3), (0.5, -0.5, 0.5, -0.5))  # the same attitude with w positive
-    assert clean(1.0, [*good[:3], *(1.01 * part for part in good[3:])]) is not None  # rounding of some systems
+    assert pose_of(1.0, [*good[:3], *(1.01 * part for part in good[3:])]) is not None  # rounding of some systems
     bad = [[0, 0, 0, 0, 0, 0, 0], good[:6], [math.nan, *good[1:]], [*good[:6], math.inf], [0, 0, 101, 1, 0, 0, 0]]
     for numbers in (*bad, [*good[:3], 0.9, 0, 0, 0]):
-        assert clean(1.0, numbers) is None
+        assert pose_of(1.0, numbers) is None
 
 
 def test_the_packet_is_the_firmwares() -> None:

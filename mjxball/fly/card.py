@@ -98,9 +98,8 @@ def variants(config: Config, choice: ThrustChoice = ThrustChoice(), more: PairGa
     `choice.curve` leaves one; `more` gains are laid over the card's, whichever the curve.
     """
     known = motors.firmware(config)
-    names = [name for name in CURVE_NAMES if name in (known["curve"], *known["converts"], choice.curve)]
-    if choice.curve is not None:
-        names = [choice.curve]
+    possible = (known["curve"], *known["converts"]) if choice.curve is None else (choice.curve,)
+    names = [name for name in CURVE_NAMES if name in possible]
     found: list[dict[CurveName, Variant]] = [{}, {}]
     for name in names:
         own = with_curve(config, name)

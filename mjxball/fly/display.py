@@ -33,7 +33,6 @@ class View(NamedTuple):
     supervisor: Supervisor
     states: list[DroneState]
     ages: list[float]
-    goal: np.ndarray
     wanted: tuple[Setpoint, Setpoint]
     late: float  # [s]
     missed: int

@@ -292,5 +292,5 @@ class Flight:
         goal, state = self.goal(self._now), self.supervisor.state
         laws = self._commands._asdict() if self._commands is not None and state in GUIDED else {}
         self.note("tick", self._now, state=state.value, goal=goal, sent=sent, ages=self._ages, late=late, **laws)
-        shown = self._states, self._ages, goal, (sent[0], sent[1]), late, missed
+        shown = self._states, self._ages, (sent[0], sent[1]), late, missed
         self.view = View(self._now - self._start, self.supervisor, *shown)

@@ -31,7 +31,7 @@ from mjxball.fly import mocap_supervision as supervision
 from mjxball.fly import packets
 from mjxball.fly.limits import NAMES, Check
 from mjxball.fly.link import Link
-from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose, Track, Tracks, clean
+from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose, Track, Tracks, pose_of
 from mjxball.fly.process import wait_until
 from mjxball.fly.supervisor import Fault
 from mjxball.fly.telemetry import Note
@@ -120,7 +120,7 @@ class Source:
             self.names = what.get("names", self.names)
             self.failure = what.get("error", self.failure)
             return
-        poses = [None if one is None else clean(one[0], one[1:]) for one in what]
+        poses = [None if one is None else pose_of(one[0], one[1:]) for one in what]
         self._take((poses[0], poses[1]))
 
 

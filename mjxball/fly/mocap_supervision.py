@@ -71,7 +71,7 @@ Tracks = tuple[Track, Track]
 Places = Sequence[Sequence[float] | None]  # where each drone's own estimator has it [m], None: unknown
 
 
-def clean(time: float, numbers: Sequence[float], limits: MocapLimits = MocapLimits()) -> Pose | None:
+def pose_of(time: float, numbers: Sequence[float], limits: MocapLimits = MocapLimits()) -> Pose | None:
     """A pose of x, y, z, qw, qx, qy, qz with its quaternion at unit length; None if they cannot be one."""
     if len(numbers) != 7 or not all(map(math.isfinite, numbers)):
         return None

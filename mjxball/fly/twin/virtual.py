@@ -290,10 +290,10 @@ class World:
 
     # Faults.
 
-    def spoil(self, number: int, **faults: Any) -> None:
+    def fault_drone(self, number: int, **faults: Any) -> None:
         """Switch `DroneFaults` of one drone on."""
         self.drones[number].faults = dataclasses.replace(self.drones[number].faults, **faults)
 
-    def disturb(self, number: int, **faults: Any) -> None:
+    def fault_link(self, number: int, **faults: Any) -> None:
         """Switch `LinkFaults` of one drone on."""
         self.drones[number].link = dataclasses.replace(self.drones[number].link, **faults)
