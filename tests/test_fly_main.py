@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment, run
+from conftest import too_busy
 from tables import rows
 
 from mjxball.fly import flight_log
@@ -172,7 +173,7 @@ def flown(flight: Ended) -> Ended:
     events = {event.split(":")[0] for record in flight.records for event in record.get("events", [])}
     if events & {"DEADLINES", "STALE", "REFUSED"}:
         assert flight.code == 1
-        pytest.skip(f"the machine was too busy: {sorted(events)}")
+        too_busy(f"{sorted(events)}")
     return flight
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment
+from conftest import too_busy
 from fly_virtual import World
 from vrpn_server import Poses, VrpnServer
 from wire import unpack_pose
@@ -409,7 +410,7 @@ class Flown:
         failed = {one["name"] for one in self.records if one["kind"] == "check" and not one["passed"]}
         late = failed and all(name.endswith(("states", "state age")) for name in failed)
         if events & {"DEADLINES", "STALE"} or late:
-            pytest.skip(f"the machine was too busy: {sorted(events | failed)}")
+            too_busy(f"{sorted(events | failed)}")
 
     def _hear(self, twin: Twin, number: int, onward: Callable[..., None], datagram: bytes, now: float) -> None:
         if datagram[:1] and datagram[0] >> 4 == packets.POSE_PORT:

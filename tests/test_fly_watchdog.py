@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, environment
+from conftest import too_busy
 from tables import rows
 
 from mjxball.fly import flight_log, packets, watchdog
@@ -128,7 +129,7 @@ def test_a_runner_lost_in_the_air_is_brought_down(number: signal.Signals, tmp_pa
         if twin is not None:
             break
     else:
-        pytest.skip("the machine was too busy: the runner's own checks ended every flight on the ground")
+        too_busy("the runner's own checks ended every flight on the ground")
     assert twin.failure is None
     assert twin.truth.thrust == (0, 0)
     # Not by the firmware's own watchdog, which locks a drone that hears nothing for 2 s.
