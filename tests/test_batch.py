@@ -30,7 +30,10 @@ SCENARIOS = [
 
 @pytest.mark.parametrize(
     "name",
-    ["copy", "transport", *(pytest.param(name, marks=pytest.mark.slow) for name in ("adaptive-mass", "lqg", "oracle"))],
+    [
+        "copy",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("transport", "adaptive-mass", "lqg", "oracle")),
+    ],
 )
 def test_batch_equals_recorded_flights(name: str) -> None:
     transport = next(path for path in shipped_policies() if path.stem == "transport")

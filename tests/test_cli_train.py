@@ -85,6 +85,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here / "run"
 
 
+@pytest.mark.slow
 def test_run_writes_every_file(finished: Path) -> None:
     names = {path.name for path in finished.iterdir()}
     assert names == {"config.json", "metrics.csv", "tensorboard", "checkpoints", "policy.npz", "eval"}
@@ -93,6 +94,7 @@ def test_run_writes_every_file(finished: Path) -> None:
     assert (finished / "eval" / "training.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_run_records_what_made_it(finished: Path) -> None:
     record = json.loads((finished / "config.json").read_text())
     config = configs.validate(configs.from_dict(record["config"]))
@@ -106,6 +108,7 @@ def test_run_records_what_made_it(finished: Path) -> None:
     assert card["preset"] == "transport"
 
 
+@pytest.mark.slow
 def test_run_logs_metrics_in_order(finished: Path) -> None:
     rows = rows_of(finished)
     steps = [int(row["steps"]) for row in rows]
@@ -119,10 +122,12 @@ def test_run_logs_metrics_in_order(finished: Path) -> None:
     assert rows[-1]["eval_return"]
 
 
+@pytest.mark.slow
 def test_run_policy_flies(finished: Path) -> None:
     assert np.isfinite(command_of(finished / "policy.npz")).all()
 
 
+@pytest.mark.slow
 def test_export_of_the_run_is_its_policy(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "exported.npz"
     before = listing(finished)

@@ -161,6 +161,7 @@ class TestPair:
             assert np.abs(np.asarray(theirs) - ours).max() < 2e-5 * scale, name
 
 
+@pytest.mark.slow
 def test_the_flight_policy_goes_where_waypoints_lead() -> None:
     corners = ((0.4, 0.0, 0.4), (0.4, 0.4, 0.4))
     path = ((12.0, corners[1]), (24.0, (0.0, 0.0, 0.0)))

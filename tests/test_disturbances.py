@@ -92,6 +92,7 @@ def test_scenarios_are_the_same_alone_and_in_a_batch() -> None:
     np.testing.assert_allclose(batch.position, alone.position, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_engines_agree_on_a_gusty_flight() -> None:
     scenario = Scenario(seconds=4, disturbance=Disturbance(gust=0.5, seed=1), start_tilt=(0.1, 0.1))
     flights = [simulate(CONFIG, copying(CONFIG), scenario, engine) for engine in ("newton-euler", "mjx", "mujoco")]

@@ -33,6 +33,7 @@ def world_of(preset: str, seconds: float) -> World:
     return World(settings, contents=contents, physics=make_pair(contents.card))
 
 
+@pytest.mark.slow
 def test_a_free_flight_rises_stays_and_lands() -> None:
     world = world_of("flight", 5.0)
     world.fly_until(State.FLY)

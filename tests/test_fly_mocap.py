@@ -106,7 +106,11 @@ REFUSALS = [
 
 
 @pytest.mark.parametrize(
-    ("flags", "reason"), REFUSALS, ids=[f"{n} {reason[:30]}" for n, (_, reason) in enumerate(REFUSALS)]
+    ("flags", "reason"),
+    [  # whoever waits for an answer belongs to the second tier
+        pytest.param(*row, id=f"{n} {row[1][:30]}", marks=pytest.mark.slow if row[1].endswith(" 5 s") else ())
+        for n, row in enumerate(REFUSALS)
+    ],
 )
 def test_refusals(flags: list[str], reason: str, deaf: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     uris, sockets = deaf

@@ -164,7 +164,7 @@ def assert_same_info(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
             np.testing.assert_allclose(value, theirs.get(name, np.zeros(3)), rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+@pytest.mark.parametrize("mode", ["NextStep", pytest.param("SameStep", marks=pytest.mark.slow)])
 def test_the_vector_is_gymnasiums_own_vector_of_single_worlds(short: Config, mode: str):
     """Three episodes of 8 steps: seeds, autoreset, endings and info as in `SyncVectorEnv`."""
     ours = FollowerVectorEnv(3, config=short, physics="newton-euler", autoreset_mode=mode)
@@ -253,6 +253,7 @@ def playground_wrapped(env: PlaygroundEnv, length: int) -> Any:
     return wrapper.wrap_for_brax_training(env, episode_length=length)
 
 
+@pytest.mark.slow
 def test_playgrounds_wrappers_take_the_adapter():
     env = PlaygroundEnv("transport", physics="newton-euler")
     assert (env.dt, env.sim_dt, env.n_substeps, env.action_size) == (0.02, 0.005, 4, 3)

@@ -89,6 +89,7 @@ def test_failures_are_never_averaged_away() -> None:
     assert math.isnan(bootstrap(np.array([math.nan])).median)
 
 
+@pytest.mark.slow
 def test_scores_hold_every_seed_and_one_flight(scores) -> None:
     assert len(scores) == (3 + 3) * 3
     for score in scores:
@@ -99,6 +100,7 @@ def test_scores_hold_every_seed_and_one_flight(scores) -> None:
     assert len(set(delays)) == 3  # the variants really differ
 
 
+@pytest.mark.slow
 def test_oracle_is_left_out_of_the_wins(scores) -> None:
     won = wins(scores)
     assert "oracle" not in won
@@ -111,6 +113,7 @@ def with_peaks(score: Score, name: str, peak: float) -> Score:
     return dataclasses.replace(score, follower=name, metrics=metrics)
 
 
+@pytest.mark.slow
 def test_verdict_counts_wins_and_compares_peaks(scores) -> None:
     """`mine` has the largest peak of all, then the smallest."""
     for peak, won, duel in ((5.0, "0", "0 : 6"), (1e-6, "6", "6 : 0")):

@@ -31,7 +31,7 @@ class TestConversion:
         assert other.autopilot.roll_rate[0] < 0.7 * config.autopilot.roll_rate[0]  # its curve is 1.63 times as steep
         for axis in (0, 1):
             mine, theirs = drone_loop(config, axis), drone_loop(other, axis)
-            for part in ("kp", "kd", "kdd", "slow"):
+            for part in ("kp", "kd", "kdd", "integral_gain"):
                 assert getattr(theirs, part) == pytest.approx(getattr(mine, part), rel=1e-6)
         back = with_curve(other, NEWER)
         for axis in ("roll_rate", "pitch_rate", "yaw_rate"):
@@ -124,6 +124,7 @@ class TestBattery:
 
 
 class TestDrawnWorlds:
+    @pytest.mark.slow
     def test_every_world_can_be_flown(self) -> None:
         config = preset("flight")
         env = CoupledPairEnv(config, "newton-euler")
@@ -149,6 +150,7 @@ class TestDrawnWorlds:
             command = resets.flyable(jnp.array(0.0175), jnp.array([4.0]), jnp.array([0.0]), scale)
             assert bool(command[0]) is fine
 
+    @pytest.mark.slow
     def test_other_presets_draw_no_battery(self) -> None:
         env = CoupledPairEnv(preset("robust"), "newton-euler")
         load = env.reset(jax.random.PRNGKey(0)).pipeline_state.load

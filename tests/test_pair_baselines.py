@@ -138,11 +138,13 @@ def sway() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(("name", "most"), [("adaptive", 0.2), ("oracle", 0.15), ("lqg", 0.03)])
+@pytest.mark.slow
 def test_flight_sways_less_than_copying(sway, name: str, most: float) -> None:
     assert (sway["copy"] > 0.4).all()
     assert (sway[name] < most).all()
 
 
+@pytest.mark.slow
 def test_lqg_brings_the_ball_back_on_the_stand() -> None:
     """Copying, the ball lies at its stop, 80 mm away."""
     start = Scenario(

@@ -84,6 +84,7 @@ def test_every_world_draws_its_own_within_the_ranges(transport: Config) -> None:
     assert set(np.asarray(drawn.delay)) == {0, 1, 2}
 
 
+@pytest.mark.slow
 def test_rotors_of_a_world_are_those_of_a_plant_with_such_rotors(transport: Config) -> None:
     pair = compile_env(transport, "newton-euler")
     world = pair.reset(jax.random.key(3)).pipeline_state
@@ -164,6 +165,7 @@ def test_a_gust_pushes(disturbed: CompiledEnv) -> None:
     assert float(moved[0] - kept[0]) == pytest.approx(0.02 * 5.0 / mass, rel=0.05)
 
 
+@pytest.mark.slow
 def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> None:
     config = with_settings(transport, scenario={"cg_random_visits": 0.5, "cg_amplitude": (0.05, 0.1)})
     env = CoupledPairEnv(config, "newton-euler")

@@ -122,6 +122,7 @@ class TestResponse:
         assert designed[:, nominal].max() < 1.02 * 8
         assert np.abs(designed[-250:] - 8).max() < 0.8
 
+    @pytest.mark.slow
     def test_better_than_before_in_every_corner(self) -> None:
         """Against the gains by hand that the presets had first: overshoot and the deflection by the ball's moment."""
         moment = (0.5 * 0.0075 * 9.81 * 0.08, 0.0, 0.0)
@@ -134,6 +135,7 @@ class TestResponse:
 
 
 class TestCommand:
+    @pytest.mark.slow
     def test_writes_what_the_runner_reads(self, tmp_path: Path, designs, capsys) -> None:
         out, picture = tmp_path / "gains.json", tmp_path / "gains.svg"
         assert command.main(["--out", str(out), "--picture", str(picture)]) == 0

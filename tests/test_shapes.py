@@ -13,7 +13,10 @@ from collections.abc import Callable
 from typing import Any
 
 import jaxtyping
+import pytest
 from command_line import REPOSITORY, run
+
+pytestmark = pytest.mark.slow
 
 CHECKED = ("physics", "sim", "algorithms", "env", "rewards", "train.program", "evaluate.batch")
 

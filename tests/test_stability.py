@@ -24,6 +24,7 @@ def paper() -> Config:
     return preset("paper")
 
 
+@pytest.mark.slow
 def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: Config) -> None:
     """x = (g / kp) m c g / (2 Kp_theta); slowest mode s^2 + kd s + kp, a little faster for the attitude loop's lag.
 

@@ -17,14 +17,14 @@ from mjxball.sim.rollout import Trajectory, load_of, simulate, simulate_batch, s
 from mjxball.sim.scenario import Scenario
 
 CASES = {
-    "sine": (paper_with(), Scenario(omega=1.0, seconds=8)),
-    "waveform": (paper_with(motion=SAMPLES), Scenario(seconds=8)),
-    "rolling": (paper_with(motion=ROLLING), Scenario(seconds=8, ball_start=0.03, goal=(0.3, 0.2, 0.1))),
-    "mass": (paper_with(), Scenario(seconds=8, mass_changes=((2.0, 0.2), (5.0, -0.3)), goal=(0.2, 0.2, 0.2))),
-    "light_ball": (paper_with(LIGHT_BALL), Scenario(seconds=8, amplitude=0.08)),
-    "varied": (paper_with(VARIED), Scenario(seconds=8, amplitude=0.08, mass=0.35)),
-    "pivot": (paper_with(PIVOT, ROLLING), Scenario(seconds=5, goal=(0, 0, 0), ball_start=0.01)),
-    "heave": (paper_with(HEAVE), Scenario(seconds=8, goal=(0, 0, 0.2))),
+    "sine": (paper_with(), Scenario(omega=1.0, seconds=4)),
+    "waveform": (paper_with(motion=SAMPLES), Scenario(seconds=4)),
+    "rolling": (paper_with(motion=ROLLING), Scenario(seconds=4, ball_start=0.03, goal=(0.3, 0.2, 0.1))),
+    "mass": (paper_with(), Scenario(seconds=4, mass_changes=((1.0, 0.2), (2.5, -0.3)), goal=(0.2, 0.2, 0.2))),
+    "light_ball": (paper_with(LIGHT_BALL), Scenario(seconds=4, amplitude=0.08)),
+    "varied": (paper_with(VARIED), Scenario(seconds=4, amplitude=0.08, mass=0.35)),
+    "pivot": (paper_with(PIVOT, ROLLING), Scenario(seconds=3, goal=(0, 0, 0), ball_start=0.01)),
+    "heave": (paper_with(HEAVE), Scenario(seconds=4, goal=(0, 0, 0.2))),
 }
 
 
