@@ -1,0 +1,152 @@
+"""First-order gradients of the return through a differentiable environment, window by window of its episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from mjxball.algorithms.base import Environments, Phase, Policy, Schedule
+from mjxball.config import Config, Gradient
+from mjxball.errors import InputError
+
+Array = Any
+ADAM = optax.scale_by_adam()
+LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
+
+
+class GradientState(NamedTuple):
+    """What the algorithm knows."""
+
+    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}
+    adam: Any
+    slope: Any  # gradient of the last window's loss, a pytree like `layers`
+    loss: Array  # () minus the mean reward of the last window
+    mean: Array  # (n,) of the observations in the flights with random actions
+    square: Array  # (n,) mean of their squares
+    seen: Array  # () windows that `mean` and `square` are of
+
+
+class FirstOrderGradient:
+    """Backpropagation through windows of `gradient.horizon` steps of all environments, then one step of Adam.
+
+    `collect` flies a window and differentiates its mean reward with respect to the policy's weights; `update` takes
+    the step. `gradient.damping` multiplies the gradient that passes from one control step to the one before.
+    """
+
+    metrics = ("loss", "gradient_norm")
+    collect_keys = 1
+    update_keys = 0
+
+    def __init__(self, config: Config, environments: Environments):
+        own = config.gradient
+        self._config, self._environments, self._shards = own, environments, environments.shards
+        self.steps_per_collect = own.horizon
+        window = own.num_envs * own.horizon
+        self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations, 0.0)
+        self._sizes = (environments.observation_size, *own.policy_layers, 2 * environments.action_size)
+        self._mask = jnp.asarray(environments.policy_mask, jnp.float32)
+
+    def init(self, key: Array) -> GradientState:
+        """Weights as Flax draws them (LeCun's), zeros in the last layer: the first policy adds nothing."""
+        layers = {}
+        pairs = list(zip(self._sizes[:-1], self._sizes[1:], strict=True))
+        for number, (rows, columns) in enumerate(pairs):
+            key, own = jax.random.split(key)
+            kernel = jax.nn.initializers.lecun_uniform()(own, (rows, columns))
+            last = number == len(pairs) - 1
+            layers[f"hidden_{number}"] = {"kernel": kernel * (0.01 if last else 1.0), "bias": jnp.zeros(columns)}
+        zero, none = jnp.zeros(()), jnp.zeros(self._sizes[0])
+        slope = jax.tree.map(jnp.zeros_like, layers)
+        return GradientState(layers, ADAM.init(layers), slope, zero, none, none, zero)
+
+    def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
+        """One window of all environments, its gradient, and in the first one the observations' statistics."""
+        (key,) = keys
+        reset_key, action_key = jax.random.split(key)
+        resets = jax.random.split(reset_key, self._config.horizon)
+        shape = (self._config.horizon, self._environments.count, self._environments.action_size)
+        random = jax.random.uniform(self._shards.own(action_key), shape, minval=-1.0, maxval=1.0)
+        (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(
+            state.layers, state, envs, resets, random, phase
+        )
+        slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
+        first = phase.random & phase.recording
+        weight = 1.0 / (state.seen + 1.0)
+        known = state._replace(
+            slope=slope,
+            loss=loss,
+            mean=jnp.where(first, state.mean + weight * (mean - state.mean), state.mean),
+            square=jnp.where(first, state.square + weight * (square - state.square), state.square),
+            seen=state.seen + first,
+        )
+        return known, envs
+
+    def _window(self, layers: Any, state: GradientState, envs: Any, resets: Array, random: Array, phase: Phase) -> Any:
+        policy = self.policy(state._replace(layers=layers))
+        damped = self._config.damping
+
+        def step(envs: Any, drawn: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array]]:
+            key, noise = drawn
+            envs = envs._replace(states=_damp(envs.states, damped)) if damped < 1 else envs
+            seen = envs.states.obs
+            action = jnp.where(phase.random, noise, policy(seen))
+            envs, after = self._environments.step(envs, action, key)
+            return envs, (after.reward, seen)
+
+        envs, (rewards, seen) = jax.lax.scan(step, envs, (resets, random))
+        seen = jax.lax.stop_gradient(seen)
+        return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
+
+    def update(
+        self, state: GradientState, keys: Sequence[Array], progress: Array, phase: Phase
+    ) -> tuple[GradientState, dict[str, Array]]:
+        """One step of Adam along the window's gradient; its rate falls by a cosine."""
+        own = self._config
+        norm = optax.global_norm(state.slope)
+        # A window that diverged has no gradient.
+        sound = jnp.isfinite(norm) & phase.learning
+        slope = jax.tree.map(
+            lambda one: jnp.where(sound, one * jnp.minimum(1.0, own.max_grad_norm / (norm + 1e-9)), 0.0), state.slope
+        )
+        fall = own.learning_rate_end + (1.0 - own.learning_rate_end) * 0.5 * (1.0 + jnp.cos(jnp.pi * progress))
+        direction, adam = ADAM.update(slope, state.adam)
+        rate = own.learning_rate * fall
+        moved = state._replace(
+            layers=jax.tree.map(lambda value, along: value - rate * along, state.layers, direction), adam=adam
+        )
+        moved = jax.tree.map(lambda new, old: jnp.where(sound, new, old), moved, state)
+        return moved, dict(zip(self.metrics, (state.loss, norm), strict=True))
+
+    def policy(self, state: GradientState) -> Policy:
+        """The policy as it is."""
+        variance = state.square - state.mean**2
+        deviation = jnp.where(state.seen > 0, jnp.sqrt(jnp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
+        return Policy(state.layers, state.mean, deviation, self._mask)
+
+    def partition(self, whole: Any, split: Any) -> Any:
+        """Everything that is known is whole."""
+        return whole
+
+    def check_parts(self, parts: int) -> None:
+        """Raise InputError unless the environments can be cut into `parts`."""
+        if self._config.num_envs % parts:
+            raise InputError(
+                f"gradient.num_envs = {self._config.num_envs} cannot be split over {parts} devices evenly; "
+                "make it a multiple"
+            )
+
+
+def _damp(tree: Any, factor: float) -> Any:
+    """`tree` as it is; a gradient that passes through its floats is multiplied by `factor`."""
+
+    def one(leaf: Array) -> Array:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            return leaf
+        return factor * leaf + (1.0 - factor) * jax.lax.stop_gradient(leaf)
+
+    return jax.tree.map(one, tree)
