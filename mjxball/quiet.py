@@ -72,3 +72,16 @@ def import_brax_training() -> BraxTraining:
     )
     with _silence():
         return BraxTraining(*map(importlib.import_module, names))
+
+
+class BraxPpo(NamedTuple):
+    """The parts of Brax's PPO that work on current JAX."""
+
+    losses: ModuleType
+    networks: ModuleType
+
+
+def import_brax_ppo() -> BraxPpo:
+    """Return Brax's PPO losses and networks, imported silently."""
+    with _silence():
+        return BraxPpo(*(importlib.import_module(f"brax.training.agents.ppo.{name}") for name in BraxPpo._fields))

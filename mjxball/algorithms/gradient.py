@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 
 from mjxball.algorithms.base import Environments, Phase, Policy, Schedule
-from mjxball.config import Config, Gradient
+from mjxball.config import Config
 from mjxball.errors import InputError
 
 Array = Any

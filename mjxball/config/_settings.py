@@ -280,6 +280,31 @@ class Sac:
 
 
 @dataclass(frozen=True)
+class Ppo:
+    """Proximal policy optimisation, with `train.py --algorithm ppo`."""
+
+    total_steps: int = setting(4_000_000, "environment steps in all", low=1)
+    num_envs: int = setting(512, "environments that are stepped at once", low=1)
+    unroll_length: int = setting(20, "steps of every environment between two updates", low=1)
+    epochs: int = setting(4, "passes over these steps in an update", low=1)
+    minibatches: int = setting(8, "parts of the environments that each pass is cut into", low=1)
+    policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
+    value_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the state value", low=1)
+    learning_rate: float = setting(1e-3, "Adam's rate at the start", above=0)
+    learning_rate_end: float = setting(0.05, "rate at the end of the run over the rate at its start", above=0, high=1)
+    discount: float = setting(0.97, "gamma", low=0, high=0.99999)
+    gae_lambda: float = setting(0.95, "lambda of the generalised advantage estimate", low=0, high=1)
+    clipping: float = setting(0.2, "largest change of an action's probability that is rewarded", above=0)
+    entropy_cost: float = setting(1e-3, "weight of the policy's entropy", low=0)
+    reward_scale: float = setting(1.0, "factor on the reward", above=0)
+    max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
+    curriculum: float = setting(
+        0.0, "share of training over which the CG's amplitude and speed grow to the scenario's", low=0, high=1
+    )
+    num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
+
+
+@dataclass(frozen=True)
 class Gradient:
     """First-order gradients through the closed form, with `train.py --algorithm gradient`."""
 
@@ -321,6 +346,7 @@ class Config:
     scenario: Scenario = Scenario()
     reward: Reward = Reward()
     sac: Sac = Sac()
+    ppo: Ppo = Ppo()
     gradient: Gradient = Gradient()
     bounds: Bounds = Bounds()
 

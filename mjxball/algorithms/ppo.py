@@ -1,0 +1,183 @@
+"""Proximal policy optimisation (Schulman et al. 2017) on Brax's networks and loss."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import Array
+
+from mjxball.algorithms.base import Environments, Phase, Policy, Schedule, Transition
+from mjxball.config import Config, Ppo
+from mjxball.errors import InputError
+from mjxball.quiet import import_brax_ppo, import_brax_training
+
+brax = import_brax_training()
+brax_ppo = import_brax_ppo()
+ADAM = optax.scale_by_adam()
+
+
+class PpoState(NamedTuple):
+    """What the algorithm knows."""
+
+    parameters: Any  # Brax's of policy and value
+    adam: Any
+    normaliser: Any  # running mean and deviation of the observations
+    rollout: Any  # Brax's `Transition`, the newest steps of all environments: (envs, unroll_length, ...)
+
+
+class ProximalPolicyOptimization:
+    """`collect` flies `ppo.unroll_length` steps, `update` learns from them alone; see `mjxball.algorithms.base`."""
+
+    metrics = ("loss", "policy_loss", "value_loss", "deviation")
+    collect_keys = 2
+    update_keys = 1
+
+    def __init__(self, config: Config, environments: Environments):
+        ppo = config.ppo
+        self._config, self._environments, self._shards = ppo, environments, environments.shards
+        self.steps_per_collect = ppo.unroll_length
+        self.schedule = Schedule(
+            ppo.total_steps, ppo.num_envs, ppo.num_envs * ppo.unroll_length, ppo.num_evaluations, ppo.curriculum
+        )
+        self._mask = environments.policy_mask
+        self._sizes = (environments.observation_size, environments.action_size)
+        self.networks = make_networks(ppo, self._mask, self._sizes[1], environments.critic_mask)
+
+    def init(self, key: Array) -> PpoState:
+        """Fresh networks, and a rollout of zeros."""
+        policy_key, value_key = jax.random.split(key)
+        parameters = brax_ppo.losses.PPONetworkParams(
+            policy=self.networks.policy_network.init(policy_key), value=self.networks.value_network.init(value_key)
+        )
+        size, actions = self._sizes
+        specification = brax.specs.Array((size,), jnp.dtype("float32"))
+        shape = (self._environments.count, self._config.unroll_length)
+        seen, acted, none = jnp.zeros((*shape, size)), jnp.zeros((*shape, actions)), jnp.zeros(shape)
+        parameters_none = jnp.zeros((*shape, 2 * actions))
+        rollout = _rollout(Transition(seen, acted, none, none, seen, none), parameters_none, acted, none)
+        return PpoState(parameters, ADAM.init(parameters), brax.running_statistics.init_state(specification), rollout)
+
+    def collect(self, state: PpoState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[PpoState, Any]:
+        """`unroll_length` steps of all environments; what was seen goes into the normaliser."""
+        act_keys, reset_keys = (jax.random.split(key, self._config.unroll_length) for key in keys)
+        distribution = self.networks.parametric_action_distribution
+
+        def step(envs: Any, drawn: tuple[Array, Array]) -> tuple[Any, Any]:
+            parameters = self.networks.policy_network.apply(state.normaliser, state.parameters.policy, envs.states.obs)
+            raw = distribution.sample_no_postprocessing(parameters, self._shards.own(drawn[0]))
+            action = jnp.where(phase.evaluate, distribution.mode(parameters), distribution.postprocess(raw))
+            envs, seen = self._environments.step(envs, action, drawn[1])
+            return envs, _rollout(seen, parameters, raw, distribution.log_prob(parameters, raw))
+
+        envs, flown = jax.lax.scan(step, envs, (act_keys, reset_keys))
+        flown = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), flown)
+        normaliser = brax.running_statistics.update(
+            state.normaliser, flown.observation, pmap_axis_name=self._shards.axis
+        )
+        # In an evaluation nothing is remembered.
+        kept = state._replace(normaliser=normaliser, rollout=flown)
+        return jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), kept, state), envs
+
+    def update(
+        self, state: PpoState, keys: Sequence[Array], progress: Array, phase: Phase
+    ) -> tuple[PpoState, dict[str, Array]]:
+        """`epochs` passes over the rollout in `minibatches` parts, each environment's steps together."""
+        ppo, count = self._config, self._environments.count
+        rate = ppo.learning_rate * (1.0 + (ppo.learning_rate_end - 1.0) * progress)
+        order_key, loss_key = jax.random.split(self._shards.own(keys[0]))
+        orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(order_key, ppo.epochs))
+        batches = orders.reshape(ppo.epochs * ppo.minibatches, -1)
+
+        def loss(parameters: Any, batch: Any, key: Array) -> tuple[Array, dict[str, Array]]:
+            return brax_ppo.losses.compute_ppo_loss(
+                parameters,
+                state.normaliser,
+                batch,
+                key,
+                self.networks,
+                entropy_cost=ppo.entropy_cost,
+                discounting=ppo.discount,
+                reward_scaling=ppo.reward_scale,
+                gae_lambda=ppo.gae_lambda,
+                clipping_epsilon=ppo.clipping,
+            )
+
+        def one(number: Array, carry: Any) -> Any:
+            parameters, adam, _ = carry
+            batch = jax.tree.map(lambda leaf: leaf[batches[number]], state.rollout)
+            gradient, seen = jax.grad(loss, has_aux=True)(parameters, batch, jax.random.fold_in(loss_key, number))
+            gradient = self._shards.mean(gradient)
+            gradient, _ = optax.clip_by_global_norm(ppo.max_grad_norm).update(gradient, optax.EmptyState())
+            direction, adam = ADAM.update(gradient, adam)
+            parameters = jax.tree.map(lambda value, along: value - rate * along, parameters, direction)
+            report = (seen["total_loss"], seen["policy_loss"], seen["v_loss"], seen["policy_dist_mean_std"])
+            return parameters, adam, jnp.stack(report)
+
+        count = jnp.where(phase.learning, len(batches), 0)
+        start = (state.parameters, state.adam, jnp.zeros(len(self.metrics)))
+        parameters, adam, report = jax.lax.fori_loop(0, count, one, start)
+        return state._replace(parameters=parameters, adam=adam), dict(zip(self.metrics, report, strict=True))
+
+    def policy(self, state: PpoState) -> Policy:
+        """The policy, and what it knows of its observations."""
+        mask = jnp.asarray(self._mask, jnp.float32)
+        return Policy(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
+
+    def partition(self, whole: Any, split: Any) -> PpoState:
+        """The rollout is cut, the rest is whole."""
+        return PpoState(whole, whole, whole, split)
+
+    def check_parts(self, parts: int) -> None:
+        """Raise InputError unless environments and minibatches can be cut into `parts`."""
+        if self._config.num_envs % (parts * self._config.minibatches):
+            raise InputError(
+                f"ppo.num_envs = {self._config.num_envs} cannot be cut into {self._config.minibatches} minibatches on "
+                f"{parts} devices evenly; make it a multiple"
+            )
+
+
+def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) -> Any:
+    """Brax's PPO networks: tanh-squashed Gaussian policy and state value, ReLU, on normalised observations."""
+    distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
+    policy, value = (_normaliser(shown) for shown in (mask, critic_mask))
+    return brax_ppo.networks.PPONetworks(
+        policy_network=brax.networks.make_policy_network(
+            distribution.param_size,
+            len(mask),
+            preprocess_observations_fn=policy,
+            hidden_layer_sizes=config.policy_layers,
+            activation=jax.nn.relu,
+        ),
+        value_network=brax.networks.make_value_network(
+            len(mask),
+            preprocess_observations_fn=value,
+            hidden_layer_sizes=config.value_layers,
+            activation=jax.nn.relu,
+        ),
+        parametric_action_distribution=distribution,
+    )
+
+
+def _normaliser(mask: Any) -> Any:
+    shown = np.asarray(mask, np.float32)
+    return lambda observation, statistics: brax.running_statistics.normalize(observation, statistics) * shown
+
+
+def _rollout(seen: Transition, parameters: Array, raw: Array, likely: Array) -> Any:
+    """Brax's container; `parameters` of the distribution that `raw`, an action before tanh, was drawn from."""
+    return brax.types.Transition(
+        observation=seen.observation,
+        action=seen.action,
+        reward=seen.reward,
+        discount=1 - seen.terminated,
+        next_observation=seen.next_observation,
+        extras={
+            "state_extras": {"truncation": seen.done * (1 - seen.terminated)},
+            "policy_extras": {"raw_action": raw, "log_prob": likely, "distribution_params": parameters},
+        },
+    )
