@@ -110,6 +110,7 @@ class Algorithm(Protocol):
 
     schedule: Schedule
     metrics: tuple[str, ...]  # names of what `update` reports
+    engines: tuple[str, ...]  # physics engines that it works with, the default first
     collect_keys: int  # random keys that `collect` takes
     update_keys: int  # and that `update` takes
     steps_per_collect: int  # steps of every environment in one `collect`

@@ -38,6 +38,7 @@ class FirstOrderGradient:
     """
 
     metrics = ("loss", "gradient_norm")
+    engines = ("newton-euler",)  # MJX iterates, and what iterates has no gradient backwards
     collect_keys = 1
     update_keys = 0
 

@@ -34,6 +34,7 @@ class ProximalPolicyOptimization:
     """`collect` flies `ppo.unroll_length` steps, `update` learns from them alone; see `mjxball.algorithms.base`."""
 
     metrics = ("loss", "policy_loss", "value_loss", "deviation")
+    engines = ("mjx", "newton-euler")
     collect_keys = 2
     update_keys = 1
 

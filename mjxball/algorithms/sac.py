@@ -202,6 +202,7 @@ class SoftActorCritic:
     """The algorithm as the trainer sees it (`mjxball.algorithms.base.Algorithm`)."""
 
     metrics = ("alpha", "entropy", "critic_loss", "policy_loss")
+    engines = ("mjx", "newton-euler")
     collect_keys = 3
     update_keys = 2
     steps_per_collect = 1

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from mjxball import __version__, cli, config
+from mjxball.algorithms import ALGORITHMS
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
@@ -45,7 +46,7 @@ def parser() -> cli.Parser:
         usage="%(prog)s [PRESET] [--seed N] [--num-seeds K] [--sweep FILE] [--out DIR] [--resume DIR]\n"
         "                [--physics ENGINE] [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
         "                [--<config path> VALUE ...]",
-        description="Train a follower with soft actor-critic, export it to NumPy and judge it against `copy`.",
+        description="Train a follower, export it to NumPy and judge it against `copy`.",
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
     )
     names = ", ".join(config.PRESETS)
@@ -59,7 +60,9 @@ def parser() -> cli.Parser:
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
     result.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
     result.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state), your own")
-    result.add_argument("--algorithm", metavar="MODULE:CLASS", help="learning algorithm of your own (default SAC)")
+    result.add_argument(
+        "--algorithm", metavar="NAME", help=f"one of {', '.join(ALGORITHMS)} (default sac), or MODULE:CLASS, your own"
+    )
     result.add_argument("--physics", choices=TRAINING_ENGINES, help="physics engine (default mjx)")
     result.add_argument("--distributed", action="store_true", help="train with the other processes of this job")
     result.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
@@ -112,14 +115,16 @@ def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: boo
     _wake_devices()
     from mjxball.train.run import Run
 
+    state = None
     if resume:
         from mjxball.train.checkpoint import restore_state
-    state = restore_state(out, settings, origin) if resume else None
-    if resume and processes.is_writer():
+
+        state, total = restore_state(out, settings, origin)
         steps = 0 if state is None else int(np.ravel(state.steps)[0])
-        print(f"continuing {out} after {steps:,} of {settings.sac.total_steps:,} steps", file=sys.stderr)
-    if state is not None and int(np.ravel(state.steps)[0]) >= settings.sac.total_steps:
-        return None
+        if processes.is_writer():
+            print(f"continuing {out} after {steps:,} of {total:,} steps", file=sys.stderr)
+        if steps >= total:
+            return None
     try:
         return 0 if Run(settings, out, origin, state).train() else 130
     except TrainingDivergedError as error:
@@ -159,10 +164,12 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
     extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
+    _refuse_settings_of_others(options)
+    physics = _check_extensions(extensions, settings, options.physics) if extensions else options.physics or "mjx"
     origin: dict[str, Any] = {
         "command": command,
         "seed": seed,
-        "physics": options.physics or "mjx",
+        "physics": physics,
         "seeds": members,
         "sweep": _read_sweep(options.sweep, members, settings),
         "package_version": __version__,
@@ -171,7 +178,6 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
         "versions": versions(),
     }
     if extensions:
-        _check_extensions(extensions, settings, origin["physics"])
         origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
     return settings, origin, out
 
@@ -182,17 +188,36 @@ def _digest(names: dict[str, str]) -> str | None:
     return digest(names)
 
 
-def _check_extensions(names: dict[str, str], settings: config.Config, physics: str) -> None:
-    """Refuse what cannot be found or does not fit, before anything is written."""
+def _refuse_settings_of_others(options: argparse.Namespace) -> None:
+    """Refuse a setting of an algorithm of ours that is not the one which trains."""
+    used = options.algorithm or "sac"
+    given = [name.removeprefix("config:") for name, value in vars(options).items() if value and "config:" in name]
+    for path in given:
+        section = path.partition(".")[0]
+        if used in ALGORITHMS and section in ALGORITHMS and section != used:
+            raise InputError(
+                f"--{path} is a setting of {section}, and {used} trains; drop it or say --algorithm {section}"
+            )
+
+
+def _check_extensions(names: dict[str, str], settings: config.Config, wanted: str | None) -> str:
+    """The physics engine to train on; refuses what cannot be found or does not fit, before anything is written."""
     from mjxball.train.extensions import Extensions, make_env, resolve
 
     extensions = resolve(Extensions(**names))
+    engines = getattr(extensions.algorithm, "engines", TRAINING_ENGINES)
+    physics = wanted or engines[0]
+    if physics not in engines:
+        raise InputError(
+            f"--algorithm {names['algorithm']} cannot train on --physics {physics}; it can on {', '.join(engines)}"
+        )
     make_env(extensions, settings, physics)
     missing = [name for name in ("init", "collect", "update", "policy") if not hasattr(extensions.algorithm, name)]
     if extensions.algorithm is not None and missing:
         raise InputError(
             f"--algorithm {names['algorithm']} lacks {', '.join(missing)}; see docs/howto/own-algorithm.md"
         )
+    return physics
 
 
 def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:

@@ -87,6 +87,10 @@ def validate(config: Config) -> Config:
             f"sac.total_steps {config.sac.total_steps} leaves nothing to learn after "
             f"sac.warmup_steps {config.sac.warmup_steps}"
         )
+    if config.ppo.num_envs % config.ppo.minibatches:
+        raise InputError(
+            f"ppo.num_envs {config.ppo.num_envs} cannot be cut into ppo.minibatches {config.ppo.minibatches} equal parts"
+        )
     if config.sac.replay_size % config.sac.num_envs:
         raise InputError("sac.replay_size must be a multiple of sac.num_envs")
     return config

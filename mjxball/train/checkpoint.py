@@ -129,8 +129,10 @@ def _named_leaves(state: Any) -> dict[str, Any]:
     return {_name(path): leaf for path, leaf in leaves if leaf.size}
 
 
-def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> TrainState | None:
-    """The newest state of the run directory that `read_config` describes, as NumPy; None if none was ever saved.
+def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> tuple[TrainState | None, int]:
+    """(newest state of the run directory that `read_config` describes, steps of its whole training).
+
+    The state holds NumPy arrays; None if none was ever saved.
 
     Raises InputError if every checkpoint is damaged or the worlds were cut otherwise than now.
     """
@@ -140,7 +142,7 @@ def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> TrainSta
             f"{run} was trained with every follower's worlds on {parts} device(s), not {population.parts}; "
             "continue it with as many processes as before"
         )
-    return _restore(run, population, discard=True)
+    return _restore(run, population, discard=True), population.program.schedule.total_steps
 
 
 def _restore(run: Path, population: Population, discard: bool) -> TrainState | None:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
 from mjxball.env import CoupledPairEnv
 from mjxball.errors import InputError
@@ -30,10 +31,11 @@ DEFAULTS = Extensions()
 
 
 def find(name: str, flag: str) -> Any:
-    """The object that "package.module:Name" names; also modules in the current directory are found."""
-    module, _, attribute = name.partition(":")
+    """The object that "package.module:Name" names, or one of ours; also modules in the current directory are found."""
+    ours = ALGORITHMS if flag == "--algorithm" else {}
+    module, _, attribute = ours.get(name, name).partition(":")
     if not module or not attribute:
-        raise InputError(f"{flag} takes package.module:Name, not {name!r}")
+        raise InputError(f"{flag} takes {''.join(f'{one}, ' for one in ours)}package.module:Name, not {name!r}")
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
     try:
@@ -65,7 +67,7 @@ def digest(names: Mapping[str, str | None]) -> str | None:
         {
             inspect.getsourcefile(inspect.getmodule(find(name, f"--{flag}")) or object) or ""
             for flag, name in names.items()
-            if name
+            if name and name not in ALGORITHMS
         }
     )
     if not files:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball import config as configs
+from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.physics.step import TRAINING_ENGINES
@@ -174,13 +175,16 @@ def differences(recorded: Mapping[str, Any]) -> list[str]:
     return found
 
 
-UNSWEPT = ("sac.curriculum",)  # the program branches on whether it is 0
+# The program branches on whether they are 0 or 1.
+UNSWEPT = ("sac.curriculum", "ppo.curriculum", "gradient.damping")
 # Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
 SWEEPABLE = (
     *(
         path
         for path, value, _ in configs.leaves(Config())
-        if isinstance(value, float) and path.startswith(("sac.", "reward.")) and path not in UNSWEPT
+        if isinstance(value, float)
+        and path.startswith(("reward.", *(f"{name}." for name in ALGORITHMS)))
+        and path not in UNSWEPT
     ),
     "follower.action_scale_tilt",
     "follower.action_scale_vertical",
