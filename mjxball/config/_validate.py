@@ -89,7 +89,7 @@ def validate(config: Config) -> Config:
         )
     if config.ppo.num_envs % config.ppo.minibatches:
         raise InputError(
-            f"ppo.num_envs {config.ppo.num_envs} cannot be cut into ppo.minibatches {config.ppo.minibatches} equal parts"
+            f"ppo.num_envs {config.ppo.num_envs} is not a multiple of ppo.minibatches {config.ppo.minibatches}"
         )
     if config.sac.replay_size % config.sac.num_envs:
         raise InputError("sac.replay_size must be a multiple of sac.num_envs")
