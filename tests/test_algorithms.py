@@ -14,7 +14,6 @@ import scipy.linalg
 import toys
 from command_line import assert_refused
 from conftest import with_settings
-from mjxball.train.environments import Environments
 
 from mjxball.algorithms import ALGORITHMS
 from mjxball.algorithms.base import Phase, Shards
@@ -23,7 +22,7 @@ from mjxball.commands.train import main
 from mjxball.config import Config
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, find
-from mjxball.train.program import Program
+from mjxball.train.program import Environments, Program
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
 Q, R = np.diag([1.0, 0.1]), np.array([[0.05]])

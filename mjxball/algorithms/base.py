@@ -100,8 +100,12 @@ class Environments(Protocol):
     critic_mask: Any  # (n,) the same for what is needed in training only
     shards: Shards
 
-    def step(self, envs: Any, action: Float[Array, "envs actions"], key: Array) -> tuple[Any, Transition]:
-        """Step `envs` with `action`; those that end start anew, at states drawn with `key`."""
+    def restart(self, envs: Any, key: Array) -> Any:
+        """All of `envs` at states drawn with `key`."""
+        ...
+
+    def step(self, envs: Any, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Any, Transition]:
+        """Step `envs` with `action`; those that end start anew, at states drawn with `key` (None: they go on)."""
         ...
 
 

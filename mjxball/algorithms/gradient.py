@@ -66,13 +66,14 @@ class FirstOrderGradient:
 
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
         """One window of all environments, its gradient, and in the first one the observations' statistics."""
-        (key,) = keys
-        reset_key, action_key = jax.random.split(key)
-        resets = jax.random.split(reset_key, self._config.horizon)
+        reset_key, action_key = jax.random.split(keys[0])
         shape = (self._config.horizon, self._environments.count, self._environments.action_size)
         random = jax.random.uniform(self._shards.own(action_key), shape, minval=-1.0, maxval=1.0)
+        # Every window begins anew: its worlds have seen no other policy, and no gradient comes from before it.
+        fresh = self._environments.restart(envs, reset_key)
+        envs = jax.tree.map(lambda new, old: jnp.where(phase.evaluate, old, new), fresh, envs)
         (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(
-            state.layers, state, envs, resets, random, phase
+            state.layers, state, envs, random, phase
         )
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
         first = phase.random & phase.recording
@@ -86,20 +87,17 @@ class FirstOrderGradient:
         )
         return known, envs
 
-    def _window(self, layers: Any, state: GradientState, envs: Any, resets: Array, random: Array, phase: Phase) -> Any:
-        policy = self.policy(state._replace(layers=layers))
-        damped = self._config.damping
+    def _window(self, layers: Any, state: GradientState, envs: Any, random: Array, phase: Phase) -> Any:
+        policy, damping = self.policy(state._replace(layers=layers)), self._config.damping
 
-        def step(envs: Any, drawn: tuple[Array, Array]) -> tuple[Any, tuple[Array, Array]]:
-            key, noise = drawn
-            envs = envs._replace(states=_damp(envs.states, damped)) if damped < 1 else envs
+        def step(envs: Any, noise: Array) -> tuple[Any, tuple[Array, Array]]:
+            envs = envs._replace(states=_damp(envs.states, damping)) if damping < 1 else envs
             seen = envs.states.obs
             action = jnp.where(phase.random, noise, policy(seen))
-            envs, after = self._environments.step(envs, action, key)
-            return envs, (after.reward, seen)
+            envs, after = self._environments.step(envs, action, None)
+            return envs, (after.reward, jax.lax.stop_gradient(seen))
 
-        envs, (rewards, seen) = jax.lax.scan(step, envs, (resets, random))
-        seen = jax.lax.stop_gradient(seen)
+        envs, (rewards, seen) = jax.lax.scan(step, envs, random)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
 
     def update(

@@ -93,18 +93,22 @@ class Environments:
         peaks = dict.fromkeys(states.metrics, jnp.zeros(self.count))
         return Envs(states, Statistics(zero, zero, totals, peaks), difficulty)
 
-    def step(self, envs: Envs, action: Float[Array, "envs actions"], key: Array) -> tuple[Envs, Transition]:
+    def restart(self, envs: Envs, key: Array) -> Envs:
+        """See `mjxball.algorithms.base.Environments`."""
+        return envs._replace(states=self.reset(key, envs.difficulty))
+
+    def step(self, envs: Envs, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Envs, Transition]:
         """See `mjxball.algorithms.base.Environments`."""
         before = envs.states
-        after = self._step(before, action)
+        after = states = self._step(before, action)
         terminated = after.done * (1 - after.info["truncation"])
-        fresh = self.reset(key, envs.difficulty)
 
         def reset_if_done(new: Array, old: Array) -> Array:
             done = after.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
             return jnp.where(done, new, old)
 
-        states = jax.tree.map(reset_if_done, fresh, after)
+        if key is not None:
+            states = jax.tree.map(reset_if_done, self.reset(key, envs.difficulty), after)
         statistics, metrics = envs.statistics, after.metrics
         statistics = Statistics(
             reward=statistics.reward + after.reward.mean(),
