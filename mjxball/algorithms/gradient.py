@@ -25,9 +25,9 @@ class GradientState(NamedTuple):
     adam: Any
     slope: Any  # gradient of the last window's loss, a pytree like `layers`
     loss: Array  # () minus the mean reward of the last window
-    mean: Array  # (n,) of the observations in the flights with random actions
+    mean: Array  # (n,) of the observations in the first window, which nothing is learnt from
     square: Array  # (n,) mean of their squares
-    seen: Array  # () windows that `mean` and `square` are of
+    seen: Array  # () 1 once they are known
 
 
 class FirstOrderGradient:
@@ -52,7 +52,7 @@ class FirstOrderGradient:
         self._mask = jnp.asarray(environments.policy_mask, jnp.float32)
 
     def init(self, key: Array) -> GradientState:
-        """Weights as Flax draws them (LeCun's), zeros in the last layer: the first policy adds nothing."""
+        """Weights as Flax draws them (LeCun's), near 0 in the last layer: the first policy adds hardly anything."""
         layers = {}
         pairs = list(zip(self._sizes[:-1], self._sizes[1:], strict=True))
         for number, (rows, columns) in enumerate(pairs):
@@ -65,39 +65,35 @@ class FirstOrderGradient:
         return GradientState(layers, ADAM.init(layers), slope, zero, none, none, zero)
 
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
-        """One window of all environments, its gradient, and in the first one the observations' statistics."""
-        reset_key, action_key = jax.random.split(keys[0])
-        shape = (self._config.horizon, self._environments.count, self._environments.action_size)
-        random = jax.random.uniform(self._shards.own(action_key), shape, minval=-1.0, maxval=1.0)
+        """One window of all environments and its gradient; the first one gives the observations' statistics."""
         # Every window begins anew: its worlds have seen no other policy, and no gradient comes from before it.
-        fresh = self._environments.restart(envs, reset_key)
+        fresh = self._environments.restart(envs, keys[0])
         envs = jax.tree.map(lambda new, old: jnp.where(phase.evaluate, old, new), fresh, envs)
-        (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(
-            state.layers, state, envs, random, phase
-        )
+        (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(state.layers, state, envs)
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
-        first = phase.random & phase.recording
-        weight = 1.0 / (state.seen + 1.0)
-        known = state._replace(
+        first = (phase.random & phase.recording).astype(jnp.float32)
+        known = GradientState(
+            layers=state.layers,
+            adam=state.adam,
             slope=slope,
             loss=loss,
-            mean=jnp.where(first, state.mean + weight * (mean - state.mean), state.mean),
-            square=jnp.where(first, state.square + weight * (square - state.square), state.square),
-            seen=state.seen + first,
+            mean=first * mean + (1 - first) * state.mean,
+            square=first * square + (1 - first) * state.square,
+            seen=jnp.maximum(state.seen, first),
         )
+        known = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), known, state)
         return known, envs
 
-    def _window(self, layers: Any, state: GradientState, envs: Any, random: Array, phase: Phase) -> Any:
+    def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
         policy, damping = self.policy(state._replace(layers=layers)), self._config.damping
 
-        def step(envs: Any, noise: Array) -> tuple[Any, tuple[Array, Array]]:
+        def step(envs: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
             envs = envs._replace(states=_damp(envs.states, damping)) if damping < 1 else envs
             seen = envs.states.obs
-            action = jnp.where(phase.random, noise, policy(seen))
-            envs, after = self._environments.step(envs, action, None)
+            envs, after = self._environments.step(envs, policy(seen), None)
             return envs, (after.reward, jax.lax.stop_gradient(seen))
 
-        envs, (rewards, seen) = jax.lax.scan(step, envs, random)
+        envs, (rewards, seen) = jax.lax.scan(step, envs, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
 
     def update(
