@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -36,13 +37,13 @@ SMALL = {
 
 
 class LinearQuadratic(toys.Env):
-    """x' = A x + B u at the cost x'Q x + u'R u, from |x| of 0.02 at most: there tanh is as good as linear."""
+    """x' = A x + B u at the cost x'Q x + u'R u, from |x| of some 0.002: there tanh is as good as linear."""
 
     observation_size, action_size, backend = 2, 1, "none"
 
     def reset(self, rng: Any) -> Any:
         zero = jnp.zeros(())
-        return toys.State(None, 0.02 * jax.random.normal(rng, (2,)), zero, zero, {}, {"truncation": zero})
+        return toys.State(None, 0.002 * jax.random.normal(rng, (2,)), zero, zero, {}, {"truncation": zero})
 
     def step(self, state: Any, action: Any) -> Any:
         x = state.obs
@@ -52,9 +53,9 @@ class LinearQuadratic(toys.Env):
 
 def linear(config: Config) -> tuple[FirstOrderGradient, Environments]:
     """A policy without hidden layers on 32 worlds, 300 steps long."""
-    settings = {"num_envs": 32, "horizon": 300, "policy_layers": ()}
+    settings = dataclasses.replace(config.gradient, num_envs=32, horizon=300, policy_layers=())  # linear: no user's
     environments = Environments(LinearQuadratic(), 32, Shards())
-    return FirstOrderGradient(with_settings(config, gradient=settings), environments), environments
+    return FirstOrderGradient(dataclasses.replace(config, gradient=settings), environments), environments
 
 
 def test_the_gradient_of_a_linear_policy_is_that_of_the_lyapunov_equations(transport: Config) -> None:
@@ -74,8 +75,8 @@ def test_the_gradient_of_a_linear_policy_is_that_of_the_lyapunov_equations(trans
         state = state._replace(layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}})
         after, _ = algorithm.collect(state, environments.begin(states, 1.0), [jax.random.PRNGKey(2)], TRAIN)
         found = -np.asarray(after.slope["hidden_0"]["kernel"])[:, :1].T
-        # tanh(u) is u to 1 % at the largest u here, 0.2; at the optimum the sum is 0 and the terms are of size 1e-4.
-        np.testing.assert_allclose(found, wanted, rtol=0.03, atol=2e-7)
+        # Float32; at the optimum what is left is a thousandth of what it is elsewhere.
+        np.testing.assert_allclose(found, wanted, rtol=0.01, atol=1e-11)
 
 
 def returns(config: Config, name: str, env: Any, seed: int = 0) -> np.ndarray:
@@ -112,9 +113,9 @@ def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
     kept = jax.tree.map(np.asarray, half)  # as a checkpoint keeps it
     twice, *_ = advance(kept, programs.train(3 * window))
     jax.tree.map(np.testing.assert_array_equal, once, twice)
-    # An evaluation leaves what is known untouched.
+    # An evaluation changes nothing of the policy.
     seen, *_ = advance(once, programs.evaluate(2 * window))
-    jax.tree.map(np.testing.assert_array_equal, once.algorithm, seen.algorithm)
+    jax.tree.map(np.testing.assert_array_equal, program.policy(once), program.policy(seen))
 
 
 def test_a_run_by_gradient_writes_a_policy_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,7 +133,7 @@ def test_a_run_by_gradient_writes_a_policy_and_resumes(tmp_path: Path, monkeypat
     ("flags", "word"),
     [
         (["--algorithm", "gradient", "--physics", "mjx"], "newton-euler"),
-        (["--algorithm", "ppo", "--sac.tau", "0.1"], "--sac.tau is for --algorithm sac"),
+        (["--algorithm", "ppo", "--sac.tau", "0.1"], "--sac.tau is a setting of sac"),
         (["--gradient.horizon", "10"], "--algorithm gradient"),
         (["--algorithm", "td3"], "sac, ppo, gradient, package.module:Name"),
         (["--algorithm", "ppo", "--ppo.minibatches", "7"], "ppo.minibatches"),

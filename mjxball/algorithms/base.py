@@ -101,11 +101,11 @@ class Environments(Protocol):
     shards: Shards
 
     def restart(self, envs: Any, key: Array) -> Any:
-        """All of `envs` at states drawn with `key`."""
+        """Those of `envs` whose episode ended start anew, at states drawn with `key`."""
         ...
 
     def step(self, envs: Any, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Any, Transition]:
-        """Step `envs` with `action`; those that end start anew, at states drawn with `key` (None: they go on)."""
+        """Step `envs` with `action`, then `restart` them; with a `key` of None those that ended go on."""
         ...
 
 

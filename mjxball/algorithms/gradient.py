@@ -66,9 +66,7 @@ class FirstOrderGradient:
 
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
         """One window of all environments and its gradient; the first one gives the observations' statistics."""
-        # Every window begins anew: its worlds have seen no other policy, and no gradient comes from before it.
-        fresh = self._environments.restart(envs, keys[0])
-        envs = jax.tree.map(lambda new, old: jnp.where(phase.evaluate, old, new), fresh, envs)
+        envs = self._environments.restart(envs, keys[0])
         (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(state.layers, state, envs)
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
         first = (phase.random & phase.recording).astype(jnp.float32)

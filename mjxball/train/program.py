@@ -95,20 +95,19 @@ class Environments:
 
     def restart(self, envs: Envs, key: Array) -> Envs:
         """See `mjxball.algorithms.base.Environments`."""
-        return envs._replace(states=self.reset(key, envs.difficulty))
+        before = envs.states
+
+        def reset_if_done(new: Array, old: Array) -> Array:
+            done = before.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
+            return jnp.where(done, new, old)
+
+        return envs._replace(states=jax.tree.map(reset_if_done, self.reset(key, envs.difficulty), before))
 
     def step(self, envs: Envs, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Envs, Transition]:
         """See `mjxball.algorithms.base.Environments`."""
         before = envs.states
-        after = states = self._step(before, action)
+        after = self._step(before, action)
         terminated = after.done * (1 - after.info["truncation"])
-
-        def reset_if_done(new: Array, old: Array) -> Array:
-            done = after.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
-            return jnp.where(done, new, old)
-
-        if key is not None:
-            states = jax.tree.map(reset_if_done, self.reset(key, envs.difficulty), after)
         statistics, metrics = envs.statistics, after.metrics
         statistics = Statistics(
             reward=statistics.reward + after.reward.mean(),
@@ -117,7 +116,8 @@ class Environments:
             peaks={name: jnp.maximum(peak, metrics[name]) for name, peak in statistics.peaks.items()},
         )
         transition = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
-        return Envs(states, statistics, envs.difficulty), transition
+        stepped = Envs(after, statistics, envs.difficulty)
+        return stepped if key is None else self.restart(stepped, key), transition
 
     def over_shards(self, statistics: Statistics) -> Statistics:
         """Statistics of all shards together; `peaks` stay each shard's own environments."""
