@@ -296,7 +296,7 @@ class Ppo:
     gae_lambda: float = setting(0.95, "lambda of the generalised advantage estimate", low=0, high=1)
     clipping: float = setting(0.2, "largest change of an action's probability that is rewarded", above=0)
     entropy_cost: float = setting(1e-3, "weight of the policy's entropy", low=0)
-    reward_scale: float = setting(1.0, "factor on the reward", above=0)
+    reward_scale: float = setting(0.02, "factor on the reward: the value's loss shares the gradient's norm", above=0)
     max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
     curriculum: float = setting(
         0.0, "share of training over which the CG's amplitude and speed grow to the scenario's", low=0, high=1
