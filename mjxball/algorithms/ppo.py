@@ -119,9 +119,9 @@ class ProximalPolicyOptimization:
             report = (seen["total_loss"], seen["policy_loss"], seen["v_loss"], seen["policy_dist_mean_std"])
             return parameters, adam, jnp.stack(report)
 
-        count = jnp.where(phase.learning, len(batches), 0)
+        steps = jnp.where(phase.learning, len(batches), 0)
         start = (state.parameters, state.adam, jnp.zeros(len(self.metrics)))
-        parameters, adam, report = jax.lax.fori_loop(0, count, one, start)
+        parameters, adam, report = jax.lax.fori_loop(0, steps, one, start)
         return state._replace(parameters=parameters, adam=adam), dict(zip(self.metrics, report, strict=True))
 
     def policy(self, state: PpoState) -> Policy:
