@@ -16,7 +16,6 @@ import toys
 from command_line import assert_refused
 from conftest import with_settings
 
-from mjxball.algorithms import ALGORITHMS
 from mjxball.algorithms.base import Phase, Shards
 from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.commands.train import main
@@ -101,7 +100,7 @@ def test_a_point_is_pushed_to_rest(name: str, transport: Config) -> None:
     assert after > -0.06
 
 
-@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+@pytest.mark.parametrize("name", ["ppo", "gradient", pytest.param("sac", marks=pytest.mark.slow)])
 def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
     config = with_settings(transport, timing={"episode_steps": 80}, **{name: SMALL[name]})
     extensions = Extensions(toys.DoubleIntegrator, None, find(name, "--algorithm"))
@@ -118,6 +117,7 @@ def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
     jax.tree.map(np.testing.assert_array_equal, program.policy(once), program.policy(seen))
 
 
+@pytest.mark.slow
 def test_a_run_by_gradient_writes_a_policy_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     flags = ["--gradient.gradient_steps", "2", "--gradient.num_envs", "4", "--gradient.horizon", "20"]
