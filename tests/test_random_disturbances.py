@@ -58,7 +58,7 @@ def test_noise_has_the_judges_deviations_and_is_white(transport: Config) -> None
     assert np.abs(following).max() < 5 / math.sqrt(STEPS)
 
 
-@pytest.mark.parametrize(("seconds", "steps"), [(0.02, 1), (0.04, 2), (0.05, 2)])
+@pytest.mark.parametrize(("seconds", "steps"), [(0.02, 1), (0.04, 2), (0.05, 2), (0.056, 3)])
 def test_delay_is_whole_control_steps(transport: Config, seconds: float, steps: int) -> None:
     config = with_settings(transport, scenario={"delay": (seconds, seconds)})
     truth = jnp.arange(20.0)[:, None] * jnp.ones(18)
