@@ -1,4 +1,4 @@
-"""The networks of soft actor-critic, Brax's."""
+"""The networks of soft actor-critic, Brax's, and the normalisation that all networks share."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = N
     """
     distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
     observation_size = len(mask)
-    normalise, normalise_all = _normaliser(mask), _normaliser(mask if critic_mask is None else critic_mask)
+    normalise, normalise_all = normaliser(mask), normaliser(mask if critic_mask is None else critic_mask)
     value_network = brax.networks.make_value_network(
         observation_size, preprocess_observations_fn=normalise_all, hidden_layer_sizes=config.critic_layers
     )
@@ -58,7 +58,7 @@ def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = N
     )
 
 
-def _normaliser(mask: Any) -> Callable[[Array, Any], Array]:
+def normaliser(mask: Any) -> Callable[[Array, Any], Array]:
     """Normalisation of an observation by running statistics, with zeros where `mask` (n,) has them."""
     shown = np.asarray(mask, np.float32)
     return lambda observation, statistics: brax.running_statistics.normalize(observation, statistics) * shown

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax import Array
 
 from mjxball.algorithms.base import Environments, Phase, Policy, Schedule, Transition
+from mjxball.algorithms.networks import normaliser
 from mjxball.config import Config, Ppo
 from mjxball.errors import InputError
 from mjxball.quiet import import_brax_ppo, import_brax_training
@@ -145,7 +145,7 @@ class ProximalPolicyOptimization:
 def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) -> Any:
     """Brax's PPO networks: tanh-squashed Gaussian policy and state value, ReLU, on normalised observations."""
     distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
-    policy, value = (_normaliser(shown) for shown in (mask, critic_mask))
+    policy, value = (normaliser(shown) for shown in (mask, critic_mask))
     return brax_ppo.networks.PPONetworks(
         policy_network=brax.networks.make_policy_network(
             distribution.param_size,
@@ -162,11 +162,6 @@ def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) ->
         ),
         parametric_action_distribution=distribution,
     )
-
-
-def _normaliser(mask: Any) -> Any:
-    shown = np.asarray(mask, np.float32)
-    return lambda observation, statistics: brax.running_statistics.normalize(observation, statistics) * shown
 
 
 def _rollout(seen: Transition, parameters: Array, raw: Array, likely: Array) -> Any:
