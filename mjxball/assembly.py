@@ -1,4 +1,4 @@
-"""Leader, object, ball and follower as one MuJoCo model, built with MjSpec from the typed config.
+"""Drones, carrier, object and ball as one MuJoCo model, built with MjSpec from the typed config.
 
 `python -m mjxball.assembly OUT.xml` writes the reference plant as MJCF, for any MuJoCo viewer.
 """
@@ -15,26 +15,34 @@ import numpy as np
 from mjxball.cli import make_parser, output_file, quit_on_interrupt, run_command
 from mjxball.config import Attitude, Plant
 from mjxball.control import mixer
-from mjxball.control.constants import ROLLING_INERTIA, plant_constants
+from mjxball.plant import ROLLING_INERTIA, plant_parameters
 
 ASSEMBLY = "assembly"
 LEADER = "leader"
 FOLLOWER = "follower"
 BALL = "ball"
-BALL_JOINT = "cg"
+BALL_JOINT = "cg"  # the first of the ball's slides
+BALL_JOINTS = (BALL_JOINT, "cg_across")
 COLOURS = {LEADER: (0.85, 0.25, 0.2, 1.0), FOLLOWER: (0.2, 0.4, 0.85, 1.0)}
 
 
-def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
-    """Return the model's MjSpec: the object's shell, two welded drones, and the moving mass on a slide joint.
+def drone_names(plant: Plant) -> list[str]:
+    """Names of the drones' bodies in their order: leader, follower; of several followers follower1, follower2, ..."""
+    followers = plant.count - 1
+    numbered = iter([FOLLOWER] if followers == 1 else [f"{FOLLOWER}{number + 1}" for number in range(followers)])
+    return [LEADER if number == plant.leader else next(numbered) for number in range(plant.count)]
 
-    The drones' centres sit at their mounts. In the reference plant the shell is massless and the ball carries
-    the object's whole mass with the box's inertia. The root is free, or on a stand: a
-    hinge along x (`pivot`), or a vertical slide and that hinge (`heave`). Eight `motor` actuators, in the
-    order leader 1..4, follower 1..4, take rotor forces in newtons; their gear holds the yaw moment.
+
+def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
+    """Return the model's MjSpec: carrier and shell, welded drones, and the moving mass on one slide joint or two.
+
+    The drones' centres sit at their mounts, turned by their yaw. In the reference plant the shell is massless and the
+    ball carries the object's whole mass with the box's inertia. The root is free, or on a stand: a
+    hinge along x (`pivot`), or a vertical slide and that hinge (`heave`). Four `motor` actuators for each drone, in
+    the drones' order, take rotor forces in newtons; their gear holds the yaw moment.
     `timestep` [s] matters only to viewers and to MuJoCo's own integrator.
     """
-    constants = plant_constants(plant, Attitude())
+    numbers = plant_parameters(plant, Attitude())
     fixed, moving = (1 - plant.moving_fraction) * plant.object_mass, plant.moving_fraction * plant.object_mass
     spec = mujoco.MjSpec()
     spec.modelname = "mjxball"
@@ -43,25 +51,32 @@ def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     _add_scenery(spec)
-    shell_inertia = (plant.object_mass * constants.shell_inertia_per_mass).tolist()
+    shell_inertia = numbers.carrier_inertia + plant.object_mass * numbers.shell_inertia_per_mass
     body = spec.worldbody.add_body(
-        name=ASSEMBLY, mass=fixed, explicitinertial=True, ipos=[0, 0, 0], inertia=shell_inertia
+        name=ASSEMBLY,
+        mass=fixed + plant.carrier_mass,
+        explicitinertial=True,
+        ipos=[0, 0, 0],
+        inertia=shell_inertia.tolist(),
     )
     _add_root_joints(body, plant.stand)
     half = np.array(plant.object_size) / 2
     _add_visual(body, "shell", mujoco.mjtGeom.mjGEOM_BOX, half, (0.75, 0.65, 0.45, 0.35))
     body.add_site(name="origin", pos=[0, 0, 0], size=[0.01, 0.01, 0.01])
-    _add_drone(spec, body, LEADER, plant.leader_mass, plant.leader_inertia, plant.leader_mount, plant)
-    _add_drone(spec, body, FOLLOWER, plant.follower_mass, plant.follower_inertia, plant.follower_mount, plant)
+    if plant.count > 2:
+        _add_spokes(body, plant)
+    for number, name in enumerate(drone_names(plant)):
+        _add_drone(spec, body, name, number, plant)
     ball = body.add_body(
         name=BALL,
         mass=moving,
         explicitinertial=True,
         ipos=[0, 0, 0],
-        inertia=(plant.object_mass * constants.ball_inertia_per_mass).tolist(),
+        inertia=(plant.object_mass * numbers.ball_inertia_per_mass).tolist(),
     )
-    axis = [1.0, 0, 0] if plant.cg_axis == "x" else [0, 1.0, 0]
-    ball.add_joint(name=BALL_JOINT, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, armature=ROLLING_INERTIA * moving)
+    for joint, direction in zip(BALL_JOINTS, plant.directions, strict=False):
+        axis = np.eye(3)[direction].tolist()
+        ball.add_joint(name=joint, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, armature=ROLLING_INERTIA * moving)
     _add_visual(ball, "cg", mujoco.mjtGeom.mjGEOM_SPHERE, [plant.ball_radius, 0, 0], (0.95, 0.75, 0.1, 1.0))
     return spec
 
@@ -125,29 +140,46 @@ def _add_visual(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Any
     return geom
 
 
-def _add_drone(
-    spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, mass: float, inertia: Any, mount: Any, plant: Plant
-) -> None:
-    drone = parent.add_body(
-        name=name, pos=mount, mass=mass, explicitinertial=True, ipos=[0, 0, 0], inertia=list(inertia)
+def _add_spokes(body: mujoco.MjsBody, plant: Plant) -> None:
+    """Rods from O to every drone, which are only drawn."""
+    for number, drone in enumerate(plant.drones):
+        rod = _add_visual(body, f"spoke{number}", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.008], (0.75, 0.65, 0.45, 0.8))
+        rod.fromto[:] = [0, 0, 0, *drone.mount]
+
+
+def _add_drone(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, number: int, plant: Plant) -> None:
+    """Drone `number` of `plant`, whose body is called `name`."""
+    own = plant.drones[number]
+    arm, force, yaw_per_thrust = (
+        plant.of_drones(field)[number] for field in ("arm", "rotor_force_max", "yaw_per_thrust")
     )
-    _add_visual(drone, f"{name}_hub", mujoco.mjtGeom.mjGEOM_BOX, [0.035, 0.035, 0.015], COLOURS[name])
+    colour = COLOURS[LEADER if number == plant.leader else FOLLOWER]
+    drone = parent.add_body(
+        name=name,
+        pos=own.mount,
+        quat=[np.cos(own.yaw / 2), 0, 0, np.sin(own.yaw / 2)],
+        mass=own.mass,
+        explicitinertial=True,
+        ipos=[0, 0, 0],
+        inertia=list(own.inertia),
+    )
+    _add_visual(drone, f"{name}_hub", mujoco.mjtGeom.mjGEOM_BOX, [0.035, 0.035, 0.015], colour)
     places, spins = mixer.PLACES[plant.layout], mixer.SPIN[plant.layout]
-    for number, (axis, spin) in enumerate(zip(places, spins, strict=True), start=1):
-        place = mixer.lever(plant.arm, plant.layout) * np.array([*axis, 0.0])
-        label = f"{name}_rotor{number}"
-        arm = _add_visual(drone, f"{label}_arm", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.005], COLOURS[name])
-        arm.fromto[:] = [0, 0, 0, *place]
+    for rotor, (axis, spin) in enumerate(zip(places, spins, strict=True), start=1):
+        place = mixer.lever(arm, plant.layout) * np.array([*axis, 0.0])
+        label = f"{name}_rotor{rotor}"
+        rod = _add_visual(drone, f"{label}_arm", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.005], colour)
+        rod.fromto[:] = [0, 0, 0, *place]
         disc = _add_visual(
-            drone, f"{label}_disc", mujoco.mjtGeom.mjGEOM_CYLINDER, [0.4 * plant.arm, 0.003], (0.2, 0.2, 0.2, 0.4)
+            drone, f"{label}_disc", mujoco.mjtGeom.mjGEOM_CYLINDER, [0.4 * arm, 0.003], (0.2, 0.2, 0.2, 0.4)
         )
         disc.pos = [place[0], place[1], 0.015]
         drone.add_site(name=label, pos=place, size=[0.005, 0.005, 0.005])
         motor = spec.add_actuator(name=label, target=label, trntype=mujoco.mjtTrn.mjTRN_SITE)
         motor.set_to_motor()
-        motor.gear[:] = [0, 0, 1, 0, 0, spin * plant.yaw_per_thrust]
+        motor.gear[:] = [0, 0, 1, 0, 0, spin * yaw_per_thrust]
         motor.ctrllimited = True
-        motor.ctrlrange[:] = [0, plant.rotor_force_max]
+        motor.ctrlrange[:] = [0, force]
 
 
 def main(arguments: list[str] | None = None) -> int:

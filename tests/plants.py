@@ -7,21 +7,19 @@ import dataclasses
 import numpy as np
 
 from mjxball.baselines import make_baseline
-from mjxball.config import Config, Motion, Plant, preset
+from mjxball.config import Config, Drone, Motion, Plant, preset
 from mjxball.control.followers import Baseline
 from mjxball.physics.engine import CgState, PlantState, Wrench
 
 REFERENCE = Plant()
 # Nothing equal, nothing aligned: masses, inertias, mounts off the axis, another length and CG axis.
 VARIED = Plant(
-    leader_mass=1.3,
-    follower_mass=0.7,
+    drones=(
+        Drone(mass=1.3, inertia=(2.0e-3, 3.1e-3, 4.2e-3), mount=(0.31, 0.02, 0.05)),
+        Drone(mass=0.7, inertia=(1.1e-3, 2.3e-3, 3.4e-3), mount=(-0.19, -0.03, 0.04)),
+    ),
     object_mass=0.35,
-    leader_inertia=(2.0e-3, 3.1e-3, 4.2e-3),
-    follower_inertia=(1.1e-3, 2.3e-3, 3.4e-3),
     object_size=(0.5, 0.12, 0.08),
-    leader_mount=(0.31, 0.02, 0.05),
-    follower_mount=(-0.19, -0.03, 0.04),
     arm=0.09,
 )
 LIGHT_BALL = dataclasses.replace(VARIED, moving_fraction=0.4)
@@ -29,8 +27,10 @@ SIDEWAYS = dataclasses.replace(
     VARIED,
     cg_axis="y",
     object_size=(0.1, 0.44, 0.05),
-    leader_mount=(0.02, 0.25, 0.05),
-    follower_mount=(-0.01, -0.18, 0.04),
+    drones=(
+        dataclasses.replace(VARIED.drones[0], mount=(0.02, 0.25, 0.05)),
+        dataclasses.replace(VARIED.drones[1], mount=(-0.01, -0.18, 0.04)),
+    ),
     moving_fraction=0.7,
 )
 PIVOT = dataclasses.replace(SIDEWAYS, stand="pivot")
@@ -40,8 +40,7 @@ BEAM = Plant(
     stand="pivot",
     cg_axis="y",
     object_size=(0.1, 0.34, 0.05),
-    leader_mount=(0.0, 0.17, 0.0),
-    follower_mount=(0.0, -0.17, 0.0),
+    drones=(Drone(mount=(0.0, 0.17, 0.0)), Drone(mount=(0.0, -0.17, 0.0))),
 )
 PLANTS = {
     "reference": REFERENCE,
@@ -63,23 +62,29 @@ def random_states(plant: Plant, count: int, random: np.random.Generator) -> Plan
         quaternion[:, 2:], rates[:, 1:] = 0, 0
         keep = np.array([0.0, 0.0, float(plant.stand == "heave")])
         position, velocity = position * keep, velocity * keep
-    half = plant.object_size["xy".index(plant.cg_axis)] / 2
+    half, places = reach(plant), (count,) if len(plant.directions) == 1 else (count, 2)
     return PlantState(
         position=position,
         quaternion=quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
         velocity=velocity,
         rates=rates,
-        rotor_force=random.uniform(0, plant.rotor_force_max, (count, 2, 4)),
+        rotor_force=random.uniform(0, plant.rotor_force_max, (count, plant.count, 4)),
         time=random.uniform(0, 20, count),
-        ball_offset=random.uniform(-half, half, count),
-        ball_rate=random.normal(size=count),
+        ball_offset=random.uniform(-half, half, places),
+        ball_rate=random.normal(size=places),
     )
+
+
+def reach(plant: Plant) -> float:
+    """Half of the object's length along the load's directions [m]."""
+    return min(plant.object_size[axis] for axis in plant.directions) / 2
 
 
 def random_motion(plant: Plant, count: int, random: np.random.Generator) -> CgState:
     """Offsets within the object, with any rate and acceleration."""
-    reach = plant.moving_fraction * plant.object_size["xy".index(plant.cg_axis)] / 2
-    return CgState(random.uniform(-reach, reach, count), *random.normal(size=(2, count)))
+    places = (count,) if len(plant.directions) == 1 else (count, 2)
+    most = plant.moving_fraction * reach(plant)
+    return CgState(random.uniform(-most, most, places), *random.normal(size=(2, *places)))
 
 
 def random_wrench(count: int, random: np.random.Generator) -> Wrench:
@@ -95,3 +100,30 @@ def paper_with(plant: Plant = REFERENCE, motion: Motion | None = None):
 def copying(config: Config) -> Baseline:
     """The follower that copies its leader."""
     return make_baseline("copy", config)
+
+
+def team(count: int, seed: int, **changes: object) -> Plant:
+    """`count` drones of which no two are alike, anywhere and turned by any angle, on a carrier with a moving load."""
+    random = np.random.default_rng(seed)
+    drones = tuple(
+        Drone(
+            mass=random.uniform(0.5, 1.5),
+            inertia=tuple(random.uniform(2e-3, 3.5e-3, 3)),
+            mount=(*random.uniform(-0.4, 0.4, 2), random.uniform(-0.05, 0.05)),
+            yaw=random.uniform(-np.pi, np.pi),
+            arm=random.uniform(0.08, 0.15),
+            rotor_force_max=random.uniform(5, 9),
+            rotor_lag=random.uniform(0.02, 0.05),
+            yaw_per_thrust=random.uniform(0.01, 0.03),
+        )
+        for _ in range(count)
+    )
+    settings = {
+        "drones": drones,
+        "carrier_mass": 0.05 * count,
+        "carrier_inertia": (2e-3, 3e-3, 4e-3),
+        "object_mass": 0.1 * count,
+        "object_size": (0.5, 0.44, 0.08),
+        "cg_axis": "xy",
+    }
+    return Plant(**(settings | changes))

@@ -9,7 +9,7 @@ from plants import PLANTS
 
 from mjxball.assembly import BALL, BALL_JOINT, FOLLOWER, LEADER, build_model, main, to_mjcf
 from mjxball.config import Attitude
-from mjxball.control.constants import plant_constants
+from mjxball.plant import plant_parameters
 
 DOFS = {"free": 6, "pivot": 1, "heave": 2}
 
@@ -22,14 +22,11 @@ def test_model_has_the_plants_masses_places_and_joints(name: str) -> None:
     mujoco.mj_forward(model, data)
     assert model.nv == DOFS[plant.stand] + 1
     assert model.nu == 8
-    total = plant.leader_mass + plant.follower_mass + plant.object_mass
+    total = sum(drone.mass for drone in plant.drones) + plant.object_mass
     assert model.body_mass.sum() == pytest.approx(total)
-    for body, mass, mount in (
-        (LEADER, plant.leader_mass, plant.leader_mount),
-        (FOLLOWER, plant.follower_mass, plant.follower_mount),
-    ):
-        assert model.body(body).mass[0] == pytest.approx(mass)
-        np.testing.assert_allclose(data.body(body).xipos, mount, atol=1e-15)
+    for body, drone in zip((LEADER, FOLLOWER), plant.pair, strict=True):
+        assert model.body(body).mass[0] == pytest.approx(drone.mass)
+        np.testing.assert_allclose(data.body(body).xipos, drone.mount, atol=1e-15)
     assert model.body(BALL).mass[0] == pytest.approx(plant.moving_fraction * plant.object_mass)
     np.testing.assert_array_equal(model.jnt_axis[model.joint(BALL_JOINT).id], np.eye(3)["xy".index(plant.cg_axis)])
 
@@ -37,7 +34,7 @@ def test_model_has_the_plants_masses_places_and_joints(name: str) -> None:
 @pytest.mark.parametrize("name", PLANTS)
 def test_mujocos_mass_matrix_has_the_inertia_about_o(name: str) -> None:
     plant = PLANTS[name]
-    constants = plant_constants(plant, Attitude())
+    constants = plant_parameters(plant, Attitude())
     model = build_model(plant)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -81,7 +78,7 @@ def test_bare_mujoco_hovers_with_the_motors_at_their_share() -> None:
     plant = PLANTS["reference"]
     model = build_model(plant, timestep=0.002)
     data = mujoco.MjData(model)
-    data.ctrl[:] = (plant.leader_mass + plant.object_mass / 2) * plant.gravity / 4
+    data.ctrl[:] = (plant.pair[0].mass + plant.object_mass / 2) * plant.gravity / 4
     mujoco.mj_step(model, data, 500)
     assert np.abs(data.qpos[:3]).max() < 1e-9  # one second at rest, rounding only
 

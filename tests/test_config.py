@@ -58,7 +58,7 @@ class TestJson:
 
     def test_whole_numbers_for_floats_are_read_as_floats(self):
         data = configs.to_dict(configs.preset("paper"))
-        data["plant"]["leader_mass"] = 1
+        data["plant"]["drones"][0]["mass"] = 1
         config = configs.from_dict(json.loads(json.dumps(data)))
         assert configs.config_hash(config) == configs.config_hash(configs.preset("paper"))
 
@@ -91,13 +91,13 @@ class TestJson:
     @rows(
         ("section", "leaf", "value"),
         [
-            ("plant", "leader_mass", "heavy"),
-            ("plant", "leader_mass", True),
-            ("plant", "leader_mass", None),
-            ("plant", "leader_mass", [1.0]),
-            ("plant", "leader_inertia", 0.01),
-            ("plant", "leader_inertia", [0.01, "x", 0.01]),
-            ("plant", "leader_inertia", [[1, 1, 1]]),
+            ("plant.drones.0", "mass", "heavy"),
+            ("plant.drones.0", "mass", True),
+            ("plant.drones.0", "mass", None),
+            ("plant.drones.0", "mass", [1.0]),
+            ("plant.drones.0", "inertia", 0.01),
+            ("plant.drones.0", "inertia", [0.01, "x", 0.01]),
+            ("plant.drones.0", "inertia", [[1, 1, 1]]),
             ("sac", "worlds", 12.5),
             ("sac", "updates", 2.5),
             ("sac", "policy_layers", [64, 2.5]),
@@ -111,7 +111,10 @@ class TestJson:
     def test_wrong_type_is_refused_and_named(self, section, leaf, value):
         """A `config.json` edited by hand: JSON holds any type anywhere."""
         data = configs.to_dict(configs.preset("transport"))
-        data[section][leaf] = value
+        part: Any = data
+        for step in section.split("."):
+            part = part[int(step) if step.isdigit() else step]
+        part[leaf] = value
         with pytest.raises(InputError, match=leaf) as error:
             configs.validate(configs.from_dict(json.loads(json.dumps(data))))
         assert str(error.value).isprintable()
@@ -176,8 +179,8 @@ class TestOverride:
             ("plant.arm", "0.1,0.2"),
             ("sac.num_envs", "12.5"),
             ("sac.num_envs", "1e3"),
-            ("plant.leader_inertia", "1,2,x"),
-            ("plant.leader_inertia", "1;2;3"),
+            ("plant.drones.0.inertia", "1,2,x"),
+            ("plant.drones.0.inertia", "1;2;3"),
             ("sac.policy_layers", "64,"),
             ("sac.alpha_fixed", "maybe"),
         ],
@@ -192,10 +195,10 @@ class TestValidate:
     @rows(
         ("path", "value"),
         [
-            ("plant.leader_mass", -1.0),
+            ("plant.drones.0.mass", -1.0),
             ("plant.object_mass", 0.0),
-            ("plant.leader_inertia", (1e-3, -1e-3, 1e-3)),
-            ("plant.leader_inertia", (1e-3, 1e-3)),
+            ("plant.drones.0.inertia", (1e-3, -1e-3, 1e-3)),
+            ("plant.drones.0.inertia", (1e-3, 1e-3)),
             ("plant.rotor_lag", 0.0),
             ("plant.gravity", -9.81),
             ("leader.tilt_limit", 1.3),
@@ -239,7 +242,7 @@ class TestValidate:
             ({"scenario.goal_range": 1.5}, "termination_distance"),
             ({"scenario.goal_range": 1.0, "scenario.start_position": 0.5}, "termination_distance"),
             ({"scenario.termination_distance": 1.7}, "termination_distance"),
-            ({"plant.leader_mount": (-0.2, 0.0, 0.0)}, "leader_mount"),
+            ({"plant.drones.0.mount": (-0.2, 0.0, 0.0)}, "plant.drones.0.mount"),
             ({"timing.physics_steps": 3}, "ms"),
             ({"timing.control_period": 0.04}, "ms"),
             ({"sac.num_envs": 2048, "sac.replay_size": 1024}, "replay"),
@@ -296,8 +299,11 @@ class TestOldNames:
         config = configs.preset("flight")
         recorded = json.loads(configs.to_json(config))
         for old, new in configs.RENAMED.items():
-            (part, name), (new_part, new_name) = old.split("."), new.split(".")
-            recorded[part][name] = recorded[new_part].pop(new_name)
+            (part, name), (*way, new_name) = old.split("."), new.split(".")
+            place = recorded
+            for step in way:
+                place = place[int(step) if step.isdigit() else step]
+            recorded[part][name] = place.pop(new_name)
         assert configs.from_dict(recorded) == configs.from_record(recorded) == config
 
     def test_dotted_names(self):

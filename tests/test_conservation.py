@@ -8,10 +8,10 @@ from plants import LIGHT_BALL, REFERENCE, VARIED, copying, paper_with
 
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.control.constants import plant_constants
 from mjxball.physics import mujoco, newton_euler
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
 from mjxball.physics.motion import sine
+from mjxball.plant import plant_parameters
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
@@ -37,10 +37,10 @@ def advance(state: PlantState, rate: PlantState, h: float) -> PlantState:
 def momenta(plant: Plant, mass: np.ndarray, cg: CgState, state: PlantState) -> tuple[np.ndarray, np.ndarray]:
     """Linear momentum, and angular momentum about the moving centre of mass, summed body by body in the world."""
     matrix = rotations.matrix_from_quaternion(state.quaternion)
-    constants, share = plant_constants(plant, Attitude()), plant.moving_fraction
+    constants, share = plant_parameters(plant, Attitude()), plant.moving_fraction
     axis = np.array([1.0, 0, 0])
     inertias = [
-        *(np.array(i) for i in (plant.leader_inertia, plant.follower_inertia)),
+        *(np.array(drone.inertia) for drone in plant.drones),
         constants.shell_inertia_per_mass * mass[:, None],
         constants.ball_inertia_per_mass * mass[:, None],
     ]
@@ -97,7 +97,7 @@ def test_free_fall_conserves_momentum(plant: Plant, make_engine: object) -> None
         state = advance(state, mean, STEP)
     later_linear, later_angular = momenta(plant, mass, sine(state.time, *sines), state)
     fallen = np.zeros((WORLDS, 3))
-    fallen[:, 2] = -(plant.leader_mass + plant.follower_mass + mass) * plant.gravity * SECONDS
+    fallen[:, 2] = -(sum(drone.mass for drone in plant.drones) + mass) * plant.gravity * SECONDS
     # 1e-9 relative is the issue's bound: RK4 at 1 ms leaves a truncation error near (3 rad/s x 1 ms)^4 x 1 s.
     scale_linear = np.linalg.norm(linear + fallen, axis=-1).max()
     assert np.abs(later_linear - linear - fallen).max() <= 1e-9 * scale_linear
@@ -109,17 +109,17 @@ def test_free_fall_conserves_momentum(plant: Plant, make_engine: object) -> None
 def test_objects_own_equations_hold_with_the_contact_wrenches(physics: str) -> None:
     """Newton at the moving CG and Euler about it, from differences of the flown trajectory's own accelerations."""
     config = paper_with(VARIED)
-    plant, constants = config.plant, plant_constants(config.plant, config.attitude)
+    plant, constants = config.plant, plant_parameters(config.plant, config.attitude)
     flight = simulate(config, copying(config), Scenario(omega=2.0, amplitude=0.1, mass=0.3, seconds=4.0), physics)
     matrix = rotations.matrix_from_quaternion(flight.quaternion)
     state = PlantState(
         flight.position, flight.quaternion, flight.velocity, flight.rates, flight.rotor_force, flight.time, *[None] * 2
     )
-    from mjxball.physics.step import total_wrench
+    from mjxball.physics.engine import total_wrench
 
     ones = np.ones_like(flight.time)
     cg = sine(flight.time, 0.1 * ones, 2.0 * ones, 0.0 * ones)
-    wrench = total_wrench(np, flight.rotor_force, constants.mounts, plant.arm, plant.yaw_per_thrust)
+    wrench = total_wrench(plant, constants, flight.rotor_force)
     linear, angular = newton_euler.make_engine(plant, config.attitude).prescribed(state, wrench, 0.3 * ones, cg)
     along = np.array([1.0, 0, 0])
     c, rate, acceleration = (value[:, None] * along for value in cg)

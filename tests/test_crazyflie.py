@@ -150,7 +150,7 @@ class TestMotors:
     def test_rig_hovers_at_the_papers_thrust(self) -> None:
         """75.5 g on eight motors at thr_hov = 46000."""
         plant = rig()
-        assert plant.leader_mass + plant.follower_mass + plant.object_mass == pytest.approx(0.0755)
+        assert sum(drone.mass for drone in plant.drones) + plant.object_mass == pytest.approx(0.0755)
         assert crazyflie.motor_command(OLDER, np.array(0.0755 * 9.81 / 8)) == pytest.approx(46000, abs=50)
 
     @pytest.mark.parametrize("curve", [OLDER, LINEAR], ids=["older", "2026.04"])

@@ -10,11 +10,11 @@ import pytest
 from plants import PLANTS, ROLLING, SAMPLES, paper_with, random_motion, random_states, random_wrench
 from tables import rows
 
-from mjxball.config import Attitude, Motion
-from mjxball.control.constants import plant_constants
+from mjxball.config import Attitude, Motion, replace
 from mjxball.physics import mjx, mujoco, newton_euler
-from mjxball.physics.engine import Load
-from mjxball.physics.step import make_accelerations, total_wrench
+from mjxball.physics.engine import Load, total_wrench
+from mjxball.physics.step import make_accelerations
+from mjxball.plant import plant_parameters
 
 STATES = 10_000
 FEWER = 300  # for plants beside the reference: one world of C MuJoCo takes 50 us
@@ -88,8 +88,8 @@ def violent(motion: Motion, changes: int) -> tuple:
         mass_change=random.uniform(-0.05, 0.2, (STATES, changes)),
         mass_change_time=random.uniform(0, 20, (STATES, changes)),
     )
-    constants = plant_constants(config.plant, config.attitude)
-    wrench = total_wrench(np, state.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust)
+    constants = plant_parameters(config.plant, config.attitude)
+    wrench = total_wrench(config.plant, constants, state.rotor_force)
     return config, state, wrench, load
 
 
@@ -117,7 +117,7 @@ def with_more_inertia(name: str, function: str) -> tuple:
     """(plant, its arguments, more inertia (FEWER, 3), accelerations of a plant whose leader has it)."""
     plant = PLANTS[name]
     added = np.random.default_rng(5).uniform(-1e-3, 4e-3, 3)
-    heavier = dataclasses.replace(plant, leader_inertia=tuple(np.add(plant.leader_inertia, added)))
+    heavier = replace(plant, "drones.0.inertia", tuple(np.add(plant.drones[0].inertia, added)))
     arguments = arguments_for(plant, function, 6)
     expected = getattr(SECOND(heavier, Attitude()), function)(*arguments)
     return plant, arguments, np.broadcast_to(added, (FEWER, 3)), expected
@@ -149,7 +149,7 @@ def test_closed_form_matches_the_hand_solution_of_design_section_4() -> None:
     state = state._replace(quaternion=np.tile([1.0, 0, 0, 0], (50, 1)), rates=np.zeros((50, 3)))
     mass = random.uniform(0.1, 0.6, 50)
     linear, angular = newton_euler.make_engine(plant, Attitude()).prescribed(state, wrench, mass, cg)
-    constants = plant_constants(plant, Attitude())
+    constants = plant_parameters(plant, Attitude())
     jx, jy, jz = np.diag(constants.drone_inertia)[:, None] + mass * (
         constants.object_inertia_per_mass[:, None] + np.array([0, 1, 1])[:, None] * cg.offset**2
     )
@@ -189,10 +189,10 @@ def test_plant_is_parameters() -> None:
     mass = np.full(30, 0.4)
     heavy = dataclasses.replace(
         plant,
-        leader_mass=3 * plant.leader_mass,
-        follower_mass=3 * plant.follower_mass,
-        leader_inertia=tuple(3 * value for value in plant.leader_inertia),
-        follower_inertia=tuple(3 * value for value in plant.follower_inertia),
+        drones=tuple(
+            dataclasses.replace(drone, mass=3 * drone.mass, inertia=tuple(3 * value for value in drone.inertia))
+            for drone in plant.drones
+        ),
     )
     light_result = newton_euler.make_engine(plant, Attitude()).prescribed(state, wrench, mass, cg)
     tripled = wrench._replace(force=3 * wrench.force, torque=3 * wrench.torque)

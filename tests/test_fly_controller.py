@@ -63,7 +63,7 @@ def test_a_flight_of_the_pilot_is_a_flight_of_the_simulation() -> None:
     assert config.leader.ki == (0.2, 0.1, 0.1)
     controller, follower = Controller(Policy(contents, "a")), Policy(contents, "b")
     random, goal, integral = np.random.default_rng(2), np.array([0.3, -0.2, 0.5]), np.zeros(3)
-    mount = np.array(contents.card["plant"]["follower_mount"])
+    mount = np.array(config.plant.pair[1].mount)
     follower.reset()
     for _ in range(20):
         position, euler, velocity, rates = (0.3 * random.normal(size=3) for _ in range(4))

@@ -10,7 +10,6 @@ import pytest
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control import crazyflie, motors, rotations
-from mjxball.control.constants import plant_constants
 from mjxball.control.crazyflie import PARAMETERS, STOCK, gains_of, pair_gains, with_gains
 from mjxball.fly.twin.conditions import Conditions, DroneKind, Surroundings, drone_kind
 from mjxball.fly.twin.coupled import CoupledPair
@@ -18,6 +17,7 @@ from mjxball.fly.twin.physics import PairState
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_control_step, start_state
+from mjxball.plant import plant_parameters
 
 PRESETS = ("flight", "stand")
 PERIOD = 0.005  # the twin's
@@ -67,7 +67,7 @@ def test_a_second_in_the_air_is_that_of_the_closed_form(preset: str) -> None:
     values = map(np.float64, (mass, mass, 0.03, 1.0, 0.0))
     load = Load(*values, np.zeros(0), np.zeros(0))
     step = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude))
-    constants = plant_constants(config.plant, config.attitude)
+    constants = plant_parameters(config.plant, config.attitude)
     command = np.array([[0.06, -0.05, 0.3], [0.02, 0.03, -0.2]])
     carried = constants.drone_mass + constants.share * mass
     sent = crazyflie.setpoints(config.autopilot, command, carried, config.plant.gravity)

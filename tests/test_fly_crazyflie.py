@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from mjxball import config as configs
 from mjxball.control import crazyflie, rotations
-from mjxball.control.constants import plant_constants
 from mjxball.errors import InputError
 from mjxball.fly import card
 from mjxball.fly.command import ForceCurve, to_setpoint
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.physics import StandIn, make_pair
+from mjxball.plant import plant_parameters
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
 
@@ -93,7 +93,7 @@ def test_the_leader_flies_the_cards_law(preset: str) -> None:
 @given(st.sampled_from(PRESETS), tilt, tilt, vertical)
 def test_what_is_sent_is_what_was_simulated(preset: str, roll: float, pitch: float, lift: float) -> None:
     config = configs.preset(preset)
-    constants = plant_constants(config.plant, config.attitude)
+    constants = plant_parameters(config.plant, config.attitude)
     carried = constants.drone_mass + constants.share * config.plant.object_mass
     command = np.array([[roll, pitch, lift]] * 2)
     expected = crazyflie.setpoints(config.autopilot, command, carried, config.plant.gravity)

@@ -61,7 +61,7 @@ def test_the_log_holds_the_flight(recording: Recording) -> None:
     config = card.with_curve(recording.config, "older")
     assert recording.setup.gains == card.gains_of(config)
     plant = config.plant
-    weight = (plant.leader_mass + plant.follower_mass + plant.object_mass) * plant.gravity
+    weight = (sum(drone.mass for drone in plant.drones) + plant.object_mass) * plant.gravity
     # It hangs in the air for the last second: what the curve makes of the thrust that was sent is its weight.
     assert recording.rotor_force[flying][-100:].sum(axis=(1, 2)).mean() == pytest.approx(weight, rel=0.04)
     np.testing.assert_allclose(recording.rotor_force[~flying][-1], 0.0)

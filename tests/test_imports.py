@@ -1,5 +1,5 @@
-"""Imports run one way, along the data: config -> control -> policy | assembly -> physics -> env -> algorithms -> train
--> evaluate.
+"""Imports run one way, along the data: config -> plant -> control -> policy | assembly -> physics -> env -> algorithms
+-> train -> evaluate.
 
 Read from the syntax tree of every module, so that a lazy import inside a function counts as well.
 """
@@ -20,6 +20,7 @@ FLOORS = (
     {"errors"},
     {"config"},
     {"cli", "cache", "quiet", "plotting"},
+    {"plant"},
     {"control"},
     {"policy", "baselines"},
     {"assembly"},
@@ -35,8 +36,8 @@ FLOORS = (
     {"entry"},
 )
 FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}
-GROUND = {"errors", "config", "control"}  # all of our own that `control` and `policy` may import
-BASE = ("errors", "config", "cli", "control", "policy", "entry")  # what the base install runs: NumPy alone
+GROUND = {"errors", "config", "plant", "control"}  # all of our own that `control` and `policy` may import
+BASE = ("errors", "config", "cli", "plant", "control", "policy", "entry")  # what the base install runs: NumPy alone
 OURS = "mjxball"
 
 

@@ -12,9 +12,9 @@ from mjxball.baselines import LAWS as FOLLOWERS
 from mjxball.baselines import make_law
 from mjxball.config import Autopilot, preset
 from mjxball.control import attitude, crazyflie, leader, mixer, observation, rotations
-from mjxball.control.attitude import AttitudeGains
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import ObservationHistory
+from mjxball.plant import AttitudeGains
 
 WORLDS = 64
 random = np.random.default_rng(7)
@@ -86,6 +86,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "leader.clip_command": (lambda c: leader.clip_command(c, *LIMITS), (normal(3),)),
     "mixer.wrench_from_rotors": (lambda f: mixer.wrench_from_rotors(f, 0.12, 0.02), (normal(4),)),
     "mixer.rotors_from_wrench": (lambda w: mixer.rotors_from_wrench(w, 0.12, 0.02), (normal(4),)),
+    "mixer.turned": (lambda w: mixer.turned(w, 0.7), (normal(4),)),
     "mixer.wrench_from_rotors x": (lambda f: mixer.wrench_from_rotors(f, 0.046, 0.006, "x"), (normal(4),)),
     "mixer.rotors_from_wrench x": (lambda w: mixer.rotors_from_wrench(w, 0.046, 0.006, "x"), (normal(4),)),
     "crazyflie.to_firmware": (crazyflie.to_firmware, (EULER,)),
@@ -124,7 +125,6 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
 }
 # Computed once in NumPy float64, from the config, not from arrays.
 NOT_LAWS = {
-    "attitude.design_gains",
     "mixer.lever",
     "mixer.torque_per_force",
     "crazyflie.unpack",

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mjxball.assembly import build_model
-from mjxball.config import Attitude, Plant
+from mjxball.config import Attitude, Drone, Plant
 from mjxball.control import mixer, rotations
-from mjxball.control.constants import plant_constants
-from mjxball.physics.step import total_wrench
+from mjxball.physics.engine import total_wrench
+from mjxball.plant import plant_parameters
 
 ARM, YAW = 0.12, 0.02
 forces = arrays(np.float64, 4, elements=st.floats(0, 5.5))
@@ -51,10 +51,10 @@ def test_wrench_survives_the_rotors(wrench):
 @pytest.mark.parametrize("lever_y", [0.0, 0.05], ids=["drones on the x axis", "drones off the x axis"])
 def test_motors_of_the_model_give_the_same_wrench(lever_y):
     """MuJoCo's generalized force of the free joint is [R F, tau]: force in the world, torque in the body."""
-    plant = Plant(leader_mount=(0.17, lever_y, 0.02), follower_mount=(-0.15, -lever_y, 0.0))
+    plant = Plant(drones=(Drone(mount=(0.17, lever_y, 0.02)), Drone(mount=(-0.15, -lever_y, 0.0))))
     model = build_model(plant)
     data = mujoco.MjData(model)
-    mounts = plant_constants(plant, Attitude()).mounts
+    parameters = plant_parameters(plant, Attitude())
     random = np.random.default_rng(1)
     for _ in range(5):
         rotor_force = random.uniform(0, plant.rotor_force_max, (2, 4))
@@ -63,7 +63,7 @@ def test_motors_of_the_model_give_the_same_wrench(lever_y):
         data.qpos[:] = [*random.normal(size=3), *quaternion, 0.05]
         data.ctrl[:] = rotor_force.ravel()
         mujoco.mj_forward(model, data)
-        wrench = total_wrench(np, rotor_force, mounts, plant.arm, plant.yaw_per_thrust)
+        wrench = total_wrench(plant, parameters, rotor_force)
         force = rotations.matrix_from_euler(euler) @ wrench.force
         # MuJoCo works in float64; positions of some metres cost an ulp of 4e-16 m times 44 N.
         np.testing.assert_allclose(data.qfrc_actuator, [*force, *wrench.torque, 0.0], rtol=0, atol=1e-13)

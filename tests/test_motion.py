@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 
 from mjxball import config as configs
 from mjxball.commands.train import main as train
-from mjxball.config import Attitude, Motion, Plant
+from mjxball.config import Attitude, Motion, Plant, replace
 from mjxball.errors import InputError
 from mjxball.evaluate.suites import read_waveform
 from mjxball.physics import motion, newton_euler
@@ -145,7 +145,7 @@ def ball_alone(plant: Plant, offset: float, rate: float = 0.0, tilt: float = 0.0
 
 def test_ball_rolls_down_a_held_slope_with_five_sevenths_of_g() -> None:
     """On a pivot too heavy to turn, a solid ball rolls with 5/7 g sin(slope)."""
-    plant = dataclasses.replace(BEAM, leader_inertia=(1e9, 1e9, 1e9))
+    plant = replace(BEAM, "drones.0.inertia", (1e9, 1e9, 1e9))
     engine = newton_euler.make_engine(plant, Attitude())
     state = ball_alone(plant, 0.0, tilt=0.3)
     zero = np.zeros((1, 3))
@@ -192,7 +192,7 @@ def test_ball_larger_than_the_rod_is_refused() -> None:
 
 
 def test_zero_inertia_and_too_large_a_step_are_refused() -> None:
-    with pytest.raises(InputError, match="leader_inertia"):
-        configs.validate(paper_with(dataclasses.replace(Plant(), leader_inertia=(0.0, 1e-3, 1e-3))))
+    with pytest.raises(InputError, match=r"plant\.drones\.0\.inertia"):
+        configs.validate(paper_with(replace(Plant(), "drones.0.inertia", (0.0, 1e-3, 1e-3))))
     with pytest.raises(InputError, match="200 Hz"):
         configs.validate(configs.replace(paper_with(), "timing.physics_steps", 3))

@@ -14,11 +14,11 @@ from mjxball.commands import evaluate, train
 from mjxball.commands.scenarios import scenarios_of, setup_of
 from mjxball.config import Config, preset, validate
 from mjxball.control import crazyflie, rotations
-from mjxball.control.constants import plant_constants
 from mjxball.errors import InputError
 from mjxball.fly.preflight import read_gains
 from mjxball.physics.engine import Load
 from mjxball.physics.step import make_stepper, start_state
+from mjxball.plant import plant_parameters
 from mjxball.rig import identify as command
 from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify
@@ -54,7 +54,7 @@ def record(config: Config, rig: Rig, seconds: float, noise: float = 1.0) -> dict
     )
     step, zero = make_stepper(config, "newton-euler"), np.zeros((1, 3))
     state = start_state(config, zero, zero, zero, mass * one, np.zeros(1))
-    constants = plant_constants(config.plant, config.attitude)
+    constants = plant_parameters(config.plant, config.attitude)
     commands: list[np.ndarray] = []
     log: dict[str, list[np.ndarray]] = {"setpoints": [], "states": []}
     for number in range(round(seconds / PERIOD)):

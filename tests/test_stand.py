@@ -12,8 +12,8 @@ from plants import BEAM
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, Leader, ball_limit
-from mjxball.control.constants import plant_constants
 from mjxball.evaluate.stand_figure import LEVEL, SETTINGS, STAND_START, StandFlight, fly_stand, stand_config
+from mjxball.plant import plant_parameters
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 
@@ -31,7 +31,7 @@ def test_still_cg_tilts_a_copying_pair_as_far_as_its_attitude_loops_give_way() -
         STAND_START, mass=0.2, amplitude=0.05, omega=0.0, phase=math.pi / 2, ball_start=0.0, seconds=6.0
     )
     flight = fly_stand(setup, make_baseline("copy", setup), True, "newton-euler", still)
-    kp = plant_constants(setup.plant, setup.attitude).gains.kp[0]
+    kp = plant_parameters(setup.plant, setup.attitude).gains.kp[0]
     lean = -0.2 * 9.81 * 0.05 / (2 * kp)  # the CG lies on the leader's side, which goes down
     assert flight.ball[-1] == pytest.approx(0.05)
     # What is left after 6 s at 10 rad/s is rounding; cos(phi) is 1e-4 from 1.

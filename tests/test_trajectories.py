@@ -157,8 +157,8 @@ def test_a_flight_that_diverges_is_marked_and_harms_no_neighbour() -> None:
 @pytest.mark.parametrize(
     ("section", "leaf", "value", "word"),
     [
-        ("plant", "leader_mass", -1.0, "leader_mass"),
-        ("plant", "leader_inertia", (0.0, 1e-3, 1e-3), "leader_inertia"),
+        ("plant.drones.0", "mass", -1.0, "drones.0.mass"),
+        ("plant.drones.0", "inertia", (0.0, 1e-3, 1e-3), "drones.0.inertia"),
         ("plant", "ball_radius", 1.0, "larger"),
         ("plant", "gravity", 0.0, "gravity"),
         ("timing", "physics_steps", 1, "200 Hz"),

@@ -27,8 +27,9 @@ def test_at_the_reach_everything_balances_and_one_rotor_is_at_its_limit(
     paper: Config, mass: float, believed: float, drones: tuple[float, float], thrust: tuple[float, float]
 ) -> None:
     """Force and moment about O of four weights' and eight rotors' forces, the leader's four alike."""
-    plant = dataclasses.replace(paper.plant, leader_mass=drones[0], follower_mass=drones[1])
-    gravity, half, arm = plant.gravity, plant.leader_mount[0], plant.arm
+    pair = zip(paper.plant.drones, drones, strict=True)
+    plant = dataclasses.replace(paper.plant, drones=tuple(dataclasses.replace(one, mass=own) for one, own in pair))
+    gravity, half, arm = plant.gravity, plant.pair[0].mount[0], plant.arm
     offset = trim_limit(plant, mass, 0.0, believed, thrust)
     leader = thrust[0] * (drones[0] + believed / 2) * gravity
     follower = (sum(drones) + mass) * gravity - leader

@@ -269,7 +269,7 @@ def test_rotors_are_where_the_layout_puts_them(flight: Flight, browser: Any, tmp
         }"""
     )
     tab.close()
-    centres = np.mean(np.array(discs), axis=1)[:4] - shown["position"][0] - shown.plant.leader_mount
+    centres = np.mean(np.array(discs), axis=1)[:4] - shown["position"][0] - shown.plant.pair[0].mount
     np.testing.assert_allclose(np.abs(centres[:, :2]), side, atol=2e-3)  # level but for the start's tilt
 
 

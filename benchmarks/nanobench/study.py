@@ -95,7 +95,7 @@ def inertia_over_mass(found: Study, fit: Rotation) -> Array:
 def plant_inertia_over_mass() -> Array:
     """(2,) of the simulated drone [m2]."""
     plant = config.preset("flight").plant
-    return np.array(plant.leader_inertia[:2]) / plant.leader_mass
+    return np.array(plant.pair[0].inertia[:2]) / plant.pair[0].mass
 
 
 def ranges(found: Study) -> dict[str, Any]:

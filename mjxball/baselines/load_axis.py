@@ -8,10 +8,11 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import leader
-from mjxball.control.constants import drone_loop, plant_constants, thrust_slopes
+from mjxball.control.constants import drone_loop, thrust_slopes
 from mjxball.control.followers import copy_gains
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 from mjxball.errors import InputError
+from mjxball.plant import plant_parameters
 
 Array = Any
 
@@ -82,23 +83,23 @@ def load_axis(config: Config, name: str) -> LoadAxis:
     if plant.cg_axis == "x" and plant.stand != "free":
         raise InputError(f"follower {name!r} balances a free pair along x, or a pair along y; this stand locks pitch")
     axis = "yx".index(plant.cg_axis)
-    constants = plant_constants(plant, attitude)
+    constants = plant_parameters(plant, attitude)
     inertia = np.diag(constants.drone_inertia) + plant.object_mass * constants.object_inertia_per_mass
-    kp, kd, thrust_surplus = constants.gains.kp[axis], constants.gains.kd[axis], 0.0
+    kp, kd, thrust_surplus = float(constants.gains.kp[axis]), float(constants.gains.kd[axis]), 0.0
     if config.autopilot.kind == "crazyflie":
         loop = drone_loop(config, axis)
         kp, kd, thrust_surplus = loop.kp, loop.kd, loop.thrust_surplus
     roll, pitch, _ = attitude.natural_frequency
     leader_share, follower_share = map(float, constants.share)
-    along = "xy".index(plant.cg_axis)
+    along, (lead, follow) = plant.directions[0], plant.pair
     return LoadAxis(
         axis=axis,
         sign=1.0 if axis else -1.0,
         kp=kp,
         kd=kd,
         inertia=float(inertia[axis]),
-        half_length=0.5 * (plant.leader_mount[along] - plant.follower_mount[along]),
-        drone_mass=(plant.leader_mass, plant.follower_mass),
+        half_length=0.5 * (lead.mount[along] - follow.mount[along]),
+        drone_mass=(lead.mass, follow.mass),
         share=(leader_share, follower_share),
         gravity=plant.gravity,
         slope=thrust_slopes(config)[1],

@@ -33,7 +33,7 @@ def evaluate_log(path: Path, out: Path) -> int:
     recorded = result_of(recording, f"{recording.policy}, flown")
     simulated = result_of(fly_again(recording), "the same, simulated")
     plant = recording.config.plant
-    files = draw(recorded, simulated, plant.stand != "free", plant.leader_mount, out)
+    files = draw(recorded, simulated, plant.stand != "free", plant.drones[plant.leader].mount, out)
     print(differences(recorded, simulated))  # noqa: T201
     print("figures: " + ", ".join(map(str, files)))  # noqa: T201
     return 0

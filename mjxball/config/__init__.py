@@ -3,6 +3,7 @@
 Importing it needs the standard library only.
 """
 
+from mjxball.config._plant import Drone, Plant
 from mjxball.config._presets import PRESETS, RIGS, preset
 from mjxball.config._renamed import CONSTANT, RENAMED, current_name, old_names, with_current_names
 from mjxball.config._settings import (
@@ -14,7 +15,6 @@ from mjxball.config._settings import (
     Gradient,
     Leader,
     Motion,
-    Plant,
     Ppo,
     Reward,
     Sac,
@@ -43,6 +43,7 @@ __all__ = [
     "Autopilot",
     "Bounds",
     "Config",
+    "Drone",
     "Follower",
     "Gradient",
     "Leader",

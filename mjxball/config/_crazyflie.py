@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
+from mjxball.config._plant import Drone, Plant
 from mjxball.config._settings import (
     Autopilot,
     Bounds,
@@ -12,12 +13,12 @@ from mjxball.config._settings import (
     Follower,
     Leader,
     Motion,
-    Plant,
     Reward,
     Sac,
     Scenario,
     Timing,
 )
+from mjxball.config._tree import leaves
 
 # mass [kg], motor curve [N], whose motor: firmware of 2025.12.1 on compensates for the battery, force is a line.
 DRONES: dict[str, tuple[float, tuple[float, float], Any]] = {
@@ -43,19 +44,15 @@ def rig(drone: str = "2.1") -> Plant:
     Weighs 75.5 g with the 2.1, which hovers at 50 562 of 60 000 units, and at the paper's 46 000 on the older curve.
     """
     mass, curve, _ = DRONES[drone]
+    inertia = (1.66e-5, 1.66e-5, 2.93e-5)
     return Plant(
-        leader_mass=mass,
-        follower_mass=mass,
+        drones=tuple(Drone(mass=mass, inertia=inertia, mount=(0.0, y, 0.0)) for y in (0.15, -0.15)),
         object_mass=0.0175,
-        leader_inertia=(1.66e-5, 1.66e-5, 2.93e-5),
-        follower_inertia=(1.66e-5, 1.66e-5, 2.93e-5),
         object_size=(0.02, 0.30, 0.01),
         moving_fraction=0.0075 / 0.0175,
         ball_radius=0.006,
         ball_stop=0.08,
         cg_axis="y",
-        leader_mount=(0.0, 0.15, 0.0),
-        follower_mount=(0.0, -0.15, 0.0),
         arm=0.046,
         layout="x",
         rotor_force_max=sum(curve),
@@ -84,13 +81,9 @@ STRONG: dict[str, Any] = {"scenario.cg_amplitude": (0.0, 0.034), "scenario.uncom
 
 def rig_settings(drone: str) -> dict[str, Any]:
     """What a plant file of the pair of `DRONES` says: every setting of plant and autopilot that a 2.1 has otherwise."""
-    parts: dict[str, list[Any]] = {"plant": [rig(drone), rig()], "autopilot": [autopilot(drone), autopilot()]}
-    changed = {
-        f"{part}.{item.name}": getattr(mine, item.name)
-        for part, (mine, usual) in parts.items()
-        for item in fields(mine)
-        if getattr(mine, item.name) != getattr(usual, item.name)
-    }
+    mine, usual = (Config(plant=rig(name), autopilot=autopilot(name)) for name in (drone, "2.1"))
+    pairs = zip(leaves(mine), leaves(usual), strict=True)
+    changed = {path: value for (path, value, _), (_, other, _) in pairs if value != other}
     return changed if drone.startswith("2.1") else {**changed, **STRONG}
 
 

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from mjxball.errors import InputError
 
 # Old dotted path -> new one. Old flags are accepted and hidden in --help.
 RENAMED = {
+    "plant.leader_mass": "plant.drones.0.mass",
+    "plant.leader_inertia": "plant.drones.0.inertia",
+    "plant.leader_mount": "plant.drones.0.mount",
+    "plant.follower_mass": "plant.drones.1.mass",
+    "plant.follower_inertia": "plant.drones.1.inertia",
+    "plant.follower_mount": "plant.drones.1.mount",
     "sac.steps": "sac.total_steps",
     "sac.worlds": "sac.num_envs",
     "sac.batch": "sac.batch_size",
@@ -65,6 +72,9 @@ def with_current_names(data: Any) -> Any:
     if not isinstance(data, dict):
         return data
     found = {part: dict(values) if isinstance(values, dict) else values for part, values in data.items()}
+    plant = found.get("plant")
+    if isinstance(plant, dict) and isinstance(plant.get("drones"), (list, tuple)):
+        plant["drones"] = [dict(drone) if isinstance(drone, dict) else drone for drone in plant["drones"]]
     for old in (*RENAMED, *CONSTANT):
         part, _, name = old.partition(".")
         if not isinstance(found.get(part), dict) or name not in found[part]:
@@ -73,12 +83,27 @@ def with_current_names(data: Any) -> Any:
         if old in CONSTANT:
             check_constant(old, value)
             continue
-        new_part, _, new_name = RENAMED[old].partition(".")
-        place = found.setdefault(new_part, {})
+        *way, new_name = RENAMED[old].split(".")
+        place = _place(found, way)
+        if not isinstance(place, dict):
+            raise InputError(f"configuration has no place for {RENAMED[old]}, which stands there as {old}")
         if new_name in place:
             raise InputError(f"{RENAMED[old]} is given twice, also under its old name {old}")
         place[new_name] = value
     return found
+
+
+def _place(data: Any, way: Sequence[str]) -> Any:
+    """What stands in nested `data` at the end of `way`; made if it is missing, None if something else is there."""
+    for step, after in zip(way, (*way[1:], ""), strict=True):
+        if isinstance(data, dict):
+            data = data.setdefault(step, [] if after.isdigit() else {})
+        elif isinstance(data, list) and step.isdigit():
+            data += [{} for _ in range(int(step) + 1 - len(data))]
+            data = data[int(step)]
+        else:
+            return None
+    return data
 
 
 def check_constant(path: str, value: Any) -> None:

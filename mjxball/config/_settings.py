@@ -2,64 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
-Vector3 = tuple[float, float, float]
-Range = tuple[float, float]
-
-
-def setting(
-    default: Any,
-    about: str,
-    *,
-    above: float | None = None,
-    low: float | None = None,
-    high: float | None = None,
-    ordered: bool = False,
-) -> Any:
-    """Declare a leaf: default, help text, and bounds that hold for each of its numbers.
-
-    `above` is exclusive, `low` and `high` are inclusive, `ordered` asks for low <= high in a range.
-    """
-    bounds = {"about": about, "above": above, "low": low, "high": high, "ordered": ordered}
-    return field(default=default, metadata=bounds)
-
-
-def drawn(default: Range, about: str, **bounds: Any) -> Any:
-    """Declare a range that resets draw from, low <= high."""
-    return setting(default, about, ordered=True, **bounds)
-
-
-@dataclass(frozen=True)
-class Plant:
-    """The rigid assembly: two drones, one object. Defaults are the `paper` plant (docs/model.md)."""
-
-    leader_mass: float = setting(1.0, "mass of the leader [kg]", above=0)
-    follower_mass: float = setting(1.0, "mass of the follower [kg]", above=0)
-    object_mass: float = setting(0.2, "nominal mass of the object, all of it moving with the CG [kg]", above=0)
-    leader_inertia: Vector3 = setting((2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the leader [kg m2]", above=0)
-    follower_inertia: Vector3 = setting((2.3e-3, 2.3e-3, 4.0e-3), "principal inertia of the follower [kg m2]", above=0)
-    object_size: Vector3 = setting((0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", above=0)
-    moving_fraction: float = setting(
-        1.0, "share of the object's mass that moves; the rest is a fixed box about O", above=0, high=1
-    )
-    ball_radius: float = setting(0.02, "radius of the moving ball [m]", above=0)
-    ball_stop: float = setting(0.0, "ball's centre from O at an end stop, 0: it touches the object's end [m]", low=0)
-    cg_axis: Literal["x", "y"] = setting("x", "body axis along which the CG moves and the drones are mounted")
-    stand: Literal["free", "pivot", "heave"] = setting(
-        "free", "free flight; pivot: O fixed, only roll free; heave: roll and height free"
-    )
-    leader_mount: Vector3 = setting((0.17, 0.0, 0.0), "centre of the leader from O, body axes [m]")
-    follower_mount: Vector3 = setting((-0.17, 0.0, 0.0), "centre of the follower from O, body axes [m]")
-    arm: float = setting(0.12, "centre of a drone to each rotor [m]", above=0)
-    layout: Literal["plus", "x"] = setting(
-        "plus", "rotors on the body axes, 1 at +x, 2 at +y; or between them as on a Crazyflie, 1 at +x -y, 2 at -x -y"
-    )
-    rotor_force_max: float = setting(5.5, "largest force of one rotor [N]", above=0)
-    rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", above=0)
-    yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", above=0)
-    gravity: float = setting(9.81, "gravitational acceleration [m/s2]", above=0)
+from mjxball.config._leaf import Range, Vector3, drawn, setting
+from mjxball.config._plant import Plant
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from mjxball.config._plant import Drone
 from mjxball.config._renamed import CONSTANT, check_constant, current_name, with_current_names
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
@@ -23,6 +24,9 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasse
         path = f"{prefix}{item.name}"
         if dataclasses.is_dataclass(value):
             yield from leaves(value, f"{path}.")
+        elif _are_records(value):
+            for number, record in enumerate(value):
+                yield from leaves(record, f"{path}.{number}.")
         elif item.metadata:
             yield path, value, item
 
@@ -30,9 +34,17 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasse
 def replace(config: Any, path: str, value: Any) -> Any:
     """Return a copy of `config` with the leaf at the dotted `path` replaced, unchecked."""
     head, _, rest = path.partition(".")
+    if isinstance(config, tuple):
+        number = int(head)
+        return (*config[:number], replace(config[number], rest, value), *config[number + 1 :])
     if rest:
         value = replace(getattr(config, head), rest, value)
     return dataclasses.replace(config, **{head: value})
+
+
+def _are_records(value: Any) -> bool:
+    """Whether `value` is a tuple of dataclasses, such as the plant's drones."""
+    return isinstance(value, tuple) and bool(value) and dataclasses.is_dataclass(value[0])
 
 
 def override(config: Config, path: str, text: str) -> Config:
@@ -105,14 +117,25 @@ def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
     values = {}
     for name in names:
         value = data[name]
+        where, record = f"{path}.{name}".lstrip("."), _record_type(hints[name])
         if dataclasses.is_dataclass(hints[name]):
-            value = from_dict(value, hints[name], f"{path}.{name}".lstrip("."))
+            value = from_dict(value, hints[name], where)
+        elif record is not None:
+            if not isinstance(value, (list, tuple)):
+                raise InputError(f"configuration {where} must be a list")
+            value = tuple(from_dict(one, record, f"{where}.{number}") for number, one in enumerate(value))
         elif isinstance(value, list):
             value = tuple(map(float, value)) if _is_float_tuple(hints[name], value) else tuple(value)
         elif hints[name] is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         values[name] = value
     return kind(**values)
+
+
+def _record_type(hint: Any) -> Any:
+    """The dataclass of which `hint` allows a tuple of any length; None for any other hint."""
+    kinds = typing.get_args(hint)
+    return kinds[0] if kinds[1:] == (Ellipsis,) and dataclasses.is_dataclass(kinds[0]) else None
 
 
 def from_record(data: Any) -> Any:
@@ -126,6 +149,8 @@ def from_record(data: Any) -> Any:
 
 
 def _completed(data: Any, default: Any) -> Any:
+    if isinstance(data, (list, tuple)) and isinstance(default, tuple) and default and isinstance(default[0], dict):
+        return [_completed(one, to_dict(Drone())) for one in data]
     if not isinstance(data, dict) or not isinstance(default, dict):
         return data
     return {**data, **{name: _completed(data.get(name, value), value) for name, value in default.items()}}

@@ -8,11 +8,13 @@ import math
 import typing
 from typing import Any, Literal
 
-from mjxball.config._settings import Config, Plant
+from mjxball.config._plant import Plant
+from mjxball.config._settings import Config
 from mjxball.config._tree import leaves
 from mjxball.errors import InputError
 
 LARGEST = 1e12  # of any number in a configuration
+MOST_DRONES, FARTHEST = 16, 10.0  # of a plant; of a mount from O [m]
 
 
 def _types_of(owner: Any) -> dict[str, Any]:
@@ -63,7 +65,7 @@ def validate(config: Config) -> Config:
     for path, value, item in leaves(config):
         owner: Any = config
         for part in path.split(".")[:-1]:
-            owner = getattr(owner, part)
+            owner = owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
         _check_leaf(path, value, item, _types_of(owner)[item.name])
     _validate_plant(config.plant)
     _validate_autopilot(config)
@@ -96,16 +98,38 @@ def validate(config: Config) -> Config:
     return config
 
 
+APART = 1e-3  # [m] by which two drones' centres must differ
+
+
 def _validate_plant(plant: Plant) -> None:
-    along = "xy".index(plant.cg_axis)
-    if plant.leader_mount[along] <= plant.follower_mount[along]:
-        raise InputError(f"plant.leader_mount must lie ahead of plant.follower_mount along {plant.cg_axis}")
-    if 2 * plant.ball_radius > plant.object_size[along]:
+    if plant.count < 2 or plant.count > MOST_DRONES:
+        raise InputError(f"plant.drones must hold 2 to {MOST_DRONES} drones, a leader and its followers")
+    if plant.leader >= plant.count:
+        raise InputError(f"plant.leader {plant.leader} is none of the {plant.count} drones, which count from 0")
+    for (one, a), (other, b) in itertools.combinations(enumerate(plant.drones), 2):
+        if math.dist(a.mount, b.mount) < APART:
+            raise InputError(f"plant.drones.{one}.mount and plant.drones.{other}.mount are the same place")
+    for number, drone in enumerate(plant.drones):
+        if math.hypot(*drone.mount) > FARTHEST:
+            raise InputError(f"plant.drones.{number}.mount lies beyond {FARTHEST:g} m from O")
+    if plant.carrier_mass > 0 and min(plant.carrier_inertia) <= 0:
+        raise InputError(f"plant.carrier_inertia {plant.carrier_inertia!r} is singular, and the carrier has a mass")
+    if len(plant.directions) == 1:
+        along = plant.directions[0]
+        places = [drone.mount[along] for drone in plant.drones]
+        if max(places) - min(places) < APART:
+            raise InputError(f"plant.drones sit at one place along {plant.cg_axis}, where nothing holds the load")
+        if plant.count == 2 and places[plant.leader] <= places[1 - plant.leader]:
+            raise InputError(
+                f"plant.drones.{plant.leader}.mount, the leader's, must lie ahead of the follower's along "
+                f"{plant.cg_axis}"
+            )
+    length = min(plant.object_size[axis] for axis in plant.directions)
+    if 2 * plant.ball_radius > length:
         raise InputError(
-            f"plant.ball_radius {plant.ball_radius:g} m makes a ball larger than the object, "
-            f"which is {plant.object_size[along]:g} m long"
+            f"plant.ball_radius {plant.ball_radius:g} m makes a ball larger than the object, which is {length:g} m long"
         )
-    end = plant.object_size[along] / 2 - plant.ball_radius
+    end = length / 2 - plant.ball_radius
     if plant.ball_stop > end + 1e-12:
         raise InputError(f"plant.ball_stop {plant.ball_stop:g} m lies off the object, where a ball reaches {end:.4g} m")
 
@@ -116,13 +140,8 @@ THRUST_MARGIN = 0.2  # share of a Crazyflie's thrust that a hover must leave
 def thrust_margin(config: Config) -> float:
     """Share of the weaker drone's full thrust that hovering the heaviest object leaves; negative: it cannot hover."""
     plant, most = config.plant, 4 * sum(config.autopilot.motor_curve)
-    along = "xy".index(plant.cg_axis)
-    ahead, behind = plant.leader_mount[along], plant.follower_mount[along]
     mass = config.scenario.object_mass[1] + max(config.scenario.mass_change[1], 0.0)
-    carried = (
-        plant.leader_mass - behind / (ahead - behind) * mass,
-        plant.follower_mass + ahead / (ahead - behind) * mass,
-    )
+    carried = (drone.mass + share * mass for drone, share in zip(plant.drones, plant.shares, strict=True))
     return 1 - max(carried) * plant.gravity / most
 
 
@@ -149,12 +168,12 @@ def _validate_autopilot(config: Config) -> None:
 
 def cg_limit(plant: Plant) -> float:
     """Largest offset of the CG from O that keeps the moving mass on the object [m]."""
-    return plant.moving_fraction * plant.object_size["xy".index(plant.cg_axis)] / 2
+    return plant.moving_fraction * min(plant.object_size[axis] for axis in plant.directions) / 2
 
 
 def ball_limit(plant: Plant) -> float:
-    """Offset of a rolling ball at which it touches an end stop [m]."""
-    return plant.ball_stop or plant.object_size["xy".index(plant.cg_axis)] / 2 - plant.ball_radius
+    """Offset of a rolling ball at which it touches an end stop or the rim [m]."""
+    return plant.ball_stop or min(plant.object_size[axis] for axis in plant.directions) / 2 - plant.ball_radius
 
 
 def _validate_motion(config: Config) -> None:

@@ -2,28 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 from mjxball.control import mixer
+from mjxball.plant.parameters import AttitudeGains
 
 Array = Any
-
-
-class AttitudeGains(NamedTuple):
-    """PD gains of one drone on (roll, pitch, yaw)."""
-
-    kp: tuple[float, ...]  # (3,) [N m/rad]
-    kd: tuple[float, ...]  # (3,) [N m s/rad]
-
-
-def design_gains(inertia: Array, natural_frequency: Array, damping: float) -> AttitudeGains:
-    """Gains of one of two equal drones for the assembly's inertia about O (3,) [kg m2]: each takes half.
-
-    Kp = J wn^2 / 2, Kd = J zeta wn (ours).
-    """
-    kp = tuple(0.5 * j * w * w for j, w in zip(inertia, natural_frequency, strict=True))
-    kd = tuple(j * damping * w for j, w in zip(inertia, natural_frequency, strict=True))
-    return AttitudeGains(kp, kd)
 
 
 def rotor_commands(
@@ -33,15 +17,17 @@ def rotor_commands(
     carried_mass: Array,
     gains: AttitudeGains,
     gravity: float,
-    arm: float,
-    yaw_per_thrust: float,
-    rotor_force_max: float,
+    arm: Array | float,
+    yaw_per_thrust: Array | float,
+    rotor_force_max: Array | float,
     layout: str = "plus",
+    yaw: Array | float = 0.0,
 ) -> Array:
     """Clipped rotor forces (..., 4) [N] for `command` = (roll, pitch [rad], vertical acceleration [m/s2]) (..., 3).
 
     `euler` = (phi, theta, psi) (..., 3) [rad], body `rates` (..., 3) [rad/s]; `carried_mass` (...) is the drone's
-    own mass plus its share of the believed object mass [kg]. Desired yaw is 0 (paper).
+    own mass plus its share of the believed object mass [kg]. Desired yaw is 0 (paper). All angles are the carrier's;
+    `arm`, `yaw_per_thrust`, `rotor_force_max` and `yaw`, by which a drone is turned on it [rad], are (...) or a float.
     T = m (g + az) / (cos phi cos theta); tau = Kp (desired - euler) - Kd rates.
     """
     xp = command.__array_namespace__()
@@ -50,5 +36,7 @@ def rotor_commands(
     thrust = carried_mass * (gravity + command[..., 2]) / level
     desired = xp.stack([command[..., 0], command[..., 1], xp.zeros_like(command[..., 0])], axis=-1)
     torque = kp * (desired - euler) - kd * rates
-    rotors = mixer.rotors_from_wrench(xp.concat([thrust[..., None], torque], axis=-1), arm, yaw_per_thrust, layout)
-    return xp.clip(rotors, 0.0, rotor_force_max)
+    wrench = mixer.turned(xp.concat([thrust[..., None], torque], axis=-1), -yaw)
+    rotors = mixer.rotors_from_wrench(wrench, arm, yaw_per_thrust, layout)
+    most = rotor_force_max if isinstance(rotor_force_max, float) else rotor_force_max[..., None]
+    return xp.clip(rotors, 0.0, most)

@@ -1,64 +1,16 @@
-"""Numbers that follow from the plant: inertia about O, attitude gains, hover shares. NumPy, float64."""
+"""Numbers that follow from a plant and its autopilot: what can be trimmed, hover commands, linearised loops."""
 
 from __future__ import annotations
 
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
-
-from mjxball.config import Attitude, Config, Plant
-from mjxball.control import crazyflie, mixer, rotations
-from mjxball.control.attitude import AttitudeGains, design_gains
+from mjxball.config import Config, Plant
+from mjxball.control import crazyflie, mixer
 from mjxball.control.mixer import torque_per_force
+from mjxball.plant import plant_parameters
 
 Array = Any
-ROLLING_INERTIA = 0.4  # spin inertia of a solid ball over r^2 and its mass: (7/5) m x'' = m g sin
-
-
-class PlantConstants(NamedTuple):
-    """Derived constants of one plant."""
-
-    drone_mass: np.ndarray  # (2,) leader, follower [kg]
-    mounts: np.ndarray  # (2, 3) leader, follower from O, body axes [m]
-    share: np.ndarray  # (2,) share of the object's weight that each drone carries with the CG at O
-    gains: AttitudeGains  # attitude gains of each drone
-    drone_moment: np.ndarray  # (3,) sum of m_i r_i [kg m]
-    drone_inertia: np.ndarray  # (3, 3) inertia of both drones about O, body axes [kg m2]
-    shell_inertia_per_mass: np.ndarray  # (3,) of the fixed part of the object about O, per kg of object [m2]
-    ball_inertia_per_mass: np.ndarray  # (3,) of the moving part about its own centre, per kg of object [m2]
-
-    @property
-    def object_inertia_per_mass(self) -> np.ndarray:
-        """(3,) of the whole object about O with the CG at O, per kg of object [m2]."""
-        return self.shell_inertia_per_mass + self.ball_inertia_per_mass
-
-
-def box_inertia_per_mass(size: tuple[float, float, float]) -> np.ndarray:
-    """Principal inertia (3,) [m2] of a uniform box with edges `size` [m], about its centre, per unit mass."""
-    a, b, c = size
-    return np.array([b * b + c * c, a * a + c * c, a * a + b * b]) / 12
-
-
-def plant_constants(plant: Plant, attitude: Attitude) -> PlantConstants:
-    """Derive the constants of `plant`; the attitude gains are those of `attitude.design_object_mass` at c = 0.
-
-    If the whole object moves (`moving_fraction` 1) the moving mass has the box's inertia, as in the reference
-    plant; else it is a solid ball, and the fixed rest is the box.
-    """
-    mass = np.array([plant.leader_mass, plant.follower_mass])
-    mounts = np.array([plant.leader_mount, plant.follower_mount])
-    own = np.diag(plant.leader_inertia) + np.diag(plant.follower_inertia)
-    drone_inertia = own + sum(m * rotations.point_inertia(r) for m, r in zip(mass, mounts, strict=True))
-    box, fraction = box_inertia_per_mass(plant.object_size), plant.moving_fraction
-    ball = box if fraction == 1 else np.full(3, fraction * ROLLING_INERTIA * plant.ball_radius**2)
-    shell = (1 - fraction) * box
-    design_inertia = np.diag(drone_inertia) + attitude.design_object_mass * (shell + ball)
-    ahead, behind = mounts[:, "xy".index(plant.cg_axis)]
-    share = np.array([-behind, ahead]) / (ahead - behind)
-    gains = design_gains(design_inertia, attitude.natural_frequency, attitude.damping)
-    gains = AttitudeGains(tuple(map(float, gains.kp)), tuple(map(float, gains.kd)))
-    return PlantConstants(mass, mounts, share, gains, mass @ mounts, drone_inertia, shell, ball)
 
 
 def trim_limit(
@@ -76,13 +28,15 @@ def trim_limit(
     moment of that and of the CG with the share `margin` of it left.
     """
     believed = object_mass if believed_mass is None else believed_mass
-    ahead, behind = (getattr(plant, name)["xy".index(plant.cg_axis)] for name in ("leader_mount", "follower_mount"))
+    lead, follow = plant.pair
+    ahead, behind = (drone.mount[plant.directions[0]] for drone in (lead, follow))
+    arm, most = follow.arm or plant.arm, follow.rotor_force_max or plant.rotor_force_max
     strong, own = thrust
     # What each drone lifts beyond its own mass.
-    leader_lift = strong * (plant.leader_mass - behind / (ahead - behind) * believed) - plant.leader_mass
+    leader_lift = strong * (lead.mass - behind / (ahead - behind) * believed) - lead.mass
     follower_lift = object_mass - leader_lift
-    asked = (plant.follower_mass + follower_lift) * plant.gravity / 4  # of each rotor, times `own`
-    torque = (1 - margin) * torque_per_force(plant.arm, plant.layout) * (own * plant.rotor_force_max - asked)
+    asked = (follow.mass + follower_lift) * plant.gravity / 4  # of each rotor, times `own`
+    torque = (1 - margin) * torque_per_force(arm, plant.layout) * (own * most - asked)
     uneven = abs(ahead * leader_lift + behind * follower_lift) * plant.gravity  # moment about O of both lifts
     return (torque - uneven) / (object_mass * plant.gravity)
 
@@ -104,7 +58,7 @@ class DroneLoop(NamedTuple):
 
 def hover(config: Config) -> tuple[float, float]:
     """(motor command at hover, force of a motor per command there [N]), the mean of both drones."""
-    constants, curve = plant_constants(config.plant, config.attitude), config.autopilot.motor_curve
+    constants, curve = plant_parameters(config.plant, config.attitude), config.autopilot.motor_curve
     weight = (constants.drone_mass + constants.share * config.plant.object_mass) * config.plant.gravity
     command = float(crazyflie.motor_command(curve, weight / 4).mean())
     a, b = curve
@@ -113,7 +67,7 @@ def hover(config: Config) -> tuple[float, float]:
 
 def thrust_slopes(config: Config) -> tuple[float, float]:
     """Thrust per commanded vertical acceleration [kg] of leader and follower near hover."""
-    law, constants = config.autopilot, plant_constants(config.plant, config.attitude)
+    law, constants = config.autopilot, plant_parameters(config.plant, config.attitude)
     if law.kind == "crazyflie" and law.thrust_law == "paper":
         slope = 4 * hover(config)[1] * law.thrust_per_acceleration
         return slope, slope

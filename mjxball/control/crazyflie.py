@@ -142,9 +142,10 @@ def cascade(
     return xp.where(on, after, reset), xp.where(on, motors, xp.zeros_like(motors))
 
 
-def integral_shares(xp: Any, autopilot: Autopilot, dtype: Any) -> Array:
-    """Factors (2, 1) on ki of leader and follower."""
-    return xp.asarray([[1.0], [autopilot.follower_integrals]], dtype=dtype)
+def integral_shares(xp: Any, autopilot: Autopilot, dtype: Any, drones: int = 2, leader: int = 0) -> Array:
+    """Factors (N, 1) on ki of every drone: the leader integrates in full."""
+    shares = [[1.0 if number == leader else autopilot.follower_integrals] for number in range(drones)]
+    return xp.asarray(shares, dtype=dtype)
 
 
 def mix(thrust: Array, output: Array, compensate: Callable[[Array], Array] | None = None) -> Array:

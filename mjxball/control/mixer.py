@@ -11,12 +11,12 @@ PLACES = {"plus": ((1, 0), (0, 1), (-1, 0), (0, -1)), "x": ((1, -1), (-1, -1), (
 SPIN = {"plus": (1, -1, 1, -1), "x": (-1, 1, -1, 1)}  # sign of the yaw moment of a positive force
 
 
-def lever(arm: float, layout: str) -> float:
+def lever(arm: Any, layout: str) -> Any:
     """Distance of a rotor from the body axes that it lies off [m]; `arm` is that from the drone's centre."""
     return arm if layout == "plus" else arm / math.sqrt(2)
 
 
-def wrench_from_rotors(force: Array, arm: float, yaw_per_thrust: float, layout: str = "plus") -> Array:
+def wrench_from_rotors(force: Array, arm: Array | float, yaw_per_thrust: Array | float, layout: str = "plus") -> Array:
     """(T, tau_x, tau_y, tau_z) (..., 4) [N, N m] of rotor forces F1..F4 (..., 4) [N], about the drone's centre."""
     xp = force.__array_namespace__()
     f1, f2, f3, f4 = (force[..., i] for i in range(4))
@@ -27,7 +27,21 @@ def wrench_from_rotors(force: Array, arm: float, yaw_per_thrust: float, layout: 
     return xp.stack([thrust, side * roll, side * pitch, yaw_per_thrust * yaw], axis=-1)
 
 
-def rotors_from_wrench(wrench: Array, arm: float, yaw_per_thrust: float, layout: str = "plus") -> Array:
+def turned(wrench: Array, yaw: Array | float) -> Array:
+    """`wrench` = (T, tau_x, tau_y, tau_z) (..., 4) in axes that are turned by -`yaw` (...) about z [rad].
+
+    The wrench of a drone that is turned by `yaw`, in the carrier's axes.
+    """
+    if isinstance(yaw, float) and yaw == 0.0:
+        return wrench
+    xp = wrench.__array_namespace__()
+    yaw = xp.asarray(yaw, dtype=wrench.dtype)
+    c, s = xp.cos(yaw), xp.sin(yaw)
+    thrust, x, y, z = (wrench[..., i] for i in range(4))
+    return xp.stack([thrust, c * x - s * y, s * x + c * y, z], axis=-1)
+
+
+def rotors_from_wrench(wrench: Array, arm: Array | float, yaw_per_thrust: Array | float, layout: str = "plus") -> Array:
     """Rotor forces F1..F4 (..., 4) [N] that give `wrench` = (T, tau_x, tau_y, tau_z) (..., 4); the exact inverse."""
     xp = wrench.__array_namespace__()
     thrust, tx, ty, tz = (wrench[..., i] / 4 for i in range(4))
@@ -40,6 +54,6 @@ def rotors_from_wrench(wrench: Array, arm: float, yaw_per_thrust: float, layout:
     return xp.stack([*rotors, thrust + roll + pitch - yaw, thrust + roll - pitch + yaw], axis=-1)
 
 
-def torque_per_force(arm: float, layout: str) -> float:
+def torque_per_force(arm: Any, layout: str) -> Any:
     """Roll or pitch torque per force [m] that a drone has: times (F_max - T / 4) it is the largest at thrust T."""
     return (2 if layout == "plus" else 4) * lever(arm, layout)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball import config as configs
-from mjxball.config import Config, Plant, with_current_names
+from mjxball.config import Config, with_current_names
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
@@ -19,11 +19,13 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     period = config.timing.control_period
     if abs(policy.control_period - period) > 1e-9:
         raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
-    expected = dataclasses.asdict(config.plant)
-    made_for = {key: tuple(v) if isinstance(v, list) else v for key, v in policy.card["plant"].items()}
-    for key, value in expected.items():
-        if key != "object_mass" and made_for.setdefault(key, getattr(Plant(), key)) != value:
-            raise InputError(f"{path} was made for another plant: {key} is {made_for[key]!r}, not {value!r}")
+    made_for = configs.from_record({"plant": policy.card["plant"]}).plant
+    if made_for.count != config.plant.count:
+        raise InputError(f"{path} was made for a plant of {made_for.count} drones, not {config.plant.count}")
+    pairs = zip(configs.leaves(made_for), configs.leaves(config.plant), strict=True)
+    for (key, found, _), (_, value, _) in pairs:
+        if key != "object_mass" and found != value:
+            raise InputError(f"{path} was made for another plant: {key} is {found!r}, not {value!r}")
     if compare_laws:
         _refuse_other_laws(path, policy.card, config)
     return policy

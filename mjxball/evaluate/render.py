@@ -106,13 +106,13 @@ def _framing(plant: Plant, position: np.ndarray, goal: np.ndarray) -> tuple[np.n
     centre = np.median(goal, axis=0)
     points = points[np.abs(points - centre).max(axis=-1) < 3.0]  # a flight that failed leaves the picture
     low, high = points.min(axis=0), points.max(axis=0)
-    arms = np.linalg.norm(plant.leader_mount) + 1.6 * plant.arm
+    arms = max(np.linalg.norm(drone.mount) for drone in plant.drones) + 1.6 * plant.arm
     return (low + high) / 2, float(0.85 * (np.linalg.norm(high - low) / 2 + arms) / np.tan(np.radians(22.5)))
 
 
 def _render(folder: Path) -> None:
     about = json.loads((folder / "about.json").read_text())
-    plant = configs.from_dict({**configs.to_dict(configs.Config()), "plant": about["plant"]}).plant
+    plant = configs.from_record({"plant": about["plant"]}).plant
     with np.load(folder / "flights.npz") as stored:
         pictures = frames(plant, about["labels"], {name: stored[name] for name in stored.files})
     stream, options = io.BytesIO(), {"duration": round(1000 / FRAMES_PER_SECOND), "loop": 0, "quality": 60, "method": 3}

@@ -85,8 +85,9 @@ def fly_stand(config: Config, follower: Follower, leader_error: bool, physics: s
     """
     config = configs.replace(config, "follower.error", "leader" if leader_error else "object")
     flown = simulate(config, follower, scenario, physics)
-    lever = rotations.rotate(rotations.matrix_from_quaternion(flown.quaternion), np.array(config.plant.leader_mount))
-    rise = flown.position[:, 2] - flown.target[:, 2] + lever[:, 2] - config.plant.leader_mount[2]
+    mount = config.plant.drones[config.plant.leader].mount
+    lever = rotations.rotate(rotations.matrix_from_quaternion(flown.quaternion), np.array(mount))
+    rise = flown.position[:, 2] - flown.target[:, 2] + lever[:, 2] - mount[2]
     ball = flown.cg_offset / config.plant.moving_fraction
     return StandFlight(flown.time, LEVEL + rise, flown.euler[:, 0], flown.follower_command[:, 2], ball)
 

@@ -30,11 +30,11 @@ def config_of(card: Mapping[str, Any]) -> Config:
     Raises InputError if the card's configuration is none.
     """
     data = configs.to_dict(configs.from_record({"plant": {}, **card.get("config", {})}))
-    data["plant"] = {**data["plant"], **card["plant"]}
+    data["plant"] = {**data["plant"], **configs.with_current_names({"plant": card["plant"]})["plant"]}
     tilt, vertical = card["command_limits"]
     data["leader"] |= {"kp": card["leader_kp"], "kd": card["leader_kd"], "tilt_limit": tilt, "vertical_limit": vertical}
     data["timing"] |= {"control_period": card["control_period"]}
-    return configs.validate(configs.from_dict(data))
+    return configs.validate(configs.from_record(data))
 
 
 def is_crazyflie(config: Config) -> bool:
@@ -113,11 +113,11 @@ def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple
     """Command maps of leader and follower: each carries itself and its share of the object, as in simulation."""
     plant, autopilot = config.plant, config.autopilot
     known = is_crazyflie(config)
-    shares = Rig(plant.leader_mount, plant.follower_mount).weights
+    shares = Rig.of_plant(plant).weights
     curve = ForceCurve(*autopilot.motor_curve) if known else curve_of(config, choice.curve or "linear")
     hover = autopilot.hover_thrust if choice.hover is None else choice.hover
     law = choice.law or (autopilot.thrust_law if known else "calibrated")
-    own = (plant.leader_mass, plant.follower_mass)
+    own = [drone.mass for drone in plant.pair]
     carried = [mass + share * plant.object_mass for mass, share in zip(own, shares, strict=True)]
     if choice.mass is not None or not known:
         whole = UNKNOWN_MASS if choice.mass is None else choice.mass

@@ -202,7 +202,7 @@ def read_recording(path: Path) -> Recording:
     """The flight in the log `path`. Raises InputError with one sentence if there is none."""
     log = load(path)
     plant = log.config.plant
-    rig = Rig(plant.leader_mount, plant.follower_mount)
+    rig = Rig.of_plant(plant)
     ticks: list[Mapping[str, Any]] = []
     seen: list[ObjectState] = []
     newest: dict[str, DroneState] = {}
@@ -269,7 +269,7 @@ def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
     for drone, gains in enumerate(recording.setup.gains):
         for name, value in gains.items():
             pair.set_parameter(drone, name, value)
-    rig = Rig(recording.config.plant.leader_mount, recording.config.plant.follower_mount)
+    rig = Rig.of_plant(recording.config.plant)
     state, seen, forces, offsets = pair.start(), [], [], []
     for time, sent in zip(recording.time, recording.sent, strict=True):
         seen.append(object_state([drone_state(state, number) for number in range(2)], rig))

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from mjxball import config as configs
 from mjxball.control import rotations
 from mjxball.fly.packets import DroneState, Health, Packet
 
@@ -138,7 +139,16 @@ class Rig:
     @classmethod
     def of_card(cls, card: Mapping[str, Any]) -> Rig:
         """The rig that a policy was trained for."""
-        return cls(tuple(card["plant"]["leader_mount"]), tuple(card["plant"]["follower_mount"]))
+        plant: Any = configs.with_current_names({"plant": card["plant"]})["plant"]
+        leader = int(plant.get("leader", 0))
+        mounts = [tuple(drone["mount"]) for drone in plant["drones"]]
+        return cls(mounts[leader], mounts[1 - leader])
+
+    @classmethod
+    def of_plant(cls, plant: configs.Plant) -> Rig:
+        """That of a plant of two drones; InputError for any other."""
+        leader, follower = plant.pair
+        return cls(leader.mount, follower.mount)
 
     @property
     def mounts(self) -> np.ndarray:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from mjxball.config import Config
 from mjxball.control import attitude, crazyflie, motors, rotations
-from mjxball.control.constants import plant_constants
 from mjxball.physics.engine import Array, Load, PlantState
+from mjxball.plant import PlantParameters, parts, plant_parameters
+from mjxball.plant.parameters import shared
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -21,41 +22,50 @@ USUAL_BATTERY = 3.7  # [V] in hover, where none is drawn
 
 
 def rotor_targets(
-    config: Config, constants: Any, state: PlantState, commands: Float[Array, "... 2 3"], believed_mass: Scalar
-) -> Float[Array, "... 2 4"]:
-    """Rotor forces [N] that both attitude loops ask for at `commands`."""
-    xp = commands.__array_namespace__()
-    plant = config.plant
+    config: Config,
+    numbers: PlantParameters,
+    state: PlantState,
+    commands: Float[Array, "... drones 3"],
+    believed_mass: Scalar,
+) -> Float[Array, "... drones 4"]:
+    """Rotor forces [N] that all attitude loops ask for at `commands`."""
     euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
-    own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
     return attitude.rotor_commands(
         commands,
         euler[..., None, :],
         state.rates[..., None, :],
-        own + share * believed_mass[..., None],
-        constants.gains,
-        plant.gravity,
-        plant.arm,
-        plant.yaw_per_thrust,
-        plant.rotor_force_max,
-        plant.layout,
+        carried_mass(numbers, state, believed_mass),
+        numbers.gains,
+        parts.entry(numbers.gravity),
+        shared(numbers.arm, commands),
+        shared(numbers.yaw_per_thrust, commands),
+        shared(numbers.rotor_force_max, commands),
+        config.plant.layout,
+        shared(numbers.yaw, commands),
     )
 
 
-def make_autopilot(config: Config) -> Autopilot:
-    """Return `autopilot(state, commands (..., 2, 3), load)` -> (loops, rotor forces (..., 2, 4) asked for [N])."""
-    constants = plant_constants(config.plant, config.attitude)
+def carried_mass(numbers: PlantParameters, state: PlantState, believed_mass: Scalar) -> Float[Array, "... drones"]:
+    """Mass that every drone believes to carry, itself and its share of the object [kg]."""
+    xp, dtype = state.rates.__array_namespace__(), state.rates.dtype
+    own, share = (xp.asarray(value, dtype=dtype) for value in (numbers.drone_mass, numbers.share))
+    return own + share * believed_mass[..., None]
+
+
+def make_autopilot(config: Config, parameters: PlantParameters | None = None) -> Autopilot:
+    """Return `autopilot(state, commands (..., N, 3), load)` -> (loops, rotor forces (..., N, 4) asked for [N])."""
+    constants = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
     if config.autopilot.kind == "ideal":
         return lambda state, commands, load: (
             state.loops,
             rotor_targets(config, constants, state, commands, load.believed_mass),
         )
 
-    powered = make_powered(config)
+    powered = make_powered(config, constants)
 
     def firmware(
-        state: PlantState, commands: Float[Array, "... 2 3"], load: Load
-    ) -> tuple[Float[Array, "... 2 13"], Float[Array, "... 2 4"]]:
+        state: PlantState, commands: Float[Array, "... drones 3"], load: Load
+    ) -> tuple[Float[Array, "... drones 13"], Float[Array, "... drones 4"]]:
         if load.battery is not None:
             return powered(state, commands, load)
         if config.autopilot.drone and motors.compensates(config.autopilot.motor_curve):
@@ -63,11 +73,10 @@ def make_autopilot(config: Config) -> Autopilot:
             usual = commands[..., 0, 0] * 0.0
             return powered(state, commands, load._replace(battery=usual + USUAL_BATTERY, uncompensated=usual))
         xp, law, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
-        own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
-        sent = crazyflie.setpoints(law, commands, own + share * load.believed_mass[..., None], gravity)
+        sent = crazyflie.setpoints(law, commands, carried_mass(constants, state, load.believed_mass), gravity)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
-        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype)
+        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype, config.plant.count, config.plant.leader)
         loops, duty = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals)
         left = xp.maximum(1.0 - law.sag * state.time, xp.zeros_like(state.time))[..., None, None]
         return loops, left * crazyflie.motor_force(law.motor_curve, duty)
@@ -75,13 +84,12 @@ def make_autopilot(config: Config) -> Autopilot:
     return firmware
 
 
-def make_powered(config: Config) -> Autopilot:
+def make_powered(config: Config, constants: PlantParameters) -> Autopilot:
     """The firmware's loops with motors that follow the battery, `load.battery`, with or without its compensation.
 
     Where `load.uncompensated`, what the firmware is sent and its gains are converted for its curve
     (`motors.with_curve`), as the runner does.
     """
-    constants = plant_constants(config.plant, config.attitude)
     law, gravity = config.autopilot, config.plant.gravity
     motor = motors.MOTORS[law.drone or "2.1"]
     uncompensated_law = motors.with_curve(config, motors.OLDER).autopilot
@@ -89,11 +97,10 @@ def make_powered(config: Config) -> Autopilot:
     line = motors.compensates(law.motor_curve)
 
     def powered(
-        state: PlantState, commands: Float[Array, "... 2 3"], load: Load
-    ) -> tuple[Float[Array, "... 2 13"], Float[Array, "... 2 4"]]:
+        state: PlantState, commands: Float[Array, "... drones 3"], load: Load
+    ) -> tuple[Float[Array, "... drones 13"], Float[Array, "... drones 4"]]:
         xp = commands.__array_namespace__()
-        own, share = (xp.asarray(value, dtype=state.rates.dtype) for value in (constants.drone_mass, constants.share))
-        carried = own + share * load.believed_mass[..., None]
+        carried = carried_mass(constants, state, load.believed_mass)
         uncompensated: Array = load.uncompensated
         volts: Array = load.battery
         old, battery = uncompensated[..., None, None] > 0, volts[..., None, None]
@@ -104,7 +111,7 @@ def make_powered(config: Config) -> Autopilot:
         )
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
-        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype)
+        integrals = crazyflie.integral_shares(xp, law, state.rates.dtype, config.plant.count, config.plant.leader)
         rate_share = 1.0 + (slower - 1.0) * uncompensated[..., None, None]
 
         def duty(command: Array) -> Array:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from mjxball.config import Plant
 from mjxball.control import mixer, rotations
-from mjxball.control.constants import PlantConstants
+from mjxball.plant import PlantParameters, parts
+from mjxball.plant.parameters import of_drone, own_inertia, shared
 
 Array = Any  # NumPy's or JAX's
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
     Scalar = Float[Array, "..."]
+    # Of the load along its directions: (...) on a line, (..., 2) in a plane.
+    Coordinates = Float[Array, "..."]
     Vector = Float[Array, "... 3"]
     Matrix = Float[Array, "... 3 3"]
 # A flight beyond one of these has diverged: the physics no longer holds, and no flight came back from there.
@@ -29,11 +32,11 @@ class PlantState(NamedTuple):
     quaternion: Float[Array, "... 4"]  # body -> world, (w, x, y, z)
     velocity: Vector  # of O in the world [m/s]
     rates: Vector  # angular velocity in body axes [rad/s]
-    rotor_force: Float[Array, "... 2 4"]  # leader, follower [N]
+    rotor_force: Float[Array, "... drones 4"]  # [N]
     time: Scalar  # since the start of the episode [s]
-    ball_offset: Scalar  # of a rolling ball from O along the CG axis [m]; unused by prescribed motions
-    ball_rate: Scalar  # [m/s]
-    loops: Float[Array, "... 2 13"] | None = None  # of a Crazyflie, see `control.crazyflie`; None: ideal
+    ball_offset: Coordinates  # of a rolling ball from O [m]; unused by prescribed motions
+    ball_rate: Coordinates  # [m/s]
+    loops: Float[Array, "... drones 13"] | None = None  # of a Crazyflie, see `control.crazyflie`; None: ideal
 
     def each(self, function: Callable[..., Any], *others: PlantState) -> PlantState:
         """`function` of every leaf that there is, and of the same leaf of `others`."""
@@ -42,11 +45,21 @@ class PlantState(NamedTuple):
 
 
 class CgState(NamedTuple):
-    """CG offset from O along the CG axis, with consistent derivatives."""
+    """Coordinates of the CG from O along the load's directions, with consistent derivatives."""
 
-    offset: Scalar  # [m]
-    rate: Scalar  # [m/s]
-    acceleration: Scalar  # [m/s2]
+    offset: Coordinates  # [m]
+    rate: Coordinates  # [m/s]
+    acceleration: Coordinates  # [m/s2]
+
+
+def coordinates(value: Coordinates, directions: int) -> list[Scalar]:
+    """The load's coordinates one by one: `value` itself on a line, else its last axis."""
+    return [value] if directions == 1 else [value[..., number] for number in range(directions)]
+
+
+def joined(values: Sequence[Scalar]) -> Coordinates:
+    """The inverse of `coordinates`."""
+    return values[0] if len(values) == 1 else values[0].__array_namespace__().stack(values, axis=-1)
 
 
 class Load(NamedTuple):
@@ -61,11 +74,11 @@ class Load(NamedTuple):
     mass_change_time: Float[Array, "... changes"]  # when [s]
     external_force: Vector | None = None  # force on O in the world, held over a control step [N]; None: none
     rotor_lag_scale: Scalar | None = None  # factor on the rotors' time constant; None: 1
-    thrust_scale: Float[Array, "... 2"] | None = None  # factor on the rotor forces of leader and follower; None: 1
+    thrust_scale: Float[Array, "... drones"] | None = None  # factor on each drone's rotor forces; None: 1
     added_inertia: Vector | None = None  # about the body axes through O, without mass [kg m2]; None: none
     cg_path: Float[Array, "... places"] | None = None  # in [-1, 1], see `motion.visits`; None: the CG follows the sine
     follows_path: Scalar | None = None  # 1 where it does, 0 where it follows the sine
-    battery: Scalar | None = None  # voltage of both batteries [V]; None: motors follow the curve
+    battery: Scalar | None = None  # voltage of all batteries [V]; None: motors follow the curve
     uncompensated: Scalar | None = None  # 1 where the firmware does not compensate for the battery, else 0
 
 
@@ -84,15 +97,42 @@ class Engine(NamedTuple):
     # prescribed(state, wrench, object_mass, cg, added_inertia):
     #   the CG follows `cg`, driven by whatever force that takes
     prescribed: Callable[[PlantState, Wrench, Scalar, CgState, Vector | None], tuple[Vector, Vector]]
-    # rolling(state, wrench, object_mass, force on the ball along the axis [N], added_inertia):
+    # rolling(state, wrench, object_mass, force on the ball along its directions [N], added_inertia):
     #   the ball at state.ball_offset rolls freely; returns its acceleration [m/s2] as well
-    rolling: Callable[[PlantState, Wrench, Scalar, Scalar, Vector | None], tuple[Vector, Vector, Scalar]]
+    rolling: Callable[[PlantState, Wrench, Scalar, Coordinates, Vector | None], tuple[Vector, Vector, Coordinates]]
+
+
+def rotor_wrenches(
+    plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"]
+) -> Float[Array, "... drones 4"]:
+    """(T, tau_x, tau_y, tau_z) [N, N m] of each drone's rotors about its own centre, body axes."""
+    arm, yaw_moment, yaw = (
+        shared(value, rotor_force) for value in (parameters.arm, parameters.yaw_per_thrust, parameters.yaw)
+    )
+    return mixer.turned(mixer.wrench_from_rotors(rotor_force, arm, yaw_moment, plant.layout), yaw)
+
+
+def total_wrench(plant: Plant, parameters: PlantParameters, rotor_force: Float[Array, "... drones 4"]) -> Wrench:
+    """Wrench about O of all rotors, `rotor_force` [N]."""
+    drones = rotor_wrenches(plant, parameters, rotor_force)
+    along_x: parts.Part = 0.0
+    along_y: parts.Part = 0.0
+    thrust: parts.Part = 0.0
+    torque = parts.ZERO
+    for number in range(parameters.size):
+        lift, *own = (drones[..., number, k] for k in range(4))
+        _, _, mount, _ = of_drone(parameters, number)
+        thrust, torque = parts.plus(thrust, lift), parts.add(torque, (own[0], own[1], own[2]))
+        along_x = parts.plus(along_x, parts.times(mount[0], lift))
+        along_y = parts.plus(along_y, parts.times(mount[1], lift))
+    levers = (along_y, parts.minus(0.0, along_x), 0.0)
+    return Wrench(parts.stacked((0.0, 0.0, thrust), thrust), parts.stacked(parts.add(torque, levers), thrust))
 
 
 def contact_wrenches(
-    plant: Plant, constants: PlantConstants, state: PlantState, linear: Vector, angular: Vector
-) -> tuple[Float[Array, "... 2 3"], Float[Array, "... 2 3"]]:
-    """Contact forces [N] and torques [N m] of leader and follower on the object, body axes.
+    plant: Plant, parameters: PlantParameters, state: PlantState, linear: Vector, angular: Vector
+) -> tuple[Float[Array, "... drones 3"], Float[Array, "... drones 3"]]:
+    """Contact forces [N] and torques [N m] of every drone on the carrier, body axes.
 
     `linear` is the acceleration of O in the world, `angular` in body axes:
     F_i = T_i e3 - m_i g R^T E3 - m_i a_i, a_i = a_b + w' x r_i + w x (w x r_i),
@@ -100,20 +140,22 @@ def contact_wrenches(
     """
     xp = state.rates.__array_namespace__()
     matrix = rotations.matrix_from_quaternion(state.quaternion)
-    rates, down = state.rates, matrix[..., 2, :]
-    body = rotations.rotate_back(matrix, linear)
-    rotors = mixer.wrench_from_rotors(state.rotor_force, plant.arm, plant.yaw_per_thrust, plant.layout)
+    rates, down = parts.split(state.rates), parts.split(matrix[..., 2, :])
+    body, turning = parts.split(rotations.rotate_back(matrix, linear)), parts.split(angular)
+    held = parts.add(parts.scale(parts.entry(parameters.gravity), down), body)
+    rotors = rotor_wrenches(plant, parameters, state.rotor_force)
     forces, torques = [], []
-    for drone, inertia in enumerate((plant.leader_inertia, plant.follower_inertia)):
-        mass = float(constants.drone_mass[drone])
-        mount = xp.asarray(constants.mounts[drone], dtype=rates.dtype)
-        own = xp.asarray(inertia, dtype=rates.dtype)
-        lever = rotations.cross(angular, mount) + rotations.cross(rates, rotations.cross(rates, mount))
-        thrust = rotors[..., drone, 0]
-        still = xp.zeros_like(thrust)
-        push = xp.stack([still, still, thrust], axis=-1)
-        forces.append(push - mass * (plant.gravity * down + body + lever))
-        torques.append(rotors[..., drone, 1:] - rotations.cross(rates, own * rates) - own * angular)
+    for drone in range(parameters.size):
+        mass, _, mount, _ = of_drone(parameters, drone)
+        own = own_inertia(parameters, drone)
+        lever = parts.add(parts.cross(turning, mount), parts.cross(rates, parts.cross(rates, mount)))
+        thrust, *about = (rotors[..., drone, k] for k in range(4))
+        force = parts.subtract((0.0, 0.0, thrust), parts.scale(mass, parts.add(held, lever)))
+        gyration = parts.cross(rates, parts.rotate(own, rates))
+        spun = parts.subtract((about[0], about[1], about[2]), gyration)
+        torque = parts.subtract(spun, parts.rotate(own, turning))
+        forces.append(parts.stacked(force, thrust))
+        torques.append(parts.stacked(torque, thrust))
     return xp.stack(forces, axis=-2), xp.stack(torques, axis=-2)
 
 

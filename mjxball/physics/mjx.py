@@ -8,48 +8,58 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxball.assembly import ASSEMBLY, BALL, build_model
+from mjxball.assembly import ASSEMBLY, BALL, build_model, drone_names
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.control.constants import ROLLING_INERTIA, plant_constants
 from mjxball.physics.engine import CgState, Engine, PlantState, Wrench
+from mjxball.plant import ROLLING_INERTIA, PlantParameters, parts, plant_parameters
 from mjxball.quiet import import_mjx
 
 if TYPE_CHECKING:
     from jax import Array
     from jaxtyping import Float
 
-    from mjxball.physics.engine import Scalar, Vector
+    from mjxball.physics.engine import Coordinates, Scalar, Vector
 
 
-def make_engine(plant: Plant, attitude: Attitude) -> Engine:
+def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | None = None) -> Engine:
     """Return the MJX engine of `plant` for one world; use `jax.vmap` for many.
 
+    `parameters`: its numbers, if they are not those of `plant`; traced ones may differ from world to world.
+
     MJX computes the mass matrix and the bias forces. With the ball's acceleration c'' prescribed, the root's
-    accelerations follow from their own rows, and the force that drives the slide (whose reaction moves the
-    assembly) never needs to be formed; a rolling ball adds its own row. Dynamics do not depend on where the
+    accelerations follow from their own rows, and the force that drives the slides (whose reaction moves the
+    assembly) never needs to be formed; a rolling ball adds its own rows. Dynamics do not depend on where the
     assembly is or on its linear velocity, so both are zero here: that keeps float32 at its best.
     """
-    stages = _Stages(plant, attitude)
-    share = plant.moving_fraction
+    stages = _Stages(plant, plant_parameters(plant, attitude), parameters)
+    share = parts.entry(stages.numbers.moving_fraction)
 
     def prescribed(
         state: PlantState, wrench: Wrench, object_mass: Scalar, cg: CgState, added: Vector | None = None
     ) -> tuple[Vector, Vector]:
-        mass, bias = stages.equations(state, object_mass, cg.offset / share, cg.rate / share, added)
+        offset, rate, acceleration = (jnp.atleast_1d(value) / share for value in cg)
+        mass, bias = stages.equations(state, object_mass, offset, rate, added)
         n = stages.root
-        force = stages.applied(state, wrench) - bias[:n] - mass[:n, n] * (cg.acceleration / share)
+        force = stages.applied(state, wrench) - bias[:n]
+        for k in range(stages.slides):
+            force = force - mass[:n, n + k] * acceleration[k]
         return stages.result(state, _solve(mass[:n, :n], force))
 
     def rolling(
-        state: PlantState, wrench: Wrench, object_mass: Scalar, ball_force: Scalar, added: Vector | None = None
-    ) -> tuple[Vector, Vector, Scalar]:
-        mass, bias = stages.equations(state, object_mass, state.ball_offset, state.ball_rate, added)
-        n = stages.root
+        state: PlantState, wrench: Wrench, object_mass: Scalar, ball_force: Coordinates, added: Vector | None = None
+    ) -> tuple[Vector, Vector, Coordinates]:
+        offset, rate, pushed = map(jnp.atleast_1d, (state.ball_offset, state.ball_rate, ball_force))
+        mass, bias = stages.equations(state, object_mass, offset, rate, added)
+        n, slides = stages.root, range(stages.slides)
         driven = _solve(mass[:n, :n], stages.applied(state, wrench) - bias[:n])
-        recoil = _solve(mass[:n, :n], -mass[:n, n])
-        ball = (ball_force - bias[n] - mass[n, :n] @ driven) / (mass[n, n] + mass[n, :n] @ recoil)
-        return *stages.result(state, driven + ball * recoil), ball
+        recoils = [_solve(mass[:n, :n], -mass[:n, n + k]) for k in slides]
+        driving = [pushed[k] - bias[n + k] - mass[n + k, :n] @ driven for k in slides]
+        inertia = [[mass[n + i, n + j] + mass[n + i, :n] @ recoils[j] for j in slides] for i in slides]
+        ball = _solve_ball(inertia, driving)
+        for acceleration, recoil in zip(ball, recoils, strict=True):
+            driven = driven + acceleration * recoil
+        return *stages.result(state, driven), ball[0] if stages.slides == 1 else jnp.stack(ball)
 
     return Engine(prescribed, rolling)
 
@@ -57,22 +67,28 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
 class _Stages:
     """MJX's smooth dynamics of one plant, with the object's mass as an argument."""
 
-    def __init__(self, plant: Plant, attitude: Attitude):
+    def __init__(self, plant: Plant, nominal: PlantParameters, parameters: PlantParameters | None):
         self._mjx = import_mjx()
-        constants = plant_constants(plant, attitude)
-        # Merging the welded bodies is exact and faster; a shell whose mass varies must stay a body of its own.
-        model = build_model(plant, fuse=plant.moving_fraction == 1)
+        self.numbers = nominal if parameters is None else parameters
+        # Merging the welded bodies is exact and faster; a shell whose mass varies must stay a body of its own, and so
+        # must drones whose numbers are not those of the model.
+        self._fused = plant.moving_fraction == 1 and parameters is None
+        model = build_model(plant, fuse=self._fused)
         # MJX's own choice is the first device of all processes, which only the first process can reach.
         here = {"device": jax.local_devices()[0], "impl": "jax"}
         self._model, self._blank = self._mjx.put_model(model, **here), self._mjx.make_data(model, **here)
-        self._bodies = np.array([model.body(ASSEMBLY).id, model.body(BALL).id])
-        self._fractions = np.array([1 - plant.moving_fraction, plant.moving_fraction])
-        self._inertias = np.array([constants.shell_inertia_per_mass, constants.ball_inertia_per_mass])
-        self._stand, self._rigid = plant.stand, plant.moving_fraction == 1
-        self.root = model.nv - 1  # degrees of freedom of the root; the ball's slide comes last
+        self._assembly, self._ball = model.body(ASSEMBLY).id, model.body(BALL).id
+        self._drones = None if parameters is None else np.array([model.body(name).id for name in drone_names(plant)])
+        self._stand, self.slides = plant.stand, len(plant.directions)
+        self.root = model.nv - self.slides  # degrees of freedom of the root; the ball's slides come last
 
     def equations(
-        self, state: PlantState, object_mass: Scalar, offset: Scalar, rate: Scalar, added: Vector | None
+        self,
+        state: PlantState,
+        object_mass: Scalar,
+        offset: Float[Array, " slides"],
+        rate: Float[Array, " slides"],
+        added: Vector | None,
     ) -> tuple[Float[Array, "nv nv"], Float[Array, " nv"]]:
         """Mass matrix and bias force, ball at `offset` moving at `rate`; inertia is `added`."""
         dtype = state.rates.dtype
@@ -84,9 +100,7 @@ class _Stages:
             position = [*heave, rotations.roll_of_quaternion(state.quaternion)[None]]
             velocity = [*heave, state.rates[:1]]
         model = self._loaded(object_mass, dtype)
-        data = self._blank.replace(
-            qpos=jnp.concatenate([*position, offset[None]]), qvel=jnp.concatenate([*velocity, rate[None]])
-        )
+        data = self._blank.replace(qpos=jnp.concatenate([*position, offset]), qvel=jnp.concatenate([*velocity, rate]))
         mjx = self._mjx
         for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.com_vel, mjx.rne):
             data = stage(model, data)
@@ -105,14 +119,29 @@ class _Stages:
         return mass.at[axes, axes].add(jnp.diag(inertia)), bias.at[axes].add(gyration)
 
     def _loaded(self, object_mass: Scalar, dtype: Any) -> Any:
-        m = self._model
+        m, own = self._model, self.numbers
         mass, inertia, armature = (a.astype(dtype) for a in (m.body_mass, m.body_inertia, m.dof_armature))
-        part = slice(1, None) if self._rigid else slice(None)
-        bodies, fractions, inertias = self._bodies[part], self._fractions[part], self._inertias[part]
+        share = parts.entry(own.moving_fraction)
+        moving = object_mass * share
+        mass = mass.at[self._ball].set(moving)
+        inertia = inertia.at[self._ball].set(object_mass * jnp.asarray(own.ball_inertia_per_mass, dtype))
+        if not self._fused:
+            mass = mass.at[self._assembly].set(object_mass * (1 - share) + parts.entry(own.carrier_mass))
+            shell = object_mass * jnp.asarray(own.shell_inertia_per_mass, dtype)
+            inertia = inertia.at[self._assembly].set(shell + jnp.asarray(own.carrier_inertia, dtype))
+        changed = {}
+        if self._drones is not None:
+            mass = mass.at[self._drones].set(own.drone_mass)
+            inertia = inertia.at[self._drones].set(own.own_inertia)
+            half, still = 0.5 * jnp.asarray(own.yaw, dtype), jnp.zeros(len(self._drones), dtype)
+            turned = jnp.stack([jnp.cos(half), still, still, jnp.sin(half)], axis=-1)
+            changed["body_pos"] = m.body_pos.astype(dtype).at[self._drones].set(own.mounts)
+            changed["body_quat"] = m.body_quat.astype(dtype).at[self._drones].set(turned)
         return m.replace(
-            body_mass=mass.at[bodies].set(object_mass * fractions.astype(dtype)),
-            body_inertia=inertia.at[bodies].set(object_mass * inertias.astype(dtype)),
-            dof_armature=armature.at[-1].set(ROLLING_INERTIA * object_mass * self._fractions[1].astype(dtype)),
+            body_mass=mass,
+            body_inertia=inertia,
+            dof_armature=armature.at[self.root :].set(ROLLING_INERTIA * moving),
+            **changed,
         )
 
     def applied(self, state: PlantState, wrench: Wrench) -> Float[Array, " root"]:
@@ -130,6 +159,15 @@ class _Stages:
         zero = jnp.zeros((), solution.dtype)
         rise = solution[0] if self._stand == "heave" else zero
         return jnp.stack([zero, zero, rise]), jnp.stack([solution[-1], zero, zero])
+
+
+def _solve_ball(inertia: list[list[Any]], force: list[Any]) -> list[Any]:
+    """Solve for the ball's accelerations, one or two."""
+    if len(force) == 1:
+        return [force[0] / inertia[0][0]]
+    (a, b), (c, d) = inertia
+    determinant = a * d - b * c
+    return [(d * force[0] - b * force[1]) / determinant, (a * force[1] - c * force[0]) / determinant]
 
 
 def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Float[Array, " root"]:

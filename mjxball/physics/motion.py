@@ -8,18 +8,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mjxball.config import Config, ball_limit, cg_limit
+from mjxball.config import Config, cg_limit
 from mjxball.errors import InputError
 from mjxball.physics.engine import Array, CgState, Load
+from mjxball.plant import PlantParameters, parts, plant_parameters
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from mjxball.physics.engine import Scalar
+    from mjxball.physics.engine import Coordinates, Scalar
 
 Prescribed = Callable[[Array, Load], CgState]
 ROLLING_FRICTION = 0.005  # over the normal force
 STOP_FREQUENCY, STOP_DAMPING = 60.0, 0.4  # of the ball against an end stop [rad/s]; 1 does not bounce
+TINY = 1e-18  # [m2], [m2/s2]
 CREEP = 0.005  # [m/s] below which rolling friction fades to zero, so that its sign is smooth
 
 
@@ -122,27 +124,43 @@ def make_prescribed(config: Config) -> Prescribed:
     return lambda time, load: follow_spline(spline, time)
 
 
-def make_rolling_force(config: Config) -> Callable[[Scalar, Scalar, Scalar], Scalar]:
-    """Return `force(offset, rate, ball_mass)` [N] along the axis: rolling friction and end stops (ours).
+def make_rolling_force(
+    config: Config, parameters: PlantParameters | None = None
+) -> Callable[[Coordinates, Coordinates, Scalar], Coordinates]:
+    """Return `force(offset, rate, ball_mass)` [N] along the load's directions: rolling friction, stops.
 
     Friction is -mu m_b g tanh(v / creep). A stop is a one-sided spring and damper that never pulls; the
-    inertia against it is 7/5 m_b, that of a solid ball that rolls.
+    inertia against it is 7/5 m_b, that of a solid ball that rolls (ours). A plate's rim is round and acts along
+    the radius alone.
     """
-    plant = config.plant
-    end = ball_limit(plant)
+    numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
+    end, gravity = parts.entry(numbers.ball_limit), parts.entry(numbers.gravity)
+    directions = len(config.plant.directions)
     stiffness = 1.4 * STOP_FREQUENCY**2
     damping = 1.4 * 2 * STOP_DAMPING * STOP_FREQUENCY
 
-    def force(offset: Scalar, rate: Scalar, ball_mass: Scalar) -> Scalar:
+    def on_rod(offset: Scalar, rate: Scalar, ball_mass: Scalar) -> Scalar:
         xp = offset.__array_namespace__()
-        friction = -ROLLING_FRICTION * plant.gravity * xp.tanh(rate / CREEP)
+        friction = -ROLLING_FRICTION * gravity * xp.tanh(rate / CREEP)
         beyond = xp.maximum(offset - end, 0.0)
         below = xp.maximum(-end - offset, 0.0)
         upper = xp.where(beyond > 0, xp.minimum(-stiffness * beyond - damping * rate, 0.0), 0.0)
         lower = xp.where(below > 0, xp.maximum(stiffness * below - damping * rate, 0.0), 0.0)
         return ball_mass * (friction + upper + lower)
 
-    return force
+    def on_plate(offset: Coordinates, rate: Coordinates, ball_mass: Scalar) -> Coordinates:
+        xp = offset.__array_namespace__()
+        # Both lengths are never 0, so that their gradients exist.
+        speed = xp.sqrt((rate * rate).sum(axis=-1) + TINY)[..., None]
+        distance = xp.sqrt((offset * offset).sum(axis=-1) + TINY)[..., None]
+        outwards = offset / distance
+        friction = -ROLLING_FRICTION * gravity * xp.tanh(speed / CREEP) * rate / speed
+        beyond = xp.maximum(distance - end, 0.0)
+        along = (outwards * rate).sum(axis=-1)[..., None]
+        stop = xp.where(beyond > 0, xp.minimum(-stiffness * beyond - damping * along, 0.0), 0.0)
+        return ball_mass[..., None] * (friction + stop * outwards)
+
+    return on_rod if directions == 1 else on_plate
 
 
 def object_mass(time: Scalar, load: Load) -> Scalar:

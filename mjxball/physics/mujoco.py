@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
-from mjxball.assembly import ASSEMBLY, BALL, FOLLOWER, LEADER, build_model
+from mjxball.assembly import ASSEMBLY, BALL, build_model, drone_names
 from mjxball.config import Attitude, Config, Plant
-from mjxball.control import mixer, rotations
-from mjxball.control.constants import ROLLING_INERTIA, plant_constants
+from mjxball.control import rotations
 from mjxball.physics import motion
-from mjxball.physics.engine import CgState, Engine, Load, PlantState, Wrench
+from mjxball.physics.engine import CgState, Engine, Load, PlantState, Wrench, rotor_wrenches
+from mjxball.plant import ROLLING_INERTIA, plant_parameters
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from mjxball.physics.engine import Array, Scalar, Vector
+    from mjxball.physics.engine import Array, Coordinates, Scalar, Vector
 
 
 def make_engine(plant: Plant, attitude: Attitude) -> Engine:
@@ -44,17 +44,17 @@ def make_engine(plant: Plant, attitude: Attitude) -> Engine:
         return result[..., :3], result[..., 3:6]
 
     def rolling(
-        state: PlantState, wrench: Wrench, object_mass: Scalar, ball_force: Scalar, added: Vector | None = None
-    ) -> tuple[Vector, Vector, Scalar]:
+        state: PlantState, wrench: Wrench, object_mass: Scalar, ball_force: Coordinates, added: Vector | None = None
+    ) -> tuple[Vector, Vector, Coordinates]:
         _refuse(added)
 
-        def one(s: PlantState, w: Wrench, mass: float, force: float) -> np.ndarray:
+        def one(s: PlantState, w: Wrench, mass: float, force: Array) -> np.ndarray:
             world.place(s, mass, s.ball_offset, s.ball_rate)
             world.push(s, w)
             return world.roll(force)
 
         result = _each((state, wrench, object_mass, ball_force), state.time.shape, one)
-        return result[..., :3], result[..., 3:6], result[..., 6]
+        return result[..., :3], result[..., 3:6], result[..., 6] if len(plant.directions) == 1 else result[..., 6:]
 
     return Engine(prescribed, rolling)
 
@@ -82,18 +82,19 @@ class MujocoWorld:
     def __init__(self, plant: Plant, attitude: Attitude):
         self.model = build_model(plant)
         self.data = mujoco.MjData(self.model)
-        self._plant, self._constants = plant, plant_constants(plant, attitude)
+        self._plant, self._numbers = plant, plant_parameters(plant, attitude)
         self._shell, self._ball = self.model.body(ASSEMBLY).id, self.model.body(BALL).id
-        self._drones = [self.model.body(name).id for name in (LEADER, FOLLOWER)]
-        self._slide = self.model.nv - 1
+        self._drones = [self.model.body(name).id for name in drone_names(plant)]
+        self._slides = slice(self.model.nv - len(plant.directions), self.model.nv)
 
-    def place(self, state: PlantState, object_mass: float, offset: float, rate: float) -> None:
+    def place(self, state: PlantState, object_mass: float, offset: Array, rate: Array) -> None:
         """Set mass, positions and velocities, and compute everything that depends on them; no force yet."""
-        model, data, share = self.model, self.data, self._plant.moving_fraction
-        model.body_mass[[self._shell, self._ball]] = object_mass * (1 - share), object_mass * share
-        model.body_inertia[self._shell] = object_mass * self._constants.shell_inertia_per_mass
-        model.body_inertia[self._ball] = object_mass * self._constants.ball_inertia_per_mass
-        model.dof_armature[self._slide] = ROLLING_INERTIA * object_mass * share
+        model, data, share, own = self.model, self.data, self._plant.moving_fraction, self._numbers
+        model.body_mass[self._shell] = object_mass * (1 - share) + own.carrier_mass
+        model.body_mass[self._ball] = object_mass * share
+        model.body_inertia[self._shell] = object_mass * own.shell_inertia_per_mass + own.carrier_inertia
+        model.body_inertia[self._ball] = object_mass * own.ball_inertia_per_mass
+        model.dof_armature[self._slides] = ROLLING_INERTIA * object_mass * share
         roll = rotations.roll_of_quaternion(state.quaternion)
         root = {
             "free": ([*state.position, *state.quaternion], [*state.velocity, *state.rates]),
@@ -101,7 +102,7 @@ class MujocoWorld:
             "pivot": ([roll], [state.rates[0]]),
         }
         position, velocity = root[self._plant.stand]
-        data.qpos[:], data.qvel[:] = [*position, offset], [*velocity, rate]
+        data.qpos[:], data.qvel[:] = [*position, *np.atleast_1d(offset)], [*velocity, *np.atleast_1d(rate)]
         data.qfrc_applied[:] = 0
         data.xfrc_applied[:] = 0
         mujoco.mj_fwdPosition(model, data)
@@ -114,21 +115,20 @@ class MujocoWorld:
         origin = self.data.xpos[self._shell]
         mujoco.mj_applyFT(self.model, self.data, force, torque, origin, self._shell, self.data.qfrc_applied)
 
-    def drive(self, acceleration: float) -> Float[np.ndarray, " 7"]:
-        """Give the ball `acceleration` along its slide by the force that it takes; see `roll` for the result."""
-        model, data = self.model, self.data
-        unit = np.zeros((1, model.nv))
-        unit[0, self._slide] = 1.0
-        free, response = np.zeros((1, model.nv)), np.zeros((1, model.nv))
+    def drive(self, acceleration: Array) -> Float[np.ndarray, " n"]:
+        """Give the ball `acceleration` along its slides by the force that it takes; see `roll` for the result."""
+        model, data, slides = self.model, self.data, self._slides
+        unit = np.eye(model.nv)[slides]
+        free, response = np.zeros((1, model.nv)), np.zeros_like(unit)
         pushed = data.qfrc_applied + self._external() - data.qfrc_bias
         mujoco.mj_solveM(model, data, free, pushed[None])
         mujoco.mj_solveM(model, data, response, unit)
-        return self.roll((acceleration - free[0, self._slide]) / response[0, self._slide])
+        return self.roll(np.linalg.solve(response[:, slides], np.atleast_1d(acceleration) - free[0, slides]))
 
-    def roll(self, force: float) -> Float[np.ndarray, " 7"]:
-        """Accelerations: O in the world, angular in body axes, ball; with `force` on the slide [N]."""
+    def roll(self, force: Array) -> Float[np.ndarray, " n"]:
+        """Accelerations: O in the world, angular in body axes, ball (one or two); with `force` on the slides [N]."""
         model, data = self.model, self.data
-        data.qfrc_applied[self._slide] += force
+        data.qfrc_applied[self._slides] += force
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)
         data.qacc[:] = data.qacc_smooth
@@ -136,20 +136,19 @@ class MujocoWorld:
         if self._plant.stand == "free":
             return a.copy()
         rise = a[0] if self._plant.stand == "heave" else 0.0
-        return np.array([0.0, 0.0, rise, a[-2], 0.0, 0.0, a[-1]])
+        roll = a[self._slides.start - 1]
+        return np.array([0.0, 0.0, rise, roll, 0.0, 0.0, *a[self._slides]])
 
-    def load_drones(self, state: PlantState, rotor_force: Float[Array, "2 4"]) -> None:
+    def load_drones(self, state: PlantState, rotor_force: Float[Array, "drones 4"]) -> None:
         """Apply each drone's rotor wrench to its own body, so that the welds carry it to the object."""
         matrix = rotations.matrix_from_quaternion(state.quaternion)
-        wrenches = mixer.wrench_from_rotors(
-            rotor_force, self._plant.arm, self._plant.yaw_per_thrust, self._plant.layout
-        )
+        wrenches = rotor_wrenches(self._plant, self._numbers, rotor_force)
         for body, wrench in zip(self._drones, wrenches, strict=True):
             self.data.xfrc_applied[body, :3] = matrix[:, 2] * wrench[0]
             self.data.xfrc_applied[body, 3:] = matrix @ wrench[1:]
 
-    def contact_wrenches(self, state: PlantState) -> Float[np.ndarray, "2 2 3"]:
-        """Force and torque that leader and follower exert on the object, body axes, at their centres.
+    def contact_wrenches(self, state: PlantState) -> Float[np.ndarray, "2 drones 3"]:
+        """Forces, then torques that the drones exert on the carrier, body axes, at their centres.
 
         MuJoCo's `cfrc_int` of a drone's body is what the weld exerts on the drone: world axes, torque first,
         about the centre of mass of the whole tree. `load_drones` and `drive` or `roll` must come first.
@@ -157,11 +156,11 @@ class MujocoWorld:
         mujoco.mj_rnePostConstraint(self.model, self.data)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
         about = self.data.subtree_com[self.model.body_rootid[self._shell]]
-        result = np.empty((2, 2, 3))
+        result = np.empty((2, len(self._drones), 3))
         for number, body in enumerate(self._drones):
             torque, force = -self.data.cfrc_int[body, :3], -self.data.cfrc_int[body, 3:]
             moved = torque + np.cross(about - self.data.xipos[body], force)
-            result[number] = force @ matrix, moved @ matrix
+            result[:, number] = force @ matrix, moved @ matrix
         return result
 
     def _external(self) -> Float[np.ndarray, " nv"]:
@@ -175,24 +174,24 @@ class MujocoWorld:
 
 def flown_contact_wrenches(
     config: Config, flown: PlantState, load: Load
-) -> tuple[Float[np.ndarray, "T n 2 3"], Float[np.ndarray, "T n 2 3"]]:
+) -> tuple[Float[np.ndarray, "T n drones 3"], Float[np.ndarray, "T n drones 3"]]:
     """Contact forces and torques of recorded states (T, n, ...) from MuJoCo's internal forces."""
     world = MujocoWorld(config.plant, config.attitude)
     share, rolling = config.plant.moving_fraction, config.motion.kind == "rolling"
     mass = motion.object_mass(flown.time, load)
     if rolling:
-        ball = CgState(flown.ball_offset, flown.ball_rate, flown.time)
+        ball = CgState(flown.ball_offset, flown.ball_rate, flown.ball_rate)
         drive = motion.make_rolling_force(config)(flown.ball_offset, flown.ball_rate, share * mass)
     else:
         ball = motion.make_prescribed(config)(flown.time, load)
         ball = CgState(ball.offset / share, ball.rate / share, ball.acceleration / share)
         drive = ball.acceleration
 
-    def one(state: PlantState, object_mass: float, ball: CgState, drive: float) -> np.ndarray:
+    def one(state: PlantState, object_mass: float, ball: CgState, drive: Array) -> np.ndarray:
         world.place(state, object_mass, ball.offset, ball.rate)
         world.load_drones(state, state.rotor_force)
         world.roll(drive) if rolling else world.drive(drive)
         return world.contact_wrenches(state)
 
     result = _each((flown, mass, ball, drive), flown.time.shape, one)
-    return result[..., 0, :], result[..., 1, :]
+    return result[..., 0, :, :], result[..., 1, :, :]

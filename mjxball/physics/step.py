@@ -12,21 +12,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjxball.config import Config
-from mjxball.control import crazyflie, mixer, rotations
-from mjxball.control.constants import plant_constants
+from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import motion
 from mjxball.physics.autopilot import make_autopilot
-from mjxball.physics.engine import Array, Engine, Load, PlantState, Wrench
+from mjxball.physics.engine import Array, Engine, Load, PlantState, Wrench, total_wrench
+from mjxball.plant import PlantParameters, parts, plant_parameters
+from mjxball.plant.parameters import shared
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from mjxball.physics.engine import Scalar, Vector
+    from mjxball.physics.engine import Coordinates, Scalar, Vector
 
 TRAINING_ENGINES = ("mjx", "newton-euler")  # on JAX
 ENGINES = (*TRAINING_ENGINES, "mujoco")
-# control_step(state, commands (..., 2, 3) of leader and follower, load) -> state one control period later
+# control_step(state, commands (..., N, 3) of all drones, body axes, load) -> state one control period later
 ControlStep = Callable[[PlantState, Array, Load], PlantState]
 # repeat(body, count, value): apply `body` to `value` `count` times
 Repeat = Callable[[Callable[[PlantState], PlantState], int, PlantState], PlantState]
@@ -39,8 +40,12 @@ def python_repeat(body: Callable[[PlantState], PlantState], count: int, value: P
     return value
 
 
-def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_repeat) -> ControlStep:
+def make_control_step(
+    config: Config, engine: Engine, repeat: Repeat = python_repeat, parameters: PlantParameters | None = None
+) -> ControlStep:
     """Return the function that advances the plant one control period with commands held.
+
+    `parameters`: the plant's numbers, if they are not those of `config.plant`; the engine must have the same.
 
     Each physics step samples the attitude loop, moves the rotors' first-order lag exactly (its mean force
     acts over the step), and integrates drift-kick-drift: half a step of motion, the accelerations there,
@@ -49,27 +54,19 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
     the sampling of the attitude loop.
     """
     plant = config.plant
-    constants = plant_constants(plant, config.attitude)
+    numbers = plant_parameters(plant, config.attitude) if parameters is None else parameters
     h = config.physics_step
-    nominal = math.exp(-h / plant.rotor_lag)  # share of the old rotor force left after a step
-    accelerate = make_accelerations(config, engine)
+    accelerate = make_accelerations(config, engine, numbers)
+    autopilot = make_autopilot(config, numbers)
 
-    autopilot = make_autopilot(config)
-
-    def physics_step(state: PlantState, commands: Float[Array, "... 2 3"], load: Load) -> PlantState:
-        xp = commands.__array_namespace__()
+    def physics_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         loops, target = autopilot(state, commands, load)
-        keep, mean = nominal, plant.rotor_lag / h * (1 - nominal)  # `mean`: its mean share over the step
-        if load.rotor_lag_scale is not None:
-            lag = (plant.rotor_lag * load.rotor_lag_scale)[..., None, None]
-            keep = xp.exp(-h / lag)
-            mean = lag / h * (1 - keep)
+        keep, mean = _rotor_shares(shared(numbers.rotor_lag, state.rotor_force), load.rotor_lag_scale, h)
         if load.thrust_scale is not None:
             target = target * load.thrust_scale[..., None]
         acting = target + mean * (state.rotor_force - target)
         middle = _drift(state, h / 2)
-        rotors = total_wrench(xp, acting, constants.mounts, plant.arm, plant.yaw_per_thrust, plant.layout)
-        wrench = with_external_force(rotors, middle, load)
+        wrench = with_external_force(total_wrench(plant, numbers, acting), middle, load)
         linear, angular, ball = accelerate(middle, wrench, load)
         kicked = middle._replace(
             velocity=state.velocity + h * linear,
@@ -80,31 +77,44 @@ def make_control_step(config: Config, engine: Engine, repeat: Repeat = python_re
         )
         return _drift(kicked, h / 2)
 
-    def control_step(state: PlantState, commands: Float[Array, "... 2 3"], load: Load) -> PlantState:
+    def control_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         return repeat(lambda s: physics_step(s, commands, load), config.timing.physics_steps, state)
 
     return control_step
 
 
+def _rotor_shares(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any, Any]:
+    """Shares of the old rotor force that are left after a step of `h` [s] and, in the mean, during it; `lag` [s]."""
+    if scale is None and isinstance(lag, float):
+        keep = math.exp(-h / lag)
+        return keep, lag / h * (1 - keep)
+    each: Array = lag if scale is None else lag * scale[..., None]
+    scaled = each[..., None]
+    left = scaled.__array_namespace__().exp(-h / scaled)
+    return left, scaled / h * (1 - left)
+
+
 def make_accelerations(
-    config: Config, engine: Engine
-) -> Callable[[PlantState, Wrench, Load], tuple[Vector, Vector, Scalar]]:
+    config: Config, engine: Engine, parameters: PlantParameters | None = None
+) -> Callable[[PlantState, Wrench, Load], tuple[Vector, Vector, Coordinates]]:
     """Return `accelerate(state, wrench, load)` -> (linear, angular, ball), whatever way the CG moves.
 
     The ball's acceleration is 0 for prescribed motions, whose offset is a function of time alone.
     """
+    numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
+    share = parts.entry(numbers.moving_fraction)
     if config.motion.kind == "rolling":
-        force = motion.make_rolling_force(config)
+        force = motion.make_rolling_force(config, numbers)
 
-        def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Scalar]:
+        def roll(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Coordinates]:
             mass = motion.object_mass(state.time, load)
-            on_ball = force(state.ball_offset, state.ball_rate, config.plant.moving_fraction * mass)
+            on_ball = force(state.ball_offset, state.ball_rate, share * mass)
             return engine.rolling(state, wrench, mass, on_ball, load.added_inertia)
 
         return roll
     prescribed = motion.make_prescribed(config)
 
-    def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Scalar]:
+    def follow(state: PlantState, wrench: Wrench, load: Load) -> tuple[Vector, Vector, Coordinates]:
         mass = motion.object_mass(state.time, load)
         cg = prescribed(state.time, load)
         linear, angular = engine.prescribed(state, wrench, mass, cg, load.added_inertia)
@@ -113,30 +123,12 @@ def make_accelerations(
     return follow
 
 
-def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Scalar]:
+def make_cg_offset(config: Config) -> Callable[[PlantState, Load], Coordinates]:
     """Return `cg_offset(state, load)` [m], where the CG is now."""
     if config.motion.kind == "rolling":
         return lambda state, load: config.plant.moving_fraction * state.ball_offset
     prescribed = motion.make_prescribed(config)
     return lambda state, load: prescribed(state.time, load).offset
-
-
-def total_wrench(
-    xp: Any,
-    rotor_force: Float[Array, "... 2 4"],
-    mounts: Float[np.ndarray, "2 3"],
-    arm: float,
-    yaw_per_thrust: float,
-    layout: str = "plus",
-) -> Wrench:
-    """Wrench about O of all rotors, `rotor_force` [N], drones at `mounts` [m]."""
-    drones = mixer.wrench_from_rotors(rotor_force, arm, yaw_per_thrust, layout)  # (..., 2, 4)
-    thrust = drones[..., 0]
-    zero = xp.zeros_like(thrust[..., 0])
-    lever_x, lever_y = (xp.asarray(mounts[:, i], dtype=rotor_force.dtype) for i in (0, 1))
-    torque = drones[..., 0, 1:] + drones[..., 1, 1:]
-    levers = xp.stack([_total(lever_y * thrust), -_total(lever_x * thrust), zero], axis=-1)
-    return Wrench(xp.stack([zero, zero, _total(thrust)], axis=-1), torque + levers)
 
 
 def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench:
@@ -147,22 +139,18 @@ def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench
     return wrench._replace(force=wrench.force + rotations.rotate_back(matrix, load.external_force))
 
 
-def _total(pair: Float[Array, "... 2"]) -> Scalar:
-    return pair[..., 0] + pair[..., 1]
-
-
-def hover_rotor_force(config: Config, believed_mass: Scalar) -> Float[Array, "... 2 4"]:
+def hover_rotor_force(config: Config, believed_mass: Scalar) -> Float[Array, "... drones 4"]:
     """Rotor forces [N] that hover the believed object mass [kg] with the CG at O."""
     xp = believed_mass.__array_namespace__()
-    constants = plant_constants(config.plant, config.attitude)
-    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (constants.drone_mass, constants.share))
+    numbers = plant_parameters(config.plant, config.attitude)
+    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (numbers.drone_mass, numbers.share))
     per_rotor = (own + share * believed_mass[..., None]) * config.plant.gravity / 4
-    per_rotor = xp.clip(per_rotor, 0.0, config.plant.rotor_force_max)
+    per_rotor = xp.clip(per_rotor, 0.0, shared(numbers.rotor_force_max, per_rotor))
     return xp.stack([per_rotor] * 4, axis=-1)
 
 
 def start_state(
-    config: Config, position: Vector, euler: Vector, velocity: Vector, believed_mass: Scalar, ball_offset: Scalar
+    config: Config, position: Vector, euler: Vector, velocity: Vector, believed_mass: Scalar, ball_offset: Coordinates
 ) -> PlantState:
     """State at time 0 with the rotors at the believed hover thrust.
 
@@ -175,8 +163,8 @@ def start_state(
         euler = euler * xp.asarray([1.0, 0.0, 0.0], dtype=euler.dtype)
     loops = None
     if config.autopilot.kind == "crazyflie":
-        both = xp.stack([euler, euler], axis=-2)
-        loops = crazyflie.start_loops(both, xp.zeros_like(both))
+        each = xp.stack([euler] * config.plant.count, axis=-2)
+        loops = crazyflie.start_loops(each, xp.zeros_like(each))
     return PlantState(
         loops=loops,
         position=position,

@@ -10,7 +10,8 @@ import numpy as np
 
 from mjxball.config import Autopilot, Config
 from mjxball.control import crazyflie, mixer, rotations
-from mjxball.control.constants import hover, plant_constants
+from mjxball.control.constants import hover
+from mjxball.plant import plant_parameters
 
 NAMES = ("roll", "pitch", "yaw")
 DRONE = np.array([1.66e-5, 1.66e-5, 2.93e-5])  # inertia for which the delivered gains were found good [kg m2]
@@ -29,7 +30,7 @@ class Axis(NamedTuple):
 
 def inertia_about_o(config: Config) -> np.ndarray:
     """Inertia (3,) of the assembly about O with the moving mass at O [kg m2]."""
-    constants = plant_constants(config.plant, config.attitude)
+    constants = plant_parameters(config.plant, config.attitude)
     return np.diag(constants.drone_inertia) + config.plant.object_mass * constants.object_inertia_per_mass
 
 
@@ -41,9 +42,9 @@ def axes(config: Config) -> tuple[Axis, ...]:
     tilting = 2 * 4 * mixer.lever(plant.arm, plant.layout) / 2 * slope
     torque = np.array([tilting, tilting, 2 * 4 * plant.yaw_per_thrust * slope])
     inertia = inertia_about_o(config)
-    stop = plant.ball_stop or plant.object_size["xy".index(plant.cg_axis)] / 2
+    stop = plant.ball_stop or min(plant.object_size[axis] for axis in plant.directions) / 2
     moment = plant.moving_fraction * plant.object_mass * plant.gravity * stop
-    loaded = np.array([plant.cg_axis == "y", plant.cg_axis == "x", False])
+    loaded = np.array(["y" in plant.cg_axis, "x" in plant.cg_axis, False])
     gain, trim = np.degrees(torque / inertia), loaded * moment / torque
     spare = crazyflie.FULL - command
     room = (2 * spare, 2 * spare, spare)

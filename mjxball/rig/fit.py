@@ -13,10 +13,10 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import crazyflie, mixer, motors
-from mjxball.control.constants import plant_constants
 from mjxball.control.crazyflie import PERIOD
 from mjxball.errors import InputError
 from mjxball.fly.card import motor_of
+from mjxball.plant import plant_parameters
 from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.log import Log
 
@@ -127,7 +127,7 @@ def fly_windows(
     Pitch and yaw are the log's.
     """
     law, plant, h, motor = config.autopilot, config.plant, crazyflie.PERIOD, motor_model(config, log)
-    mass, lever = pair_mass(config), np.array([plant.leader_mount[1], plant.follower_mount[1]])
+    mass, lever = pair_mass(config), np.array([drone.mount[1] for drone in plant.pair])
     keep = np.exp(-h / parameters.lag)[:, None, None]
     shares = crazyflie.integral_shares(np, law, float)
     mean = (parameters.lag[:, None, None] / h) * (1 - keep)
@@ -162,7 +162,7 @@ def fly_windows(
 
 def pair_mass(config: Config) -> float:
     """All that flies [kg]."""
-    constants = plant_constants(config.plant, config.attitude)
+    constants = plant_parameters(config.plant, config.attitude)
     return float(constants.drone_mass.sum()) + config.plant.object_mass
 
 

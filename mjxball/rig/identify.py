@@ -165,8 +165,10 @@ def plant_settings(settings: config.Config, found: Estimate) -> dict[str, Any]:
     return {
         "plant.rotor_lag": _rounded(found.lag),
         "plant.rotor_force_max": _rounded(sum(curve)),
-        "plant.leader_inertia": [_rounded(value) for value in own(plant.leader_inertia)],
-        "plant.follower_inertia": [_rounded(value) for value in own(plant.follower_inertia)],
+        **{
+            f"plant.drones.{number}.inertia": [_rounded(value) for value in own(drone.inertia)]
+            for number, drone in enumerate(plant.drones)
+        },
         "autopilot.motor_curve": [_rounded(value) for value in curve],
         # What takes more than there is is a rig that is too weak: `validate` says so.
         "autopilot.hover_thrust": min(round(hover(stronger)[0]), THRUST_CEILING),

@@ -77,7 +77,7 @@ class Laws:
         # On a pivot height stays: a drone's own follows from roll, and flies on that.
         self._free = None if config.plant.stand == "free" else (0.0, 0.0, 1.0)
         self._follower_sees = config.follower.error
-        self._leader_mount, self._follower_mount = config.plant.leader_mount, config.plant.follower_mount
+        self._leader_mount, self._follower_mount = (drone.mount for drone in config.plant.pair)
 
     def observe(self, state: Body, goal: Vector) -> Observation:
         """The follower's observation; `goal` of O."""

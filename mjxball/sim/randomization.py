@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import crazyflie, motors
-from mjxball.control.constants import plant_constants, trim_limit
+from mjxball.control.constants import trim_limit
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import start_state
+from mjxball.plant import plant_parameters
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -48,11 +48,11 @@ class ResetDistribution:
         )
         self.varies = any(scale != (1.0, 1.0) for scale in scales)
         self.powered = scenario.battery[1] > 0
-        self._constants = constants = plant_constants(config.plant, config.attitude)
+        self._constants = constants = plant_parameters(config.plant, config.attitude)
         self._motor = motors.MOTORS[config.autopilot.drone or "2.1"]
-        self._lever = 2 * min(map(abs, (constants.mounts[:, "xy".index(config.plant.cg_axis)])))
+        self._lever = 2 * min(map(abs, constants.mounts[:, config.plant.directions[0]]))
         self._levels = config.follower.shares_integrals and config.leader.level_gain > 0
-        self._drones = np.asarray(config.plant.leader_inertia) + config.plant.follower_inertia
+        self._drones = constants.own_inertia.sum(axis=0)
         self._object = constants.object_inertia_per_mass
 
     def draw(self, rng: Array, difficulty: Scalar | float = 1.0) -> tuple[Load, PlantState, Vector]:
@@ -137,7 +137,7 @@ class ResetDistribution:
         """As `trimmed` for drones that can be flown: one's rotors, and what one lifts more and the other less."""
         plant = self.config.plant
         weakest = 1.0 if load.thrust_scale is None else jnp.minimum(load.thrust_scale[0], load.thrust_scale[1])
-        apart = LIFT * (plant.leader_mass + plant.follower_mass + mass) * self._lever if self._levels else 0.0
+        apart = LIFT * (sum(drone.mass for drone in plant.drones) + mass) * self._lever if self._levels else 0.0
         return trim_limit(plant, mass, self.config.scenario.trim_margin, None, (1.0, weakest)) + apart / mass
 
     def draw_drives(

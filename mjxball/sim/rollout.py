@@ -11,20 +11,19 @@ import numpy as np
 
 from mjxball.config import Config, Plant, preset, validate
 from mjxball.control import rotations
-from mjxball.control.constants import plant_constants
 from mjxball.control.followers import Baseline, Follower, PrivilegedInfo
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
-from mjxball.physics.engine import Load, PlantState, contact_wrenches
+from mjxball.physics.engine import Load, PlantState, contact_wrenches, total_wrench
 from mjxball.physics.motion import make_prescribed, object_mass
 from mjxball.physics.step import (
     make_accelerations,
     make_cg_offset,
     make_stepper,
     start_state,
-    total_wrench,
     with_external_force,
 )
+from mjxball.plant import plant_parameters
 from mjxball.sim.closed_loop import ClosedLoop
 from mjxball.sim.disturbances import record, sensors_of
 from mjxball.sim.scenario import Scenario, check_scenario
@@ -44,7 +43,7 @@ class Tick(NamedTuple):
     position: Float[np.ndarray, "n 3"]  # of O in the world [m]
     target: Float[np.ndarray, "n 3"]  # goal of O [m]
     euler: Float[np.ndarray, "n 3"]  # roll, pitch, yaw [rad]
-    rotor_force: Float[np.ndarray, "n 2 4"]  # leader, follower [N]
+    rotor_force: Float[np.ndarray, "n drones 4"]  # [N]
     leader_command: Float[np.ndarray, "n 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
     follower_command: Float[np.ndarray, "n 3"]  # likewise
     diverged: Bool[np.ndarray, " n"]
@@ -67,14 +66,14 @@ class Trajectory:
     euler: Float[np.ndarray, "T ... 3"]  # roll, pitch, yaw [rad]
     rates: Float[np.ndarray, "T ... 3"]  # body rates [rad/s]
     quaternion: Float[np.ndarray, "T ... 4"]  # body -> world (w, x, y, z)
-    rotor_force: Float[np.ndarray, "T ... 2 4"]  # leader, follower [N]
+    rotor_force: Float[np.ndarray, "T ... drones 4"]  # [N]
     leader_command: Float[np.ndarray, "T ... 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
     follower_command: Float[np.ndarray, "T ... 3"]  # likewise
     observation: Float[np.ndarray, "T ... 18"]  # what the follower saw
     cg_offset: Float[np.ndarray, "T ..."]  # along the CG axis from O [m]
     object_mass: Float[np.ndarray, "T ..."]  # [kg]
-    contact_force: Float[np.ndarray, "T ... 2 3"]  # of leader, follower on the object, body axes [N]
-    contact_torque: Float[np.ndarray, "T ... 2 3"]  # likewise, about each drone's centre [N m]
+    contact_force: Float[np.ndarray, "T ... drones 3"]  # of every drone on the carrier, body axes [N]
+    contact_torque: Float[np.ndarray, "T ... drones 3"]  # likewise, about each drone's centre [N m]
     goal: Float[np.ndarray, "... 3"]  # of O, the last one of a sequence of waypoints [m]
     target: Float[np.ndarray, "T ... 3"]  # goal of O at every step [m]
     diverged: Bool[np.ndarray, "..."]
@@ -243,7 +242,7 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
     """
     plant = config.plant
     ahead = 0.5 * config.timing.control_period + plant.rotor_lag
-    drones = plant.leader_mass + plant.follower_mass
+    drones = sum(drone.mass for drone in plant.drones) + plant.carrier_mass
     prescribed = None if config.motion.kind == "rolling" else make_prescribed(config)
 
     def privileged(state: PlantState, load: Load) -> PrivilegedInfo:
@@ -260,7 +259,7 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
 
 def flown_contact_wrenches(
     config: Config, flown: PlantState, load: Load, physics: str
-) -> tuple[Float[np.ndarray, "T n 2 3"], Float[np.ndarray, "T n 2 3"]]:
+) -> tuple[Float[np.ndarray, "T n drones 3"], Float[np.ndarray, "T n drones 3"]]:
     """Contact forces and torques of recorded states (T, n, ...), see `physics.engine.contact_wrenches`.
 
     `mujoco` reads MuJoCo's own internal forces; the other engines, and flights with a push, share the closed form.
@@ -269,11 +268,9 @@ def flown_contact_wrenches(
         from mjxball.physics.mujoco import flown_contact_wrenches as measured
 
         return measured(config, flown, load)
-    constants = plant_constants(config.plant, config.attitude)
+    constants = plant_parameters(config.plant, config.attitude)
     accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
-    wrench = total_wrench(
-        np, flown.rotor_force, constants.mounts, config.plant.arm, config.plant.yaw_per_thrust, config.plant.layout
-    )
+    wrench = total_wrench(config.plant, constants, flown.rotor_force)
     linear, angular, _ = accelerate(flown, with_external_force(wrench, flown, load), load)
     return contact_wrenches(config.plant, constants, flown, linear, angular)
 

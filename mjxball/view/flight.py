@@ -81,8 +81,7 @@ def load_flight(path: str | os.PathLike[str]) -> Flight:
         if about["format"] != FORMAT:
             raise ValueError
         title = str(about["title"])
-        settings = configs.to_dict(configs.Config())
-        plant = configs.from_dict({**settings, "plant": about["plant"]}).plant
+        plant = configs.from_record({"plant": about["plant"]}).plant
     except (KeyError, TypeError, ValueError, RecursionError):
         raise InputError(f"{path} is not a flight that this version reads") from None
     return check_flight(Flight(title[:200], plant, arrays), str(path))

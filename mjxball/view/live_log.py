@@ -83,7 +83,7 @@ class LiveLog:
         self._config, self._firmware = header["config"], FirmwareSetup.of_header(header)
         self._curves = self._firmware.force_curves(self._config)
         plant = self._config.plant
-        self._rig = Rig(plant.leader_mount, plant.follower_mount)
+        self._rig = Rig.of_plant(plant)
         # Of whichever curve: it is known once the motors turn, when the page has its scale.
         known = [own.map.curve for one in variants(self._config) for own in one.values()]
         strongest = max(curve.force(packets.THRUST_CEILING) for curve in (*self._curves, *known))

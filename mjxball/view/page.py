@@ -62,7 +62,7 @@ def plant_of(plant: Plant) -> dict[str, Any]:
         "size": plant.object_size,
         "arm": plant.arm,
         "rotors": [[lever * x, lever * y] for x, y in mixer.PLACES[plant.layout]],  # from a drone's centre [m]
-        "mounts": [plant.leader_mount, plant.follower_mount],
+        "mounts": [drone.mount for drone in plant.drones],
         "axis": "xy".index(plant.cg_axis),
         "share": plant.moving_fraction,
         "ball": plant.ball_radius,

@@ -37,7 +37,7 @@ def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
     disabled = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     spec.option.disableflags &= ~int(disabled)
     floor = spec.geom("floor")
-    lowest = min(plant.leader_mount[2], plant.follower_mount[2])
+    lowest = min(drone.mount[2] for drone in plant.drones)
     floor.pos = [0.0, 0.0, lowest - LEG - FOOT if plant.stand != "pivot" else -1.0]
     floor.contype, floor.conaffinity = 1, 2
     for name in (LEADER, FOLLOWER):
@@ -74,7 +74,7 @@ class CoupledPair:
         self.data = mujoco.MjData(self.model)
         self._free, self._heaves = plant.stand == "free", plant.stand == "heave"
         self._roll = 1 if self._heaves else 0  # joint of a stand's roll
-        self._mounts = np.array([plant.leader_mount, plant.follower_mount])
+        self._mounts = np.array([drone.mount for drone in plant.pair])
         self._slide = self.model.joint(BALL_JOINT).dofadr[0]
         self._slide_position = self.model.joint(BALL_JOINT).qposadr[0]
         self._body = self.model.body(ASSEMBLY).id

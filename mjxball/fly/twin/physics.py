@@ -246,7 +246,8 @@ def pair_of(
     Raises InputError if the coupled model is needed and MuJoCo is not installed.
     """
     if not is_crazyflie(config):
-        mounts = (config.plant.leader_mount, config.plant.follower_mount)
+        leader, follower = config.plant.pair
+        mounts = (leader.mount, follower.mount)
         return StandIn(StandInPlant(mounts=mounts), kind, surroundings)
     try:
         from mjxball.fly.twin.coupled import CoupledPair

@@ -1,0 +1,104 @@
+"""The plant's settings: drones fixed to a carrier, and the load that moves on it. SI units, body axes about O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mjxball.config._leaf import Vector3, setting
+from mjxball.errors import InputError
+
+
+@dataclass(frozen=True)
+class Drone:
+    """One drone and where it sits. Zeros behind `yaw` stand for the plant's own number, which all drones share."""
+
+    mass: float = setting(1.0, "mass of the drone [kg]", above=0)
+    inertia: Vector3 = setting((2.3e-3, 2.3e-3, 4.0e-3), "principal inertia about its own axes [kg m2]", above=0)
+    mount: Vector3 = setting((0.0, 0.0, 0.0), "centre of the drone from O, body axes [m]")
+    yaw: float = setting(0.0, "angle about body z by which it is turned on the carrier [rad]", low=-6.3, high=6.3)
+    arm: float = setting(0.0, "its centre to each rotor, 0: plant.arm [m]", low=0)
+    rotor_force_max: float = setting(0.0, "largest force of one rotor, 0: plant.rotor_force_max [N]", low=0)
+    rotor_lag: float = setting(0.0, "time constant of a rotor's force, 0: plant.rotor_lag [s]", low=0)
+    yaw_per_thrust: float = setting(0.0, "yaw moment of a rotor over its force, 0: plant.yaw_per_thrust [m]", low=0)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A rigid carrier, the drones on it, one of which leads, and a load that moves. Defaults are the `paper` plant."""
+
+    drones: tuple[Drone, ...] = (Drone(mount=(0.17, 0.0, 0.0)), Drone(mount=(-0.17, 0.0, 0.0)))
+    leader: int = setting(0, "number of the drone that leads, counted from 0", low=0)
+    carrier_mass: float = setting(0.0, "mass of the carrier, besides the object's part that does not move [kg]", low=0)
+    carrier_inertia: Vector3 = setting((0.0, 0.0, 0.0), "principal inertia of the carrier about O [kg m2]", low=0)
+    object_mass: float = setting(0.2, "nominal mass of the object, all of it moving with the CG [kg]", above=0)
+    object_size: Vector3 = setting((0.34, 0.10, 0.05), "edges of the object, a uniform box about O [m]", above=0)
+    moving_fraction: float = setting(
+        1.0, "share of the object's mass that moves; the rest is a fixed box about O", above=0, high=1
+    )
+    ball_radius: float = setting(0.02, "radius of the moving ball [m]", above=0)
+    ball_stop: float = setting(
+        0.0, "ball's centre from O at an end stop or at the rim, 0: it touches the object's end [m]", low=0
+    )
+    cg_axis: Literal["x", "y", "xy"] = setting(
+        "x", "body axis along which the CG moves and a pair is mounted; xy: it moves in the plane"
+    )
+    stand: Literal["free", "pivot", "heave"] = setting(
+        "free", "free flight; pivot: O fixed, only roll free; heave: roll and height free"
+    )
+    arm: float = setting(0.12, "centre of a drone to each rotor [m]", above=0)
+    layout: Literal["plus", "x"] = setting(
+        "plus", "rotors on the body axes, 1 at +x, 2 at +y; or between them as on a Crazyflie, 1 at +x -y, 2 at -x -y"
+    )
+    rotor_force_max: float = setting(5.5, "largest force of one rotor [N]", above=0)
+    rotor_lag: float = setting(0.03, "time constant of a rotor's force [s]", above=0)
+    yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", above=0)
+    gravity: float = setting(9.81, "gravitational acceleration [m/s2]", above=0)
+
+    @property
+    def count(self) -> int:
+        """How many drones there are, N."""
+        return len(self.drones)
+
+    @property
+    def pair(self) -> tuple[Drone, Drone]:
+        """Leader and follower of a plant of two; InputError for any other."""
+        if len(self.drones) != 2:
+            raise InputError(f"this needs a plant of two drones, a leader and a follower, and it has {self.count}")
+        return self.drones[self.leader], self.drones[1 - self.leader]
+
+    @property
+    def directions(self) -> tuple[int, ...]:
+        """Body axes (0 x, 1 y) along which the load moves: one for a line, two for a plane."""
+        return tuple("xy".index(axis) for axis in self.cg_axis)
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Share of the load's weight that each drone carries with the CG at O: the most even ones that hold it level.
+
+        Of all shares that add up to 1 and have no moment about O across the load's directions, those with the least sum
+        of squares: 1/N - (r_i - m) C^-1 m, with the mounts' mean m and scatter C (ours).
+        """
+        count, axes = len(self.drones), self.directions
+        mean = [sum(drone.mount[axis] for drone in self.drones) / count for axis in axes]
+        off = [[drone.mount[axis] - m for axis, m in zip(axes, mean, strict=True)] for drone in self.drones]
+        scatter = [[sum(row[i] * row[j] for row in off) for j in range(len(axes))] for i in range(len(axes))]
+        weights = _solved(scatter, mean)
+        return tuple(1 / count - sum(a * b for a, b in zip(row, weights, strict=True)) for row in off)
+
+    def of_drones(self, name: str) -> tuple[float, ...]:
+        """`name` (arm, rotor_force_max, rotor_lag or yaw_per_thrust) of every drone."""
+        return tuple(getattr(drone, name) or getattr(self, name) for drone in self.drones)
+
+
+def _solved(matrix: list[list[float]], vector: list[float]) -> list[float]:
+    """Least-norm solution of the symmetric system, 1 x 1 or 2 x 2; a direction without scatter is left out."""
+    if len(vector) == 1:
+        return [vector[0] / matrix[0][0]] if matrix[0][0] > 0 else [0.0]
+    (a, b), (_, d) = matrix
+    determinant, trace = a * d - b * b, a + d
+    x, y = vector
+    if determinant > 1e-9 * trace * trace:
+        return [(d * x - b * y) / determinant, (a * y - b * x) / determinant]
+    square = trace * trace or 1.0
+    return [(a * x + b * y) / square, (b * x + d * y) / square]

@@ -1,0 +1,174 @@
+"""A plant's numbers as a pytree of arrays, and what follows from them about O.
+
+Structure (how many drones, rotor layout, stand, directions of the load) is static and stays in `config.Plant`; numbers
+are `PlantParameters`. As NumPy arrays they are constants, which fold into a compiled program; as JAX arrays every world
+may have its own.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjxball.config import Attitude, Plant, ball_limit
+from mjxball.plant import parts
+from mjxball.plant.parts import Part, Parts, Rows
+
+Array = Any
+ROLLING_INERTIA = 0.4  # spin inertia of a solid ball over r^2 and its mass: (7/5) m x'' = m g sin
+
+
+class AttitudeGains(NamedTuple):
+    """PD gains of one drone on (roll, pitch, yaw)."""
+
+    kp: Array  # (3,) [N m/rad]
+    kd: Array  # (3,) [N m s/rad]
+
+
+class PlantParameters(NamedTuple):
+    """Numbers of a plant of N drones, any batch shape in front of every array."""
+
+    drone_mass: Array  # (N,) [kg]
+    own_inertia: Array  # (N, 3) principal inertia about each drone's own centre and axes [kg m2]
+    mounts: Array  # (N, 3) centres from O, body axes [m]
+    yaw: Array  # (N,) angle about body z by which a drone is turned [rad]
+    arm: Array  # (N,) centre to rotor [m]
+    yaw_per_thrust: Array  # (N,) yaw moment of a rotor over its force [m]
+    rotor_force_max: Array  # (N,) [N]
+    rotor_lag: Array  # (N,) time constant of a rotor's force [s]
+    share: Array  # (N,) share of the load's weight that a drone believes it carries
+    gains: AttitudeGains  # of each drone, about body axes
+    carrier_mass: Array  # () [kg]
+    carrier_inertia: Array  # (3,) about O [kg m2]
+    moving_fraction: Array  # () share of the object's mass that moves
+    shell_inertia_per_mass: Array  # (3,) of the fixed part of the object about O, per kg of object [m2]
+    ball_inertia_per_mass: Array  # (3,) of the moving part about its own centre, per kg of object [m2]
+    ball_limit: Array  # () offset of a rolling ball at which it touches an end stop or the rim [m]
+    gravity: Array  # () [m/s2]
+
+    @property
+    def object_inertia_per_mass(self) -> Array:
+        """(3,) of the whole object about O with the CG at O, per kg of object [m2]."""
+        return self.shell_inertia_per_mass + self.ball_inertia_per_mass
+
+    @property
+    def drone_inertia(self) -> np.ndarray:
+        """(3, 3) inertia about O of all drones and the carrier, body axes [kg m2]; of constants alone."""
+        return np.array(rigid_inertia(self))
+
+    @property
+    def size(self) -> int:
+        """How many drones there are, N."""
+        return int(self.drone_mass.shape[-1])
+
+
+def of_drone(parameters: PlantParameters, number: int) -> tuple[Part, Parts, Parts, Part]:
+    """(mass, own principal inertia, mount, yaw) of drone `number`."""
+    inertia, mount = (
+        (parts.entry(array, number, 0), parts.entry(array, number, 1), parts.entry(array, number, 2))
+        for array in (parameters.own_inertia, parameters.mounts)
+    )
+    yaw = parts.entry(parameters.yaw, number)
+    return parts.entry(parameters.drone_mass, number), inertia, mount, yaw
+
+
+def rigid_mass(parameters: PlantParameters) -> Part:
+    """Of all drones and the carrier [kg]."""
+    drones = [parts.entry(parameters.drone_mass, number) for number in range(parameters.size)]
+    return parts.total([*drones, parts.entry(parameters.carrier_mass)])
+
+
+def rigid_moment(parameters: PlantParameters) -> Parts:
+    """Sum of m_i r_i over the drones [kg m]; the carrier's centre is O."""
+    found = parts.ZERO
+    for number in range(parameters.size):
+        mass, _, mount, _ = of_drone(parameters, number)
+        found = parts.add(found, parts.scale(mass, mount))
+    return found
+
+
+def rigid_inertia(parameters: PlantParameters) -> Rows:
+    """About O, of all drones and the carrier, body axes [kg m2]."""
+    own: Rows = (parts.ZERO,) * 3
+    far: Rows = (parts.ZERO,) * 3
+    for number in range(parameters.size):
+        mass, inertia, mount, yaw = of_drone(parameters, number)
+        own = parts.add_rows(own, parts.diagonal_turned_about_z(yaw, inertia))
+        far = parts.add_rows(far, parts.scale_rows(mass, parts.point_inertia(mount)))
+    carrier = parts.diagonal(_vector(parameters.carrier_inertia))
+    return parts.add_rows(parts.add_rows(own, far), carrier)
+
+
+def _vector(array: Array) -> Parts:
+    return parts.entry(array, 0), parts.entry(array, 1), parts.entry(array, 2)
+
+
+def own_inertia(parameters: PlantParameters, number: int) -> Rows:
+    """Inertia of drone `number` about its own centre, body axes [kg m2]."""
+    _, inertia, _, yaw = of_drone(parameters, number)
+    return parts.diagonal_turned_about_z(yaw, inertia)
+
+
+def shell_and_ball(parameters: PlantParameters) -> tuple[Parts, Parts]:
+    """Inertia per kg of object of its fixed and of its moving part [m2]."""
+    return _vector(parameters.shell_inertia_per_mass), _vector(parameters.ball_inertia_per_mass)
+
+
+def shared(values: Array, like: Array) -> Any:
+    """A float if `values` (..., N) are constants that are all equal, else an array of the type of `like`."""
+    if isinstance(values, np.ndarray) and values.ndim == 1:
+        if (values == values[0]).all():
+            return float(values[0])
+        return like.__array_namespace__().asarray(values, dtype=like.dtype)
+    return values
+
+
+def box_inertia_per_mass(size: tuple[float, float, float]) -> np.ndarray:
+    """Principal inertia (3,) [m2] of a uniform box with edges `size` [m], about its centre, per unit mass."""
+    a, b, c = size
+    return np.array([b * b + c * c, a * a + c * c, a * a + b * b]) / 12
+
+
+def design_gains(inertia: Array, natural_frequency: Array, damping: float, drones: int = 2) -> AttitudeGains:
+    """Gains of one of N equal `drones` for the assembly's inertia about O (3,) [kg m2], of which each takes its part.
+
+    Kp = J wn^2 / N, Kd = 2 J zeta wn / N (ours).
+    """
+    kp = tuple(j * w * w / drones for j, w in zip(inertia, natural_frequency, strict=True))
+    kd = tuple(2 / drones * j * damping * w for j, w in zip(inertia, natural_frequency, strict=True))
+    return AttitudeGains(kp, kd)
+
+
+def plant_parameters(plant: Plant, attitude: Attitude) -> PlantParameters:
+    """Constants of `plant`; the attitude gains are those of `attitude.design_object_mass` at c = 0.
+
+    If the whole object moves (`moving_fraction` 1) the moving mass has the box's inertia, as in the reference
+    plant; else it is a solid ball, and the fixed rest is the box.
+    """
+    drones, fraction = plant.drones, plant.moving_fraction
+    box = box_inertia_per_mass(plant.object_size)
+    ball = box if fraction == 1 else np.full(3, fraction * ROLLING_INERTIA * plant.ball_radius**2)
+    nothing = AttitudeGains(np.zeros(3), np.zeros(3))
+    found = PlantParameters(
+        drone_mass=np.array([drone.mass for drone in drones]),
+        own_inertia=np.array([drone.inertia for drone in drones]),
+        mounts=np.array([drone.mount for drone in drones]),
+        yaw=np.array([drone.yaw for drone in drones]),
+        arm=np.array(plant.of_drones("arm")),
+        yaw_per_thrust=np.array(plant.of_drones("yaw_per_thrust")),
+        rotor_force_max=np.array(plant.of_drones("rotor_force_max")),
+        rotor_lag=np.array(plant.of_drones("rotor_lag")),
+        share=np.array(plant.shares),
+        gains=nothing,
+        carrier_mass=np.array(plant.carrier_mass),
+        carrier_inertia=np.array(plant.carrier_inertia),
+        moving_fraction=np.array(fraction),
+        shell_inertia_per_mass=(1 - fraction) * box,
+        ball_inertia_per_mass=ball,
+        ball_limit=np.array(ball_limit(plant)),
+        gravity=np.array(plant.gravity),
+    )
+    inertia = np.diag(found.drone_inertia) + attitude.design_object_mass * found.object_inertia_per_mass
+    gains = design_gains(inertia, attitude.natural_frequency, attitude.damping, plant.count)
+    return found._replace(gains=AttitudeGains(np.array(gains.kp), np.array(gains.kd)))

@@ -1,0 +1,107 @@
+"""Teams of any number of drones: the engines agree, momentum is conserved, contact wrenches hold the carrier."""
+
+from __future__ import annotations
+
+import itertools
+
+import jax
+import numpy as np
+import pytest
+from plants import random_motion, random_states, team
+from tables import rows
+from test_engines import TOLERANCE, jitted, relative_difference
+
+from mjxball.config import Attitude, Plant
+from mjxball.physics import mjx, mujoco, newton_euler
+from mjxball.physics.engine import contact_wrenches, total_wrench
+from mjxball.plant import plant_parameters
+
+STATES = 100
+LOADS = {
+    "plane": {"cg_axis": "xy"},
+    "light ball on a plate": {"cg_axis": "xy", "moving_fraction": 0.4},
+    "line": {"cg_axis": "y", "moving_fraction": 0.7},
+}
+STANDS = ("free", "pivot", "heave")
+TEAMS = [
+    (count, load, stand)
+    for (count, load), stand in zip(itertools.product((2, 3, 4, 6), LOADS), itertools.cycle(STANDS), strict=False)
+]
+
+
+def arguments_for(plant: Plant, function: str, count: int = STATES) -> tuple:
+    """States, the wrenches of their rotors, object masses and what moves the load."""
+    random = np.random.default_rng(7)
+    state, parameters = random_states(plant, count, random), plant_parameters(plant, Attitude())
+    wrench = total_wrench(plant, parameters, state.rotor_force)
+    last = (
+        random_motion(plant, count, random) if function == "prescribed" else random.normal(size=state.ball_rate.shape)
+    )
+    return state, wrench, random.uniform(0.1, 0.6, count), last
+
+
+@rows("count, load, stand", TEAMS)
+@rows("function", ["prescribed", "rolling"])
+def test_closed_form_and_mujoco_agree_on_every_team(count: int, load: str, stand: str, function: str) -> None:
+    plant = team(count, seed=count, stand=stand, **LOADS[load])
+    arguments = arguments_for(plant, function)
+    found, expected = (
+        getattr(make(plant, Attitude()), function)(*arguments)
+        for make in (newton_euler.make_engine, mujoco.make_engine)
+    )
+    assert relative_difference(found, expected) <= TOLERANCE
+    assert np.abs(expected[1]).max() > 1  # [rad/s2]: something turns
+
+
+MJX_TEAMS = [
+    pytest.param(3, "plane", "free"),
+    pytest.param(4, "light ball on a plate", "free", marks=pytest.mark.slow),
+    pytest.param(6, "light ball on a plate", "heave", marks=pytest.mark.slow),
+    pytest.param(2, "line", "pivot", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("count", "load", "stand"), MJX_TEAMS)
+def test_mjx_agrees_on_teams(count: int, load: str, stand: str) -> None:
+    plant = team(count, seed=count, stand=stand, **LOADS[load])
+    closed = newton_euler.make_engine(plant, Attitude())
+    for function in ("prescribed", "rolling"):
+        arguments = arguments_for(plant, function)
+        fast = jitted(lambda: getattr(mjx.make_engine(plant, Attitude()), function))(*arguments)  # noqa: B023
+        assert relative_difference(fast, getattr(closed, function)(*arguments)) <= TOLERANCE, function
+
+
+@pytest.mark.parametrize("engine", ["newton-euler", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_every_world_may_have_another_rig(engine: str) -> None:
+    """Traced numbers give what the same numbers give as constants."""
+    make = {"newton-euler": newton_euler.make_engine, "mjx": mjx.make_engine}[engine]
+    rigs = [team(3, seed=seed, moving_fraction=0.4) for seed in range(3)]
+    numbers = [plant_parameters(rig, Attitude()) for rig in rigs]
+    worlds = jax.tree.map(lambda *leaves: np.stack(leaves), *numbers)
+    arguments = arguments_for(rigs[0], "rolling", len(rigs))
+
+    def traced(parameters, *each):
+        return make(rigs[0], Attitude(), parameters).rolling(*each)
+
+    found = jitted(lambda: traced)(worlds, *arguments)
+    for number, rig in enumerate(rigs):
+        alone = jax.tree.map(lambda leaf: leaf[number : number + 1], arguments)  # noqa: B023
+        expected = newton_euler.make_engine(rig, Attitude()).rolling(*alone)
+        assert relative_difference([leaf[number : number + 1] for leaf in found], expected) <= TOLERANCE
+
+
+def test_contact_wrenches_are_those_of_mujoco() -> None:
+    plant = team(4, seed=11, moving_fraction=0.4)
+    state, wrench, mass, motion = arguments_for(plant, "prescribed", 20)
+    linear, angular = newton_euler.make_engine(plant, Attitude()).prescribed(state, wrench, mass, motion)
+    force, torque = contact_wrenches(plant, plant_parameters(plant, Attitude()), state, linear, angular)
+    world, share = mujoco.MujocoWorld(plant, Attitude()), plant.moving_fraction
+    for row in range(20):
+        one = state.each(lambda leaf: leaf[row])  # noqa: B023
+        world.place(one, mass[row], motion.offset[row] / share, motion.rate[row] / share)
+        world.load_drones(one, one.rotor_force)
+        world.drive(motion.acceleration[row] / share)
+        expected = world.contact_wrenches(one)
+        # 1e-9 of newtons and newton metres of order 10: MuJoCo moves torques between points
+        np.testing.assert_allclose(force[row], expected[0], atol=1e-8)
+        np.testing.assert_allclose(torque[row], expected[1], atol=1e-8)
