@@ -40,7 +40,10 @@ hypothesis.settings.register_profile("mjxball", deadline=None, derandomize=True,
 hypothesis.settings.load_profile("mjxball")
 
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
-QUEUE, ROOM = Path(__file__), Path(__file__).parent  # locked, never written: they are there on every machine
+# Locked, never written: they are there on every machine. Tests by the clock share one room, all others the other.
+QUEUE, CLOCKED, OTHERS, SKY = (
+    Path(__file__).parents[1] / name for name in ("tests/conftest.py", "tests", ".", "mjxball")
+)
 
 
 @contextlib.contextmanager
@@ -58,15 +61,41 @@ ATTEMPTS = 3  # of a test that flies by the clock, on a machine that others may 
 running: list[pytest.Item] = []  # the test that runs
 
 
+def by_the_clock(item: pytest.Item) -> bool:
+    """Whether a busy machine would spoil the test."""
+    return any(item.get_closest_marker(name) for name in ("flight", "clock"))
+
+
+# Files that take longest, which begin first, so that no worker is left with one of them at the end.
+LONGEST = (
+    "test_fly_mocap_flight",
+    "test_fly_link",
+    "test_fly_main",
+    "test_fly_watchdog",
+    "test_fly_rehearsal",
+)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """With `--dist loadfile`, files begin in the order of `pytest_collection_modifyitems`."""
+    config.option.loadscopereorder = False
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The second tier is what is marked `slow`, what flies by the clock (`alone`) and what opens a browser."""
+    """The second tier is what is marked `slow`, what goes by the clock (`flight`, `clock`) and what opens a browser.
+
+    What goes by the clock begins first, on all workers together, then the longest files.
+    """
     for item in items:
-        if item.get_closest_marker("alone"):
+        if by_the_clock(item):
             item.add_marker(pytest.mark.flaky(reruns=ATTEMPTS - 1, reruns_delay=1))
             item.add_marker(pytest.mark.slow)
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.slow)
+    clocked = {item.path for item in items if by_the_clock(item)}
+    places = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: (item.path not in clocked, places.get(item.path.stem, len(places))))
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -83,16 +112,19 @@ def too_busy(reason: str) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """With workers side by side (`-n 2`), a test marked `alone` has the machine to itself.
+    """With workers side by side (`-n 2`), nothing that computes much runs beside a test by the clock.
 
-    Whoever waits for the room stands in the queue, so that a test that wants it alone is not passed for ever.
+    One marked `flight` flies alone or beside tests marked `clock`, which mostly wait. Whoever waits for a room to be
+    left stands in the queue, so that nobody is passed for ever.
     """
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return (yield)
-    kind = fcntl.LOCK_EX if item.get_closest_marker("alone") else fcntl.LOCK_SH
+    mine, theirs = (CLOCKED, OTHERS) if by_the_clock(item) else (OTHERS, CLOCKED)
     with contextlib.ExitStack() as stack:
-        with locked(QUEUE, fcntl.LOCK_EX):
-            stack.enter_context(locked(ROOM, kind))
+        if item.get_closest_marker("flight"):
+            stack.enter_context(locked(SKY, fcntl.LOCK_EX))
+        with locked(QUEUE, fcntl.LOCK_EX), locked(theirs, fcntl.LOCK_EX):
+            stack.enter_context(locked(mine, fcntl.LOCK_SH))
         return (yield)
 
 

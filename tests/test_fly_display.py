@@ -20,7 +20,7 @@ from mjxball.fly.limits import Limits
 from mjxball.fly.packets import ZERO, DroneState
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 
-pytestmark = pytest.mark.alone  # keys and pictures by the clock
+pytestmark = pytest.mark.clock  # keys and pictures by the clock
 
 LIMITS = Limits()
 

@@ -92,7 +92,7 @@ def opened(twin: Twin) -> Link:
     return link
 
 
-@pytest.mark.alone
+@pytest.mark.clock
 def test_cflib_still_connects_after_a_storm() -> None:
     random = np.random.default_rng(5)
     with Twin(StandIn()) as twin:
@@ -111,7 +111,7 @@ def test_cflib_still_connects_after_a_storm() -> None:
     assert twin.failure is None
 
 
-@pytest.mark.alone
+@pytest.mark.clock
 def test_the_runner_survives_a_hostile_twin() -> None:
     with Twin(StandIn()) as twin:
         link = opened(twin)
@@ -131,7 +131,7 @@ def test_the_runner_survives_a_hostile_twin() -> None:
     assert twin.failure is None
 
 
-@pytest.mark.alone
+@pytest.mark.clock
 def test_connecting_to_a_hostile_twin_ends_one_way_or_the_other() -> None:
     with Twin(StandIn()) as twin:
         twin.drones[0].faults = DroneFaults(garbage=2.0)

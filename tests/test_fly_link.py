@@ -24,7 +24,7 @@ from mjxball.fly.twin.physics import StandIn
 from mjxball.fly.twin.server import HOST, Twin
 
 pytest.importorskip("cflib")
-pytestmark = pytest.mark.alone  # by the clock
+pytestmark = pytest.mark.clock  # by the clock
 SHORT = Deadlines(connect=1.5, silence=1.0, attempts=2, parameter=0.5, first_state=0.7, close=1.0)
 
 

@@ -19,7 +19,7 @@ from mjxball.fly.twin.physics import RUNNING, Modes, PairState, StandIn
 from mjxball.fly.twin.server import HOST, Twin
 
 cflib = pytest.importorskip("cflib")
-pytestmark = pytest.mark.alone  # by the clock
+pytestmark = pytest.mark.clock  # by the clock
 LIMIT = 10.0  # [s] that an answer may take on a busy machine
 
 

@@ -46,13 +46,13 @@ def watched(frames: list[bytes], close: bool = True) -> tuple[LastKnownState, fl
             os.close(reading)
 
 
-@pytest.mark.alone
+@pytest.mark.clock
 def test_a_closed_pipe_in_the_air_is_a_death() -> None:
     frames = [packed(IDLE, NOTHING), packed(FLYING, SEEN)]
     assert watched(frames) == (SEEN, 0.0)
 
 
-@pytest.mark.alone
+@pytest.mark.clock
 def test_silence_in_the_air_is_a_hang_and_the_runner_is_killed() -> None:
     assert watched([packed(FLYING, SEEN)], close=False) == (SEEN, watchdog.SILENCE)
 
@@ -120,7 +120,7 @@ def lost_in_the_air(number: signal.Signals, log: Path) -> Twin | None:
     return twin
 
 
-@pytest.mark.alone
+@pytest.mark.flight
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
 def test_a_runner_lost_in_the_air_is_brought_down(number: signal.Signals, tmp_path: Path) -> None:
     for attempt in range(3):
