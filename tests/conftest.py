@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import dataclasses
 import fcntl
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_line import HASTY
 
+from mjxball import cache
 from mjxball import config as configs
 from mjxball.algorithms import sac
 from mjxball.algorithms.base import Policy
@@ -27,13 +31,14 @@ from mjxball.env import CoupledPairEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
 
-# Programs here are small and run once: to optimise them little takes a third off the time of tests that compile. Level
-# 0 compiles no sooner than level 1 and computes four times as slowly. XLA reads its flags when it first compiles;
-# processes that tests start compile as users' do, unless they are given these.
-HASTY = "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true"
+# XLA reads its flags when it first compiles; processes that tests start have those of users unless a test says so.
 with pytest.MonkeyPatch.context() as patched:
     patched.setenv("XLA_FLAGS", f"{HASTY} {os.environ.get('XLA_FLAGS', '')}")
     jax.jit(lambda: jnp.zeros(1))()
+if cache.VARIABLE not in os.environ:  # one compilation cache a run: of its workers and of the processes they start
+    os.environ[cache.VARIABLE] = tempfile.mkdtemp(prefix="mjxball-cache-")
+    atexit.register(shutil.rmtree, os.environ[cache.VARIABLE], ignore_errors=True)
+cache.enable_compilation_cache()
 
 # Derandomised: the same examples on every machine, so that a red build is never a matter of luck.
 hypothesis.settings.register_profile("mjxball", deadline=None, derandomize=True, database=None, max_examples=60)

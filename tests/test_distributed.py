@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import HASTY
+from command_line import HASTY
 
 from mjxball.commands.train import main as train
 from mjxball.errors import InputError

@@ -249,6 +249,7 @@ class TestBraxWrappers:
         np.testing.assert_array_equal(steps.info["truncation"][self.EPISODE - 1], 1.0)
 
 
+@pytest.mark.release
 class TestStockBrax:
     """Brax's own trainers run on the environment, given the function that JAX has removed."""
 
@@ -259,7 +260,6 @@ class TestStockBrax:
 
         monkeypatch.setattr(jax, "device_put_replicated", copies, raising=False)
 
-    @pytest.mark.release
     def test_ppo_trains(self, transport):
         from brax.training.agents.ppo import train as ppo
 
@@ -283,7 +283,6 @@ class TestStockBrax:
         assert all(np.isfinite(reward) and reward < 0 for _, reward in seen)
         assert finite(parameters)
 
-    @pytest.mark.slow
     def test_sac_trains(self, transport):
         from brax.training.agents.sac import train as sac
 

@@ -12,8 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import REPOSITORY, environment
-from conftest import HASTY
+from command_line import HASTY, REPOSITORY, environment
 
 # Loaded by every Python process that finds it: notes what it sees, one line each.
 HOOK = """

@@ -11,7 +11,8 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from conftest import HASTY, with_settings
+from command_line import HASTY
+from conftest import with_settings
 
 from mjxball.commands.train import main as train
 from mjxball.config import Config

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import HASTY
+from command_line import HASTY
 
 from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS
