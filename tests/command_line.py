@@ -25,6 +25,24 @@ HASTY = " ".join(
         "--xla_cpu_use_fusion_emitters=false",
     )
 )
+# Training for seconds: closed-form physics, tiny networks, two updates a step. One program for all tests that train so.
+TINY: dict[str, Any] = {
+    "--physics": "newton-euler",
+    "--timing.episode_steps": 100,
+    "--sac.num_envs": 32,
+    "--sac.replay_size": 3200,
+    "--sac.warmup_steps": 1024,
+    "--sac.batch_size": 64,
+    "--sac.updates_per_step": 2,
+    "--sac.policy_layers": "16,16",
+    "--sac.critic_layers": "16,16",
+}
+
+
+def tiny(**extra: Any) -> list[str]:
+    """Flags of such a training; in names of `extra` two underscores are a dot."""
+    flags = {**TINY, **{f"--{name.replace('__', '.')}": value for name, value in extra.items()}}
+    return [str(word) for pair in flags.items() for word in pair]
 
 
 def call(main: Main, arguments: Sequence[object]) -> int:

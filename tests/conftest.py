@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import short_train
 from command_line import HASTY
 
 from mjxball import cache
@@ -235,6 +236,12 @@ def remembering(transport: Config) -> Trained:
 def remembering_pair(remembering: Trained) -> CompiledEnv:
     """The environment that such a follower is trained in."""
     return compile_env(remembering.config, "newton-euler")
+
+
+@pytest.fixture
+def short_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trainings in this process judge their policy by one second of flight."""
+    monkeypatch.setattr("mjxball.commands.train.standard_scenarios", short_train.one_second)
 
 
 @pytest.fixture

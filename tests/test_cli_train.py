@@ -26,6 +26,7 @@ from command_line import (
     load_arrays,
     run,
     script,
+    tiny,
 )
 from tables import rows
 
@@ -34,28 +35,10 @@ from mjxball import config as configs
 from mjxball.commands.train import main, parser
 from mjxball.policy import Policy
 
-WORLDS = 32
-# Small enough for seconds: closed-form physics, tiny networks, one update a step.
-TINY: dict[str, Any] = {
-    "--physics": "newton-euler",
-    "--timing.episode_steps": 100,
-    "--sac.num_envs": WORLDS,
-    "--sac.replay_size": 32_000,
-    "--sac.warmup_steps": 1024,
-    "--sac.batch_size": 64,
-    "--sac.updates_per_step": 1,
-    "--sac.policy_layers": "16,16",
-    "--sac.critic_layers": "16,16",
-}
 STEPS = 4096
 LONG = 96_000  # several seconds of training, so that Ctrl-C arrives in the middle
 ROW = re.compile(r"^\s*[\d,]+ / [\d,]+ steps")
 EVALUATED = {"eval_return", "eval_steady_error", "eval_peak", "eval_tilt_error", "eval_vertical_error"}
-
-
-def command(**extra: Any) -> list[object]:
-    flags = {**TINY, **{f"--{name.replace('__', '.')}": value for name, value in extra.items()}}
-    return [script("train.py"), *(word for pair in flags.items() for word in pair)]
 
 
 def rows_of(run_directory: Path) -> list[dict[str, str]]:
@@ -79,7 +62,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run in a fresh working directory."""
     here = tmp_path_factory.mktemp("finished")
     with contextlib.chdir(here), contextlib.redirect_stdout(io.StringIO()) as said:
-        assert call(main, command(out="run", seed=3, sac__total_steps=STEPS)[1:]) == 0
+        assert call(main, tiny(out="run", seed=3, sac__total_steps=STEPS)) == 0
     assert "run/policy.npz" in said.getvalue()
     assert sorted(path.name for path in here.iterdir()) == ["run"]
     return here / "run"
@@ -146,7 +129,7 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that got one Ctrl-C after its first row of progress."""
     here = tmp_path_factory.mktemp("interrupted")
     child = subprocess.Popen(
-        [sys.executable, *map(str, command(out="run", sac__total_steps=LONG))],
+        [sys.executable, str(script("train.py")), *tiny(out="run", sac__total_steps=LONG)],
         cwd=here,
         env=environment(),
         stdout=subprocess.PIPE,
@@ -191,23 +174,21 @@ def test_export_of_an_interrupted_run(interrupted: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_run_quit_while_it_compiled_is_started_anew(finished: Path, tmp_path: Path) -> None:
+def test_a_run_quit_while_it_compiled_is_started_anew(finished: Path, tmp_path: Path, short_verdict: None) -> None:
     """Ctrl-C twice before the first checkpoint leaves `config.json` and an empty table: enough to resume from."""
     run_directory = tmp_path / "run"
     (run_directory / "checkpoints").mkdir(parents=True)
     shutil.copy(finished / "config.json", run_directory)
     (run_directory / "metrics.csv").write_text((finished / "metrics.csv").read_text().splitlines()[0] + "\n")
-    done = run([script("train.py"), "--resume", "run"], tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert call(main, ["--resume", run_directory]) == 0
     np.testing.assert_array_equal(command_of(run_directory / "policy.npz"), command_of(finished / "policy.npz"))
 
 
 @pytest.mark.slow
-def test_resume_finishes_an_interrupted_run(interrupted: Path) -> None:
+def test_resume_finishes_an_interrupted_run(interrupted: Path, short_verdict: None) -> None:
     before = rows_of(interrupted)
     recorded = (interrupted / "config.json").read_bytes()
-    done = run([script("train.py"), "--resume", "run"], interrupted.parent)
-    assert done.returncode == 0, done.stderr
+    assert call(main, ["--resume", interrupted]) == 0
     rows = rows_of(interrupted)
     assert rows[: len(before)] == before
     steps = [int(row["steps"]) for row in rows]

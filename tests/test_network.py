@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import HASTY, REPOSITORY, environment
+from command_line import REPOSITORY, environment, tiny
 
 # Loaded by every Python process that finds it: notes what it sees, one line each.
 HOOK = """
@@ -24,15 +24,13 @@ def note(event, arguments):
             log.write(f"{event} {arguments[1:] or arguments!r}\\n")
 sys.addaudithook(note)
 """
-WORK = """
-import sys
+WORK = f"""
+import short_train
 from mjxball import export
 from mjxball.commands import evaluate, train
-tiny = ["--physics", "newton-euler", "--sac.total_steps", "1100", "--sac.num_envs", "32", "--sac.replay_size", "3200",
-        "--sac.warmup_steps", "1024", "--sac.updates_per_step", "1", "--timing.episode_steps", "50",
-        "--sac.policy_layers", "8,8", "--sac.critic_layers", "8,8", "--out", "run"]
+train.standard_scenarios = short_train.one_second
 codes = [
-    train.main(tiny),
+    train.main({tiny(sac__total_steps=1100, out="run")}),
     export.main(["run", "out.npz"]),
     evaluate.main("run/policy.npz --followers copy --seconds 1 --physics mujoco --out report".split()),
 ]
@@ -58,8 +56,7 @@ def watched(tmp_path: Path) -> dict[str, str]:
     (tmp_path / "hook" / "sitecustomize.py").write_text(HOOK)
     return {
         **environment(),
-        "XLA_FLAGS": HASTY,
-        "PYTHONPATH": f"{tmp_path / 'hook'}:{REPOSITORY}",
+        "PYTHONPATH": f"{tmp_path / 'hook'}:{REPOSITORY}:{REPOSITORY / 'tests'}",
         "NETWORK_LOG": str(tmp_path / "network.log"),
     }
 

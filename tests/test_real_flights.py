@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import REPOSITORY, environment
+from command_line import REPOSITORY, call, environment
 from flights_made import COLUMNS, Truth, fly, write
 
+import real_flights
 from mjxball.control.crazyflie import PERIOD
 from mjxball.errors import InputError
 from nanobench import cascade, lift
@@ -43,8 +44,18 @@ def flights(made: Path) -> list[Flight]:
 
 
 @pytest.fixture(scope="module")
-def found(made: Path) -> Study:
-    return study(made)
+def reported(made: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Study, Path]:
+    """What the script found, and where it wrote `out.json` and `out.png`."""
+    place, kept = tmp_path_factory.mktemp("reported"), []
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(real_flights.study, "study", lambda *given: kept.append(study(*given)) or kept[0])
+        assert call(real_flights.main, [made, "--json", place / "out.json", "--figure", place / "out.png"]) == 0
+    return kept[0], place
+
+
+@pytest.fixture(scope="module")
+def found(reported: tuple[Study, Path]) -> Study:
+    return reported[0]
 
 
 def test_a_flight_is_read_in_our_units(flights: list[Flight]) -> None:
@@ -157,12 +168,10 @@ def test_the_script_refuses_in_one_line_with_code_2(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_script_writes_what_it_found(made: Path, tmp_path: Path) -> None:
-    result = run(made, "--json", tmp_path / "out.json", "--figure", tmp_path / "out.png")
-    assert result.returncode == 0, result.stderr
-    data = json.loads((tmp_path / "out.json").read_text())
+def test_the_script_writes_what_it_found(reported: tuple[Study, Path]) -> None:
+    data = json.loads((reported[1] / "out.json").read_text())
     assert {"command", "commit", "fit", "forecasts", "cascade", "thrust", "ranges"} <= data.keys()
-    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    assert (reported[1] / "out.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.release

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -13,27 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import HASTY
+from command_line import environment as child_environment
+from command_line import tiny
 
 from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS
 from mjxball.train.run_directory import PACKAGE, SOURCES
 
 REPOSITORY = Path(__file__).parents[1]
-TINY = [
-    *("--physics", "newton-euler", "--sac.total_steps", "24000", "--sac.num_envs", "32", "--sac.replay_size", "3200"),
-    *(
-        "--sac.warmup_steps",
-        "1024",
-        "--sac.updates_per_step",
-        "2",
-        "--timing.episode_steps",
-        "120",
-        "--sac.policy_layers",
-        "16,16",
-    ),
-    *("--sac.critic_layers", "16,16"),
-]
+STEPS = 24_000
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +33,13 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
     """A run that was never interrupted. Its replay has wrapped around several times."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    launch(["--out", str(out), *TINY], cache).wait(timeout=240)
+    launch(["--out", str(out), *tiny(sac__total_steps=STEPS)], cache).wait(timeout=240)
     return out
 
 
 def launch(arguments: list[str], cache: Path) -> subprocess.Popen:
-    environment = {**os.environ, "MJXBALL_CACHE": str(cache), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": HASTY}
-    command = [sys.executable, str(REPOSITORY / "train.py"), *arguments]
+    environment = {**child_environment(), "MJXBALL_CACHE": str(cache), "PYTHONPATH": str(REPOSITORY)}
+    command = [sys.executable, str(REPOSITORY / "tests" / "short_train.py"), *arguments]
     return subprocess.Popen(
         command, cwd=REPOSITORY, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
@@ -71,7 +58,7 @@ def complete(run: Path) -> list[int]:
 @pytest.mark.slow
 def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: Path, cache: Path) -> None:
     run = tmp_path / "killed"
-    child = launch(["--out", str(run), *TINY], cache)
+    child = launch(["--out", str(run), *tiny(sac__total_steps=STEPS)], cache)
     deadline = time.monotonic() + 120
     while not complete(run) and child.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -80,7 +67,7 @@ def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: P
     assert child.returncode == -signal.SIGKILL, "the run ended before it could be killed"
     kept = complete(run)
     assert kept
-    assert kept[-1] < 24000
+    assert kept[-1] < STEPS
     (run / CHECKPOINTS / f"{kept[-1] + 32}.orbax-checkpoint-tmp").mkdir()  # as a write cut short leaves it
     again = launch(["--resume", str(run)], cache)
     output = again.communicate(timeout=240)[0]
@@ -92,25 +79,24 @@ def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: P
 
 
 @pytest.mark.slow
-def test_damaged_checkpoint_is_skipped_with_a_warning(whole: Path, tmp_path: Path, cache: Path) -> None:
+def test_damaged_checkpoint_is_skipped_with_a_warning(
+    whole: Path, tmp_path: Path, short_verdict: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "damaged"
     shutil.copytree(whole, run)
     newest = complete(run)[-1]
     for path in (run / CHECKPOINTS / str(newest)).rglob("*"):
         if path.is_file() and path.stat().st_size > 200:
             path.write_bytes(path.read_bytes()[:100])
-    again = launch(["--resume", str(run)], cache)
-    output = again.communicate(timeout=240)[0]
-    assert again.returncode == 0, output
+    assert train(["--resume", str(run)]) == 0
+    output = "".join(capsys.readouterr())
     assert f"checkpoint {newest} cannot be read and is skipped" in output
     for name, value in arrays(whole).items():
         np.testing.assert_array_equal(arrays(run)[name], value, err_msg=name)
     assert complete(run)[-1] == newest
     # The damaged one was replaced: resuming once more finds nothing to complain about.
-    once_more = launch(["--resume", str(run)], cache)
-    output = once_more.communicate(timeout=240)[0]
-    assert once_more.returncode == 0, output
-    assert "skipped" not in output
+    assert train(["--resume", str(run)]) == 0
+    assert "skipped" not in "".join(capsys.readouterr())
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import pickle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +15,7 @@ from fly_virtual import World, log_header
 
 from mjxball import cli
 from mjxball import config as configs
+from mjxball.config import Config
 from mjxball.fly import card
 from mjxball.fly.command import CurveName
 from mjxball.fly.flight_log import Journal, read
@@ -89,10 +91,21 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
+FOUND: dict[bytes, Estimate] = {}  # by settings and log, since finding takes seconds
+
+
+def identify_once(settings: Config, log: Log) -> Estimate:
+    """`identify`, which is asked once about the same."""
+    key = pickle.dumps((settings, tuple(log)))
+    if key not in FOUND:
+        FOUND[key] = identify(settings, log)
+    return FOUND[key]
+
+
 def identified(path: Path) -> Estimate:
     """What is found in the log `path`, by what it says that flew."""
     log = read_log(path)
-    return identify(command.flown_with(CONFIG, log, None, path), log)
+    return identify_once(command.flown_with(CONFIG, log, None, path), log)
 
 
 def truth(case: Case) -> np.ndarray:
@@ -132,23 +145,23 @@ def assert_near(found: Estimate, case: Case) -> None:
     assert (np.abs(errors) < 3 * spread + MODEL[case.exact]).all(), (found, wanted)
 
 
-def found_already(monkeypatch: pytest.MonkeyPatch, found: Estimate) -> None:
-    """Let the command report what this test found in its log, which takes seconds to find."""
-    monkeypatch.setattr(command, "identify", lambda *_: found)
+@pytest.fixture
+def once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command asks `identify_once`."""
+    monkeypatch.setattr(command, "identify", identify_once)
 
 
 def test_hovering_tells_the_force_and_says_that_it_tells_no_more(
-    logs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys: Any
+    logs: dict[str, Path], once: None, capsys: Any
 ) -> None:
     path = logs["delivered, hover"]
     found = identified(path)
     assert found.thrust == pytest.approx(1.0, abs=0.01)
-    found_already(monkeypatch, found)
     call(command.main, [path])
     assert "too little moves in this log" in capsys.readouterr().out
 
 
-def test_from_the_runners_log_to_a_plant_file(logs: dict[str, Path], tmp_path: Path, capsys: Any) -> None:
+def test_from_the_runners_log_to_a_plant_file(logs: dict[str, Path], tmp_path: Path, once: None, capsys: Any) -> None:
     """The command on two logs; the plant file is the rig that flew, not the one that was thought."""
     name = "older, one weaker, quick"
     out = tmp_path / "plant.json"
@@ -245,16 +258,13 @@ def spoilt(path: Path, out: Path, begin: float, seconds: float) -> Path:
     return out
 
 
-def test_gaps_and_frozen_states_are_left_out(
-    logs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
-) -> None:
+def test_gaps_and_frozen_states_are_left_out(logs: dict[str, Path], tmp_path: Path, once: None, capsys: Any) -> None:
     name = "delivered, late"
     path = spoilt(logs[name], tmp_path / "spoilt.jsonl", 4.0, 1.5)
     whole, holed = read_log(logs[name]), read_log(path)
     assert np.sum(whole.usable) - np.sum(holed.usable) == pytest.approx(2 * 1.5 / 0.002, abs=30)  # but its last rows
     found = identified(path)
     assert_near(found, CASES[name])
-    found_already(monkeypatch, found)
     assert call(command.main, [path]) == 0
     said = capsys.readouterr().err.splitlines()
     assert [line.partition(" for ")[0] for line in said] == [

@@ -30,7 +30,7 @@ def test_still_cg_tilts_a_copying_pair_as_far_as_its_attitude_loops_give_way() -
     still = dataclasses.replace(
         STAND_START, mass=0.2, amplitude=0.05, omega=0.0, phase=math.pi / 2, ball_start=0.0, seconds=6.0
     )
-    flight = fly_stand(setup, make_baseline("copy", setup), True, "newton-euler", still)
+    (flight,) = fly_stand(setup, [make_baseline("copy", setup)], True, "newton-euler", still)
     kp = plant_parameters(setup.plant, setup.attitude).gains.kp[0]
     lean = -0.2 * 9.81 * 0.05 / (2 * kp)  # the CG lies on the leader's side, which goes down
     assert flight.ball[-1] == pytest.approx(0.05)
@@ -43,7 +43,8 @@ def test_leader_on_the_stand_flies_on_its_own_position() -> None:
     """Roll alone lifts the leader off its place: the error that copying is shown commands it down, O's does not."""
     setup = stand_config()
     start = dataclasses.replace(STAND_START, start_position=(0.0, 0.0, 0.0), seconds=0.02)
-    own, objects = (fly_stand(setup, make_baseline("copy", setup), shown, "newton-euler", start) for shown in (1, 0))
+    copy = make_baseline("copy", setup)
+    own, objects = (fly_stand(setup, [copy], shown, "newton-euler", start)[0] for shown in (True, False))
     rise = 0.15 * math.sin(STAND_START.start_tilt[0])
     assert own.height[0] == pytest.approx(LEVEL + rise)
     assert own.vertical[0] == pytest.approx(-0.1 * rise, rel=1e-3)  # kp_z of the paper's experiment
@@ -52,13 +53,13 @@ def test_leader_on_the_stand_flies_on_its_own_position() -> None:
 
 @pytest.fixture(scope="module")
 def flown() -> dict[str, dict[str, StandFlight]]:
-    """30 s of copying and of the shipped follower, with the paper's settings and with better ones."""
-    scenario, mine = dataclasses.replace(STAND_START, seconds=30.0), Policy.load(shipped_policy("stand"))
+    """25 s of copying and of the shipped follower, with the paper's settings and with better ones."""
+    scenario, mine = dataclasses.replace(STAND_START, seconds=25.0), Policy.load(shipped_policy("stand"))
     setups = {settings: stand_config(settings) for settings in SETTINGS}
     return {
         settings: {
-            "copy": fly_stand(setup, make_baseline("copy", setup), True, "newton-euler", scenario),
-            "mine": fly_stand(setup, mine, False, "newton-euler", scenario),
+            "copy": fly_stand(setup, [make_baseline("copy", setup)], True, "newton-euler", scenario)[0],
+            "mine": fly_stand(setup, [mine], False, "newton-euler", scenario)[0],
         }
         for settings, setup in setups.items()
     }

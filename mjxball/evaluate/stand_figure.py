@@ -15,7 +15,7 @@ from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import STEADY_AFTER
 from mjxball.evaluate.plots import Figure, as_svg, colours, legend_above, panels, thinned
 from mjxball.policy import Policy
-from mjxball.sim.rollout import simulate
+from mjxball.sim.rollout import Trajectory, check_rate, simulate_batch
 from mjxball.sim.scenario import Scenario
 
 SETTINGS = {"paper": "the paper's gains", "better": "better settings"}
@@ -78,13 +78,21 @@ def stand_config(settings: str = "paper") -> Config:
     return configs.validate(config)
 
 
-def fly_stand(config: Config, follower: Follower, leader_error: bool, physics: str, scenario: Scenario) -> StandFlight:
-    """Fly `follower` on the stand; it sees the object's error or, with `leader_error`, the leader's, as in the paper.
+def fly_stand(
+    config: Config, followers: Sequence[Follower], leader_error: bool, physics: str, scenario: Scenario
+) -> list[StandFlight]:
+    """Fly each of `followers` on the stand; it sees O's error or, with `leader_error`, the leader's, as in the paper.
 
     The leader's law is eq. 5 on e_l = p_l^d - p_l, p_l^d its position when the stick is level and O at its goal.
     """
     config = configs.replace(config, "follower.error", "leader" if leader_error else "object")
-    flown = simulate(config, follower, scenario, physics)
+    for follower in followers:
+        check_rate(config, follower)
+    flown = simulate_batch(config, [(follower, [scenario]) for follower in followers], physics)
+    return [_stand_flight(config, flown.world(number)) for number in range(len(followers))]
+
+
+def _stand_flight(config: Config, flown: Trajectory) -> StandFlight:
     mount = config.plant.drones[config.plant.leader].mount
     lever = rotations.rotate(rotations.matrix_from_quaternion(flown.quaternion), np.array(mount))
     rise = flown.position[:, 2] - flown.target[:, 2] + lever[:, 2] - mount[2]
@@ -97,8 +105,12 @@ def draw_stand(policies: Sequence[Policy], physics: str) -> Figure:
     flown: dict[str, dict[str, StandFlight]] = {}
     for settings in SETTINGS:
         config = stand_config(settings)
-        followers: list[Follower] = [*(make_baseline(name, config) for name in ("copy", "adaptive", "lqg")), *policies]
-        flown[settings] = {f.name: fly_stand(config, f, f.name == "copy", physics, STAND_START) for f in followers}
+        copy = make_baseline("copy", config)
+        others: list[Follower] = [*(make_baseline(name, config) for name in ("adaptive", "lqg")), *policies]
+        flights = fly_stand(config, [copy], True, physics, STAND_START)
+        flights += fly_stand(config, others, False, physics, STAND_START)
+        names = [copy.name, *(follower.name for follower in others)]
+        flown[settings] = dict(zip(names, flights, strict=True))
     rows = [
         (
             f"{SETTINGS[settings]}, {name}",

@@ -120,11 +120,16 @@ def simulate(
     `physics` is mjx, newton-euler or mujoco. Raises InputError for an unsound scenario or a policy of another rate.
     """
     config = plant if isinstance(plant, Config) else dataclasses.replace(preset("paper"), plant=plant)
+    check_rate(config, follower)
+    return simulate_batch(config, [(follower, [scenario or Scenario()])], physics).world(0)
+
+
+def check_rate(config: Config, follower: Follower) -> None:
+    """Raise InputError for a policy of another rate."""
     period = config.timing.control_period
     wanted = getattr(follower, "control_period", period)
     if abs(wanted - period) > 1e-9:
         raise InputError(f"{follower.name} was made for a control period of {wanted:g} s, not {period:g} s")
-    return simulate_batch(config, [(follower, [scenario or Scenario()])], physics).world(0)
 
 
 def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Trajectory:

@@ -1,0 +1,21 @@
+"""`train.py` whose verdict is one second of flight: for tests of what comes before it. Run as a script or imported."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+
+from mjxball.commands import train
+from mjxball.config import Config
+from mjxball.evaluate.suites import standard_scenarios
+from mjxball.sim.scenario import Scenario
+
+
+def one_second(settings: Config) -> tuple[Scenario, ...]:
+    """The reference scenario, cut short."""
+    return (dataclasses.replace(standard_scenarios(settings)[-1], seconds=1.0),)
+
+
+if __name__ == "__main__":
+    train.standard_scenarios = one_second
+    sys.exit(train.main())
