@@ -120,6 +120,7 @@ SOURCES = (
     "env.py",
     "rewards.py",
     "control",
+    "plant",
     "physics",
     "sim",
     "algorithms",
