@@ -11,16 +11,42 @@ from scipy.interpolate import CubicSpline
 
 from mjxball import config as configs
 from mjxball.commands.train import main as train
-from mjxball.config import Attitude, Motion, Plant, replace
+from mjxball.config import Attitude, Drone, Motion, Plant, replace
+from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.evaluate.suites import read_waveform
 from mjxball.physics import motion, newton_euler
-from mjxball.physics.engine import PlantState, Wrench
+from mjxball.physics.engine import Load, PathShape, PlantState, Wrench
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
 GAP = 1e-4  # [s] of the central differences below
 PLACES = np.array([0.3, -1.0, 1.0, 0.9, -0.2])
+
+
+PLATE = Plant(cg_axis="xy", object_size=(0.4, 0.4, 0.02))
+ELLIPSE = PathShape(np.array(0.7), np.array(0.6), np.array(1.0), np.array(1.5))
+EIGHT = PathShape(np.array(-0.4), np.array(0.8), np.array(2.0), np.array(0.3))
+IN_PLANE = {"ellipse": ELLIPSE, "figure of eight": EIGHT, "sine along x": None}
+
+
+@pytest.mark.parametrize("kind", [*IN_PLANE, "visits", "waveform"])
+def test_derivatives_of_paths_in_the_plane(kind: str) -> None:
+    time = np.linspace(0.013, 18.9, 400)
+    waves = dataclasses.replace(SAMPLES, offsets_across=tuple(reversed(SAMPLES.offsets)))
+    curve = motion.make_prescribed(paper_with(PLATE, waves if kind == "waveform" else Motion()))
+    none, many = np.zeros((400, 0)), np.full(400, 1.0)
+    places = np.broadcast_to(np.stack([PLACES, PLACES[::-1]], axis=-1), (400, len(PLACES), 2))
+    load = Load(many, many, 0.1 * many, 0.8 * many, 0.4 * many, none, none, cg_shape=IN_PLANE.get(kind))
+    load = load._replace(cg_path=places, follows_path=many) if kind == "visits" else load
+    here, before, after = curve(time, load), curve(time - GAP, load), curve(time + GAP, load)
+    assert here.offset.shape == (400, 2)
+    np.testing.assert_allclose((after.offset - before.offset) / (2 * GAP), here.rate, atol=1e-6)
+    np.testing.assert_allclose((after.rate - before.rate) / (2 * GAP), here.acceleration, atol=2e-4)
+    if kind == "ellipse":  # on the conic of a sine and one of the same speed that leads by 1.5 rad
+        c, s = np.cos(0.7), np.sin(0.7)
+        u, v = (here.offset @ np.array([[c, -s], [s, c]])).T / np.array([[0.1], [0.06]])
+        np.testing.assert_allclose(u**2 + v**2 - 2 * u * v * np.cos(1.5), np.sin(1.5) ** 2, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["sine", "waveform", "visits"])
@@ -151,6 +177,35 @@ def test_ball_rolls_down_a_held_slope_with_five_sevenths_of_g() -> None:
     zero = np.zeros((1, 3))
     _, _, ball = engine.rolling(state, Wrench(zero, zero), np.array([0.2]), np.zeros(1))
     assert ball[0] == pytest.approx(-5 / 7 * 9.81 * np.sin(0.3), rel=1e-6)  # the pivot yields by 1e-9
+
+
+def test_ball_on_a_plate_rolls_down_it_whichever_way_it_tilts() -> None:
+    """A plate too heavy to turn, tilted about x: straight down with 5/7 g sin(slope), and across nothing."""
+    heavy = Drone(mass=1e9, inertia=(1e9, 1e9, 1e9))
+    mounts = ((0.3, 0.0, 0.0), (-0.15, 0.26, 0.0), (-0.15, -0.26, 0.0))
+    plant = dataclasses.replace(PLATE, drones=tuple(dataclasses.replace(heavy, mount=mount) for mount in mounts))
+    state = ball_alone(plant, 0.0, tilt=0.3)._replace(ball_offset=np.array([[0.04, 0.03]]), ball_rate=np.zeros((1, 2)))
+    weight = np.array([[0.0, 0.0, 3e9 * 9.81]])
+    held = rotations.rotate_back(rotations.matrix_from_quaternion(state.quaternion), weight)
+    engine = newton_euler.make_engine(plant, Attitude())
+    _, _, ball = engine.rolling(state, Wrench(held, np.zeros((1, 3))), np.array([0.2]), np.zeros((1, 2)))
+    # 1e-6: the ball moves 3e9 kg by 1e-9 of its own motion
+    np.testing.assert_allclose(ball[0], [0.0, -5 / 7 * 9.81 * np.sin(0.3)], atol=1e-6)
+
+
+def test_plates_friction_opposes_and_its_rim_pushes_inwards_along_the_radius() -> None:
+    plate = dataclasses.replace(PLATE, ball_stop=0.14)
+    force = motion.make_rolling_force(paper_with(plate, ROLLING))
+    along, across = np.array([0.6, 0.8]), np.array([-0.8, 0.6])
+    places = np.array([0 * along, 0.15 * along, 0.15 * along, 0.141 * along])
+    rates = np.array([0.5 * across, 0 * across, 0.5 * across, -5.0 * along])
+    free, pushed, sliding, leaving = force(places, rates, np.full(4, 0.2))
+    friction = 0.005 * 0.2 * 9.81
+    np.testing.assert_allclose(free, -friction * across, rtol=1e-12)
+    np.testing.assert_allclose(pushed @ across, 0, atol=1e-12)
+    assert pushed @ along < -1
+    np.testing.assert_allclose(sliding, pushed - friction * across, rtol=1e-12)  # along the rim it rolls on
+    np.testing.assert_allclose(leaving, friction * along, rtol=1e-12)  # it never pulls
 
 
 def test_rolling_friction_opposes_and_stops_push_inwards() -> None:

@@ -12,6 +12,7 @@ from tables import rows
 from test_engines import TOLERANCE, jitted, relative_difference
 
 from mjxball.config import Attitude, Plant
+from mjxball.control import rotations
 from mjxball.physics import mjx, mujoco, newton_euler
 from mjxball.physics.engine import contact_wrenches, total_wrench
 from mjxball.plant import plant_parameters
@@ -105,3 +106,25 @@ def test_contact_wrenches_are_those_of_mujoco() -> None:
         # 1e-9 of newtons and newton metres of order 10: MuJoCo moves torques between points
         np.testing.assert_allclose(force[row], expected[0], atol=1e-8)
         np.testing.assert_allclose(torque[row], expected[1], atol=1e-8)
+
+
+def test_carriers_own_equations_hold_with_the_contact_wrenches() -> None:
+    """Newton and Euler about O for what the drones carry: carrier, shell and ball, with the drones' wrenches on it."""
+    plant, gravity = team(5, seed=3, moving_fraction=0.4), 9.81
+    state, wrench, mass, motion = arguments_for(plant, "prescribed")
+    parameters, share = plant_parameters(plant, Attitude()), plant.moving_fraction
+    linear, angular = newton_euler.make_engine(plant, Attitude()).prescribed(state, wrench, mass, motion)
+    force, torque = contact_wrenches(plant, parameters, state, linear, angular)
+    matrix = rotations.matrix_from_quaternion(state.quaternion)
+    body, down, w = rotations.rotate_back(matrix, linear), matrix[:, 2, :], state.rates
+    place, speed, moved = (np.pad(value / share, ((0, 0), (0, 1))) for value in motion)
+    fixed, ball = (plant.carrier_mass + (1 - share) * mass)[:, None], (share * mass)[:, None]
+    swept = np.cross(angular, place) + np.cross(w, np.cross(w, place)) + 2 * np.cross(w, speed) + moved
+    pull = ball * (body + swept + gravity * down)
+    newton = fixed * (body + gravity * down) + pull - force.sum(axis=1)
+    inertia = plant.carrier_inertia + mass[:, None] * parameters.object_inertia_per_mass
+    spin = inertia * angular + np.cross(w, inertia * w) + np.cross(place, pull)
+    euler = spin - (torque + np.cross(parameters.mounts, force)).sum(axis=1)
+    # 1e-9 of the largest force and torque
+    assert np.abs(newton).max() <= 1e-9 * np.abs(force).max()
+    assert np.abs(euler).max() <= 1e-9 * np.abs(torque).max()

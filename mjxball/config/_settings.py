@@ -11,7 +11,7 @@ from mjxball.config._plant import Plant
 
 @dataclass(frozen=True)
 class Motion:
-    """How the centre of gravity moves along `plant.cg_axis`."""
+    """How the centre of gravity moves along `plant.cg_axis`, or in the plane where that is xy."""
 
     kind: Literal["sine", "waveform", "rolling"] = setting(
         "sine", "sine: drawn or given per flight; waveform: the samples below; rolling: a free ball with end stops"
@@ -19,6 +19,9 @@ class Motion:
     times: tuple[float, ...] = setting((), "waveform: increasing sample times [s]")
     offsets: tuple[float, ...] = setting(
         (), "waveform: CG offsets at those times, a C2 spline between, held outside [m]"
+    )
+    offsets_across: tuple[float, ...] = setting(
+        (), "waveform in the plane: CG offsets along body y at those times, and offsets are those along x [m]"
     )
 
 

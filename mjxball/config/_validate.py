@@ -191,9 +191,14 @@ def _validate_motion(config: Config) -> None:
     if motion.kind == "waveform":
         if len(motion.times) != len(motion.offsets) or len(motion.times) < 2:
             raise InputError("motion.times and motion.offsets must hold the same number of samples, two or more")
-        if not all(map(math.isfinite, (*motion.times, *motion.offsets))):
+        across = motion.offsets_across or (0.0,) * len(motion.times)
+        if len(across) != len(motion.times):
+            raise InputError("motion.times and motion.offsets_across must hold the same number of samples, or none")
+        if motion.offsets_across and len(config.plant.directions) == 1:
+            raise InputError("motion.offsets_across is for a load that moves in the plane, with plant.cg_axis xy")
+        if not all(map(math.isfinite, (*motion.times, *motion.offsets, *across))):
             raise InputError("motion.times and motion.offsets must be finite")
         if any(later <= earlier for earlier, later in itertools.pairwise(motion.times)):
             raise InputError("motion.times must increase from sample to sample")
-        if max(map(abs, motion.offsets)) > limit:
+        if max(map(math.hypot, motion.offsets, across)) > limit:
             raise InputError(f"motion.offsets leave the object: the CG reaches {limit:.4g} m")

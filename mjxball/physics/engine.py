@@ -62,6 +62,15 @@ def joined(values: Sequence[Scalar]) -> Coordinates:
     return values[0] if len(values) == 1 else values[0].__array_namespace__().stack(values, axis=-1)
 
 
+class PathShape(NamedTuple):
+    """How the CG's path in a plane differs from a sine along x: (A sin a, width A sin(ratio a + lead)), turned."""
+
+    direction: Scalar  # of the first of both sines from body x [rad]
+    width: Scalar  # amplitude of the second over that of the first; 0: a line, 1 with a lead of pi / 2: a circle
+    ratio: Scalar  # angular speed of the second over that of the first; 1: an ellipse, 2: a figure of eight
+    lead: Scalar  # phase of the second [rad]
+
+
 class Load(NamedTuple):
     """The object's mass and the motion of its centre of gravity."""
 
@@ -76,10 +85,13 @@ class Load(NamedTuple):
     rotor_lag_scale: Scalar | None = None  # factor on the rotors' time constant; None: 1
     thrust_scale: Float[Array, "... drones"] | None = None  # factor on each drone's rotor forces; None: 1
     added_inertia: Vector | None = None  # about the body axes through O, without mass [kg m2]; None: none
-    cg_path: Float[Array, "... places"] | None = None  # in [-1, 1], see `motion.visits`; None: the CG follows the sine
+    # Places in units of the amplitude, (..., places) or (..., places, 2), see `motion.visits`; None: the CG follows the
+    # sine.
+    cg_path: Float[Array, "... places"] | None = None
     follows_path: Scalar | None = None  # 1 where it does, 0 where it follows the sine
     battery: Scalar | None = None  # voltage of all batteries [V]; None: motors follow the curve
     uncompensated: Scalar | None = None  # 1 where the firmware does not compensate for the battery, else 0
+    cg_shape: PathShape | None = None  # of the path in a plane; None: a sine along x
 
 
 class Wrench(NamedTuple):

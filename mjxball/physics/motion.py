@@ -1,4 +1,4 @@
-"""Motions of the object's centre of gravity along the body axis `plant.cg_axis`."""
+"""Motions of the object's centre of gravity: along a body axis, or in the carrier's plane."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from mjxball.config import Config, cg_limit
 from mjxball.errors import InputError
-from mjxball.physics.engine import Array, CgState, Load
+from mjxball.physics.engine import Array, CgState, Load, PathShape, joined
 from mjxball.plant import PlantParameters, parts, plant_parameters
 
 if TYPE_CHECKING:
@@ -68,6 +68,28 @@ def sine_or_visits(time: Scalar, load: Load) -> CgState:
     return CgState(*(xp.where(load.follows_path > 0, b, a) for a, b in zip(swinging, visiting, strict=True)))
 
 
+def lissajous(time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar, shape: PathShape | None) -> CgState:
+    """(A sin a, width A sin(ratio a + lead)) (..., 2), a = Omega t + phase, turned by the direction of `shape`."""
+    first = sine(time, amplitude, speed, phase)
+    if shape is None:
+        return CgState(*(joined([value, value.__array_namespace__().zeros_like(value)]) for value in first))
+    second = sine(time, amplitude * shape.width, speed * shape.ratio, phase * shape.ratio + shape.lead)
+    xp = shape.direction.__array_namespace__()
+    c, s = xp.cos(shape.direction), xp.sin(shape.direction)
+    return CgState(*(joined([c * u - s * v, s * u + c * v]) for u, v in zip(first, second, strict=True)))
+
+
+def lissajous_or_visits(time: Scalar, load: Load) -> CgState:
+    """As `sine_or_visits` in the plane, where the CG goes straight from one place to the next."""
+    sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
+    swinging = lissajous(time, *sines, load.cg_shape)
+    if load.cg_path is None or load.follows_path is None:
+        return swinging
+    xp, follows = time.__array_namespace__(), load.follows_path[..., None] > 0
+    ways = zip(*(visits(time, *sines, load.cg_path[..., axis]) for axis in (0, 1)), strict=True)
+    return CgState(*(xp.where(follows, joined(b), a) for a, b in zip(swinging, ways, strict=True)))
+
+
 class Spline(NamedTuple):
     """A C2 cubic spline: on piece k, c = sum_j coefficients[k, j] (t - times[k])^(3 - j)."""
 
@@ -112,16 +134,32 @@ def make_prescribed(config: Config) -> Prescribed:
 
     Raises InputError if a waveform's spline leaves the object between its samples.
     """
-    if config.motion.kind == "sine":
-        return sine_or_visits
-    spline = fit_spline(config.motion.times, config.motion.offsets)
-    limit = cg_limit(config.plant)
-    if largest_offset(spline) > limit + 1e-9:
+    in_plane, waves = len(config.plant.directions) == 2, config.motion
+    if waves.kind == "sine":
+        return lissajous_or_visits if in_plane else sine_or_visits
+    spline = fit_spline(waves.times, waves.offsets)
+    across = fit_spline(waves.times, waves.offsets_across or (0.0,) * len(waves.times)) if in_plane else None
+    limit, farthest = cg_limit(config.plant), largest_offset(spline) if across is None else _farthest(spline, across)
+    if farthest > limit + 1e-9:
         raise InputError(
-            f"the waveform swings to {largest_offset(spline):.4g} m between its samples "
+            f"the waveform swings to {farthest:.4g} m between its samples "
             f"and leaves the object: the CG reaches {limit:.4g} m; add samples"
         )
-    return lambda time, load: follow_spline(spline, time)
+    if across is None:
+        return lambda time, load: follow_spline(spline, time)
+
+    def follow(time: Scalar, load: Load) -> CgState:
+        both = zip(follow_spline(spline, time), follow_spline(across, time), strict=True)
+        return CgState(*(joined(pair) for pair in both))
+
+    return follow
+
+
+def _farthest(along: Spline, across: Spline) -> float:
+    """Largest distance from O [m] at 100 times between any two samples."""
+    shares = np.linspace(0, 1, 100)
+    time = (along.times[:-1, None] + np.diff(along.times)[:, None] * shares).ravel()
+    return float(np.hypot(follow_spline(along, time).offset, follow_spline(across, time).offset).max())
 
 
 def make_rolling_force(
