@@ -6,11 +6,13 @@ import dataclasses
 
 import numpy as np
 
+from engines import random_team, reach
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, Drone, Motion, Plant, preset
 from mjxball.control.followers import Baseline
-from mjxball.physics.engine import CgState, PlantState, Wrench
+from mjxball.physics.engine import CgState, Wrench
 
+team = random_team
 REFERENCE = Plant()
 # Nothing equal, nothing aligned: masses, inertias, mounts off the axis, another length and CG axis.
 VARIED = Plant(
@@ -54,32 +56,6 @@ SAMPLES = Motion(kind="waveform", times=(0.0, 2.0, 3.0, 7.0, 12.0, 19.0), offset
 ROLLING = Motion(kind="rolling")
 
 
-def random_states(plant: Plant, count: int, random: np.random.Generator) -> PlantState:
-    """States that the plant's stand allows: any attitude, rates of a few rad/s, rotors anywhere in their range."""
-    quaternion, rates = random.normal(size=(count, 4)), random.normal(size=(count, 3)) * 2
-    position, velocity = random.normal(size=(2, count, 3))
-    if plant.stand != "free":
-        quaternion[:, 2:], rates[:, 1:] = 0, 0
-        keep = np.array([0.0, 0.0, float(plant.stand == "heave")])
-        position, velocity = position * keep, velocity * keep
-    half, places = reach(plant), (count,) if len(plant.directions) == 1 else (count, 2)
-    return PlantState(
-        position=position,
-        quaternion=quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
-        velocity=velocity,
-        rates=rates,
-        rotor_force=random.uniform(0, plant.rotor_force_max, (count, plant.count, 4)),
-        time=random.uniform(0, 20, count),
-        ball_offset=random.uniform(-half, half, places),
-        ball_rate=random.normal(size=places),
-    )
-
-
-def reach(plant: Plant) -> float:
-    """Half of the object's length along the load's directions [m]."""
-    return min(plant.object_size[axis] for axis in plant.directions) / 2
-
-
 def random_motion(plant: Plant, count: int, random: np.random.Generator) -> CgState:
     """Offsets within the object, with any rate and acceleration."""
     places = (count,) if len(plant.directions) == 1 else (count, 2)
@@ -100,30 +76,3 @@ def paper_with(plant: Plant = REFERENCE, motion: Motion | None = None):
 def copying(config: Config) -> Baseline:
     """The follower that copies its leader."""
     return make_baseline("copy", config)
-
-
-def team(count: int, seed: int, **changes: object) -> Plant:
-    """`count` drones of which no two are alike, anywhere and turned by any angle, on a carrier with a moving load."""
-    random = np.random.default_rng(seed)
-    drones = tuple(
-        Drone(
-            mass=random.uniform(0.5, 1.5),
-            inertia=tuple(random.uniform(2e-3, 3.5e-3, 3)),
-            mount=(*random.uniform(-0.4, 0.4, 2), random.uniform(-0.05, 0.05)),
-            yaw=random.uniform(-np.pi, np.pi),
-            arm=random.uniform(0.08, 0.15),
-            rotor_force_max=random.uniform(5, 9),
-            rotor_lag=random.uniform(0.02, 0.05),
-            yaw_per_thrust=random.uniform(0.01, 0.03),
-        )
-        for _ in range(count)
-    )
-    settings = {
-        "drones": drones,
-        "carrier_mass": 0.05 * count,
-        "carrier_inertia": (2e-3, 3e-3, 4e-3),
-        "object_mass": 0.1 * count,
-        "object_size": (0.5, 0.44, 0.08),
-        "cg_axis": "xy",
-    }
-    return Plant(**(settings | changes))
