@@ -7,9 +7,10 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from plants import PLANTS, ROLLING, SAMPLES, paper_with, random_motion, random_states, random_wrench
+from plants import PLANTS, ROLLING, SAMPLES, paper_with, random_motion, random_wrench
 from tables import rows
 
+from engines import random_states
 from mjxball.config import Attitude, Motion, replace
 from mjxball.physics import mjx, mujoco, newton_euler
 from mjxball.physics.engine import Load, total_wrench

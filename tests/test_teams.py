@@ -7,10 +7,11 @@ import itertools
 import jax
 import numpy as np
 import pytest
-from plants import random_motion, random_states, team
+from plants import random_motion, team
 from tables import rows
 from test_engines import TOLERANCE, jitted, relative_difference
 
+from engines import random_states
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
 from mjxball.physics import mjx, mujoco, newton_euler
