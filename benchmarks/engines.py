@@ -2,7 +2,7 @@
 
 No two rigs are alike: masses, inertias, mounts, yaw angles, carrier. Closed form and MJX run once with numbers that are
 traced, every world with the rig of its own, and the closed form once more with constants. A difference is that of a
-state's accelerations, over the largest of them.
+state's accelerations, over the largest of them, the load's included.
 
     python benchmarks/engines.py --json benchmarks/results/engines.json
 """
@@ -123,9 +123,10 @@ def arguments_of(plant: Plant, path: str, count: int, seed: int) -> Case:
     return "prescribed", state, wrench, mass, motion.make_prescribed(config)(state.time, load)
 
 
-def difference(found: Any, expected: Any) -> float:
+def difference(found: Any, expected: Any, case: Case) -> float:
     """Largest difference of any state's accelerations, over that state's largest."""
-    rows = [[np.asarray(part).reshape(len(part), -1) for part in parts] for parts in (found, expected)]
+    given = (case[-1].acceleration,) if case[0] == "prescribed" else ()
+    rows = [[np.asarray(part).reshape(len(part), -1) for part in (*parts, *given)] for parts in (found, expected)]
     one, other = (np.concatenate(parts, axis=-1) for parts in rows)
     return float((np.abs(one - other).max(axis=-1) / np.abs(other).max(axis=-1)).max())
 
@@ -171,12 +172,12 @@ def measure(count: int, paths: tuple[str, ...], stand: str, states: int, rigs: i
             for make in (mujoco.make_engine, newton_euler.make_engine)
         )
         row: dict[str, Any] = {"drones": count, "load": f"{path} ({axis})", "stand": stand, "states": states}
-        row["closed form"] = max(map(difference, constant, expected))
+        row["closed form"] = max(map(difference, constant, expected, cases))
         together = stacked([case[1:] for case in cases])
         for engine, law in functions.items():
             found = law[name](numbers, *together)
             each = [jax.tree.map(lambda leaf: leaf[rig], found) for rig in range(rigs)]  # noqa: B023
-            row[engine] = max(map(difference, each, expected))
+            row[engine] = max(map(difference, each, expected, cases))
         yield row
 
 

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import json
 import os
 import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
 
-PLANT_PARTS = ("plant", "autopilot", "scenario", "motion")  # what a plant file may set
 EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that another extra than `train` brings
 
 
@@ -109,9 +106,9 @@ def output_file(path: Path, suffix: str) -> Path:
 def add_config_flags(parser: argparse.ArgumentParser) -> None:
     """Add `--<path> VALUE` for every leaf of the configuration, with its help text."""
     group = parser.add_argument_group("configuration", "defaults are the preset's; tuples are comma-separated")
-    rigs = ", ".join(configs.RIGS)
+    names = ", ".join(configs.PLANTS)
     group.add_argument(
-        "--plant", type=Path, metavar="FILE", help=f"JSON of settings, as mjxball.rig.identify writes it, or {rigs}"
+        "--plant", type=Path, metavar="NAME|FILE", help=f"{names}, or a rig in TOML or JSON (docs/howto/own-rig.md)"
     )
     for path, _, item in configs.leaves(configs.Config()):
         about = item.metadata["about"].replace("%", "%%")
@@ -129,40 +126,17 @@ def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> c
     return configs.validate(config)
 
 
-class PlantFile(NamedTuple):
-    """A plant file: what was measured of a rig."""
-
-    preset: str | None  # that the settings belong to
-    settings: dict[str, Any]  # by dotted path
-
-
-def read_plant(path: Path) -> PlantFile:
-    """The plant file `path`, or the one of that name in `configs.RIGS`. Raises InputError if it is neither.
-
-    The settings' values are not checked.
-    """
-    if str(path) in configs.RIGS and not path.exists():
-        return PlantFile("flight", configs.RIGS[str(path)])
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        known = f"; by name there are {', '.join(configs.RIGS)}" if isinstance(error, FileNotFoundError) else ""
-        raise InputError(f"plant file {path} cannot be read: {error.strerror or error}{known}") from None
-    except ValueError:
-        raise InputError(f"plant file {path} is not JSON") from None
-    if not isinstance(values, dict) or not values:
-        raise InputError(f'plant file {path} must be one JSON object such as {{"plant.rotor_lag": 0.06}}')
-    preset = values.pop("preset", None)
-    if preset is not None and preset not in configs.PRESETS:
-        raise InputError(f"plant file {path}: preset {preset!r} is none of {', '.join(configs.PRESETS)}")
-    for name in values:
-        if name.partition(".")[0] not in PLANT_PARTS:
-            raise InputError(f"plant file {path} may set {', '.join(PLANT_PARTS)}, not {name}")
-    return PlantFile(preset, values)
+def read_plant(path: Path) -> configs.PlantFile:
+    """The plant file `path`, or the shipped one of that name. InputError if it is neither, or its preset unknown."""
+    found = configs.read_plant(path)
+    if found.preset is not None and found.preset not in configs.PRESETS:
+        raise InputError(f"plant file {path}: preset {found.preset!r} is none of {', '.join(configs.PRESETS)}")
+    return found
 
 
 def apply_plant(config: configs.Config, path: Path | None) -> configs.Config:
     """`config` with the settings of the plant file `path`, if there is one, validated."""
     if path is None:
         return config
-    return configs.validate(configs.apply_overrides(config, read_plant(path).settings))
+    read_plant(path)
+    return configs.with_plant(config, path)

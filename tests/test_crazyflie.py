@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mjxball.cli import apply_plant
-from mjxball.config import Autopilot, Config, preset, replace, validate
-from mjxball.config._crazyflie import DRONES, autopilot, rig
+from mjxball.config import PLANTS, Autopilot, preset, replace, validate, with_plant
 from mjxball.control import crazyflie, mixer
 from mjxball.errors import InputError
 from mjxball.fly import packets
@@ -23,6 +22,8 @@ STOCK = Autopilot(kind="crazyflie")
 LEVEL, STILL = np.zeros(3), np.zeros(3)
 HOVER = np.array([0.0, 0.0, 0.0, 46000.0])
 OLDER, LINEAR = (0.0915, 0.0677), (0.0, 0.12)
+STRONGER = [("thrust-upgrade", 0.0345, 0.18), ("brushless", 0.0393, 0.20)]
+VARIANTS = [name for name in PLANTS if name.startswith("crazyflie")]
 
 
 def alone(**gains: tuple[float, float, float]) -> Autopilot:
@@ -149,7 +150,7 @@ class TestMotors:
 
     def test_rig_hovers_at_the_papers_thrust(self) -> None:
         """75.5 g on eight motors at thr_hov = 46000."""
-        plant = rig()
+        plant = preset("flight").plant
         assert sum(drone.mass for drone in plant.drones) + plant.object_mass == pytest.approx(0.0755)
         assert crazyflie.motor_command(OLDER, np.array(0.0755 * 9.81 / 8)) == pytest.approx(46000, abs=50)
 
@@ -161,9 +162,9 @@ class TestMotors:
         hovering = (command > 30000) & (command < 50000)
         assert ((gained[hovering] > 1.8e-3) & (gained[hovering] < 3.2e-3)).all()
 
-    @given(st.floats(0, 0.159), st.sampled_from(list(DRONES)))
+    @given(st.floats(0, 0.159), st.sampled_from(VARIANTS))
     def test_inverse(self, force: float, drone: str) -> None:
-        curve = DRONES[drone][1]
+        curve = with_plant(preset("flight"), drone).autopilot.motor_curve
         command = crazyflie.motor_command(curve, np.array(force))
         assert crazyflie.motor_force(curve, command) == pytest.approx(force, abs=1e-12)
 
@@ -220,24 +221,24 @@ class TestLayout:
 class TestRefused:
     """A rig that hovers on more than 70 % of its thrust is refused in one sentence."""
 
-    def with_drone(self, drone: str) -> Config:
-        return dataclasses.replace(preset("flight"), plant=rig(drone), autopilot=autopilot(drone))
-
-    @pytest.mark.parametrize("drone", ["2.1", "thrust-upgrade", "brushless"])
+    @pytest.mark.parametrize("drone", VARIANTS)
     def test_variants_hover(self, drone: str) -> None:
-        validate(self.with_drone(drone))
+        config = apply_plant(preset("flight"), Path(drone))
+        assert config.plant.rotor_force_max == pytest.approx(sum(config.autopilot.motor_curve))
+        assert config.autopilot.follower_integrals == 0.0  # only the leader's firmware integrates in any preset
 
-    @pytest.mark.parametrize("drone", ["thrust-upgrade", "brushless"])
-    def test_variants_are_plant_files_by_name(self, drone: str) -> None:
-        # Only the leader's firmware integrates in any preset.
-        expected = replace(self.with_drone(drone), "autopilot.follower_integrals", 0.0)
-        for path, value in (("cg_amplitude", (0.0, 0.034)), ("uncompensated_share", 0.0)):
-            expected = replace(expected, f"scenario.{path}", value)
-        assert apply_plant(preset("flight"), Path(f"crazyflie-{drone}")) == expected
+    @pytest.mark.parametrize(
+        ("drone", "mass", "force"), [("thrust-upgrade", 0.0345, 0.18), ("brushless", 0.0393, 0.20)]
+    )
+    def test_stronger_drones_bear_the_ball_at_its_stop(self, drone: str, mass: float, force: float) -> None:
+        config = apply_plant(preset("flight"), Path(f"crazyflie-{drone}"))
+        assert [one.mass for one in config.plant.drones] == [mass, mass]
+        assert (config.plant.rotor_force_max, config.autopilot.motor_curve) == (force, (0.0, force))
+        assert (config.scenario.cg_amplitude, config.scenario.uncompensated_share) == ((0.0, 0.034), 0.0)
 
     def test_the_plain_drone_with_a_heavier_object_does_not(self) -> None:
         with pytest.raises(InputError, match="leaves 18%, where 20% are needed"):
-            validate(replace(self.with_drone("2.1"), "scenario.object_mass", (0.015, 0.022)))
+            validate(replace(preset("flight"), "scenario.object_mass", (0.015, 0.022)))
 
     def test_too_heavy_a_load(self) -> None:
         with pytest.raises(InputError, match="thrust"):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxball.config import RIGS, Config, apply_overrides, preset, validate
+from mjxball.config import Config, apply_overrides, preset, read_plant, validate
 from mjxball.control import crazyflie, motors
 from mjxball.control.constants import drone_loop, hover
 from mjxball.control.motors import OLDER, compensates, firmware, with_curve
@@ -63,7 +63,7 @@ class TestConversion:
         assert firmware(preset("flight")) == {"drone": "2.1", "curve": "linear", "converts": ["older"]}
         assert firmware(with_curve(preset("flight"), OLDER))["curve"] == "older"
         for name, drone in (("crazyflie-brushless", "brushless"), ("crazyflie-thrust-upgrade", "thrust-upgrade")):
-            assert firmware(apply_overrides(preset("flight"), RIGS[name])) == {
+            assert firmware(apply_overrides(preset("flight"), read_plant(name).settings)) == {
                 "drone": drone,
                 "curve": "linear",
                 "converts": [],

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from mjxball.cli import read_plant
-from mjxball.config import Autopilot, apply_overrides, preset
-from mjxball.config._crazyflie import autopilot, rig
+from mjxball.config import Autopilot, apply_overrides, preset, with_plant
 from mjxball.errors import InputError
 from mjxball.fly.preflight import read_gains
 from mjxball.rig import gains as command
@@ -92,9 +91,9 @@ class TestDesign:
             assert one.worst.phase >= REQUIREMENTS.worst_phase
             assert min(one.worst.gain_up, one.worst.gain_down) >= REQUIREMENTS.worst_gain
 
-    @pytest.mark.parametrize("drone", ["2.1-older", "thrust-upgrade", "brushless"])
+    @pytest.mark.parametrize("drone", ["older", "thrust-upgrade", "brushless"])
     def test_presets_fly_them(self, drone: str) -> None:
-        config = dataclasses.replace(PAIR, plant=rig(drone), autopilot=autopilot(drone))
+        config = with_plant(preset("flight"), f"crazyflie-{drone}")
         for one in design(config):
             assert gains_of(config.autopilot, one.axis) == one.gains, one.axis.name
 

@@ -80,6 +80,7 @@ def load_axis(config: Config, name: str) -> LoadAxis:
     A Crazyflie's attitude loop is approximated by the PD part of its cascade at hover, without the integrals.
     """
     plant, attitude = config.plant, config.attitude
+    lead, follow = plant.pair
     if plant.cg_axis == "x" and plant.stand != "free":
         raise InputError(f"follower {name!r} balances a free pair along x, or a pair along y; this stand locks pitch")
     axis = "yx".index(plant.cg_axis)
@@ -91,7 +92,7 @@ def load_axis(config: Config, name: str) -> LoadAxis:
         kp, kd, thrust_surplus = loop.kp, loop.kd, loop.thrust_surplus
     roll, pitch, _ = attitude.natural_frequency
     leader_share, follower_share = map(float, constants.share)
-    along, (lead, follow) = plant.directions[0], plant.pair
+    along = plant.directions[0]
     return LoadAxis(
         axis=axis,
         sign=1.0 if axis else -1.0,

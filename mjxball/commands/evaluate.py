@@ -62,7 +62,7 @@ def parser() -> cli.Parser:
         metavar="T:DM",
         help="DM [kg] added to, or if negative dropped from, the object at T [s]",
     )
-    result.add_argument("--plant", type=Path, metavar="FILE", help="plant file of mjxball.rig.identify: rig and preset")
+    result.add_argument("--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or a file of a rig")
     result.add_argument("--physics", choices=ENGINES, default="mjx", help="physics engine (default mjx)")
     result.add_argument("--json", type=Path, metavar="FILE", help="write the cells as JSON")
     result.add_argument("--out", type=Path, metavar="DIR", help="write report.html, JSON and figures")

@@ -29,6 +29,7 @@ def setup_of(options: argparse.Namespace) -> config.Config:
     """The paper's plant and laws, or those of `--plant`, with the motion of the CG that is asked for."""
     measured = cli.read_plant(options.plant).preset if options.plant else None
     setup = cli.apply_plant(config.preset(measured or "paper"), options.plant)
+    _ = setup.plant.pair  # InputError for teams
     if options.wn_pitch is not None:
         roll, _, yaw = setup.attitude.natural_frequency
         setup = config.replace(setup, "attitude.natural_frequency", (roll, options.wn_pitch, yaw))

@@ -4,7 +4,8 @@ Importing it needs the standard library only.
 """
 
 from mjxball.config._plant import Drone, Plant
-from mjxball.config._presets import PRESETS, RIGS, preset
+from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
+from mjxball.config._presets import PRESETS, preset
 from mjxball.config._renamed import CONSTANT, RENAMED, current_name, old_names, with_current_names
 from mjxball.config._settings import (
     Attitude,
@@ -36,9 +37,10 @@ from mjxball.config._validate import ball_limit, cg_limit, validate
 
 __all__ = [
     "CONSTANT",
+    "PLANTS",
+    "PLANT_PARTS",
     "PRESETS",
     "RENAMED",
-    "RIGS",
     "Attitude",
     "Autopilot",
     "Bounds",
@@ -49,6 +51,7 @@ __all__ = [
     "Leader",
     "Motion",
     "Plant",
+    "PlantFile",
     "Ppo",
     "Reward",
     "Sac",
@@ -65,9 +68,11 @@ __all__ = [
     "old_names",
     "override",
     "preset",
+    "read_plant",
     "replace",
     "to_dict",
     "to_json",
     "validate",
     "with_current_names",
+    "with_plant",
 ]

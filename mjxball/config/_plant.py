@@ -62,9 +62,16 @@ class Plant:
 
     @property
     def pair(self) -> tuple[Drone, Drone]:
-        """Leader and follower of a plant of two; InputError for any other."""
-        if len(self.drones) != 2:
-            raise InputError(f"this needs a plant of two drones, a leader and a follower, and it has {self.count}")
+        """Leader and follower of a plant of two whose load moves along a line; InputError for any other.
+
+        What flies, trains or evaluates needs such a plant; the physics does not.
+        """
+        if len(self.drones) != 2 or len(self.directions) != 1:
+            where = "along a line" if len(self.directions) == 1 else "in the plane"
+            raise InputError(
+                "flights need a leader, one follower and a load that moves along a line; this plant has "
+                f"{self.count} drones and a load that moves {where}"
+            )
         return self.drones[self.leader], self.drones[1 - self.leader]
 
     @property

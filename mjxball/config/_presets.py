@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import types
 from dataclasses import replace
-from typing import Any
 
-from mjxball.config._crazyflie import LARGE_SAC, flight, rig_settings, stand
+from mjxball.config._crazyflie import LARGE_SAC, flight, stand
 from mjxball.config._settings import Bounds, Config, Follower, Reward, Sac, Scenario
 from mjxball.errors import InputError
 
@@ -111,11 +110,6 @@ def _robust() -> Config:
 
 PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
     {made.preset: made for made in (_transport(), _paper(), _transport_large(), _robust(), stand(), flight())}
-)
-
-# Plant files by name, for `--plant`: the pair of the presets `stand` and `flight` with other drones.
-RIGS: types.MappingProxyType[str, dict[str, Any]] = types.MappingProxyType(
-    {f"crazyflie-{drone}": rig_settings(drone) for drone in ("thrust-upgrade", "brushless")}
 )
 
 

@@ -69,10 +69,15 @@ def apply_overrides(config: Config, values: Mapping[str, Any]) -> Config:
         if path in CONSTANT:
             check_constant(path, value)
             continue
+        if path == "plant.drones":
+            config = replace(config, path, _drones(value))
+            known = {path: value for path, value, _ in leaves(config)}
+            continue
         if path not in known:
             raise InputError(f"{path} is not a setting; run train.py --help for the list")
         if isinstance(value, list):
-            value = tuple(value)  # noqa: PLW2901
+            whole = all(type(one) is int for one in value) and _holds_floats(known[path])
+            value = tuple(map(float, value) if whole else value)  # noqa: PLW2901
         if isinstance(known[path], float) and type(value) is int:
             value = float(value)  # noqa: PLW2901
         config = replace(config, path, value)
@@ -130,6 +135,20 @@ def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
             value = float(value)
         values[name] = value
     return kind(**values)
+
+
+def _holds_floats(value: Any) -> bool:
+    return isinstance(value, tuple) and any(isinstance(one, float) for one in value)
+
+
+def _drones(value: Any) -> tuple[Drone, ...]:
+    """The drones of a list of tables; what a table leaves out has its default."""
+    if not isinstance(value, (list, tuple)) or not all(isinstance(one, dict) for one in value):
+        raise InputError("plant.drones must be a list of tables, one for each drone")
+    return tuple(
+        from_dict(_completed(one, to_dict(Drone())), Drone, f"plant.drones.{number}")
+        for number, one in enumerate(value)
+    )
 
 
 def _record_type(hint: Any) -> Any:

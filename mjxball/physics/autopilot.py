@@ -84,12 +84,13 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
     return firmware
 
 
-def make_powered(config: Config, constants: PlantParameters) -> Autopilot:
+def make_powered(config: Config, parameters: PlantParameters | None = None) -> Autopilot:
     """The firmware's loops with motors that follow the battery, `load.battery`, with or without its compensation.
 
     Where `load.uncompensated`, what the firmware is sent and its gains are converted for its curve
     (`motors.with_curve`), as the runner does.
     """
+    constants = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
     law, gravity = config.autopilot, config.plant.gravity
     motor = motors.MOTORS[law.drone or "2.1"]
     uncompensated_law = motors.with_curve(config, motors.OLDER).autopilot

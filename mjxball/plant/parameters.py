@@ -143,12 +143,13 @@ def design_gains(inertia: Array, natural_frequency: Array, damping: float, drone
 def plant_parameters(plant: Plant, attitude: Attitude) -> PlantParameters:
     """Constants of `plant`; the attitude gains are those of `attitude.design_object_mass` at c = 0.
 
-    If the whole object moves (`moving_fraction` 1) the moving mass has the box's inertia, as in the reference
-    plant; else it is a solid ball, and the fixed rest is the box.
+    If the whole object moves (`moving_fraction` 1) and there is no carrier, the moving mass has the box's inertia, as
+    in the reference plant; else it is a solid ball, and the fixed rest is the box.
     """
     drones, fraction = plant.drones, plant.moving_fraction
     box = box_inertia_per_mass(plant.object_size)
-    ball = box if fraction == 1 else np.full(3, fraction * ROLLING_INERTIA * plant.ball_radius**2)
+    boxed = fraction == 1 and plant.carrier_mass == 0
+    ball = box if boxed else np.full(3, fraction * ROLLING_INERTIA * plant.ball_radius**2)
     nothing = AttitudeGains(np.zeros(3), np.zeros(3))
     found = PlantParameters(
         drone_mass=np.array([drone.mass for drone in drones]),

@@ -41,7 +41,9 @@ def parser() -> cli.Parser:
     """The flags."""
     result = cli.make_parser("python -m mjxball.rig.gains", "Compute gains for the coupled pair, with their margins.")
     result.add_argument("--preset", choices=PRESETS, default="flight", help="rig (default flight)")
-    result.add_argument("--plant", type=Path, metavar="FILE", help="plant file of mjxball.rig.identify, or by hand")
+    result.add_argument(
+        "--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or file of mjxball.rig.identify or by hand"
+    )
     result.add_argument("--out", type=Path, metavar="GAINS.json", help="write what mjxball.fly --gains uploads")
     result.add_argument("--picture", type=Path, metavar="FILE", help="draw steps, poles and margins (svg, png, pdf)")
     return result
@@ -55,6 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _gains(options: argparse.Namespace) -> int:
     settings = cli.apply_plant(config.preset(options.preset), options.plant)
+    _ = settings.plant.pair  # InputError for teams
     if options.out:
         cli.output_file(options.out, ".json")
     if options.picture:

@@ -36,7 +36,7 @@ def parser() -> cli.Parser:
     result = cli.make_parser("python -m mjxball.rig.identify", about)
     result.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="of mjxball.fly --log, or .npz; see docs")
     result.add_argument("--preset", choices=("flight", "stand"), default="flight", help="rig (default flight)")
-    result.add_argument("--plant", type=Path, metavar="FILE", help="masses and places as measured, to start from")
+    result.add_argument("--plant", type=Path, metavar="NAME|FILE", help="masses and places as measured, to start from")
     result.add_argument(
         "--gains", type=Path, metavar="FILE", help="what the drones flew with, if the log does not say (the preset's)"
     )

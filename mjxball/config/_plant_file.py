@@ -1,0 +1,102 @@
+"""Plant files: a rig in TOML or JSON, those that are shipped among them (`plants/*.toml`)."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mjxball.config._plant import Plant
+from mjxball.config._settings import Config
+from mjxball.config._tree import apply_overrides, leaves
+from mjxball.config._validate import validate
+from mjxball.errors import InputError
+
+PLANT_PARTS = ("plant", "attitude", "autopilot", "scenario", "motion")  # what a plant file may set
+SHIPPED = Path(__file__).parent / "plants"
+PLANTS = tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))  # names that `--plant` takes
+DRONES = "plant.drones"
+
+
+class PlantFile(NamedTuple):
+    """A rig, or what differs from that of a preset."""
+
+    preset: str | None  # that the settings belong to
+    settings: dict[str, Any]  # by dotted path; plant.drones a list of tables
+
+
+def read_plant(source: Path | str) -> PlantFile:
+    """The plant file `source`, .toml or .json, or the shipped one of that name. Raises InputError if it is neither.
+
+    A file holds tables `[plant]`, `[attitude]`, ... of settings, or dotted paths; `preset`, which it belongs to; and
+    `base`, a shipped plant from which it differs. One that lists `[[plant.drones]]` describes a whole plant: what it
+    leaves out has its default. Values are not checked.
+    """
+    path = Path(source)
+    if str(source) in PLANTS and not path.exists():
+        path = SHIPPED / f"{source}.toml"
+    values = _parsed(path)
+    base = values.pop("base", None)
+    if base is not None and base not in PLANTS:
+        raise InputError(f"plant file {path}: base must be one of {', '.join(PLANTS)}, not {base!r}")
+    preset = values.pop("preset", None)
+    if preset is not None and not isinstance(preset, str):
+        raise InputError(f"plant file {path}: preset must be the name of one, not {preset!r}")
+    settings = dict(_flat(values))
+    for name in settings:
+        if name.partition(".")[0] not in PLANT_PARTS or "." not in name:
+            raise InputError(f"plant file {path} may set {', '.join(PLANT_PARTS)}, not {name}")
+    if DRONES in settings:
+        whole = {f"plant.{name}": value for name, value, _ in leaves(Plant()) if not name.startswith("drones.")}
+        settings = whole | settings
+    if base is None:
+        return PlantFile(preset, settings)
+    below = read_plant(SHIPPED / f"{base}.toml")
+    return PlantFile(preset or below.preset, below.settings | settings)
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    kind = "TOML" if path.suffix == ".toml" else "JSON"
+    try:
+        text = path.read_text(encoding="utf-8")
+        values = tomllib.loads(text) if kind == "TOML" else json.loads(text)
+    except OSError as error:
+        known = f"; by name there are {', '.join(PLANTS)}" if isinstance(error, FileNotFoundError) else ""
+        raise InputError(f"plant file {path} cannot be read: {error.strerror or error}{known}") from None
+    except (ValueError, RecursionError):
+        raise InputError(f"plant file {path} is not {kind}") from None
+    if not isinstance(values, dict) or not values:
+        raise InputError(f'plant file {path} must be one {kind} object such as {{"plant.rotor_lag": 0.06}}')
+    return values
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted path, value) of nested tables."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _check_inertias(plant: Plant) -> None:
+    """Refuse principal inertia that no body has: one number larger than the sum of the others."""
+    named = {f"{DRONES}.{number}.inertia": drone.inertia for number, drone in enumerate(plant.drones)}
+    for name, inertia in {**named, "plant.carrier_inertia": plant.carrier_inertia}.items():
+        if 2 * max(inertia) > sum(inertia) * (1 + 1e-4):
+            raise InputError(f"{name} {inertia!r} is that of no body: one number is larger than the sum of the others")
+
+
+def with_plant(config: Config, source: Path | str) -> Config:
+    """`config` with the settings of the plant file `source`, validated. Raises InputError with one sentence."""
+    try:
+        settings = read_plant(source).settings
+        changed = validate(apply_overrides(config, settings))
+        if DRONES in settings:
+            _check_inertias(changed.plant)
+        return changed
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith("plant file") else f"plant file {source}: {text}") from None
