@@ -74,11 +74,9 @@ def by_the_clock(item: pytest.Item) -> bool:
 
 # Files that take longest, which begin first, so that no worker is left with one of them at the end.
 LONGEST = (
-    "test_fly_mocap_flight",
-    "test_fly_link",
-    "test_fly_main",
-    "test_fly_watchdog",
-    "test_fly_rehearsal",
+    *("test_fly_mocap_flight", "test_fly_link", "test_fly_main", "test_fly_watchdog", "test_fly_rehearsal"),
+    *("test_population", "test_rig_rehearsal", "test_distributed", "test_cli_eval", "test_docs", "test_cli_train"),
+    *("test_extensions", "test_resume", "test_figures", "test_engines", "test_program", "test_gym", "test_algorithms"),
 )
 
 

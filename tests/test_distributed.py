@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import subprocess
@@ -11,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from command_line import HASTY
+from command_line import environment
 
 from mjxball.commands.train import main as train
 from mjxball.errors import InputError
@@ -36,12 +35,12 @@ def launch(arguments: list[str], cache: Path) -> list[subprocess.Popen[str]]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     meeting = ["--distributed", "--coordinator", f"127.0.0.1:{port}", "--processes", "2", "--process"]
-    environment = {**os.environ, "MJXBALL_CACHE": str(cache), "JAX_PLATFORMS": "cpu", "XLA_FLAGS": HASTY}
+    child = {**environment(), "MJXBALL_CACHE": str(cache), "PYTHONPATH": str(REPOSITORY)}
     return [
         subprocess.Popen(
-            [sys.executable, "train.py", *arguments, *meeting, str(process)],
+            [sys.executable, "tests/short_train.py", *arguments, *meeting, str(process)],
             cwd=REPOSITORY,
-            env=environment,
+            env=child,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -149,7 +148,7 @@ def test_every_process_can_trace_mjx() -> None:
         subprocess.Popen(
             [sys.executable, "-c", TRACE, place, str(process)],
             cwd=REPOSITORY,
-            env={**os.environ, "JAX_PLATFORMS": "cpu"},
+            env=environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

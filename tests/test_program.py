@@ -92,12 +92,13 @@ def test_prefill_records_every_step_and_learns_nothing(compiled, prefilled):
 def test_a_curriculum_widens_the_motion_until_its_share_of_training_is_over(transport) -> None:
     changed = {"total_steps": 4 * WORLDS * 100, "replay_size": 4 * WORLDS * 100, "num_envs": WORLDS, "curriculum": 0.5}
     program = Program(with_settings(transport, sac=changed), "newton-euler")
+    reset = jax.jit(program.environments.reset)
     low, high = transport.scenario.cg_amplitude
     largest = {}
     for steps in (0, 100 * WORLDS, 200 * WORLDS, 400 * WORLDS):
         for record in (True, False):
             reach = program._difficulty(jnp.asarray(steps), jnp.asarray(record))
-            load = program.environments.reset(jax.random.key(1), reach).pipeline_state.load
+            load = reset(jax.random.key(1), reach).pipeline_state.load
             largest[steps, record] = float(load.cg_amplitude.max())
     assert largest[0, True] == pytest.approx(low)
     assert largest[100 * WORLDS, True] == pytest.approx(low + (largest[0, False] - low) / 2)
