@@ -69,7 +69,7 @@ running: list[pytest.Item] = []  # the test that runs
 
 def by_the_clock(item: pytest.Item) -> bool:
     """Whether a busy machine would spoil the test."""
-    return any(item.get_closest_marker(name) for name in ("flight", "clock"))
+    return any(item.get_closest_marker(name) for name in ("alone", "clock"))
 
 
 # Files that take longest, which begin first, so that no worker is left with one of them at the end.
@@ -87,7 +87,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The second tier is what is marked `slow`, what goes by the clock (`flight`, `clock`) and what opens a browser.
+    """The second tier is what is marked `slow`, what goes by the clock (`alone`, `clock`) and what opens a browser.
 
     What goes by the clock begins first, on all workers together, then the longest files.
     """
@@ -118,14 +118,14 @@ def too_busy(reason: str) -> None:
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """With workers side by side (`-n 2`), nothing that computes much runs beside a test by the clock.
 
-    One marked `flight` flies alone or beside tests marked `clock`, which mostly wait. Whoever waits for a room to be
-    left stands in the queue, so that nobody is passed for ever.
+    One marked `alone` is alone or beside tests marked `clock`, which mostly wait. Whoever waits for a room to be left
+    stands in the queue, so that nobody is passed for ever.
     """
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return (yield)
     mine, theirs = (CLOCKED, OTHERS) if by_the_clock(item) else (OTHERS, CLOCKED)
     with contextlib.ExitStack() as stack:
-        if item.get_closest_marker("flight"):
+        if item.get_closest_marker("alone"):
             stack.enter_context(locked(SKY, fcntl.LOCK_EX))
         with locked(QUEUE, fcntl.LOCK_EX), locked(theirs, fcntl.LOCK_EX):
             stack.enter_context(locked(mine, fcntl.LOCK_SH))

@@ -179,7 +179,7 @@ def landed(flight: Ended) -> None:
 NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
 
 
-@pytest.mark.flight
+@pytest.mark.alone
 def test_a_rehearsal(flights: dict[str, Ended]) -> None:
     flight = flights["rehearsed"]
     assert (flight.code, flight.states()) == (0, NORMAL), flight.out
@@ -197,7 +197,7 @@ def test_a_rehearsal(flights: dict[str, Ended]) -> None:
     assert max(errors) < 0.1  # the pair has gone where it was sent
 
 
-@pytest.mark.flight
+@pytest.mark.alone
 def test_the_log_holds_everything(flights: dict[str, Ended]) -> None:
     flight = flights["rehearsed"]
     kinds = {record["kind"] for record in flight.records}
@@ -209,7 +209,7 @@ def test_the_log_holds_everything(flights: dict[str, Ended]) -> None:
     assert all(record["raw"].state.battery > 3 for record in flight.records if record["kind"] == "state")
 
 
-@pytest.mark.flight
+@pytest.mark.alone
 def test_a_dry_run(flights: dict[str, Ended]) -> None:
     flight = flights["dry"]
     assert (flight.code, flight.states()) == (0, NORMAL)
@@ -218,7 +218,7 @@ def test_a_dry_run(flights: dict[str, Ended]) -> None:
     assert max(tick["observation"][2] for tick in flight.ticks("fly")[1:]) < 0.01  # nothing has lifted
 
 
-@pytest.mark.flight
+@pytest.mark.alone
 @pytest.mark.parametrize("name", list(SIGNALS))
 def test_signals_land(flights: dict[str, Ended], name: str) -> None:
     flight = flights[name]

@@ -29,7 +29,7 @@ from mjxball.policy.file import shipped_policy
 
 pytest.importorskip("cflib")
 pytest.importorskip("motioncapture")
-pytestmark = pytest.mark.flight
+pytestmark = pytest.mark.alone
 BODIES = ("lead", "follow")
 NO_DECK = Surroundings(deck=False)
 

@@ -20,7 +20,7 @@ from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
 
 pytest.importorskip("cflib")
-pytestmark = pytest.mark.flight  # by the clock
+pytestmark = pytest.mark.alone  # by the clock
 
 # On a machine that keeps time states are 10 ms old, ticks 0.07 - 0.5 ms late at p99: benchmarks/results/fly_loop*.json.
 OLD, LATE = 25.0, 2.0  # [ms]

@@ -120,7 +120,7 @@ def lost_in_the_air(number: signal.Signals, log: Path) -> Twin | None:
     return twin
 
 
-@pytest.mark.flight
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
 def test_a_runner_lost_in_the_air_is_brought_down(number: signal.Signals, tmp_path: Path) -> None:
     for attempt in range(3):
