@@ -84,6 +84,12 @@ def logs() -> dict[str, dict[str, np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
+def brief() -> dict[str, np.ndarray]:
+    """A log for tests that find nothing in it."""
+    return record(PAIR, RIGS["weak and slow"], 6.0)
+
+
+@pytest.fixture(scope="module")
 def found(logs) -> dict[str, Estimate]:
     return {
         name: identify(
@@ -128,8 +134,8 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         read_log(tmp_path / "none.npz")
 
 
-def test_too_short_a_flight_is_refused(logs) -> None:
-    log = {name: rows[:300] for name, rows in logs["weak and slow"].items()}
+def test_too_short_a_flight_is_refused(brief) -> None:
+    log = {name: rows[:300] for name, rows in brief.items()}
     short = make_log(log["time"], log["setpoints"], log["time"], [log["states"][:, 0], log["states"][:, 1]])
     with pytest.raises(InputError, match="5 s or more"):
         identify(PAIR, short)
@@ -182,20 +188,20 @@ class TestPlantFile:
 
 
 class TestCommand:
-    def test_from_log_to_plant_file(self, tmp_path: Path, monkeypatch, capsys, logs) -> None:
+    def test_from_log_to_plant_file(self, tmp_path: Path, monkeypatch, capsys, brief) -> None:
         monkeypatch.setattr(command, "identify", lambda settings, log: SOME)
         log, out = tmp_path / "bench.npz", tmp_path / "plant.json"
-        np.savez(log, **logs["weak and slow"])
+        np.savez(log, **brief)
         assert command.main([str(log), str(log), "--out", str(out)]) == 0
         assert cli.read_plant(out).preset == "flight"
         text = capsys.readouterr().out
         assert "motor lag     60.0" in text
         assert "all 2 logs" in text
 
-    def test_a_rig_too_weak_to_fly_is_told(self, tmp_path: Path, monkeypatch, capsys, logs) -> None:
+    def test_a_rig_too_weak_to_fly_is_told(self, tmp_path: Path, monkeypatch, capsys, brief) -> None:
         monkeypatch.setattr(command, "identify", lambda settings, log: SOME._replace(thrust=0.75))
         log = tmp_path / "bench.npz"
-        np.savez(log, **logs["weak and slow"])
+        np.savez(log, **brief)
         assert command.main([str(log)]) == 2
         assert "hovering takes" in capsys.readouterr().err
 
