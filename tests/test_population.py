@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -17,6 +18,7 @@ from conftest import with_settings
 from mjxball.commands.train import main as train
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.evaluate.suites import standard_scenarios
 from mjxball.policy import Policy
 from mjxball.policy.file import load_file
 from mjxball.train import program as programs
@@ -122,7 +124,12 @@ def test_best_member_has_the_highest_finite_return_of_the_last_evaluation() -> N
 
 
 @pytest.mark.slow
-def test_population_run_exports_every_member_and_the_best(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_population_run_exports_every_member_and_the_best(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Judged by one flight that is just long enough for peaks."""
+    shortened = lambda settings: (dataclasses.replace(standard_scenarios(settings)[-1], seconds=21.0),)  # noqa: E731
+    monkeypatch.setattr("mjxball.commands.train.standard_scenarios", shortened)
     out, sweep = tmp_path / "run", tmp_path / "sweep.json"
     sweep.write_text(json.dumps({"follower.action_scale_tilt": [0.1, 0.2]}))
     assert train([*FLAGS, "--seeds", "2", "--seed", "7", "--sweep", str(sweep), "--out", str(out)]) == 0
