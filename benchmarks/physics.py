@@ -38,8 +38,14 @@ def batch(config: configs.Config, worlds: int, dtype: type) -> tuple[PlantState,
     load = Load(mass, mass, *sine, none, none)
     zero = np.zeros((worlds, 3), dtype)
     euler = random.normal(0, 0.05, (worlds, 3)).astype(dtype)
-    commands = random.normal(0, 0.02, (worlds, 2, 3)).astype(dtype)
-    return start_state(config, zero, euler, zero, mass, zero[:, 0]), commands, load
+    commands = random.normal(0, 0.02, (worlds, config.plant.count, 3)).astype(dtype)
+    ball = zero[:, 0] if len(config.plant.directions) == 1 else zero[:, :2]
+    return start_state(config, zero, euler, zero, mass, ball), commands, load
+
+
+def plant_of(name: str) -> configs.Config:
+    """The preset `transport`, or that of the shipped plant `name`, on this plant."""
+    return configs.with_plant(configs.preset(configs.read_plant(name).preset or "transport"), name)
 
 
 def make_run(config: configs.Config, name: str, loop: str, control_steps: int) -> Any:
@@ -110,27 +116,32 @@ def main() -> None:
     parser.add_argument("--engines", nargs="+", choices=[*ENGINES, "mujoco"], default=[*ENGINES, "mujoco"])
     parser.add_argument("--loops", nargs="+", choices=LOOPS, default=list(LOOPS))
     parser.add_argument("--work", type=float, default=2e7, help="physics steps in a timed call, at most")
+    parser.add_argument("--plants", nargs="+", choices=configs.PLANTS, default=["pair"])
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    config = configs.preset("transport")
+    plants = {name: plant_of(name) for name in options.plants}
+    config = plants[options.plants[0]]
     device = jax.devices()[0].device_kind
     rows = []
     print(f"{device}, jax {jax.__version__}, float32, {config.physics_step * 1e3:g} ms steps")
-    print(f"{'engine':>14} {'loop':>9} {'worlds':>9} {'M steps/s':>11} {'compile s':>10}", flush=True)
+    print(f"{'plant':>10} {'engine':>14} {'loop':>9} {'worlds':>9} {'M steps/s':>11} {'compile s':>10}", flush=True)
 
-    def report(engine: str, loop: str, worlds: int, figures: dict[str, float]) -> None:
-        rows.append({"engine": engine, "loop": loop, "worlds": worlds, "device": device, **figures})
+    def report(plant: str, engine: str, loop: str, worlds: int, figures: dict[str, float]) -> None:
+        rows.append({"plant": plant, "engine": engine, "loop": loop, "worlds": worlds, "device": device, **figures})
         compiled = f"{figures['compile_seconds']:10.2f}" if "compile_seconds" in figures else f"{'-':>10}"
-        print(f"{engine:>14} {loop:>9} {worlds:>9} {figures['steps_per_second'] / 1e6:>11.3f} {compiled}", flush=True)
+        rate = figures["steps_per_second"] / 1e6
+        print(f"{plant:>10} {engine:>14} {loop:>9} {worlds:>9} {rate:>11.3f} {compiled}", flush=True)
 
     for name in (engine for engine in options.engines if engine in ENGINES):
         for loop in options.loops:
             for worlds in options.worlds:
-                steps = max(2, min(500, int(options.work / worlds / config.timing.physics_steps)))
-                report(name, loop, worlds, time_jax(config, name, worlds, steps, loop))
+                for plant, setup in plants.items():
+                    steps = max(2, min(500, int(options.work / worlds / setup.timing.physics_steps)))
+                    report(plant, name, loop, worlds, time_jax(setup, name, worlds, steps, loop))
     if "mujoco" in options.engines:
-        report("mujoco (ours)", "-", 1, time_mujoco(config, 500))
-        report("mj_step", "-", 1, time_mj_step(config))
+        for plant, setup in plants.items():
+            report(plant, "mujoco (ours)", "-", 1, time_mujoco(setup, 500))
+            report(plant, "mj_step", "-", 1, time_mj_step(setup))
     if options.json:
         options.json.write_text(json.dumps(rows, indent=2) + "\n")
 

@@ -1,4 +1,4 @@
-"""The pair as a picture, rendered by MuJoCo. `MUJOCO_GL` (egl, osmesa, glfw) chooses the GL library."""
+"""Drones and load as a picture, rendered by MuJoCo. `MUJOCO_GL` (egl, osmesa, glfw) chooses the GL library."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjxball.assembly import BALL_JOINT, build_spec
+from mjxball.assembly import BALL_JOINTS, build_spec
 from mjxball.config import Plant
 
 Array = Any
@@ -31,7 +31,8 @@ class Scene:
         spec.visual.quality.shadowsize = 1024  # MuJoCo's 4096 takes two thirds of a picture's time without a GPU
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._slide = self._model.jnt_qposadr[self._model.joint(BALL_JOINT).id]
+        joints = BALL_JOINTS[: len(plant.directions)]
+        self._slides = [self._model.jnt_qposadr[self._model.joint(joint).id] for joint in joints]
         self._share = plant.moving_fraction
         self._camera = mujoco.MjvCamera()
         self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, AZIMUTH, ELEVATION
@@ -43,14 +44,14 @@ class Scene:
         self._model.geom("goal").pos[:] = goal
         self._camera.lookat[:] = look_at
 
-    def picture(self, position: Array, quaternion: Array, cg_offset: float, path: Array = ()) -> np.ndarray:
+    def picture(self, position: Array, quaternion: Array, cg_offset: Array | float, path: Array = ()) -> np.ndarray:
         """Pixels (height, width, 3) uint8 with O at `position` (3,) [m], attitude (w, x, y, z), CG offset [m].
 
-        `path` (n, 3) [m] is drawn as a line behind the pair.
+        `cg_offset` has two numbers in a plane. `path` (n, 3) [m] is drawn as a line behind the object.
         """
         data = self._data
         data.qpos[:3], data.qpos[3:7] = position, quaternion
-        data.qpos[self._slide] = cg_offset / self._share
+        data.qpos[self._slides] = np.asarray(cg_offset) / self._share
         mujoco.mj_forward(self._model, data)
         self._renderer.update_scene(data, self._camera)
         for begin, end in itertools.pairwise(path):

@@ -123,6 +123,13 @@ REFUSED = {
     "mass is a word": (RING + 'mass = "heavy"', "drones.2.mass takes numbers"),
     "rim off the carrier": (RING.replace("[plant]", "[plant]\nball_stop = 0.3", 1), "lies off the object"),
     "load outside its carrier": (RING + "[scenario]\ncg_amplitude = [0.0, 0.3]", "leaves the object"),
+    "the follower first": ('base = "pair"\n[plant]\nleader = 1\n', "must lie ahead"),
+    "the leader second": (
+        'base = "crazyflie"\nplant.leader = 1\nplant.drones.0.mount = [0.0, -0.15, 0.0]\n'
+        "plant.drones.1.mount = [0.0, 0.15, 0.0]",
+        "need the leader listed first",
+    ),
+    "a Crazyflie that is turned": ('base = "crazyflie"\n[plant.drones.1]\nyaw = 0.5', "no yaw"),
     "nobody leads": (RING.replace("[plant]", "[plant]\nleader = 3", 1), "none of the 3 drones"),
     "negative rotors": (RING + "rotor_force_max = -8.0", "drones.2.rotor_force_max must be at least 0"),
 }

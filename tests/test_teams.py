@@ -7,7 +7,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
-from plants import random_motion, team
+from plants import paper_with, random_motion, team
 from tables import rows
 from test_engines import TOLERANCE, jitted, relative_difference
 
@@ -15,7 +15,8 @@ from engines import random_states
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
 from mjxball.physics import mjx, mujoco, newton_euler
-from mjxball.physics.engine import contact_wrenches, total_wrench
+from mjxball.physics.engine import Load, contact_wrenches, total_wrench
+from mjxball.physics.step import make_control_step, start_state
 from mjxball.plant import plant_parameters
 
 STATES = 100
@@ -90,6 +91,36 @@ def test_every_world_may_have_another_rig(engine: str) -> None:
         alone = jax.tree.map(lambda leaf: leaf[number : number + 1], arguments)  # noqa: B023
         expected = newton_euler.make_engine(rig, Attitude()).rolling(*alone)
         assert relative_difference([leaf[number : number + 1] for leaf in found], expected) <= TOLERANCE
+
+
+def test_a_control_step_of_every_world_may_have_another_rig() -> None:
+    """Rotor geometry, lags, limits, gains and shares too: half a second of flight with traced numbers and constants."""
+    rigs = [team(3, seed=seed, moving_fraction=0.4, leader=1) for seed in range(3)]
+    configs = [paper_with(rig) for rig in rigs]
+    random, commands = np.random.default_rng(5), np.random.default_rng(6).normal(0, 0.1, (3, 3, 3))
+    none, mass = np.zeros((3, 0)), random.uniform(0.2, 0.4, 3)
+    load = Load(mass, mass, *random.uniform(0.02, 0.08, (3, 3)), none, none)
+    zero = np.zeros((3, 3))
+    vectors = (zero, 0.1 * random.normal(size=(3, 3)), zero, mass, np.zeros((3, 2)))
+
+    def flown(config, parameters, commands, load, *start):
+        engine = newton_euler.make_engine(config.plant, config.attitude, parameters)
+        step = make_control_step(config, engine, parameters=parameters)
+        state = start_state(config, *start, parameters)
+        for _ in range(5):
+            state = step(state, commands, load)
+        return state
+
+    numbers = [plant_parameters(rig, Attitude()) for rig in rigs]
+    worlds = jax.tree.map(lambda *leaves: np.stack(leaves), *numbers)
+    together = jitted(lambda: lambda *each: flown(configs[0], *each))(worlds, commands, load, *vectors)
+    for number, config in enumerate(configs):
+        given = jax.tree.map(lambda leaf: leaf[number], (commands, load, *vectors))  # noqa: B023
+        alone = flown(config, None, *given)
+        for found, expected in zip(together.each(lambda leaf: leaf[number]), alone, strict=True):  # noqa: B023
+            if expected is not None:
+                # 1e-10: rounding, which the attitude loops' feedback does not let grow
+                np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
 
 
 def test_contact_wrenches_are_those_of_mujoco() -> None:

@@ -72,7 +72,9 @@ class Plant:
                 "flights need a leader, one follower and a load that moves along a line; this plant has "
                 f"{self.count} drones and a load that moves {where}"
             )
-        return self.drones[self.leader], self.drones[1 - self.leader]
+        if self.leader != 0:
+            raise InputError("flights need the leader listed first, and plant.leader is 1")
+        return self.drones[0], self.drones[1]
 
     @property
     def directions(self) -> tuple[int, ...]:

@@ -158,6 +158,11 @@ def _validate_autopilot(config: Config) -> None:
         raise InputError(
             f"a Crazyflie has plant.layout x and, with this autopilot.motor_curve, plant.rotor_force_max {most:.4g} N"
         )
+    if any(drone.yaw or drone.rotor_force_max for drone in config.plant.drones):
+        raise InputError(
+            "a Crazyflie has no yaw or rotor_force_max of its own in plant.drones: its firmware's axes are the rig's, "
+            "and autopilot.motor_curve is that of all drones"
+        )
     margin = thrust_margin(config)
     if margin < THRUST_MARGIN:
         raise InputError(

@@ -139,18 +139,26 @@ def with_external_force(wrench: Wrench, state: PlantState, load: Load) -> Wrench
     return wrench._replace(force=wrench.force + rotations.rotate_back(matrix, load.external_force))
 
 
-def hover_rotor_force(config: Config, believed_mass: Scalar) -> Float[Array, "... drones 4"]:
+def hover_rotor_force(
+    config: Config, believed_mass: Scalar, parameters: PlantParameters | None = None
+) -> Float[Array, "... drones 4"]:
     """Rotor forces [N] that hover the believed object mass [kg] with the CG at O."""
     xp = believed_mass.__array_namespace__()
-    numbers = plant_parameters(config.plant, config.attitude)
+    numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
     own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (numbers.drone_mass, numbers.share))
-    per_rotor = (own + share * believed_mass[..., None]) * config.plant.gravity / 4
+    per_rotor = (own + share * believed_mass[..., None]) * parts.entry(numbers.gravity) / 4
     per_rotor = xp.clip(per_rotor, 0.0, shared(numbers.rotor_force_max, per_rotor))
     return xp.stack([per_rotor] * 4, axis=-1)
 
 
 def start_state(
-    config: Config, position: Vector, euler: Vector, velocity: Vector, believed_mass: Scalar, ball_offset: Coordinates
+    config: Config,
+    position: Vector,
+    euler: Vector,
+    velocity: Vector,
+    believed_mass: Scalar,
+    ball_offset: Coordinates,
+    parameters: PlantParameters | None = None,
 ) -> PlantState:
     """State at time 0 with the rotors at the believed hover thrust.
 
@@ -171,7 +179,7 @@ def start_state(
         quaternion=rotations.quaternion_from_euler(euler),
         velocity=velocity,
         rates=xp.zeros_like(velocity),
-        rotor_force=hover_rotor_force(config, believed_mass),
+        rotor_force=hover_rotor_force(config, believed_mass, parameters),
         time=xp.zeros_like(position[..., 0]),
         ball_offset=ball_offset,
         ball_rate=xp.zeros_like(ball_offset),
