@@ -69,13 +69,18 @@ def time_jax(config: configs.Config, name: str, worlds: int, control_steps: int,
     result = jax.block_until_ready(compiled(*arguments))
     if not bool(jnp.isfinite(result.position).all()):
         raise RuntimeError("the benchmark's plant diverged")
-    times = []
+    times, cpu = [], []
     for _ in range(REPEATS):
-        started = time.perf_counter()
+        started, busy = time.perf_counter(), time.process_time()
         jax.block_until_ready(compiled(*arguments))
         times.append(time.perf_counter() - started)
+        cpu.append(time.process_time() - busy)
     steps = worlds * control_steps * config.timing.physics_steps
-    return {"steps_per_second": steps / statistics.median(times), "compile_seconds": compile_seconds}
+    return {
+        "steps_per_second": steps / statistics.median(times),
+        "steps_per_cpu_second": steps / statistics.median(cpu),
+        "compile_seconds": compile_seconds,
+    }
 
 
 def time_mujoco(config: configs.Config, control_steps: int) -> dict[str, float]:
@@ -124,13 +129,15 @@ def main() -> None:
     device = jax.devices()[0].device_kind
     rows = []
     print(f"{device}, jax {jax.__version__}, float32, {config.physics_step * 1e3:g} ms steps")
-    print(f"{'plant':>10} {'engine':>14} {'loop':>9} {'worlds':>9} {'M steps/s':>11} {'compile s':>10}", flush=True)
+    columns = f"{'M steps/s':>11} {'/CPU s':>9} {'compile s':>10}"
+    print(f"{'plant':>10} {'engine':>14} {'loop':>9} {'worlds':>9} {columns}", flush=True)
 
     def report(plant: str, engine: str, loop: str, worlds: int, figures: dict[str, float]) -> None:
         rows.append({"plant": plant, "engine": engine, "loop": loop, "worlds": worlds, "device": device, **figures})
         compiled = f"{figures['compile_seconds']:10.2f}" if "compile_seconds" in figures else f"{'-':>10}"
         rate = figures["steps_per_second"] / 1e6
-        print(f"{plant:>10} {engine:>14} {loop:>9} {worlds:>9} {rate:>11.3f} {compiled}", flush=True)
+        busy = f"{figures['steps_per_cpu_second'] / 1e6:9.3f}" if "steps_per_cpu_second" in figures else f"{'-':>9}"
+        print(f"{plant:>10} {engine:>14} {loop:>9} {worlds:>9} {rate:>11.3f} {busy} {compiled}", flush=True)
 
     for name in (engine for engine in options.engines if engine in ENGINES):
         for loop in options.loops:
