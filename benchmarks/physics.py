@@ -22,11 +22,11 @@ import numpy as np
 from mjxball import config as configs
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Load, PlantState
-from mjxball.physics.step import make_control_step, make_stepper, python_repeat, start_state
+from mjxball.physics.step import jax_repeat, make_control_step, make_stepper, python_repeat, start_state
 
 REPEATS = 5
 ENGINES = {"newton-euler": newton_euler.make_engine, "mjx": mjx.make_engine}
-LOOPS = {"loop": mjx.jax_repeat, "unrolled": python_repeat}  # the physics steps of a control step; training uses `loop`
+LOOPS = {"loop": jax_repeat, "unrolled": python_repeat}  # the physics steps of a control step; training uses `loop`
 
 
 def batch(config: configs.Config, worlds: int, dtype: type) -> tuple[PlantState, np.ndarray, Load]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,23 +17,35 @@ from mjxball.control import observation as layout
 from mjxball.control.observation import observation_history
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
-from mjxball.physics.mjx import jax_repeat, make_engine
 from mjxball.physics.motion import object_mass
-from mjxball.physics.step import TRAINING_ENGINES, ControlStep, make_cg_offset, make_control_step
-from mjxball.quiet import import_brax_env
+from mjxball.physics.step import TRAINING_ENGINES, ControlStep, jax_repeat, make_cg_offset, make_control_step
 from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
 from mjxball.sim.disturbances import RandomDisturbances
 from mjxball.sim.randomization import ResetDistribution
 
 RewardFunction = Callable[[Reward, rewards.Transition], Array]
 if TYPE_CHECKING:
-    from brax.envs.base import Env, State
     from jaxtyping import Bool, Float, Int
-else:
-    Env, State = import_brax_env()
 # [s] of an episode, after which its error counts as steady state in training's metrics. Episodes last 20 s, after which
 # alone the evaluation counts; the goal is reached after 4 s.
 STEADY_AFTER = 8.0
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class State:
+    """The fields of Brax's `State`. Brax itself takes a second to import, most of it for meshes."""
+
+    pipeline_state: Any  # `World`
+    obs: Float[Array, " n"]  # the networks' input
+    reward: Float[Array, ""]
+    done: Float[Array, ""]  # 1 at an end
+    metrics: dict[str, Array]
+    info: dict[str, Any]
+
+    def replace(self, **fields: Any) -> State:
+        """The same with other `fields`."""
+        return dataclasses.replace(self, **fields)
 
 
 class World(NamedTuple):
@@ -60,8 +73,8 @@ class Applied(NamedTuple):
     finite: Bool[Array, ""]  # whether it was
 
 
-class CoupledPairEnv(Env):
-    """Two drones, one object with a moving CG: the follower acts, the leader flies its PID.
+class CoupledPairEnv:
+    """Two drones, one object with a moving CG: the follower acts, the leader flies its PID. Brax's `Env` interface.
 
     `reset` draws goal, start, CG motion and object mass anew. `step` takes the network's action in
     [-1, 1] (3,). An episode terminates at |e_o| > d_term or when the world diverges, and is truncated at
@@ -116,6 +129,11 @@ class CoupledPairEnv(Env):
     def backend(self) -> str:
         """Name of the physics engine."""
         return self._backend
+
+    @property
+    def unwrapped(self) -> CoupledPairEnv:
+        """Itself."""
+        return self
 
     @property
     def dt(self) -> float:
@@ -299,5 +317,7 @@ class CoupledPairEnv(Env):
 
 def make_physics(config: Config, physics: str) -> ControlStep:
     """The control step of the engine `physics`, mjx or newton-euler, for one world; use `jax.vmap` for many."""
-    make = make_engine if physics == "mjx" else newton_euler.make_engine
+    make = newton_euler.make_engine
+    if physics == "mjx":
+        from mjxball.physics.mjx import make_engine as make  # takes a second to import
     return make_control_step(config, make(config.plant, config.attitude), jax_repeat)

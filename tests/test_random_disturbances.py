@@ -14,8 +14,7 @@ from conftest import CompiledEnv, compile_env, with_settings
 from mjxball.config import Config, preset, replace
 from mjxball.env import CoupledPairEnv
 from mjxball.physics import motion, newton_euler
-from mjxball.physics.mjx import jax_repeat
-from mjxball.physics.step import make_control_step
+from mjxball.physics.step import jax_repeat, make_control_step
 from mjxball.sim.disturbances import GUST_TIME, NOISE, RandomDisturbances
 
 SEEN = jnp.arange(18.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
@@ -100,8 +101,12 @@ class Environments(Protocol):
     critic_mask: Any  # (n,) the same for what is needed in training only
     shards: Shards
 
-    def restart(self, envs: Any, key: Array) -> Any:
-        """Those of `envs` whose episode ended start anew, at states drawn with `key`."""
+    def restart(self, envs: Any, key: Array, others: Bool[Array, " envs"] | None = None) -> Any:
+        """Those of `envs` whose episode ended start anew, at states drawn with `key`, and so do `others`."""
+        ...
+
+    def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
+        """The same environments with `transform` applied to the step of a single one."""
         ...
 
     def step(self, envs: Any, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Any, Transition]:

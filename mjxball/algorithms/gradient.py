@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 
 from mjxball.algorithms.base import Environments, Phase, Policy, Schedule
+from mjxball.algorithms.scalar_form import scalar_form
 from mjxball.config import Config
 from mjxball.errors import InputError
 
@@ -28,13 +29,16 @@ class GradientState(NamedTuple):
     mean: Array  # (n,) of the observations in the first window, which nothing is learnt from
     square: Array  # (n,) mean of their squares
     seen: Array  # () 1 once they are known
+    windows: Array  # () flown, as an integer
 
 
 class FirstOrderGradient:
     """Backpropagation through windows of `gradient.horizon` steps of all environments, then one step of Adam.
 
     `collect` flies a window and differentiates its mean reward with respect to the policy's weights; `update` takes
-    the step. `gradient.damping` multiplies the gradient that passes from one control step to the one before.
+    the step. Windows follow one another in an episode of `gradient.windows_per_episode`; the environments begin theirs
+    in turn, so that every window has flights towards the goal and flights at it. `gradient.damping` multiplies the
+    gradient that passes from one control step to the one before.
     """
 
     metrics = ("loss", "gradient_norm")
@@ -44,7 +48,9 @@ class FirstOrderGradient:
 
     def __init__(self, config: Config, environments: Environments):
         own = config.gradient
-        self._config, self._environments, self._shards = own, environments, environments.shards
+        # Number by number the closed form's gradient takes a quarter of the time (docs/training.md).
+        self._config, self._environments = own, environments.rewritten(scalar_form)
+        self._shards = environments.shards
         self.steps_per_collect = own.horizon
         window = own.num_envs * own.horizon
         self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations, 0.0)
@@ -62,11 +68,13 @@ class FirstOrderGradient:
             layers[f"hidden_{number}"] = {"kernel": kernel * (0.01 if last else 1.0), "bias": jnp.zeros(columns)}
         zero, none = jnp.zeros(()), jnp.zeros(self._sizes[0])
         slope = jax.tree.map(jnp.zeros_like, layers)
-        return GradientState(layers, ADAM.init(layers), slope, zero, none, none, zero)
+        return GradientState(layers, ADAM.init(layers), slope, zero, none, none, zero, jnp.zeros((), jnp.int32))
 
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
         """One window of all environments and its gradient; the first one gives the observations' statistics."""
-        envs = self._environments.restart(envs, keys[0])
+        own = self._environments
+        turn = (jnp.arange(own.count) + state.windows) % self._config.windows_per_episode == 0
+        envs = own.restart(envs, keys[0], turn & phase.recording)
         (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(state.layers, state, envs)
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
         first = (phase.random & phase.recording).astype(jnp.float32)
@@ -78,6 +86,7 @@ class FirstOrderGradient:
             mean=first * mean + (1 - first) * state.mean,
             square=first * square + (1 - first) * state.square,
             seen=jnp.maximum(state.seen, first),
+            windows=state.windows + 1,
         )
         known = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), known, state)
         return known, envs

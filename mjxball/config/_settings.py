@@ -258,9 +258,10 @@ class Ppo:
 class Gradient:
     """First-order gradients through the closed form, with `train.py --algorithm gradient`."""
 
-    gradient_steps: int = setting(40, "steps of Adam, each on one window of all environments", low=1)
-    num_envs: int = setting(64, "environments that are flown at once", low=1)
-    horizon: int = setting(200, "control steps of a window, through which the reward is differentiated", low=1)
+    gradient_steps: int = setting(120, "steps of Adam, each on one window of all environments", low=1)
+    num_envs: int = setting(32, "environments that are flown at once", low=1)
+    horizon: int = setting(100, "control steps of a window, through which the reward is differentiated", low=1)
+    windows_per_episode: int = setting(4, "windows after which an environment starts anew", low=1)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     learning_rate: float = setting(2e-2, "Adam's rate at the start", above=0)
     learning_rate_end: float = setting(0.02, "rate at the end of the run over the rate at its start", above=0, high=1)
@@ -268,7 +269,7 @@ class Gradient:
     damping: float = setting(
         1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1
     )
-    num_evaluations: int = setting(2, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
+    num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
 
 
 @dataclass(frozen=True)

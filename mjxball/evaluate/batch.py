@@ -18,7 +18,7 @@ from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
-from mjxball.physics.step import TRAINING_ENGINES, make_control_step
+from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_control_step
 from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim import rollout
@@ -57,7 +57,7 @@ class Batch:
         enable_compilation_cache()
         self._config, self._law = config, law_of(follower)
         make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
-        step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
+        step = make_control_step(config, make(config.plant, config.attitude), jax_repeat)
         self._physics = jax.vmap(step)
         self._privileged = rollout.make_privileged_info(config)
         self._shares = np.float32(not isinstance(follower, Baseline))

@@ -14,12 +14,10 @@ import numpy as np
 
 from mjxball.assembly import build_model
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv, World
+from mjxball.env import CoupledPairEnv, State, World
 from mjxball.gym import worlds
-from mjxball.quiet import import_brax_env
 
 Array = Any
-_, State = import_brax_env()
 
 
 @flax.struct.dataclass

@@ -184,8 +184,3 @@ def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Flo
     angular = rotations.solve_symmetric(mass[3:, 3:] - squares / total, force[3:] - push / total)
     back = rotations.rotate_back(coupling, angular)
     return jnp.concatenate([(force[:3] - back) / total, angular])
-
-
-def jax_repeat(body: Any, count: int, value: Any) -> Any:
-    """Apply `body` `count` times in one compiled loop."""
-    return jax.lax.scan(lambda carry, _: (body(carry), None), value, None, length=count)[0]

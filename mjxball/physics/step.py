@@ -40,6 +40,13 @@ def python_repeat(body: Callable[[PlantState], PlantState], count: int, value: P
     return value
 
 
+def jax_repeat(body: Callable[[PlantState], PlantState], count: int, value: PlantState) -> PlantState:
+    """Apply `body` `count` times in one compiled loop."""
+    import jax
+
+    return jax.lax.scan(lambda carry, _: (body(carry), None), value, None, length=count)[0]
+
+
 def make_control_step(
     config: Config, engine: Engine, repeat: Repeat = python_repeat, parameters: PlantParameters | None = None
 ) -> ControlStep:
@@ -216,7 +223,7 @@ def _jax_stepper(config: Config, physics: str) -> ControlStep:
     enable_compilation_cache()
     make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine
     with jax.enable_x64(True), on_the_host():
-        step = make_control_step(config, make(config.plant, config.attitude), mjx.jax_repeat)
+        step = make_control_step(config, make(config.plant, config.attitude), jax_repeat)
         compiled = jax.jit(jax.vmap(step))
 
     def stepper(state: PlantState, commands: Any, load: Load) -> PlantState:

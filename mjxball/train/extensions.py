@@ -26,6 +26,11 @@ class Extensions(NamedTuple):
     reward: Any = None  # function (state, action, next state) -> reward
     algorithm: Any = None  # class, see `mjxball.algorithms.base.Algorithm`
 
+    def ours(self) -> bool:
+        """Whether everything that they name is part of mjxball."""
+        names = {one if isinstance(one, str) else f"{one.__module__}:{one.__name__}" for one in self if one is not None}
+        return names <= {*ALGORITHMS, *ALGORITHMS.values()}
+
 
 DEFAULTS = Extensions()
 

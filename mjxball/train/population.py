@@ -16,7 +16,14 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from mjxball import config as configs
 from mjxball.algorithms.base import Policy, Shards
 from mjxball.config import Config
-from mjxball.train.compilation import GPU_OPTIONS, PLAIN_PRODUCTS, TracedProgram, jax_setting, partitioned_by_gspmd
+from mjxball.train.compilation import (
+    CPU_OPTIONS,
+    GPU_OPTIONS,
+    PLAIN_PRODUCTS,
+    TracedProgram,
+    jax_setting,
+    partitioned_by_gspmd,
+)
 from mjxball.train.extensions import DEFAULTS, Extensions
 from mjxball.train.program import Mode, Program, Statistics, TrainState, report, warmup
 from mjxball.train.run_directory import Sweep, source_hash, versions
@@ -101,7 +108,9 @@ class Population:
 
     def compile(self, creating: bool) -> Executables:
         """Compile everything a run needs, side by side; `create` only if `creating`."""
-        options = (GPU_OPTIONS | (PLAIN_PRODUCTS if self._single else {})) if jax.default_backend() == "gpu" else None
+        options = CPU_OPTIONS if self.program.algorithm.steps_per_collect > 1 else None
+        if jax.default_backend() == "gpu":
+            options = GPU_OPTIONS | (PLAIN_PRODUCTS if self._single else {})
         # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
         # end a process that shares GPUs with others by a segfault.
         with (
@@ -120,13 +129,14 @@ class Population:
         key: dict[str, Any] | None = {
             "config": configs.to_dict(self.config),
             "physics": self._physics,
+            "algorithm": type(self.program.algorithm).__name__,
             "members": self.members,
             "swept": {name: values.tolist() for name, values in self._values.items()},  # constants in `advance`
             "source": source_hash(),
             "versions": versions(),
         }
         values, keys = jax.tree.map(_shape, self._starts(0))
-        if any(self._extensions):
+        if not self._extensions.ours():
             key = None  # nobody knows all that they depend on
         mode, state = jax.tree.map(_shape, warmup(1)), self.template()
         result = (state, *self._result_structure(state))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -13,10 +14,10 @@ import numpy as np
 from jax import Array
 
 from mjxball import config as configs
+from mjxball.algorithms import ALGORITHMS
 from mjxball.algorithms.base import Algorithm, Phase, Policy, Schedule, Shards, Transition
-from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.config import Config
-from mjxball.train.extensions import DEFAULTS, Extensions, make_env
+from mjxball.train.extensions import DEFAULTS, Extensions, find, make_env
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -93,13 +94,19 @@ class Environments:
         peaks = dict.fromkeys(states.metrics, jnp.zeros(self.count))
         return Envs(states, Statistics(zero, zero, totals, peaks), difficulty)
 
-    def restart(self, envs: Envs, key: Array) -> Envs:
+    def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
+        """See `mjxball.algorithms.base.Environments`."""
+        other = copy.copy(self)
+        other._step = jax.vmap(transform(self.env.step))
+        return other
+
+    def restart(self, envs: Envs, key: Array, others: Bool[Array, " envs"] | None = None) -> Envs:
         """See `mjxball.algorithms.base.Environments`."""
         before = envs.states
+        ended = before.done.astype(bool) if others is None else before.done.astype(bool) | others
 
         def reset_if_done(new: Array, old: Array) -> Array:
-            done = before.done.astype(bool).reshape((-1,) + (1,) * (old.ndim - 1))
-            return jnp.where(done, new, old)
+            return jnp.where(ended.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
 
         return envs._replace(states=jax.tree.map(reset_if_done, self.reset(key, envs.difficulty), before))
 
@@ -182,7 +189,7 @@ class Program:
             config = configs.replace(config, configs.current_name(path), value)
         self.config, self._shards = config, shards or Shards()
         self.env = make_env(extensions, config, physics)
-        make: Any = extensions.algorithm or SoftActorCritic
+        make: Any = extensions.algorithm or find(ALGORITHMS["sac"], "--algorithm")
         # The algorithm says how many environments there are, and is told the part of them that is here.
         schedule: Schedule = make(config, Environments(self.env, 1, Shards())).schedule
         self.environments = Environments(self.env, schedule.num_envs // self._shards.parts, self._shards)

@@ -30,7 +30,7 @@ from mjxball.train.program import Mode, Statistics, TrainState
 from mjxball.train.progress import Progress, Row, columns
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, write_config
 
-CHUNKS = 50  # rows of metrics.csv in a run
+CHUNKS = 50  # rows of metrics.csv in a run, at most
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
 
 
@@ -166,7 +166,9 @@ class Run:
         if done < first and not ended:
             self.state, *_ = self._advance(self.state, programs.warmup(first - done))
             done = first
-        chunk = max(1, math.ceil(total / CHUNKS))
+        window = self.population.program.algorithm.steps_per_collect
+        chunk = math.ceil(total / CHUNKS / window) * window
+        chunks = math.ceil(total / chunk)
         while done < total and not ended:
             number = done // chunk + 1
             steps = min(number * chunk, total) - done
@@ -175,7 +177,7 @@ class Run:
             late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
             # All processes act on what they agreed on here, whenever a signal reaches one of them.
             ended, late = processes.any_of((stop.requested, late))
-            due = number * evaluations // CHUNKS > (number - 1) * evaluations // CHUNKS
+            due = number * evaluations // chunks > (number - 1) * evaluations // chunks
             if due or done >= total:
                 row |= self._evaluated()
             self.progress.show(row)

@@ -1,0 +1,304 @@
+"""A function of small arrays as operations on single numbers, which XLA fuses into few loops over the batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+Value = Any  # an array, or `Parts`
+Parts = Any  # object array with a tracer or a NumPy scalar for each number
+LARGEST = 128  # numbers; operations on larger arrays stay as they are
+CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
+ELEMENTWISE = frozenset(
+    [
+        "abs",
+        "acos",
+        "add",
+        "add_any",
+        "and",
+        "asin",
+        "atan",
+        "atan2",
+        "ceil",
+        "clamp",
+        "convert_element_type",
+        "copy",
+        "cos",
+        "div",
+        "eq",
+        "exp",
+        "exp2",
+        "expm1",
+        "floor",
+        "ge",
+        "gt",
+        "integer_pow",
+        "is_finite",
+        "le",
+        "log",
+        "log1p",
+        "logistic",
+        "lt",
+        "max",
+        "min",
+        "mul",
+        "ne",
+        "neg",
+        "not",
+        "or",
+        "pow",
+        "rem",
+        "round",
+        "rsqrt",
+        "select_n",
+        "sign",
+        "sin",
+        "sqrt",
+        "square",
+        "stop_gradient",
+        "sub",
+        "tan",
+        "tanh",
+        "xor",
+    ]
+)
+REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
+    "reduce_and": lambda a, b: a & b,
+    "reduce_max": jnp.maximum,
+    "reduce_min": jnp.minimum,
+    "reduce_or": lambda a, b: a | b,
+    "reduce_sum": lambda a, b: _add(a, b),
+}
+
+
+def scalar_form(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of pytrees of arrays, computed number by number; for use under `jax.vmap`.
+
+    Slices, stacks and transposes of small arrays vanish, products with constants that are 0 as well (0 times infinity
+    then is 0), and sums are added in order. A `lax.scan` without inputs and outputs for each step, as `fori_loop` of a
+    fixed count becomes, is computed again when its gradient is taken instead of remembering what happened in it. What
+    is unknown here or larger than `LARGEST` stays as it is.
+    """
+
+    def transformed(*arguments: Any) -> Any:
+        leaves, structure = jax.tree.flatten(arguments)
+        shapes = [jax.ShapeDtypeStruct(jnp.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves]
+        closed, result = jax.make_jaxpr(
+            lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), return_shape=True
+        )(*shapes)
+        values = _evaluate(closed.jaxpr, closed.consts, leaves)
+        outputs = [_array(value, v.aval) for value, v in zip(values, closed.jaxpr.outvars, strict=True)]
+        return jax.tree.unflatten(jax.tree.structure(result), outputs)
+
+    return transformed
+
+
+def _evaluate(jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Value]) -> list[Value]:
+    values: dict[Any, Value] = {}
+
+    def read(variable: Any) -> Value:
+        return np.asarray(variable.val) if isinstance(variable, core.Literal) else values[variable]
+
+    values.update(zip(jaxpr.constvars, constants, strict=True))
+    values.update(zip(jaxpr.invars, arguments, strict=True))
+    for equation in jaxpr.eqns:
+        results = _apply(equation, [read(variable) for variable in equation.invars])
+        values.update(zip(equation.outvars, results, strict=True))
+    return [read(variable) for variable in jaxpr.outvars]
+
+
+def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
+    """What `equation` makes of `inputs`."""
+    name, parameters = equation.primitive.name, equation.params
+    if name in CALLS and parameters.get(CALLS[name]) is not None:
+        called = parameters[CALLS[name]]
+        return _evaluate(called.jaxpr, called.consts, inputs)
+    if name == "scan" and _repeats(equation):
+        return _scan(parameters["jaxpr"], parameters["length"], inputs)
+    shapes = [variable.aval for variable in (*equation.invars, *equation.outvars)]
+    rewritten = name in ELEMENTWISE or name in REDUCTIONS or name in REARRANGED
+    keys = any(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended) for aval in shapes)
+    if keys or not rewritten or max(aval.size for aval in shapes) > LARGEST:
+        arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
+        outputs = equation.primitive.bind(*arrays, **parameters)
+        return outputs if equation.primitive.multiple_results else [outputs]
+    parts, shape = [_parts(value) for value in inputs], equation.outvars[0].aval.shape
+    if name in REARRANGED:
+        result = REARRANGED[name](parameters, shape, parts)
+        return result if equation.primitive.multiple_results else [result]
+    if name in REDUCTIONS:
+        return [_reduce(REDUCTIONS[name], parts[0], parameters["axes"])]
+    spread = [np.broadcast_to(part, shape) for part in parts]
+    outputs = np.empty(shape, object)
+    for index in np.ndindex(shape):
+        outputs[index] = _compute(equation, [part[index] for part in spread])
+    return [outputs]
+
+
+def _repeats(scan: Any) -> bool:
+    """Whether `scan` has neither inputs nor outputs for each step: those have an axis more outside than inside."""
+    body = scan.params["jaxpr"]
+    inner, outer = [*body.in_avals, *body.out_avals], [v.aval for v in (*scan.invars, *scan.outvars)]
+    return all(one.shape == other.shape for one, other in zip(inner, outer, strict=True))
+
+
+def _scan(body: Any, length: int, inputs: list[Value]) -> list[Value]:
+    """`length` times `body`, whose last inputs are what it returns."""
+    count = len(inputs) - len(body.out_avals)
+    fixed, shapes = inputs[:count], body.out_avals
+
+    def numbers(values: Sequence[Value]) -> list[Any]:
+        return [
+            jnp.asarray(one, aval.dtype) for v, aval in zip(values, shapes, strict=True) for one in _parts(v).ravel()
+        ]
+
+    def values(flat: Sequence[Any]) -> list[Parts]:
+        found, rest = [], list(flat)
+        for aval in shapes:
+            parts = np.empty(aval.size, object)
+            for number in range(aval.size):
+                parts[number] = rest[number]
+            found.append(parts.reshape(aval.shape))
+            rest = rest[aval.size :]
+        return found
+
+    @jax.checkpoint
+    def step(flat: list[Any]) -> list[Any]:
+        return numbers(_evaluate(body.jaxpr, body.consts, [*fixed, *values(flat)]))
+
+    flat = numbers(inputs[count:])
+    return values(jax.lax.scan(lambda carry, _: (step(carry), None), flat, length=length)[0])
+
+
+def _parts(value: Value) -> Parts:
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        return value
+    parts = np.empty(np.shape(value), object)
+    known = value if isinstance(value, jax.core.Tracer) else np.asarray(value)
+    for index in np.ndindex(parts.shape):
+        parts[index] = known[index]
+    return parts
+
+
+def _array(value: Value, aval: Any) -> Any:
+    if not (isinstance(value, np.ndarray) and value.dtype == object):
+        return value
+    if all(map(_known, value.flat)):
+        return np.array(value.tolist(), aval.dtype)
+    return jnp.stack([jnp.asarray(number, aval.dtype) for number in value.flat]).reshape(value.shape)
+
+
+def _known(number: Any) -> bool:
+    return not isinstance(number, jax.core.Tracer)
+
+
+def _is(number: Any, constant: float) -> bool:
+    return _known(number) and number.dtype != bool and number == constant
+
+
+def _add(a: Any, b: Any) -> Any:
+    return b if _is(a, 0) else a if _is(b, 0) else a + b
+
+
+def _subtract(a: Any, b: Any) -> Any:
+    return a if _is(b, 0) else -b if _is(a, 0) else a - b
+
+
+def _multiply(a: Any, b: Any) -> Any:
+    if _is(a, 0) or _is(b, 0):
+        return (a if _known(a) else b).dtype.type(0)
+    return b if _is(a, 1) else a if _is(b, 1) else a * b
+
+
+def _divide(a: Any, b: Any) -> Any:
+    return a if _is(a, 0) or _is(b, 1) else a / b
+
+
+SHORTENED = {"add": _add, "add_any": _add, "sub": _subtract, "mul": _multiply, "div": _divide}
+
+
+def _compute(equation: Any, numbers: list[Any]) -> Any:
+    """One number of an elementwise operation."""
+    name = equation.primitive.name
+    if all(map(_known, numbers)):
+        with jax.ensure_compile_time_eval():
+            return np.asarray(equation.primitive.bind(*map(jnp.asarray, numbers), **equation.params))[()]
+    if name in SHORTENED:
+        return SHORTENED[name](*numbers)
+    if name == "select_n" and _known(numbers[0]):
+        return numbers[1 + int(numbers[0])]
+    return equation.primitive.bind(*map(jnp.asarray, numbers), **equation.params)
+
+
+def _reduce(combine: Callable[[Any, Any], Any], parts: Parts, axes: Sequence[int]) -> Parts:
+    kept = [axis for axis in range(parts.ndim) if axis not in axes]
+    shape = [parts.shape[axis] for axis in kept]
+    lined = parts.transpose([*kept, *axes]).reshape([*shape, -1])
+    result = np.empty(shape, object)
+    for index in np.ndindex(*shape):
+        total, *others = lined[index]
+        for other in others:
+            total = combine(total, other)
+        result[index] = total
+    return result
+
+
+def _broadcast(parameters: Any, shape: tuple[int, ...], parts: list[Parts]) -> Parts:
+    dimensions = parameters["broadcast_dimensions"]
+    lined = [parts[0].shape[dimensions.index(axis)] if axis in dimensions else 1 for axis in range(len(shape))]
+    return np.broadcast_to(parts[0].reshape(lined), shape)
+
+
+def _slice(parameters: Any, shape: tuple[int, ...], parts: list[Parts]) -> Parts:
+    steps = parameters["strides"] or [1] * len(shape)
+    bounds = zip(parameters["start_indices"], parameters["limit_indices"], steps, strict=True)
+    return parts[0][tuple(slice(*one) for one in bounds)]
+
+
+def _product(parameters: Any, shape: tuple[int, ...], parts: list[Parts]) -> Parts:
+    """Sums of products over the contracted axes; `shape` is (batch, left, right)."""
+    (left_sum, right_sum), (left_batch, right_batch) = parameters["dimension_numbers"]
+
+    def lined(part: Parts, batch: Sequence[int], summed: Sequence[int]) -> Parts:
+        kept = [axis for axis in range(part.ndim) if axis not in (*batch, *summed)]
+        ordered = part.transpose([*batch, *kept, *summed])
+        count = len(batch) + len(kept)
+        return ordered.reshape([*ordered.shape[:count], -1]), ordered.shape[len(batch) : count]
+
+    (left, rows), (right, columns) = lined(parts[0], left_batch, left_sum), lined(parts[1], right_batch, right_sum)
+    result = np.empty(shape, object)
+    batches = shape[: len(left_batch)]
+    for batch in np.ndindex(*batches):
+        for i in np.ndindex(*rows):
+            for j in np.ndindex(*columns):
+                pairs = zip(left[batch + i], right[batch + j], strict=True)
+                products = [_multiply(a, b) for a, b in pairs]
+                total = products[0]
+                for product in products[1:]:
+                    total = _add(total, product)
+                result[batch + i + j] = total
+    return result
+
+
+def _reshaped(parameters: Any, shape: tuple[int, ...], parts: list[Parts]) -> Parts:
+    return parts[0].reshape(shape)
+
+
+REARRANGED: dict[str, Callable[[Any, tuple[int, ...], list[Parts]], Any]] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda p, shape, parts: np.concatenate(parts, axis=p["dimension"]),
+    "dot_general": _product,
+    "expand_dims": _reshaped,
+    "reshape": _reshaped,
+    "rev": lambda p, shape, parts: np.flip(parts[0], p["dimensions"]),
+    "slice": _slice,
+    "split": lambda p, shape, parts: np.split(parts[0], np.cumsum(p["sizes"])[:-1], axis=p["axis"]),
+    "squeeze": _reshaped,
+    "stack": lambda p, shape, parts: np.stack(parts, axis=p["axis"]),
+    "transpose": lambda p, shape, parts: parts[0].transpose(p["permutation"]),
+}
