@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,64 +16,19 @@ Parts = Any  # object array with a tracer or a NumPy scalar for each number
 LARGEST = 128  # numbers; operations on larger arrays stay as they are
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 ELEMENTWISE = frozenset(
-    [
-        "abs",
-        "acos",
-        "add",
-        "add_any",
-        "and",
-        "asin",
-        "atan",
-        "atan2",
-        "ceil",
-        "clamp",
-        "convert_element_type",
-        "copy",
-        "cos",
-        "div",
-        "eq",
-        "exp",
-        "exp2",
-        "expm1",
-        "floor",
-        "ge",
-        "gt",
-        "integer_pow",
-        "is_finite",
-        "le",
-        "log",
-        "log1p",
-        "logistic",
-        "lt",
-        "max",
-        "min",
-        "mul",
-        "ne",
-        "neg",
-        "not",
-        "or",
-        "pow",
-        "rem",
-        "round",
-        "rsqrt",
-        "select_n",
-        "sign",
-        "sin",
-        "sqrt",
-        "square",
-        "stop_gradient",
-        "sub",
-        "tan",
-        "tanh",
-        "xor",
-    ]
+    (
+        *("abs", "acos", "add", "add_any", "and", "asin", "atan", "atan2", "ceil", "clamp", "convert_element_type"),
+        *("copy", "cos", "div", "eq", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le"),
+        *("log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow", "rem", "round"),
+        *("rsqrt", "select_n", "sign", "sin", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor"),
+    )
 )
 REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
-    "reduce_and": lambda a, b: a & b,
+    "reduce_and": operator.and_,
     "reduce_max": jnp.maximum,
     "reduce_min": jnp.minimum,
-    "reduce_or": lambda a, b: a | b,
-    "reduce_sum": lambda a, b: _add(a, b),
+    "reduce_or": operator.or_,
+    "reduce_sum": operator.add,
 }
 
 
@@ -122,7 +78,7 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
         return _scan(parameters["jaxpr"], parameters["length"], inputs)
     shapes = [variable.aval for variable in (*equation.invars, *equation.outvars)]
     rewritten = name in ELEMENTWISE or name in REDUCTIONS or name in REARRANGED
-    keys = any(jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended) for aval in shapes)
+    keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in shapes)
     if keys or not rewritten or max(aval.size for aval in shapes) > LARGEST:
         arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
         outputs = equation.primitive.bind(*arrays, **parameters)
