@@ -115,7 +115,10 @@ class Environments(Protocol):
 
 
 class Algorithm(Protocol):
-    """A learning algorithm. All its functions are pure, and can be jitted and vmapped."""
+    """A learning algorithm. All its functions are pure, and can be jitted and vmapped.
+
+    One that is done on a CPU before it could be compiled well, or at all for a GPU, may say so: `brief = True`.
+    """
 
     schedule: Schedule
     metrics: tuple[str, ...]  # names of what `update` reports

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from mjxball.algorithms.base import Environments, Phase, Policy, Schedule
@@ -43,19 +44,20 @@ class FirstOrderGradient:
 
     metrics = ("loss", "gradient_norm")
     engines = ("newton-euler",)  # MJX iterates, and what iterates has no gradient backwards
+    brief = True
     collect_keys = 1
     update_keys = 0
 
     def __init__(self, config: Config, environments: Environments):
         own = config.gradient
-        # Number by number the closed form's gradient takes a quarter of the time (docs/training.md).
+        # Number by number a window's gradient takes a quarter of the time, and two thirds to compile.
         self._config, self._environments = own, environments.rewritten(scalar_form)
         self._shards = environments.shards
         self.steps_per_collect = own.horizon
         window = own.num_envs * own.horizon
         self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations, 0.0)
         self._sizes = (environments.observation_size, *own.policy_layers, 2 * environments.action_size)
-        self._mask = jnp.asarray(environments.policy_mask, jnp.float32)
+        self._mask: Any = np.asarray(environments.policy_mask, np.float32)
 
     def init(self, key: Array) -> GradientState:
         """Weights as Flax draws them (LeCun's), near 0 in the last layer: the first policy adds hardly anything."""
@@ -125,8 +127,9 @@ class FirstOrderGradient:
 
     def policy(self, state: GradientState) -> Policy:
         """The policy as it is."""
+        xp = state.mean.__array_namespace__()  # NumPy's, when a policy file is written: nothing is compiled for that
         variance = state.square - state.mean**2
-        deviation = jnp.where(state.seen > 0, jnp.sqrt(jnp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
+        deviation = xp.where(state.seen > 0, xp.sqrt(xp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
         return Policy(state.layers, state.mean, deviation, self._mask)
 
     def partition(self, whole: Any, split: Any) -> Any:

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import dataclasses
 import math
+import os
 import shlex
 import statistics
 import sys
@@ -206,6 +207,7 @@ def _check_extensions(names: dict[str, str], settings: config.Config, wanted: st
     from mjxball.train.extensions import Extensions, make_env, resolve
 
     extensions = resolve(Extensions(**names))
+    _choose_processor(extensions.algorithm)
     engines = getattr(extensions.algorithm, "engines", TRAINING_ENGINES)
     physics = wanted or engines[0]
     if physics not in engines:
@@ -221,6 +223,15 @@ def _check_extensions(names: dict[str, str], settings: config.Config, wanted: st
     return physics
 
 
+def _choose_processor(algorithm: Any) -> None:
+    """Train on the CPU what is done there before a GPU has compiled it, unless JAX_PLATFORMS says otherwise."""
+    import jax
+
+    if getattr(algorithm, "brief", False) and not os.environ.get("JAX_PLATFORMS"):
+        settings: Any = jax.config
+        settings.update("jax_platforms", "cpu")
+
+
 def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
     """Configuration and origin of the run to be continued; InputError if this program is not the one that made it."""
     from mjxball.train.run_directory import read_config
@@ -230,6 +241,10 @@ def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
     extensions = origin.get("extensions") or {}
     if extensions and _digest(extensions) != origin.get("extension_hash"):
         changed.append(f"{', '.join(extensions.values())} has changed")
+    if extensions.get("algorithm"):
+        from mjxball.train.extensions import find
+
+        _choose_processor(find(extensions["algorithm"], "--algorithm"))
     if changed:
         raise InputError(f"{run} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
     return settings, origin

@@ -57,6 +57,7 @@ class Population:
         self.config, self.members, self._physics, self._extensions = config, members, physics, extensions
         self._sweep = dict(sweep or {})
         self._single = members == 1 and not self._sweep
+        self._template: TrainState | None = None
         self._values = {name: np.asarray(values, np.float32) for name, values in self._sweep.items()}
         if devices is None:
             devices = jax.devices() if jax.process_count() > 1 else jax.local_devices()
@@ -95,7 +96,9 @@ class Population:
 
     def template(self) -> TrainState:
         """Shapes of what `create` returns, without computing it."""
-        return jax.eval_shape(self._create, self._values, self._keys(0))
+        if self._template is None:
+            self._template = jax.eval_shape(self._create, self._values, self._keys(0))
+        return self._template
 
     def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Array]]:
         """See `Program.advance`."""
@@ -108,7 +111,7 @@ class Population:
 
     def compile(self, creating: bool) -> Executables:
         """Compile everything a run needs, side by side; `create` only if `creating`."""
-        options = CPU_OPTIONS if self.program.algorithm.steps_per_collect > 1 else None
+        options = CPU_OPTIONS if getattr(self.program.algorithm, "brief", False) else None
         if jax.default_backend() == "gpu":
             options = GPU_OPTIONS | (PLAIN_PRODUCTS if self._single else {})
         # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once

@@ -1,0 +1,75 @@
+"""The scalar form of a function: the same numbers and gradients, without the products that are known to be 0."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxball import config as configs
+from mjxball.algorithms.scalar_form import LARGEST, scalar_form
+from mjxball.env import CoupledPairEnv
+
+
+def rotation(x: Any) -> Any:
+    """Everything that is rewritten, once."""
+    first, rest = x[:1], x[1:]
+    turned = jnp.stack([rest, rest[::-1]]).T @ jnp.diag(jnp.array([1.0, 0.0]))
+    many = jnp.broadcast_to(jnp.sin(first), (3,)) + turned.sum(axis=1)
+    swept = jax.lax.fori_loop(0, 4, lambda i, y: jnp.where(y > 0, y * 0.9, jnp.clip(y, -1.0, 1.0)) + many, many)
+    return {"a": jnp.concatenate([swept, first]).reshape(2, 2), "b": jnp.max(x), "c": jnp.linalg.norm(swept) / 2.0}
+
+
+def large(x: Any) -> Any:
+    """What is larger than `LARGEST` and what is unknown to the scalar form, between small arrays."""
+    wide = jnp.outer(x, jnp.arange(LARGEST, dtype=x.dtype)).cumsum(axis=1)
+    return jnp.sort(wide[:, -1]) + jax.random.normal(jax.random.PRNGKey(0), x.shape)
+
+
+def looped(x: Any) -> Any:
+    """A loop with inputs and outputs for each step, which stays a loop."""
+    total, each = jax.lax.scan(lambda total, one: (total + one, total * one), 0.0, x)
+    return total, each
+
+
+@pytest.mark.parametrize("function", [rotation, large, looped])
+def test_values_and_gradients_are_those_of_the_function(function: Any) -> None:
+    points = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
+
+    def loss(form: Any, x: Any) -> Any:
+        outputs = jax.tree.leaves(form(x))
+        return sum((leaf * jnp.arange(1.0, leaf.size + 1).reshape(leaf.shape)).sum() for leaf in outputs)
+
+    form = scalar_form(function)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
+        jax.vmap(form)(points),
+        jax.vmap(function)(points),
+    )
+    gradients = [jax.vmap(jax.grad(lambda x, own=own: loss(own, x)))(points) for own in (form, function)]
+    np.testing.assert_allclose(*gradients, rtol=1e-4, atol=1e-5)
+    assert jax.tree.structure(form(points[0])) == jax.tree.structure(function(points[0]))
+
+
+def test_products_with_known_zeros_vanish() -> None:
+    matrix = jnp.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 3.0, 1.0]])
+    program = jax.make_jaxpr(jax.vmap(scalar_form(lambda x: matrix @ x)))(np.ones((7, 3), np.float32))
+    names = [equation.primitive.name for equation in program.eqns]
+    assert "dot_general" not in names
+    assert names.count("mul") == 2  # by 2 and by 3
+    assert names.count("add") == 1
+
+
+@pytest.mark.parametrize("name", ["robust", "flight"])
+def test_a_step_of_an_environment_is_the_same(name: str) -> None:
+    """`robust`: disturbances, delays and a memory; `flight`: the firmware's cascade and a rolling ball."""
+    env = CoupledPairEnv(configs.preset(name), "newton-euler")
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
+    actions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (3, 3)), jnp.float32)
+    whole, form = (jax.jit(jax.vmap(step)) for step in (env.step, scalar_form(env.step)))
+    expected, found = whole(whole(states, actions), actions), form(form(states, actions), actions)
+    assert jax.tree.structure(expected) == jax.tree.structure(found)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5), found, expected)
