@@ -46,8 +46,8 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def parts() -> set[str]:
-    """What a page of `mjxball.view` is made of."""
-    places = (REPOSITORY / "mjxball" / "view" / "parts", REPOSITORY / "mjxball" / "evaluate" / "templates")
+    """What pages are made of, and the plants that have a name."""
+    places = (REPOSITORY / "mjxball" / name for name in ("view/parts", "evaluate/templates", "config/plants"))
     return {str(path.relative_to(REPOSITORY)) for place in places for path in place.iterdir()}
 
 
