@@ -1,6 +1,6 @@
 """Drones, carrier, object and ball as one MuJoCo model, built with MjSpec from the typed config.
 
-`python -m mjxball.assembly OUT.xml` writes the reference plant as MJCF, for any MuJoCo viewer.
+`python -m mjxball.assembly OUT.xml [--plant NAME|FILE]` writes a plant as MJCF, for any MuJoCo viewer.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from mjxball.cli import make_parser, output_file, quit_on_interrupt, run_command
+from mjxball.cli import make_parser, output_file, plant_setup, quit_on_interrupt, run_command
 from mjxball.config import Attitude, Plant
 from mjxball.control import mixer
 from mjxball.plant import ROLLING_INERTIA, plant_parameters
@@ -184,12 +184,14 @@ def _add_drone(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, number: i
 
 def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.assembly`; returns the exit code."""
-    parser = make_parser("python -m mjxball.assembly", "Write the reference plant as MJCF.")
+    parser = make_parser("python -m mjxball.assembly", "Write a plant as MJCF.")
     parser.add_argument("out", metavar="OUT.xml", type=Path, help="file to write; must not exist")
+    parser.add_argument("--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or a file of a rig (pair)")
     options = parser.parse_args(arguments)
 
     def command() -> int:
-        output_file(options.out, ".xml").write_text(to_mjcf(Plant()))
+        plant = plant_setup(options.plant).plant
+        output_file(options.out, ".xml").write_text(to_mjcf(plant))
         return 0
 
     return run_command(command)

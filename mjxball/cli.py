@@ -134,6 +134,12 @@ def read_plant(path: Path) -> configs.PlantFile:
     return found
 
 
+def plant_setup(path: Path | None, default: str = "paper") -> configs.Config:
+    """The preset `default`, or on the plant `path` the one that it belongs to, if it says so; validated."""
+    found = None if path is None else read_plant(path).preset
+    return apply_plant(configs.preset(found or default), path)
+
+
 def apply_plant(config: configs.Config, path: Path | None) -> configs.Config:
     """`config` with the settings of the plant file `path`, if there is one, validated."""
     if path is None:

@@ -8,7 +8,7 @@ import pytest
 from plants import PLANTS
 
 from mjxball.assembly import BALL, BALL_JOINT, FOLLOWER, LEADER, build_model, main, to_mjcf
-from mjxball.config import Attitude
+from mjxball.config import Attitude, preset, with_plant
 from mjxball.plant import plant_parameters
 
 DOFS = {"free": 6, "pivot": 1, "heave": 2}
@@ -79,6 +79,24 @@ def test_bare_mujoco_hovers_with_the_motors_at_their_share() -> None:
     model = build_model(plant, timestep=0.002)
     data = mujoco.MjData(model)
     data.ctrl[:] = (plant.pair[0].mass + plant.object_mass / 2) * plant.gravity / 4
+    mujoco.mj_step(model, data, 500)
+    assert np.abs(data.qpos[:3]).max() < 1e-9  # one second at rest, rounding only
+
+
+def test_command_line_writes_any_plant(tmp_path) -> None:
+    assert main([str(tmp_path / "team.xml"), "--plant", "team6"]) == 0
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "team.xml"))
+    assert (model.nu, model.nv) == (24, 8)
+    names = {model.body(number).name for number in range(model.nbody)}
+    assert {"leader", *(f"follower{number}" for number in range(1, 6))} <= names
+
+
+def test_bare_mujoco_hovers_a_team() -> None:
+    plant = with_plant(preset("transport"), "plate4").plant
+    model = build_model(plant, timestep=0.002)
+    data = mujoco.MjData(model)
+    weight = sum(drone.mass for drone in plant.drones) + plant.carrier_mass + plant.object_mass
+    data.ctrl[:] = weight * plant.gravity / model.nu
     mujoco.mj_step(model, data, 500)
     assert np.abs(data.qpos[:3]).max() < 1e-9  # one second at rest, rounding only
 

@@ -16,6 +16,7 @@ from mjxball.commands import evaluate, train
 from mjxball.config import Attitude, Config, Plant
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
+from mjxball.view import command as view
 
 RING = """
 [plant]
@@ -148,12 +149,13 @@ def test_mistakes_are_refused_in_one_sentence(mistake: str, tmp_path: Path, caps
 
 @rows("name", ["team4", "plate4"])
 def test_what_flies_two_drones_refuses_more(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    for main in (train.main, evaluate.main):
-        assert main(["--plant", name, "--out", str(tmp_path / "out")]) == 2
+    for main, more in ((train.main, []), (evaluate.main, []), (view.main, ["copy"])):
+        out = tmp_path / ("out.html" if main is view.main else "out")
+        assert main([*more, "--plant", name, "--out", str(out)]) == 2
         error = capsys.readouterr().err
         assert "4 drones and a load that moves in the plane" in error
         assert error.count("\n") == 1
-        assert not (tmp_path / "out").exists()
+        assert not out.exists()
 
 
 def test_shares_hold_the_load_level() -> None:

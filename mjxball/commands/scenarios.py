@@ -27,8 +27,7 @@ SCENARIO_FLAGS = (
 
 def setup_of(options: argparse.Namespace) -> config.Config:
     """The paper's plant and laws, or those of `--plant`, with the motion of the CG that is asked for."""
-    measured = cli.read_plant(options.plant).preset if options.plant else None
-    setup = cli.apply_plant(config.preset(measured or "paper"), options.plant)
+    setup = cli.plant_setup(options.plant)
     _ = setup.plant.pair  # InputError for teams
     if options.wn_pitch is not None:
         roll, _, yaw = setup.attitude.natural_frequency

@@ -36,6 +36,7 @@ def parser() -> Parser:
     flown = result.add_argument_group(
         "scenario of what is flown on the spot", "the follower's reference scenario, changed by"
     )
+    flown.add_argument("--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or a file of a rig")
     flown.add_argument("--omega", type=float, metavar="W", help="CG speed [rad/s]")
     flown.add_argument("--amplitude", type=float, metavar="A", help="of the CG [m]")
     flown.add_argument("--mass", type=float, metavar="M", help="of the object [kg]")
@@ -60,7 +61,7 @@ def _view(options: argparse.Namespace) -> int:
         if path:
             output_file(path, suffix)
     given = {name: getattr(options, name) for name in CHANGES if getattr(options, name) is not None}
-    flight = flight_from(options.source, given, options.physics)
+    flight = flight_from(options.source, given, options.physics, options.plant)
     if options.save:
         save_flight(options.save, flight)
         print(f"the flight is {options.save}")  # noqa: T201

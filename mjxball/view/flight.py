@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mjxball import config as configs
-from mjxball.config import Plant, preset
+from mjxball.cli import plant_setup
+from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.policy.container import read_arrays
@@ -112,19 +113,20 @@ def is_flight(path: Path) -> bool:
         return False
 
 
-def flight_from(source: str, changes: Mapping[str, Any], physics: str) -> Flight:
+def flight_from(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None = None) -> Flight:
     """The flight that `source` names.
 
     A flight file or a flight log is read. A policy file, a run directory (its `policy.npz`) or the name of a classical
     follower is flown through its reference scenario with `changes` to the fields of `Scenario`, on the paper's plant;
-    a policy made for Crazyflies on its own. Raises InputError if it is none of these.
+    a policy made for Crazyflies on its own; or on `plant`, a plant file or a shipped one's name. Raises InputError if
+    it is none of these.
     """
     path = Path(source)
     if path.suffix == ".npz" and is_flight(path):
         return load_flight(path)
     if path.is_file() and path.suffix != ".npz":
         return read_log(path)
-    return _flown(source, changes, physics)
+    return _flown(source, changes, physics, plant)
 
 
 def read_log(path: Path) -> Flight:
@@ -160,19 +162,22 @@ def read_log(path: Path) -> Flight:
     return check_flight(Flight(title, recording.config.plant, arrays), str(path))
 
 
-def _flown(source: str, changes: Mapping[str, Any], physics: str) -> Flight:
+def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None) -> Flight:
     from mjxball.baselines import LAWS, make_baseline
     from mjxball.evaluate.policies import load_policy, native_config
     from mjxball.evaluate.suites import REFERENCE, standard_scenarios
     from mjxball.sim.rollout import simulate
 
-    setup, reference, path = preset("paper"), REFERENCE, Path(source)
+    setup, reference, path = plant_setup(plant), REFERENCE, Path(source)
+    if plant is not None:
+        _ = setup.plant.pair  # InputError for teams
+        reference = standard_scenarios(setup)[-1]
     if source in LAWS:
         follower: Any = make_baseline(source, setup)
     else:
         file = _policy_file(path)
         native = native_config(file)
-        if native is not None:
+        if native is not None and plant is None:
             setup, reference = native, standard_scenarios(native)[-1]
         follower = load_policy(file, setup)
         follower.name = path.name if path.is_dir() else follower.name
