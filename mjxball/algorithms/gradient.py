@@ -100,7 +100,7 @@ class FirstOrderGradient:
             envs = envs._replace(states=_damp(envs.states, damping)) if damping < 1 else envs
             seen = envs.states.obs
             envs, after = self._environments.step(envs, policy(seen), None)
-            return envs, (after.reward, jax.lax.stop_gradient(seen))
+            return _forget(envs), (after.reward, jax.lax.stop_gradient(seen))
 
         envs, (rewards, seen) = jax.lax.scan(step, envs, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
@@ -143,6 +143,13 @@ class FirstOrderGradient:
                 f"gradient.num_envs = {self._config.num_envs} cannot be split over {parts} devices evenly; "
                 "make it a multiple"
             )
+
+
+def _forget(envs: Any) -> Any:
+    """`envs` without the derivatives of what the next step does not start from: a scan would carry them all back."""
+    still, states = jax.lax.stop_gradient, envs.states
+    past = {name: still(getattr(states, name)) for name in ("reward", "done", "metrics", "info")}
+    return envs._replace(states=states.replace(**past), statistics=still(envs.statistics))
 
 
 def _damp(tree: Any, factor: float) -> Any:

@@ -65,7 +65,8 @@ def train(
 def _phases(program: Program) -> Mode:
     """The warm-up, then training and evaluation in turns, stacked."""
     first, total = program.warmup_rounds, max(program.total_rounds, program.warmup_rounds)
-    ends = np.round(np.linspace(first, total, program.schedule.num_evaluations + 1)).astype(int)
+    window = program.algorithm.steps_per_collect
+    ends = np.round(np.linspace(first, total, program.schedule.num_evaluations + 1) / window).astype(int) * window
     found = [programs.warmup(first)]
     for steps in np.diff(ends):
         found += [programs.train(int(steps)), programs.evaluate(program.evaluation_steps)]
