@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from plants import team
 
 from mjxball.assembly import build_model
 from mjxball.config import Attitude, Drone, Plant
@@ -48,16 +49,21 @@ def test_wrench_survives_the_rotors(wrench):
     np.testing.assert_allclose(back, wrench, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("lever_y", [0.0, 0.05], ids=["drones on the x axis", "drones off the x axis"])
-def test_motors_of_the_model_give_the_same_wrench(lever_y):
+OFF_AXIS = Plant(drones=(Drone(mount=(0.17, 0.05, 0.02)), Drone(mount=(-0.15, -0.05, 0.0))))
+TURNED = {layout: team(3, 8, cg_axis="x", layout=layout) for layout in ("plus", "x")}
+
+
+@pytest.mark.parametrize(
+    "plant", [Plant(), OFF_AXIS, *TURNED.values()], ids=["on the x axis", "off the x axis", "turned", "turned, x"]
+)
+def test_motors_of_the_model_give_the_same_wrench(plant):
     """MuJoCo's generalized force of the free joint is [R F, tau]: force in the world, torque in the body."""
-    plant = Plant(drones=(Drone(mount=(0.17, lever_y, 0.02)), Drone(mount=(-0.15, -lever_y, 0.0))))
     model = build_model(plant)
     data = mujoco.MjData(model)
     parameters = plant_parameters(plant, Attitude())
     random = np.random.default_rng(1)
     for _ in range(5):
-        rotor_force = random.uniform(0, plant.rotor_force_max, (2, 4))
+        rotor_force = random.uniform(0, plant.rotor_force_max, (plant.count, 4))
         euler = random.uniform(-1, 1, 3)
         quaternion = rotations.quaternion_from_euler(euler)
         data.qpos[:] = [*random.normal(size=3), *quaternion, 0.05]

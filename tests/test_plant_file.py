@@ -72,10 +72,11 @@ def test_teams_stand_on_a_ring_with_neighbours_0_34_m_apart(count: int) -> None:
     assert plant.carrier_mass == pytest.approx(0.05 * count)
     assert config.scenario.object_mass == pytest.approx((0.1 * count, 0.1 * count))
     np.testing.assert_allclose(plant.carrier_inertia, 0.05 * count * radius**2 / np.array([4, 4, 2]), rtol=1e-3)
-    # Each takes its part of the coupled inertia's gains: Kp = J wn^2 / N.
+    # Each takes its part of the coupled inertia's gains: Kp = J wn^2 / N, Kd = 2 J zeta wn / N.
     parameters = plant_parameters(plant, config.attitude)
     inertia = np.diag(parameters.drone_inertia) + plant.object_mass * parameters.object_inertia_per_mass
     np.testing.assert_allclose(parameters.gains.kp, inertia * np.array([10, 10, 4]) ** 2 / count, rtol=1e-12)
+    np.testing.assert_allclose(parameters.gains.kd, 2 * 0.9 * inertia * np.array([10, 10, 4]) / count, rtol=1e-12)
 
 
 def test_plate_is_that_of_its_description() -> None:
