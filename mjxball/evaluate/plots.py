@@ -158,13 +158,16 @@ def as_svg(figure: Any) -> str:
 def draw_flights(results: Sequence[Result], title: str, path: Path) -> None:
     """Draw all followers of one scenario over time: position with goal, CG offset, both drones' commands."""
     plt = pyplot()
-    figure, axes = plt.subplots(len(PANELS), 1, sharex=True, figsize=(9, 13), constrained_layout=True)
+    # Fixed margins: to fit them takes Matplotlib as long as to draw.
+    margins = {"left": 0.1, "right": 0.985, "top": 0.96, "bottom": 0.035, "hspace": 0.1}
+    figure, axes = plt.subplots(len(PANELS), 1, sharex=True, figsize=(9, 13), gridspec_kw=margins)
     for axis, panel in zip(axes, PANELS, strict=True):
         _draw_panel(axis, results, *panel)
     axes[0].legend(loc="lower right", ncol=3, fontsize="small")
     axes[4].legend(loc="upper right", ncol=4, fontsize="small")
     axes[-1].set_xlabel("time [s]")
-    figure.suptitle(title)
+    figure.align_ylabels(axes)
+    figure.suptitle(title, y=0.985)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
