@@ -14,8 +14,7 @@ import numpy as np
 
 from mjxball.cli import make_parser, output_file, plant_setup, quit_on_interrupt, run_command
 from mjxball.config import Attitude, Plant
-from mjxball.control import mixer
-from mjxball.plant import ROLLING_INERTIA, plant_parameters
+from mjxball.plant import ROLLING_INERTIA, plant_parameters, rotors
 
 ASSEMBLY = "assembly"
 LEADER = "leader"
@@ -164,9 +163,9 @@ def _add_drone(spec: mujoco.MjSpec, parent: mujoco.MjsBody, name: str, number: i
         inertia=list(own.inertia),
     )
     _add_visual(drone, f"{name}_hub", mujoco.mjtGeom.mjGEOM_BOX, [0.035, 0.035, 0.015], colour)
-    places, spins = mixer.PLACES[plant.layout], mixer.SPIN[plant.layout]
+    places, spins = rotors.PLACES[plant.layout], rotors.SPIN[plant.layout]
     for rotor, (axis, spin) in enumerate(zip(places, spins, strict=True), start=1):
-        place = mixer.lever(arm, plant.layout) * np.array([*axis, 0.0])
+        place = rotors.lever(arm, plant.layout) * np.array([*axis, 0.0])
         label = f"{name}_rotor{rotor}"
         rod = _add_visual(drone, f"{label}_arm", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.005], colour)
         rod.fromto[:] = [0, 0, 0, *place]

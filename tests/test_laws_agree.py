@@ -125,7 +125,6 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
 }
 # Computed once in NumPy float64, from the config, not from arrays.
 NOT_LAWS = {
-    "mixer.lever",
     "mixer.torque_per_force",
     "crazyflie.unpack",
     "crazyflie.cascade",

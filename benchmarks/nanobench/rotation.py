@@ -23,8 +23,8 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 
 from mjxball.control import motors, rotations
-from mjxball.control.mixer import PLACES, SPIN
 from mjxball.control.motors import MOTORS
+from mjxball.plant.rotors import PLACES, SPIN
 from nanobench.flights import ROW, Array, Flight
 
 MOTOR = MOTORS["2.1"]  # nominal curve: the one whose compensation the flights' firmware computed

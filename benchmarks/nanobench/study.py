@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball import config
-from mjxball.control.mixer import lever
 from mjxball.errors import InputError
+from mjxball.plant.rotors import lever
 from nanobench import cascade, lift
 from nanobench.flights import Array, Flight, find_flights, read_flight
 from nanobench.forecast import HORIZON_ROWS, HORIZONS, Forecast, Memory, choose_memory, forecast

@@ -6,9 +6,10 @@ import math
 from typing import Any, NamedTuple
 
 from mjxball.config import Config, Plant
-from mjxball.control import crazyflie, mixer
+from mjxball.control import crazyflie
 from mjxball.control.mixer import torque_per_force
 from mjxball.plant import plant_parameters
+from mjxball.plant.rotors import lever
 
 Array = Any
 
@@ -25,7 +26,8 @@ def trim_limit(
     At the goal the leader commands a level hover with its share of the mass (...) that it believes [kg]; `thrust`
     is what leader's and follower's rotors (...) give of what they are asked for. What is missing of the weight the
     follower lifts at its own mount, and its pitch torque, 2 (F_max - T / 4) L for an asked thrust T, must hold the
-    moment of that and of the CG with the share `margin` of it left.
+    moment of that and of the CG with the share `margin` of it left. For training, which needs it traced; rotors that
+    would have to give less than 0 are left out of account, and `mjxball.plant.trim` serves any plant.
     """
     believed = object_mass if believed_mass is None else believed_mass
     lead, follow = plant.pair
@@ -80,7 +82,7 @@ def drone_loop(config: Config, axis: int) -> DroneLoop:
     law, plant = config.autopilot, config.plant
     attitude, rate = ((law.roll, law.roll_rate), (law.pitch, law.pitch_rate))[axis]
     # A rate loop's output moves each of four motors by half of it; the cascade counts in degrees.
-    torque = 4 * mixer.lever(plant.arm, plant.layout) / 2 * hover(config)[1] * math.degrees(1)
+    torque = 4 * lever(plant.arm, plant.layout) / 2 * hover(config)[1] * math.degrees(1)
     return DroneLoop(
         kp=torque * rate[0] * attitude[0],
         kd=torque * rate[0],

@@ -12,6 +12,7 @@ from mjxball.config import Autopilot, Config
 from mjxball.control import crazyflie, mixer, rotations
 from mjxball.control.constants import hover
 from mjxball.plant import plant_parameters
+from mjxball.plant.rotors import lever
 
 NAMES = ("roll", "pitch", "yaw")
 DRONE = np.array([1.66e-5, 1.66e-5, 2.93e-5])  # inertia for which the delivered gains were found good [kg m2]
@@ -39,7 +40,7 @@ def axes(config: Config) -> tuple[Axis, ...]:
     plant = config.plant
     command, slope = hover(config)
     # A roll output moves each motor by half of it, a yaw output by all of it.
-    tilting = 2 * 4 * mixer.lever(plant.arm, plant.layout) / 2 * slope
+    tilting = 2 * 4 * lever(plant.arm, plant.layout) / 2 * slope
     torque = np.array([tilting, tilting, 2 * 4 * plant.yaw_per_thrust * slope])
     inertia = inertia_about_o(config)
     stop = plant.ball_stop or min(plant.object_size[axis] for axis in plant.directions) / 2

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.config import Plant
-from mjxball.control import mixer
+from mjxball.plant import rotors
 from mjxball.view.flight import Flight
 
 PARTS = Path(__file__).parent / "parts"
@@ -57,11 +57,11 @@ def page_contents(flight: Flight) -> dict[str, Any]:
 
 def plant_of(plant: Plant) -> dict[str, Any]:
     """The numbers of `plant` that the scene draws."""
-    lever = mixer.lever(plant.arm, plant.layout)
+    lever = rotors.lever(plant.arm, plant.layout)
     return {
         "size": plant.object_size,
         "arm": plant.arm,
-        "rotors": [[lever * x, lever * y] for x, y in mixer.PLACES[plant.layout]],  # from a drone's centre [m]
+        "rotors": [[lever * x, lever * y] for x, y in rotors.PLACES[plant.layout]],  # from a drone's centre [m]
         "mounts": [drone.mount for drone in plant.drones],
         "axis": "xy".index(plant.cg_axis),
         "share": plant.moving_fraction,

@@ -1,0 +1,219 @@
+"""Whether rotors can hold a load at hover, and how much of their range that leaves: a linear program for any plant.
+
+The assembly hovers level. The rotors that may act must give the wrench about O that balances all weights, no yaw
+moment, less what the leader gives: four equal forces for its own weight and its share of the load, which is what its
+hover law commands at the goal. With h the share of the largest forces that lifting alone takes, a rotor of largest
+force F_max that hovers gives h F_max. A margin m leaves that share of the way to both ends of every rotor's range:
+
+    m h F_max <= F <= F_max - m (1 - h) F_max
+
+m = 1 if all rotors hover alike, 0 if one stands still or gives its most, negative if the rotors cannot hold the load
+(ours). For a pair the upper bound is that of `mjxball.control.constants.trim_limit`, which has no lower one. A stand is
+left out of account, as if the plant flew freely. Needs SciPy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from mjxball.config import Plant
+from mjxball.errors import InputError
+from mjxball.plant.rotors import PLACES, SPIN, lever
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    Forces = Float[np.ndarray, "drones 4"]
+
+
+class Trim(NamedTuple):
+    """The best that rotors can do at hover."""
+
+    margin: float  # share left of the way to both ends of the range of every rotor that acts; -inf: cannot be lifted
+    rotor_force: Forces | None  # every rotor's [N], rows as in plant.drones; None: cannot be lifted
+
+
+class _Hover(NamedTuple):
+    """Equations of the forces of n acting rotors: effect @ force = wrench + weight * (CG offset along x, along y).
+
+    Forces in units of their mean `unit`, moments in metres times that.
+    """
+
+    effect: Float[np.ndarray, "4 n"]
+    wrench: Float[np.ndarray, "4"]
+    per_offset: Float[np.ndarray, "4 2"]
+    most: Float[np.ndarray, " n"]
+    level: Float[np.ndarray, " n"]  # force that hovers, h F_max
+    acts: np.ndarray  # (N,) bool
+    leader_force: float  # of each of the leader's rotors, unless it acts or is lost [N]
+    unit: float  # [N]
+
+
+def largest_margin(
+    plant: Plant,
+    object_mass: float,
+    cg: float | Sequence[float],
+    believed_mass: float | None = None,
+    lost: Collection[int] = (),
+    leader_helps: bool = False,
+    thrust: Sequence[float] | None = None,
+) -> Trim:
+    """The trim with the largest margin for a load of `object_mass` [kg] with its CG at `cg` from O [m].
+
+    `cg` is one number along a line and (x, y) in the plane. The followers' rotors act, and the leader's too if
+    `leader_helps`; else the leader lifts its share of `believed_mass` [kg], by default the true one. Rotors of the
+    drones `lost` stand still. `thrust` (N,) is what drones give of the force that they are asked for. A plant with
+    rotor_force_max inf has no upper bound. Raises InputError if an argument does not fit the plant.
+    """
+    hover = _hover(plant, object_mass, believed_mass, lost, leader_helps, thrust)
+    if hover is None:
+        return Trim(-math.inf, None)
+    bounded = np.isfinite(hover.most)
+    identity = np.eye(len(hover.most))
+    room = np.where(bounded, hover.most - hover.level, 0.0)
+    found = _solve(
+        np.append(np.zeros(len(hover.most)), -1.0),
+        np.column_stack([hover.effect, np.zeros(4)]),
+        hover.wrench + hover.per_offset @ _in_plane(plant, cg),
+        [(None, None)] * (len(hover.most) + 1),
+        np.vstack(
+            [np.column_stack([-identity, hover.level]), np.column_stack([identity, room])[bounded]],
+        ),
+        np.append(np.zeros(len(hover.most)), hover.most[bounded]),
+    )
+    if found is None:
+        return Trim(-math.inf, None)
+    force = np.zeros((plant.count, 4))
+    force[plant.leader] = hover.leader_force
+    force[hover.acts] = hover.unit * found[:-1].reshape(-1, 4)
+    return Trim(float(found[-1]), force)
+
+
+def largest_amplitude(
+    plant: Plant,
+    object_mass: float,
+    margin: float = 0.15,
+    direction: Sequence[float] | None = None,
+    believed_mass: float | None = None,
+    lost: Collection[int] = (),
+    leader_helps: bool = False,
+    thrust: Sequence[float] | None = None,
+) -> float:
+    """CG offset [m] up to which the load can be held on both sides of O with `margin` left; negative: not even at O.
+
+    Along `direction` (x, y) of any length, by default the load's line or x; -inf if no offset can be trimmed. The
+    other arguments are those of `largest_margin`.
+    """
+    if not margin <= 1:
+        raise InputError(f"the margin must be at most 1, not {margin}")
+    along = np.eye(2)[plant.directions[0]] if direction is None else np.asarray(direction, dtype=float)
+    if along.shape != (2,) or not 0 < np.linalg.norm(along) < math.inf:
+        raise InputError(f"the direction must be two numbers that are not both 0, not {direction!r}")
+    if any(along[axis] for axis in {0, 1} - set(plant.directions)):
+        raise InputError(f"the load moves along {plant.cg_axis}, not in the direction {direction!r}")
+    hover = _hover(plant, object_mass, believed_mass, lost, leader_helps, thrust)
+    if hover is None:
+        return -math.inf
+    least, most = margin * hover.level, hover.most - margin * np.nan_to_num(hover.most - hover.level, posinf=0.0)
+    equations = np.column_stack([hover.effect, -hover.per_offset @ along / np.linalg.norm(along)])
+    bounds = [*zip(least, most, strict=True), (None, None)]
+    ends = []
+    for side in (1.0, -1.0):
+        found = _solve(np.append(np.zeros(len(least)), -side), equations, hover.wrench, bounds)
+        if found is None:
+            return -math.inf
+        ends.append(side * float(found[-1]))
+    return min(ends)
+
+
+def _in_plane(plant: Plant, cg: float | Sequence[float]) -> np.ndarray:
+    """(x, y) of an offset along the load's directions."""
+    offset = np.atleast_1d(np.asarray(cg, dtype=float))
+    if offset.shape != (len(plant.directions),) or not np.isfinite(offset).all():
+        raise InputError(f"the CG of this plant has {len(plant.directions)} finite coordinates [m], not {cg!r}")
+    found = np.zeros(2)
+    found[list(plant.directions)] = offset
+    return found
+
+
+def _hover(
+    plant: Plant,
+    object_mass: float,
+    believed_mass: float | None,
+    lost: Collection[int],
+    leader_helps: bool,
+    thrust: Sequence[float] | None,
+) -> _Hover | None:
+    """The equations, or None if the rotors that act cannot lift the assembly or need not lift anything."""
+    count, gravity = plant.count, plant.gravity
+    factor = np.ones(count) if thrust is None else np.asarray(thrust, dtype=float)
+    if not 0 < object_mass < math.inf:
+        raise InputError(f"the object's mass must be positive, not {object_mass} kg")
+    if factor.shape != (count,) or not (factor >= 0).all():
+        raise InputError(f"thrust must be {count} factors that are not negative, one for each drone, not {thrust!r}")
+    if not set(lost) <= set(range(count)):
+        raise InputError(f"lost drones must be numbers from 0 to {count - 1}, not {sorted(lost)}")
+    flies = np.array([number not in set(lost) for number in range(count)])
+    acts = flies.copy()
+    if not leader_helps:
+        acts[plant.leader] = False
+    limit = factor * plant.of_drones("rotor_force_max")
+    masses, mounts = (np.array([getattr(drone, name) for drone in plant.drones]) for name in ("mass", "mount"))
+    believed = object_mass if believed_mass is None else believed_mass
+    leader = 0.0
+    if flies[plant.leader] and not leader_helps:
+        asked = masses[plant.leader] + plant.shares[plant.leader] * believed
+        leader = min(factor[plant.leader] * asked * gravity / 4, limit[plant.leader])
+    weight = gravity * (masses.sum() + plant.carrier_mass + object_mass)
+    lift = weight - 4 * leader
+    capacity = np.isinf(limit[acts]).astype(float) if np.isinf(limit[acts]).any() else limit[acts]
+    if not 0 < lift < 4 * limit[acts].sum():
+        return None
+    level = lift / 4 * capacity / capacity.sum()
+
+    drones = [_effect(plant, number) for number in range(count)]
+    # Weights pull at their places: the wrench that holds them is (1, y, -x, 0) times each.
+    held = gravity * masses @ np.column_stack([np.ones(count), mounts[:, 1], -mounts[:, 0], np.zeros(count)])
+    held[0] = weight
+    per_offset = gravity * object_mass * np.array([[0.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
+    unit = lift / (4 * acts.sum())
+    return _Hover(
+        effect=np.column_stack([drones[number] for number in np.flatnonzero(acts)]),
+        wrench=(held - leader * drones[plant.leader].sum(axis=1)) / unit,
+        per_offset=per_offset / unit,
+        most=np.repeat(limit[acts], 4) / unit,
+        level=np.repeat(level, 4) / unit,
+        acts=acts,
+        leader_force=leader,
+        unit=unit,
+    )
+
+
+def _effect(plant: Plant, number: int) -> Float[np.ndarray, "4 4"]:
+    """Wrench about O (T, tau_x, tau_y, tau_z) per force of each of a drone's rotors, columns rotor by rotor [1, m]."""
+    drone, arm = plant.drones[number], plant.of_drones("arm")[number]
+    cosine, sine = math.cos(drone.yaw), math.sin(drone.yaw)
+    own = lever(arm, plant.layout) * np.array(PLACES[plant.layout], dtype=float)
+    x, y = (own @ [[cosine, sine], [-sine, cosine]] + drone.mount[:2]).T
+    return np.array([np.ones(4), y, -x, plant.of_drones("yaw_per_thrust")[number] * np.array(SPIN[plant.layout])])
+
+
+def _solve(
+    cost: np.ndarray,
+    equations: np.ndarray,
+    equal: np.ndarray,
+    bounds: list[Any],
+    rows: np.ndarray | None = None,
+    below: np.ndarray | None = None,
+) -> np.ndarray | None:
+    """The unknowns of least cost, or None if there are none."""
+    from scipy.optimize import linprog
+
+    result = linprog(cost, A_ub=rows, b_ub=below, A_eq=equations, b_eq=equal, bounds=bounds, method="highs")
+    if result.status not in (0, 2):
+        raise RuntimeError(f"the trim's linear program was not solved: {result.message}")
+    return None if result.status == 2 else np.asarray(result.x)

@@ -1,0 +1,213 @@
+"""The trim of a team by a linear program: against the pair's closed form, balances by hand and the physics' wrench."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import re
+
+import numpy as np
+import pytest
+from plants import team
+from tables import rows
+
+from mjxball.config import Attitude, Drone, Plant, preset, with_plant
+from mjxball.control.constants import trim_limit
+from mjxball.control.mixer import torque_per_force
+from mjxball.errors import InputError
+from mjxball.physics.engine import total_wrench
+from mjxball.plant import plant_parameters
+from mjxball.plant.trim import Trim, largest_amplitude, largest_margin
+
+PAPER = Plant()
+TEAMS = {name: with_plant(preset("paper"), name).plant for name in ("team3", "team4", "team6")}
+SIDEWAYS = dataclasses.replace(
+    PAPER, cg_axis="y", drones=(Drone(mount=(0.0, 0.2, 0.0)), Drone(mass=0.9, mount=(0.0, -0.15, 0.0)))
+)
+EXACT = 1e-9  # HiGHS ends at a vertex, which it solves to rounding
+
+
+def wrench_of(plant: Plant, force: np.ndarray) -> np.ndarray:
+    """(T, tau_x, tau_y, tau_z) about O of rotor forces (..., N, 4), by the physics."""
+    wrench = total_wrench(plant, plant_parameters(plant, Attitude()), force)
+    return np.concatenate([np.asarray(wrench.force)[..., 2:], np.asarray(wrench.torque)], axis=-1)
+
+
+def needed(plant: Plant, mass: float, cg: tuple[float, float]) -> np.ndarray:
+    """The wrench that holds all weights level."""
+    weights = [(one.mass, one.mount) for one in plant.drones] + [(plant.carrier_mass, (0, 0)), (mass, cg)]
+    return plant.gravity * sum(m * np.array([1.0, place[1], -place[0], 0.0]) for m, place in weights)
+
+
+@rows("plant", [PAPER, SIDEWAYS, dataclasses.replace(PAPER, layout="x"), dataclasses.replace(PAPER, arm=0.06)])
+def test_of_a_pair_it_is_the_closed_form(plant: Plant) -> None:
+    """Where rotors reach their most before they stand still; the closed form has no lower bound, here added by hand."""
+    upper = 0
+    believed, thrust = (None, 0.2, 0.4), ((1.0, 1.0), (0.93, 0.9), (1.04, 1.1))
+    for mass, given, margin, (lead, own) in itertools.product(
+        (0.1, 0.25, 0.4, 0.6, 0.9), believed, (0, 0.15, 0.6), thrust
+    ):
+        expected = trim_limit(plant, mass, margin, given, (lead, own))
+        found = largest_amplitude(plant, mass, margin, None, given, thrust=(lead, own))
+        first, second = plant.drones
+        share = plant.shares[0] * (mass if given is None else given)
+        follower = (first.mass + second.mass + mass - lead * (first.mass + share)) * plant.gravity / 4
+        room, least = own * plant.rotor_force_max - follower, follower
+        if room <= 0:
+            assert expected < 0
+            assert found == -math.inf
+            continue
+        upper += room <= least
+        torque = (1 - margin) * torque_per_force(plant.arm, plant.layout)
+        expected += torque * min(least - room, 0.0) / (mass * plant.gravity)
+        assert found == pytest.approx(expected, rel=EXACT, abs=EXACT)
+    assert upper > 60  # of 135
+
+
+@rows("plant, mass", [(PAPER, 0.4), *((plant, 0.15 * plant.count) for plant in TEAMS.values())])
+def test_at_the_largest_amplitude_the_margin_is_what_was_asked_for(plant: Plant, mass: float) -> None:
+    for direction in (None,) if plant is PAPER else ((1.0, 0.0), (0.0, 2.0), (-1.0, 0.5)):
+        amplitude = largest_amplitude(plant, mass, 0.15, direction)
+        along = 1.0 if direction is None else np.array(direction) / np.linalg.norm(direction)
+        ends = [largest_margin(plant, mass, sign * amplitude * along).margin for sign in (1, -1)]
+        assert min(ends) == pytest.approx(0.15, abs=EXACT)
+
+
+def random_cases() -> list[tuple]:
+    """(plant, mass, CG, lost drones, whether the leader helps, thrust factors)"""
+    found, random = [], np.random.default_rng(3)
+    for count, helps in itertools.product((3, 4, 6), (False, True)):
+        plant = team(count, seed=count, leader=count - 1, rotor_force_max=9.0)
+        lost = (0,) if count == 6 else ()
+        found.append((plant, 0.2, tuple(random.uniform(-0.03, 0.03, 2)), lost, helps, random.uniform(0.9, 1.1, count)))
+    return found
+
+
+@rows("plant, mass, cg, lost, helps, thrust", random_cases())
+def test_the_forces_hold_all_weights_and_no_others_leave_more(
+    plant: Plant, mass: float, cg: tuple, lost: tuple, helps: bool, thrust: np.ndarray
+) -> None:
+    margin, force = largest_margin(plant, mass, cg, None, lost, helps, thrust)
+    assert force is not None
+    np.testing.assert_allclose(wrench_of(plant, force), needed(plant, mass, cg), atol=1e-8)
+    assert (force[list(lost)] == 0).all()
+    acts = [number for number in range(plant.count) if number not in lost and (helps or number != plant.leader)]
+    if not helps:
+        asked = plant.drones[plant.leader].mass + plant.shares[plant.leader] * mass
+        np.testing.assert_allclose(force[plant.leader], thrust[plant.leader] * asked * plant.gravity / 4)
+    most = (thrust * plant.of_drones("rotor_force_max"))[acts, None]
+    lifting = force[acts].sum() / (4 * most.sum())
+
+    def left(forces: np.ndarray) -> np.ndarray:
+        """The margin (...) of forces (..., n, 4)."""
+        share = forces / most
+        return np.minimum(share / lifting, (1 - share) / (1 - lifting)).min(axis=(-2, -1))
+
+    assert left(force[acts]) == pytest.approx(margin, abs=EXACT)
+    # The margin is concave in the forces: none in reach that hold the same weights leave more.
+    units = np.zeros((4 * len(acts), plant.count, 4))
+    units[np.arange(len(units)), np.repeat(acts, 4), np.tile(range(4), len(acts))] = 1.0
+    unseen = np.linalg.svd(wrench_of(plant, units).T)[2][4:]
+    steps = np.random.default_rng(1).normal(size=(20_000, len(unseen))) @ unseen
+    assert left(force[acts] + 1e-3 * steps.reshape(-1, len(acts), 4)).max() <= margin + EXACT
+
+
+@rows("angle", [0.3, -2.0, math.pi / 2])
+def test_turning_the_whole_plant_changes_nothing(angle: float) -> None:
+    plant, cg = team(4, seed=4, leader=1), np.array([0.02, -0.03])
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    drones = tuple(
+        dataclasses.replace(one, mount=(*(turn @ one.mount[:2]), one.mount[2]), yaw=one.yaw + angle)
+        for one in plant.drones
+    )
+    turned = dataclasses.replace(plant, drones=drones)
+    for lost in ((), (2,)):
+        before, after = largest_margin(plant, 0.3, cg, lost=lost), largest_margin(turned, 0.3, turn @ cg, lost=lost)
+        assert after.margin == pytest.approx(before.margin, abs=EXACT)
+    reach = largest_amplitude(plant, 0.3, -0.5, cg)
+    assert largest_amplitude(turned, 0.3, -0.5, turn @ cg) == pytest.approx(reach, abs=EXACT)
+
+
+@rows("plant", [PAPER, *TEAMS.values()])
+def test_a_heavier_load_leaves_less(plant: Plant) -> None:
+    cg = 0.05 if plant is PAPER else (0.05, 0.02)
+    found = [largest_margin(plant, mass, cg).margin for mass in np.linspace(0.25, 0.8, 6)]
+    assert (np.diff(found) < -1e-3).all()
+
+
+@rows("name", ["team4", "team6"])
+def test_a_lost_drone_and_a_weak_one_leave_less_and_a_leader_that_helps_more(name: str) -> None:
+    plant = TEAMS[name]
+    every = {"margin": 0.0, "direction": (1.0, 2.0)}
+    whole = largest_amplitude(plant, 0.5, **every)
+    weak = (1.0, 0.6, *[1.0] * (plant.count - 2))
+    assert whole < largest_amplitude(plant, 0.5, **every, leader_helps=True)
+    assert largest_amplitude(plant, 0.5, **every, lost=(1,)) < whole - 0.05
+    assert largest_amplitude(plant, 0.5, **every, thrust=weak) < whole
+
+
+class TestByHand:
+    def test_equal_drones_that_all_help_hover_alike(self) -> None:
+        found = largest_margin(dataclasses.replace(TEAMS["team6"], leader=3), 0.6, (0.0, 0.0), leader_helps=True)
+        assert found.margin == pytest.approx(1.0)
+        np.testing.assert_allclose(found.rotor_force, (6 + 0.3 + 0.6) * 9.81 / 24)
+
+    def test_four_drones_that_lost_the_one_opposite_the_leader(self) -> None:
+        """The leader's 1.1 kg g pitch with the ring's radius R; two drones lift 3.5 kg g across.
+
+        Without a yaw moment half of that is on the fore and aft rotors, so that these can turn it all by at most
+        3.5 kg g L / 2 of the 1.1 kg g R.
+        """
+        ring = TEAMS["team4"]
+        radius = ring.drones[0].mount[0]
+        for size in (1000.0, math.inf):
+            plant = dataclasses.replace(ring, rotor_force_max=size)
+            found = largest_margin(plant, 0.4, (0.0, 0.0), lost=[2])
+            assert found.margin == pytest.approx(1 - 1.1 * radius / (3.5 * 0.12 / 2))
+        longer = dataclasses.replace(plant, arm=1.1 * radius / (3.5 / 2))
+        assert largest_margin(longer, 0.4, (0.0, 0.0), lost=[2]).margin == pytest.approx(0.0, abs=EXACT)
+
+    def test_rotors_that_cannot_lift(self) -> None:
+        weak = dataclasses.replace(PAPER, rotor_force_max=2.6)
+        assert largest_margin(weak, 0.2, 0.0) == Trim(-math.inf, None)
+        assert largest_margin(PAPER, 0.2, 0.0, lost=[1]).margin == -math.inf
+        assert largest_amplitude(weak, 0.2) == -math.inf
+
+    def test_a_pair_cannot_leave_more_than_one_follower_has(self) -> None:
+        """0.4 kg at 5 cm: 0.1962 N m of 2 x 0.12 m (5.5 N - 1.2 kg g / 4)."""
+        found = largest_margin(PAPER, 0.4, 0.05)
+        assert found.margin == pytest.approx(1 - 0.1962 / (0.24 * (5.5 - 1.2 * 9.81 / 4)))
+
+
+def test_no_rotors_let_four_drones_lose_any_follower_whose_leader_flies_its_hover_law() -> None:
+    plant = dataclasses.replace(TEAMS["team4"], rotor_force_max=math.inf)
+    radius = 0.2
+    places = [(0.0, 0.0), *((radius * math.cos(a), radius * math.sin(a)) for a in np.arange(8) * math.pi / 4)]
+    for mass, cg in itertools.product((0.2, 0.8, 1.6), places):
+        assert min(largest_margin(plant, mass, cg, lost=[one]).margin for one in (1, 2, 3)) < -0.2
+    assert min(largest_margin(plant, 0.4, (0.0, 0.0), lost=[one], leader_helps=True).margin for one in (1, 2, 3)) > 0.15
+    assert min(largest_margin(TEAMS["team6"], 0.6, (0.0, 0.0), lost=[one]).margin for one in range(1, 6)) > 0.15
+
+
+@rows(
+    "change, sentence",
+    [
+        ({"cg": (0.0, 0.0)}, "1 finite coordinates"),
+        ({"cg": math.nan}, "1 finite coordinates"),
+        ({"object_mass": 0.0}, "mass must be positive"),
+        ({"lost": [2]}, "numbers from 0 to 1"),
+        ({"thrust": (1.0,)}, "thrust must be 2 factors"),
+    ],
+)
+def test_what_does_not_fit_the_plant_is_refused(change: dict, sentence: str) -> None:
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        largest_margin(PAPER, **({"object_mass": 0.2, "cg": 0.0} | change))
+
+
+def test_directions_that_the_load_does_not_have_are_refused() -> None:
+    for direction in ((0.0, 1.0), (0.0, 0.0), (1.0,)):
+        with pytest.raises(InputError, match="direction"):
+            largest_amplitude(PAPER, 0.2, direction=direction)
+    with pytest.raises(InputError, match="at most 1"):
+        largest_amplitude(PAPER, 0.2, 1.5)
