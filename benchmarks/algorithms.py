@@ -56,7 +56,7 @@ def train(name: str, seed: int, flags: str, place: Path, out: Path) -> dict[str,
         "seconds": seconds,
         "compiled": float(compiled[1]) if compiled else math.nan,
     }
-    return row | {"rate": statistics.median(rates), "policy": out / "policy.npz"}
+    return row | {"rate": statistics.median(rates) if rates else math.nan, "policy": out / "policy.npz"}
 
 
 def judge(rows: list[dict[str, Any]]) -> None:
