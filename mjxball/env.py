@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 # [s] of an episode, after which its error counts as steady state in training's metrics. Episodes last 20 s, after which
 # alone the evaluation counts; the goal is reached after 4 s.
-STEADY_AFTER = 8.0
+STEADY_IN_TRAINING_AFTER = 8.0
 
 
 @jax.tree_util.register_dataclass
@@ -197,7 +197,7 @@ class CoupledPairEnv:
         # Brax's EpisodeWrapper keeps the time limit itself, and takes an end that it did not set for a termination.
         wrapped = "steps" in state.info
         truncated = jnp.logical_and(moved.steps >= self.config.timing.episode_steps, ~terminated) & (not wrapped)
-        steady = (loop.plant.time > STEADY_AFTER).astype(jnp.float32)
+        steady = (loop.plant.time > STEADY_IN_TRAINING_AFTER).astype(jnp.float32)
         return state.replace(
             pipeline_state=moved,
             obs=self._input(after, moved),

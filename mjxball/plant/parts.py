@@ -123,13 +123,6 @@ def scale_rows(k: Part, a: Rows) -> Rows:
     return scale(k, a[0]), scale(k, a[1]), scale(k, a[2])
 
 
-def turned_about_z(yaw: Part, v: Parts) -> Parts:
-    """`v` turned by `yaw` about z."""
-    cosine, sine = cosine_and_sine(yaw)
-    x, y, z = v
-    return minus(times(cosine, x), times(sine, y)), plus(times(sine, x), times(cosine, y)), z
-
-
 def diagonal_turned_about_z(yaw: Part, v: Parts) -> Rows:
     """Rz diag(v) Rz^T: principal inertia of a body that is turned by `yaw` about z."""
     cosine, sine = cosine_and_sine(yaw)
