@@ -156,6 +156,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     """Configuration, origin and directory of a new run; everything that can be refused is refused here."""
     measured = cli.read_plant(options.plant).preset if options.plant else None
     name, seed = options.preset or measured or "transport", options.seed or 0
+    _refuse_settings_of_others(options)
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
@@ -166,7 +167,6 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
     extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
-    _refuse_settings_of_others(options)
     physics = _check_extensions(extensions, settings, options.physics) if extensions else options.physics or "mjx"
     origin: dict[str, Any] = {
         "command": command,
