@@ -276,7 +276,7 @@ class CoupledPairEnv:
             law.kp,
             law.kd,
             self.config.plant.gravity,
-            (law.tilt_limit, law.vertical_limit),
+            (self.config.command.tilt_limit, self.config.command.vertical_limit),
         )
 
     def _transition(

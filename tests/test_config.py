@@ -201,7 +201,7 @@ class TestValidate:
             ("plant.drones.0.inertia", (1e-3, 1e-3)),
             ("plant.rotor_lag", 0.0),
             ("plant.gravity", -9.81),
-            ("leader.tilt_limit", 1.3),
+            ("command.tilt_limit", 1.3),
             ("leader.kp", (0.5, -0.5, 0.5)),
             ("follower.action", "indirect"),
             ("follower.history", 0),

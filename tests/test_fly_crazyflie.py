@@ -85,7 +85,7 @@ def test_the_leader_flies_the_cards_law(preset: str) -> None:
     assert (abs(commands.leader[2] - apart - lift - config.leader.ki[2] * integrated) > 1e-3) == own
     # What lifts apart has moved on by one tick. The network says nothing:
     # the follower's command is the PD law on what it observes, or the leader's own.
-    limit = config.leader.vertical_limit
+    limit = config.command.vertical_limit
     base = commands.leader[2] - 2 * apart if config.follower.shares_integrals else np.clip(lift, -limit, limit)
     assert commands.follower[2] == pytest.approx(base, abs=5e-3 if apart else 1e-5)
 

@@ -31,7 +31,7 @@ FLIGHT = apply_overrides(
         "leader.ki": (0.1, 0.1, 2.0),
         "leader.integral_band": (0.05, 0.05, 1e3),
         "leader.integral_lead": 0.0,
-        "leader.vertical_limit": 3.0,
+        "command.vertical_limit": 3.0,
         "follower.action_scale_tilt": 0.2,
         "follower.action_scale_vertical": 3.0,
         "follower.shares_integrals": False,

@@ -116,9 +116,10 @@ class TestInference:
         config = trained.config
         policy = Policy.load(saved)
         seen = OBSERVATIONS.astype(np.float32)
-        follower, leader, gravity = config.follower, config.leader, config.plant.gravity
+        follower, leader, limits = config.follower, config.leader, config.command
+        gravity = config.plant.gravity
         reach = np.array([follower.action_scale_tilt, follower.action_scale_tilt, follower.action_scale_vertical])
-        limit = np.array([leader.tilt_limit, leader.tilt_limit, leader.vertical_limit])
+        limit = np.array([limits.tilt_limit, limits.tilt_limit, limits.vertical_limit])
         wanted = np.array(leader.kp) * seen[:, 12:15] + np.array(leader.kd) * seen[:, 15:18]
         copied = np.stack([-wanted[:, 1] / gravity, wanted[:, 0] / gravity, wanted[:, 2]], axis=1)
         expected = np.clip(np.clip(copied, -limit, limit) + policy.scaled(seen) * reach, -limit, limit)

@@ -48,13 +48,13 @@ class Adaptive:
     def __init__(self, config: Config, adapts_mass: bool = False):
         self.name = "adaptive-mass" if adapts_mass else "adaptive"
         self._pid = CopiedPid(config)
-        self._limits = config.leader.tilt_limit, config.leader.vertical_limit
+        self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._height = (config.leader.kp[2], config.leader.kd[2])
         self._gains = gains = load_axis(config, self.name)
         self._adapts_mass = adapts_mass
         self._bandwidth, self._estimate_limits = BANDWIDTH, (MOMENT_LIMIT, RATE_LIMIT)
         if config.autopilot.kind == "crazyflie":
-            trimmed = gains.kp * config.leader.tilt_limit / gains.gravity
+            trimmed = gains.kp * config.command.tilt_limit / gains.gravity
             self._bandwidth, self._estimate_limits = CRAZYFLIE_BANDWIDTH, (trimmed, CRAZYFLIE_RATE * trimmed)
 
     def start(self, observation: Array) -> State:

@@ -145,7 +145,7 @@ class CrazyflieLqg:
         self._design = design(self._model, config.timing.control_period)
         self._pid = CopiedPid(config)
         self._measured_rows = [MEASURED.index(name) for name in MEASURED if name in self._model.names]
-        self._limits = config.leader.tilt_limit, config.leader.vertical_limit
+        self._limits = config.command.tilt_limit, config.command.vertical_limit
         limits = self._model.rate_integral_limit, self._model.load_limit
         self._state_bounds = self._bounds(("rate_integral", "load"), limits)
         self._error_bounds = self._bounds(("y", "height"), ERROR_LIMIT)

@@ -68,7 +68,7 @@ class Oracle:
 
     def __init__(self, config: Config):
         self._pid = CopiedPid(config)
-        self._limits = config.leader.tilt_limit, config.leader.vertical_limit
+        self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._load_axis: LoadAxis = load_axis(config, self.name)
 
     def start(self, observation: Array) -> Any:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from mjxball.config._plant_file import read_plant
 from mjxball.config._settings import (
     Bounds,
+    Command,
     Config,
     Follower,
     Leader,
@@ -29,9 +30,8 @@ PAIR = replace(
         integral_band=(0.1, 0.1, 0.3),
         integral_lead=1.0,
         level_gain=10.0,
-        tilt_limit=0.26,
-        vertical_limit=6.0,
     ),
+    command=Command(tilt_limit=0.26, vertical_limit=6.0),
 )
 
 
@@ -60,10 +60,9 @@ def stand() -> Config:
             kp=(1.0, 1.0, 0.1),
             kd=(2.0, 2.0, 5.0),
             ki=(0.2, 0.1, 0.1),
-            tilt_limit=0.26,
-            vertical_limit=3.0,
             error="own",
         ),
+        command=Command(tilt_limit=0.26, vertical_limit=3.0),
         follower=Follower(
             action="residual",
             action_scale_tilt=0.2,

@@ -33,6 +33,8 @@ RENAMED = {
     "scenario.cg_visits": "scenario.cg_random_visits",
     "scenario.leader_measured": "scenario.leader_uses_measurements",
     "scenario.older_firmware": "scenario.uncompensated_share",
+    "leader.tilt_limit": "command.tilt_limit",
+    "leader.vertical_limit": "command.vertical_limit",
     "follower.tilt_limit": "follower.action_scale_tilt",
     "follower.vertical_limit": "follower.action_scale_vertical",
     "follower.filters": "follower.observation_averages",

@@ -83,11 +83,17 @@ class Leader:
         "turns, with a follower that shares the integrals [m/s2 per rad s]",
         low=0,
     )
-    tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", above=0, high=1.2)
-    vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", above=0)
     error: Literal["object", "own"] = setting(
         "object", "what it flies on: e_o of the object, or e_l of its own place, goal + its mount (the paper's stand)"
     )
+
+
+@dataclass(frozen=True)
+class Command:
+    """Limits of what any drone is sent, leader or follower."""
+
+    tilt_limit: float = setting(0.6, "largest commanded roll or pitch [rad]", above=0, high=1.2)
+    vertical_limit: float = setting(6.0, "largest commanded vertical acceleration [m/s2]", above=0)
 
 
 @dataclass(frozen=True)
@@ -292,6 +298,7 @@ class Config:
     attitude: Attitude = Attitude()
     autopilot: Autopilot = Autopilot()
     leader: Leader = Leader()
+    command: Command = Command()
     follower: Follower = Follower()
     timing: Timing = Timing()
     scenario: Scenario = Scenario()

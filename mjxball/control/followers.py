@@ -97,5 +97,5 @@ class Copy:
 
 def copy_gains(config: Config) -> tuple[Any, ...]:
     """The arguments of `observation.copy_command` after the observation, for the configured leader."""
-    law = config.leader
-    return law.kp, law.kd, config.plant.gravity, law.tilt_limit, law.vertical_limit
+    law, limits = config.leader, config.command
+    return law.kp, law.kd, config.plant.gravity, limits.tilt_limit, limits.vertical_limit

@@ -32,7 +32,8 @@ def config_of(card: Mapping[str, Any]) -> Config:
     data = configs.to_dict(configs.from_record({"plant": {}, **card.get("config", {})}))
     data["plant"] = {**data["plant"], **configs.with_current_names({"plant": card["plant"]})["plant"]}
     tilt, vertical = card["command_limits"]
-    data["leader"] |= {"kp": card["leader_kp"], "kd": card["leader_kd"], "tilt_limit": tilt, "vertical_limit": vertical}
+    data["leader"] |= {"kp": card["leader_kp"], "kd": card["leader_kd"]}
+    data["command"] |= {"tilt_limit": tilt, "vertical_limit": vertical}
     data["timing"] |= {"control_period": card["control_period"]}
     return configs.validate(configs.from_record(data))
 

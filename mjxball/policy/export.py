@@ -37,7 +37,7 @@ def policy_file(config: Config, learnt: Any, steps: int, origin: dict[str, Any] 
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
         "action_reach": action_scale,
-        "command_limits": [leader.tilt_limit, leader.vertical_limit],
+        "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
         "leader_kp": list(leader.kp),
         "leader_kd": list(leader.kd),
         "gravity": config.plant.gravity,

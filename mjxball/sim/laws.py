@@ -68,6 +68,7 @@ class Laws:
 
     def __init__(self, config: Config):
         self._law, self._gravity = config.leader, config.plant.gravity
+        self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._shares = config.follower.shares_integrals
         self._level_gain = config.leader.level_gain
         self._washout = config.follower.washout_time
@@ -175,14 +176,14 @@ class Laws:
             return command
         xp, law = command.__array_namespace__(), self._law
         ki = xp.asarray(law.ki, dtype=command.dtype)
-        more = leader.command(ki * integral[..., :3], 0.0, self._gravity, law.tilt_limit, law.vertical_limit)
+        more = leader.command(ki * integral[..., :3], 0.0, self._gravity, *self._limits)
         return self._clip(self._with_lift_difference(command + more - integral[..., 4:], integral, -self._lift_sign))
 
     def _pid_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
         xp, law = goal.__array_namespace__(), self._law
         gains = (xp.asarray(gain, dtype=goal.dtype) for gain in (law.kp, law.kd, law.ki))
         wanted = leader.desired_acceleration(*self.leader_error(state, goal), integral[..., :3], *gains)
-        return leader.command(wanted, 0.0, self._gravity, law.tilt_limit, law.vertical_limit)
+        return leader.command(wanted, 0.0, self._gravity, *self._limits)
 
     def _with_lift_difference(self, command: Vector, integral: Integral, side: float) -> Vector:
         """`command` with what this drone lifts more than the other to turn the stick."""
@@ -190,7 +191,7 @@ class Laws:
         return xp.concat([command[..., :2], command[..., 2:] + side * self._level_gain * integral[..., 3:4]], axis=-1)
 
     def _clip(self, command: Vector) -> Vector:
-        return leader.clip_command(command, self._law.tilt_limit, self._law.vertical_limit)
+        return leader.clip_command(command, *self._limits)
 
     def _along_free_axes(self, vector: Vector) -> Vector:
         """`vector` in the world without what the stand locks."""

@@ -171,7 +171,7 @@ class ResetDistribution:
         weight = carried * self.config.plant.gravity / 4
         enough = (scale * cap[:, None] >= (1 + LIFT) * weight) & (scale * most[:, None] >= (1 + LIFT + PULL) * weight)
         command = jnp.abs(self.hover_commands(object_mass, battery, uncompensated, scale))
-        return (enough & (command < COMMAND_SHARE * self.config.leader.vertical_limit)).all(axis=-1)
+        return (enough & (command < COMMAND_SHARE * self.config.command.vertical_limit)).all(axis=-1)
 
     def hover_commands(
         self,
