@@ -18,7 +18,22 @@ CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_j
 ELEMENTWISE = frozenset(
     (
         *("abs", "acos", "add", "add_any", "and", "asin", "atan", "atan2", "ceil", "clamp", "convert_element_type"),
-        *("copy", "cos", "div", "eq", "exp", "exp2", "expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le"),
+        *(
+            "bitcast_convert_type",
+            "copy",
+            "cos",
+            "div",
+            "eq",
+            "exp",
+            "exp2",
+            "expm1",
+            "floor",
+            "ge",
+            "gt",
+            "integer_pow",
+            "is_finite",
+            "le",
+        ),
         *("log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow", "rem", "round"),
         *("rsqrt", "select_n", "sign", "sin", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor"),
     )

@@ -12,6 +12,8 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from mjxball.config import Autopilot
 
 Array = Any
@@ -97,7 +99,7 @@ def setpoints(autopilot: Autopilot, command: Array, carried_mass: Array, gravity
     else:
         force = carried_mass * (gravity + vertical) / (xp.cos(roll) * xp.cos(pitch))
         thrust = motor_command(autopilot.motor_curve, force / 4)
-    thrust = xp.round(xp.clip(thrust, THRUST_FLOOR, THRUST_CEILING))
+    thrust = _whole(xp.clip(thrust, THRUST_FLOOR, THRUST_CEILING), xp.round)
     return xp.stack([xp.rad2deg(roll), -xp.rad2deg(pitch), xp.zeros_like(roll), thrust], axis=-1)
 
 
@@ -133,7 +135,7 @@ def cascade(
     rated = asked - turning, turning - old.rates
     kept, output = _pid(inner, RATE_LIMITS, old.rate_integral, *rated, integrals)
     output = output if rate_share is None else rate_share * output
-    output = xp.trunc(xp.clip(output, -LARGEST, LARGEST))
+    output = _whole(xp.clip(output, -LARGEST, LARGEST), xp.trunc)
     thrust = setpoint[..., 3]
     on = (thrust >= IDLE)[..., None]
     motors = mix(xp.minimum(thrust, xp.asarray(float(THRUST_CEILING), dtype=thrust.dtype)), output, compensate)
@@ -154,7 +156,7 @@ def mix(thrust: Array, output: Array, compensate: Callable[[Array], Array] | Non
     M1 front right, M2 back right, M3 back left, M4 front left. What is beyond full power is taken off all four.
     """
     xp = thrust.__array_namespace__()
-    roll, pitch = xp.trunc(output[..., 0] / 2), xp.trunc(output[..., 1] / 2)
+    roll, pitch = _whole(output[..., 0] / 2, xp.trunc), _whole(output[..., 1] / 2, xp.trunc)
     yaw = -output[..., 2]
     motors = xp.stack(
         [
@@ -186,6 +188,18 @@ def _pid(
     ki = ki if share is None else ki * share
     integral = xp.clip(integral + PERIOD * error, -bound, bound)
     return integral, kp * error + ki * integral - kd / PERIOD * moved
+
+
+def _whole(value: Array, rounded: Callable[[Array], Array]) -> Array:
+    """`rounded` of a float `value` (...); a gradient passes as if nothing was rounded, where it would else be 0.
+
+    What is cut off is exact in floating point and taken through integers, which no gradient passes.
+    """
+    whole = rounded(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return whole
+    cut = whole - value
+    return value + cut.view(f"int{8 * cut.dtype.itemsize}").view(cut.dtype)
 
 
 def _wrapped(angle: Array) -> Array:
