@@ -53,6 +53,14 @@ def drone_kind(drone: str = "2.1", curve: str = "linear") -> DroneKind:
     return replace(DRONES[drone], **CURVES[curve])  # type: ignore[arg-type]
 
 
+class AddedLoad(NamedTuple):
+    """A small heavy body that is fixed to the stick in flight."""
+
+    mass: float  # [kg]
+    offset: float  # of its centre from O along the stick, toward the leader [m]
+    after: float  # the first motor has turned [s]
+
+
 @dataclass(frozen=True)
 class Surroundings:
     """Conditions around the drones in a rehearsal, which the laptop does not know."""
@@ -63,6 +71,7 @@ class Surroundings:
     delay: float = 0.0  # of every datagram each way, from the first one on [s]
     gains: tuple[float, float] = (1.0, 1.0)  # factors on the motor forces of leader and follower
     exact: bool = False  # the estimates are the truth: for comparisons with the simulation
+    load: AddedLoad | None = None  # put on in flight
     seed: int = 0
 
 
@@ -72,6 +81,7 @@ QUIET = Surroundings()
 
 # Numbers with least and most.
 RANGES = {"noise": (0.0, 100.0), "pose_hz": (1.0, 1000.0), "delay": (0.0, 0.5)}
+LOAD_RANGES = ((0.0, 0.1), (-0.15, 0.15), (0.0, 3600.0))  # of `AddedLoad`
 
 
 def add_twin_options(parser: argparse.ArgumentParser) -> None:
@@ -85,6 +95,9 @@ def add_twin_options(parser: argparse.ArgumentParser) -> None:
     add("--twin-deck", choices=("yes", "no"), help=f"{about}its positioning; no: poses must come from here (yes)")
     add("--twin-delay", type=float, metavar="S", help=f"{about}of each datagram, from the first one on (0)")
     add("--twin-gains", type=float, nargs=2, metavar=("L", "F"), help=f"{about}factors on the motor forces (1 1)")
+    about = f"{about}a load put on the stick: kg, m from O toward the leader, s after the motors first turn"
+    add("--twin-load", type=float, nargs=3, metavar=("KG", "M", "S"), help=about)
+    about = "--rehearse: "
     add("--twin-seed", type=int, metavar="N", help=f"{about}of its noise (0)")
 
 
@@ -97,6 +110,10 @@ def check_twin(options: argparse.Namespace) -> None:
     for value in options.twin_gains or ():
         if not 0.1 <= value <= 3.0:
             raise InputError(f"--twin-gains must be two numbers of 0.1 to 3, not {value:g}")
+    if options.twin_load is not None:
+        for value, (low, high), what in zip(options.twin_load, LOAD_RANGES, ("KG", "M", "S"), strict=True):
+            if not low <= value <= high:
+                raise InputError(f"--twin-load: {what} must be {low:g} to {high:g}, not {value:g}")
     if options.twin_seed is not None and options.twin_seed < 0:
         raise InputError(f"--twin-seed must not be negative, not {options.twin_seed}")
 
@@ -116,7 +133,8 @@ def surroundings(options: argparse.Namespace) -> Surroundings:
     check_twin(options)
     given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed", "gains")}
     given = {name: tuple(one) if name == "gains" else one for name, one in given.items() if one is not None}
-    return Surroundings(deck=options.twin_deck != "no", **given)
+    load = AddedLoad(*options.twin_load) if options.twin_load is not None else None
+    return Surroundings(deck=options.twin_deck != "no", load=load, **given)
 
 
 @dataclass(frozen=True)

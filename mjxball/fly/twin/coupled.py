@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from mjxball.assembly import ASSEMBLY, BALL_JOINT, FOLLOWER, LEADER, build_spec
-from mjxball.config import Config
+from mjxball.config import Config, Plant
 from mjxball.control import crazyflie, rotations
 from mjxball.control.crazyflie import with_stock_gains
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
@@ -54,6 +54,22 @@ def grounded_model(config: Config, object_mass: float) -> mujoco.MjModel:
     return model
 
 
+def put_on(model: mujoco.MjModel, plant: Plant, mass: float, offset: float) -> None:
+    """Fix a body of `mass` [kg] without size to the stick of `model`, `offset` [m] from O along the CG axis.
+
+    The stick's own centre is O. The state is not touched: position and velocity of O carry over, as of a load that
+    moves with the stick when it is let go.
+    """
+    body, axis = model.body(ASSEMBLY).id, "xy".index(plant.cg_axis)
+    before = float(model.body_mass[body])
+    after = before + mass
+    across = before * mass / after * offset**2  # about the common centre
+    model.body_mass[body] = after
+    model.body_ipos[body][axis] = mass / after * offset
+    model.body_inertia[body] += [0.0 if i == axis else across for i in range(3)]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
 SENSED = 6  # numbers of one drone's accelerometer and gyroscope
 
 
@@ -71,7 +87,7 @@ class CoupledPair:
         self.kind, self.surroundings = kind, surroundings
         plant = config.plant
         self.model = grounded_model(config, self.conditions.object_mass)
-        self.data = mujoco.MjData(self.model)
+        self._loaded = False
         self._free, self._heaves = plant.stand == "free", plant.stand == "heave"
         self._roll = 1 if self._heaves else 0  # joint of a stand's roll
         self._mounts = np.array([drone.mount for drone in plant.pair])
@@ -99,7 +115,9 @@ class CoupledPair:
 
     def start(self) -> PairState:
         """See `Pair.start`."""
-        mujoco.mj_resetData(self.model, self.data)
+        if self._loaded:
+            self.model, self._loaded = grounded_model(self.config, self.conditions.object_mass), False
+        self.data = mujoco.MjData(self.model)
         self._rotors, self._targets = np.zeros((2, 4)), np.zeros((2, 4))
         self.power = self.onboard.power = self._new_power()
         self._steps, self._flown = 0, 0.0
@@ -169,6 +187,10 @@ class CoupledPair:
 
     def _step(self) -> None:
         model, data = self.model, self.data
+        load = self.surroundings.load
+        if load is not None and not self._loaded and self._moving and self._flown >= load.after:
+            put_on(model, self.config.plant, load.mass, load.offset)
+            self._loaded = True
         mujoco.mj_step1(model, data)
         if self._steps % TICK == 0:
             self._fly()

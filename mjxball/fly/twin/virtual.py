@@ -93,7 +93,9 @@ class VirtualLink:
         logged = datagram[:1] == bytes([header(5, 2)])
         if logged and len(datagram) == 5 + _HEALTH.size and datagram[1] == HEALTH_BLOCK:
             values = zip((name for name, _ in HEALTH), _HEALTH.unpack(datagram[5:]), strict=True)
-            self.telemetry.health = HealthSample(packets.health_of(dict(values)), now)
+            health = packets.health_of(dict(values))
+            self._note("health", t=now, drone=self.name, **health._asdict())
+            self.telemetry.health = HealthSample(health, now)
         elif logged and len(datagram) == 5 + packets.STATE_SIZE:
             try:
                 state = packets.unpack_state(datagram[5:])
@@ -105,7 +107,7 @@ class VirtualLink:
 
 
 class MemoryLog:
-    """In the place of the flight log; with `keep` ticks and states as well."""
+    """In the place of the flight log; with `keep` ticks, states and health as well."""
 
     def __init__(self, keep: bool = True) -> None:
         self.records: list[dict[str, Any]] = []
@@ -113,7 +115,7 @@ class MemoryLog:
 
     def note(self, kind: str, t: float | None = None, **fields: Any) -> None:
         """Keep one record."""
-        if self._keep or kind not in ("tick", "state"):
+        if self._keep or kind not in ("tick", "state", "health"):
             self.records.append({"kind": kind, "t": t, **fields})
 
     def transitions(self) -> list[str]:
