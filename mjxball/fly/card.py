@@ -14,10 +14,11 @@ from mjxball.control import crazyflie, motors
 from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
+from mjxball.fly.handover import Handover
 from mjxball.fly.limits import Times
-from mjxball.fly.telemetry import ObjectState, Rig
+from mjxball.fly.telemetry import Rig
 from mjxball.policy import Policy
-from mjxball.sim.laws import Laws
+from mjxball.sim.laws import Body, Laws
 
 GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
 STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
@@ -143,18 +144,24 @@ class Controller:
     def __init__(self, policy: Policy):
         config = config_of(policy.card)
         self.policy, self.config, self.period = policy, config, policy.control_period
+        self.handover = Handover(policy)
         self._loop = Laws(config)
         self.reset()
 
     def reset(self) -> None:
         """Begin a flight: no integral, no memory."""
         self._integral = self._loop.zero_integral(np.zeros(3))
-        self.policy.reset()
+        self.handover.reset()
 
-    def step(self, state: ObjectState, goal: np.ndarray) -> Commands:
+    @property
+    def integral(self) -> np.ndarray:
+        """What both laws have integrated, see `sim.laws.Laws`."""
+        return self._integral
+
+    def step(self, state: Body, goal: np.ndarray) -> Commands:
         """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
         seen = self._loop.observe(state, goal)
         led = self._loop.leader_command(state, goal, self._integral)
-        followed = self._loop.follower_command(np.asarray(self.policy(seen), float), self._integral)
+        followed = self._loop.follower_command(self.handover(seen), self._integral)
         self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=followed)
         return Commands(led, followed, seen)

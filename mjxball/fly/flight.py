@@ -11,9 +11,10 @@ from mjxball.fly import command, packets
 from mjxball.fly.card import Commands, Controller
 from mjxball.fly.command import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
 from mjxball.fly.display import View
+from mjxball.fly.handover import Succession, Successor
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.mocap import Mocap
-from mjxball.fly.monitor import Monitor, Sustained, link_faults
+from mjxball.fly.monitor import Monitor, Sustained, link_faults, tilt_angle
 from mjxball.fly.packets import ZERO, PacketError, Setpoint
 from mjxball.fly.preflight import SpinCheck
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, Event, Fault, State, Supervisor
@@ -37,10 +38,12 @@ class Flight:
         note: Note,
         watchdog: Watchdog | None = None,
         mocap: Mocap | None = None,
+        successor: Successor | None = None,
     ):
         """`variants` of leader and follower by force curve; `assumed` are the curves whose gains were uploaded."""
         self.links, self.controller, self.rig, self.settings = links, controller, rig, settings
         self.note, self.watchdog, self._mocap = note, watchdog, mocap
+        self.succession = Succession(controller.handover, successor, note)
         self.supervisor = Supervisor()
         self.interrupts, self.kill = 0, False
         self.ready: bool | None = None  # checks before flight: not known yet, passed, failed
@@ -158,6 +161,9 @@ class Flight:
             return None, []
         try:
             seen = object_state(self._states, self.rig)
+            if self.supervisor.state is State.FLY:
+                distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
+                self.succession.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(self._now))
             laws = (self._commands.leader, self._commands.follower)

@@ -194,6 +194,12 @@ KINDS: dict[str, Kind] = {
         age=need(ANY_NUMBER, "of the last good pose [s]"),
         text=may(TEXT, "why"),
     ),
+    "retrain": record(
+        "a retraining process, or what it hands over, in a rehearsal with --retrain",
+        what=need(TEXT, "`ready`, `identified`, `polished`, `kept`, `taken`, `returned`, `failed`"),
+        text=may(TEXT, "in words"),
+        numbers=may(JSON, "by name"),
+    ),
     "link": record("a link ends", drone=need(DRONE), text=need(TEXT, "why")),
     "warning": record("something else that does not end a flight", text=need(TEXT)),
     "error": record("the runner itself fails", text=need(TEXT)),
@@ -202,6 +208,7 @@ KINDS: dict[str, Kind] = {
         code=need(COUNT, "exit code"),
         cause=may(TEXT, "what ended the flight, if not its plan"),
         timing=may(JSON, "the loop's: ticks, missed deadlines, lateness (median, p99, largest) [s]"),
+        flown=may(JSON, "figures of the flight under both laws, see `fly.figures`"),
         overwritten=may(array(None), "setpoints of each link that a newer one replaced"),
     ),
 }  # fmt: skip

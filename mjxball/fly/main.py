@@ -9,6 +9,7 @@ import json
 import math
 import re
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,21 +17,24 @@ from pathlib import Path
 
 from mjxball import cli
 from mjxball.cli import run_command
+from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.fly import limits
-from mjxball.fly.card import Controller, ThrustChoice, drone_of, goal_of, motor_of, times_of, variants
+from mjxball.fly.card import Controller, ThrustChoice, drone_of, goal_of, is_crazyflie, motor_of, times_of, variants
 from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.mocap import KINDS, MocapSettings, ready
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.process import Child
+from mjxball.fly.retrain import Retrainer
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
 from mjxball.policy import Policy
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
+RETRAINED = (0.004, -0.06, 14.0)  # load that --retrain puts on, unless --twin-load says more: kg, m, s
 DONGLE = re.compile(r"radio://([^/]+)/")
 LOOP_RATE = 100.0  # [Hz] at least: the policy's period is a whole number of ticks
 # Numbers with least and most: of the battery, and of the rehearsal's link.
@@ -56,9 +60,11 @@ def make_parser() -> cli.Parser:
     kinds = ", ".join(FAULT_KINDS)
     add("--fault", action="append", default=[], metavar="KIND:DRONE@S", help=f"--rehearse: {kinds}")
     add_twin_options(parser)
+    add("--retrain", action="store_true", help="--rehearse: put a load on in flight, and retrain the policy for it")
     add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
     add("--dry-run", action="store_true", help="connect, log, and send zeros only")
-    add("--seconds", type=float, default=20.0, metavar="S", help="time under both laws (20)")
+    about = "time under both laws (20; with --retrain 50)"
+    add("--seconds", type=float, metavar="S", help=about)
     about = "write everything to this new file (flight-DATE.jsonl; none for --rehearse)"
     add("--log", type=Path, metavar="FILE", help=about)
     about = "a live page of the log, for a browser on this machine (a free port)"
@@ -152,9 +158,21 @@ def check_twin_options(options: argparse.Namespace) -> None:
     given = [*(f"--{name}" for name in (*WORSE, "fault") if getattr(options, name)), *given_twin_options(options)]
     if given and not options.rehearse:
         raise InputError(f"{given[0]} is for --rehearse only")
+    if options.retrain and not options.rehearse:
+        raise InputError("--retrain is for --rehearse only")
+    if options.retrain and options.dry_run:
+        raise InputError("--retrain takes a flight: leave --dry-run out")
     check_twin(options)
     for fault in options.fault:
         read_fault(fault)
+
+
+def check_loaded(config: Config, retrains: bool) -> None:
+    """Raise InputError if the twin of `config` cannot be loaded in flight, or its policy not be retrained there."""
+    if not is_crazyflie(config):
+        raise InputError("--twin-load is for policies that were trained on Crazyflies, such as flight")
+    if retrains and (config.plant.stand != "free" or config.plant.cg_axis != "y" or config.motion.kind != "sine"):
+        raise InputError("--retrain is for pairs in free flight along y whose CG follows a sine, such as flight")
 
 
 def twin_options(options: argparse.Namespace) -> list[str]:
@@ -166,16 +184,22 @@ def twin_options(options: argparse.Namespace) -> list[str]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fly; exit code 0 if nothing went wrong, 1 after a fault, 2 on bad input."""
     options = make_parser().parse_args(arguments)
+    if options.seconds is None:
+        options.seconds = 50.0 if options.retrain else 20.0
 
     def command() -> int:
         check_options(options)
         check_twin_options(options)
+        if options.retrain and options.twin_load is None:
+            options.twin_load = list(RETRAINED)
         capture = mocap_settings(options)
         log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
         policy = Policy.load(options.policy)
         controller = Controller(policy)
         config = controller.config
         more = read_gains(options.gains) if options.gains else ({}, {})
+        if options.twin_load is not None:
+            check_loaded(config, options.retrain)
         rig = Rig.of_card(policy.card)
         period = policy.control_period / math.ceil(policy.control_period * LOOP_RATE - 1e-9)
         bounds = Limits() if options.battery is None else Limits(battery=options.battery)
@@ -193,6 +217,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
+            if options.retrain:
+                place = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+                log = log or place / "flight.jsonl"
+                asked = [str(options.policy), str(log), str(place / "retrained.npz")]
+                retrainer = stack.enter_context(Retrainer(asked, policy))
+                retrainer.wait(lambda text: print(text, flush=True))  # noqa: T201
+                setup = replace(setup, retrainer=retrainer)
             if options.rehearse:
                 ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
                 flags = ["--ports", *map(str, ports), "--policy", str(options.policy), *twin_options(options)]
@@ -203,7 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
             if options.view is not None and log is not None:
                 print(stack.enter_context(live_view(log, options.view)).line, flush=True)  # noqa: T201
-            if log and not options.log:
+            if log and not options.log and not options.retrain:
                 print(f"log: {log}", flush=True)  # noqa: T201
             return fly(uris, setup, settings, log, list(sys.argv if arguments is None else arguments))
 

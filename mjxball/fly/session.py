@@ -26,6 +26,7 @@ from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.preflight import Preflight, check, prepare
 from mjxball.fly.process import Metronome, Timing, urgent
+from mjxball.fly.retrain import Retrainer
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.watchdog import NOTHING, Watchdog
@@ -44,6 +45,7 @@ class FlightSetup:
     rig: Rig
     preflight: Preflight
     mocap: Mocap | None = None  # ready; the caller ends it
+    retrainer: Retrainer | None = None  # likewise
 
 
 def fly(
@@ -74,10 +76,16 @@ def fly(
                     setup.mocap.note = journal.note
                 curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
                 pair = (links, setup.controller, setup.variants, curves, setup.rig)
-                flight = Flight(*pair, settings, journal.note, watchdog, setup.mocap)
+                retrainer = setup.retrainer
+                if retrainer is not None:
+                    retrainer.note = journal.note
+                successor = None if retrainer is None else retrainer.take
+                flight = Flight(*pair, settings, journal.note, watchdog, setup.mocap, successor)
                 flight.ready = _checked(links, setup, settings, journal)
                 flight.refusal = "" if flight.ready else "see the checks"
                 timing = run(flight)
+                if retrainer is not None:
+                    _say_of(retrainer, flight)
                 return _ended(flight, timing, journal)
         except KeyboardInterrupt:  # before take-off; afterwards Ctrl-C is the flight's own
             journal.note("refused", text="interrupted")
@@ -144,13 +152,25 @@ def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings
     return all(one.passed for one in checks)
 
 
+def _say_of(retrainer: Retrainer, flight: Flight) -> None:
+    """What became of retraining."""
+    for one in retrainer.said:
+        _say(f"retraining: {one['what']}{': ' + one['text'] if one['text'] else ''}")
+    if not retrainer.said:
+        _say("retraining: no load was found")
+    if flight.controller.handover.returned:
+        _say(f"retraining: the first policy came back: {flight.controller.handover.returned}")
+
+
 def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     supervisor = flight.supervisor
     cause = supervisor.cause
     stayed = not (flight.settings.dry_run or flight.interrupts or flight.lifted)
     code = 0 if cause is None and not stayed else 1
     sent = [getattr(link, "overwritten", 0) for link in flight.links]
-    journal.note("end", code=code, cause=str(cause) if cause else "", timing=timing, overwritten=sent)
+    flown = {name: dataclasses.asdict(one) for name, one in flight.succession.figures.items()}
+    why = str(cause) if cause else ""
+    journal.note("end", code=code, cause=why, timing=timing, overwritten=sent, flown=flown)
     if cause is not None:
         _say(f"ended by {cause.event.name.lower().replace('_', ' ')}{': ' + cause.detail if cause.detail else ''}")
         if cause.event in (Event.DEADLINES, Event.STALE) and timing.largest > BUSY:
@@ -162,6 +182,8 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
         _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
     late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
     _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
+    for name, figures in flight.succession.figures.items():
+        _say(f"{name}: {figures}" if len(flight.succession.figures) > 1 else str(figures))
     if journal.failure:
         _say(f"the log is not complete: {journal.failure}")
     return code

@@ -70,6 +70,15 @@ class Policy:
         """Forget past observations: the next call starts an episode."""
         self._memory = None
 
+    @property
+    def memory(self) -> Array:
+        """What it remembers (..., m), see `control.observation.ObservationHistory`; None: nothing yet."""
+        return self._memory
+
+    @memory.setter
+    def memory(self, memory: Array) -> None:
+        self._memory = None if memory is None else np.array(memory, self._dtype)
+
     def scaled(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
         observation = np.asarray(observation, self._dtype)

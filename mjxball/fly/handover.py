@@ -1,0 +1,112 @@
+"""From one policy to the next in flight, without a jump in what is commanded. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from mjxball.fly.figures import SETTLING, Figures
+from mjxball.fly.telemetry import Note
+from mjxball.policy import Policy
+
+Successor = Callable[[], Policy | None]  # a policy that is to take over now, once; neither blocks nor raises
+BLEND = 0.5  # [s] over which the command goes from one policy's to the other's
+AWAY = 0.15  # [m] further from the goal than when it took over, from where on the new policy has to hand back
+# What a card says of the laws around the network, which a new policy must share to remember what the old one did.
+SAME = (
+    "history",
+    "previous_action",
+    "filters",
+    "action_mode",
+    "action_reach",
+    "command_limits",
+    "leader_kp",
+    "leader_kd",
+    "gravity",
+    "control_period",
+    "plant",
+    "config",
+)
+
+
+def difference(old: Policy, new: Policy) -> str:
+    """The field of the cards because of which `new` cannot take over from `old`, empty if it can."""
+    return next((name for name in SAME if old.card.get(name) != new.card.get(name)), "")
+
+
+class Handover:
+    """A policy, and perhaps one that takes over from it. Called once per control period.
+
+    Both are computed from then on, so that the first one can come back at any time. It does if the second one's command
+    is not finite, or O goes astray under it.
+    """
+
+    def __init__(self, policy: Policy):
+        self.first = policy
+        self.second: Policy | None = None
+        self.returned = ""  # why the first one came back
+        self._ticks = max(round(BLEND / policy.control_period), 1)
+        self._count = 0  # of the ticks of the blend
+        self._farthest = math.inf  # from the goal that the second one may let O go [m]
+
+    @property
+    def share(self) -> float:
+        """Of the second policy in the command, 0 to 1."""
+        s = self._count / self._ticks
+        return s * s * (3.0 - 2.0 * s)
+
+    def reset(self) -> None:
+        """Begin a flight with the first policy."""
+        self.second, self.returned, self._count = None, "", 0
+        self.first.reset()
+
+    def begin(self, policy: Policy, distance: float) -> None:
+        """`policy` takes over, with what the first one remembers; `distance` of O from its goal now [m]."""
+        policy.memory = self.first.memory
+        self.second, self._farthest = policy, distance + AWAY
+
+    def judge(self, distance: float) -> None:
+        """Take the first policy back if O is too far from its goal, `distance` [m], for a goal that stands still."""
+        if self.second is not None and not self.returned and distance > self._farthest:
+            self.returned = f"the object was {distance:.2f} m from its goal"
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Command (3,) = roll, pitch [rad], vertical acceleration [m/s2]."""
+        command = np.asarray(self.first(observation), float)
+        if self.second is None:
+            return command
+        with np.errstate(all="ignore"):
+            other = np.asarray(self.second(observation), float)
+        if not np.isfinite(other).all():
+            self.returned = "its command is not finite"
+            self.second, self._count = None, 0
+            return command
+        self._count = max(self._count - 1, 0) if self.returned else min(self._count + 1, self._ticks)
+        if self._count == 0:
+            self.second = None
+        return command + self.share * (other - command)
+
+
+class Succession:
+    """Asks for a policy that is to take over, and keeps the figures of what each one flew."""
+
+    def __init__(self, handover: Handover, successor: Successor | None, note: Note):
+        self._handover, self._successor, self._note = handover, successor, note
+        self._returned = False
+        self.figures: dict[str, Figures] = {}  # under both laws, by the policy in command
+
+    def update(self, now: float, elapsed: float, distance: float, tilt: float) -> None:
+        """A tick at `now` [s], `elapsed` [s] under both laws, O `distance` [m] from its goal, at a `tilt` [rad]."""
+        policy = self._successor() if self._successor is not None else None
+        if policy is not None:
+            self._handover.begin(policy, distance)
+            self._note("retrain", now, what="taken", text=policy.name)
+        self._handover.judge(distance)
+        if self._handover.returned and not self._returned:
+            self._returned = True
+            self._note("retrain", now, what="returned", text=self._handover.returned)
+        if elapsed >= SETTLING:
+            name = "first policy" if self._handover.second is None else "second policy"
+            self.figures.setdefault(name, Figures()).add(distance, tilt)

@@ -1,0 +1,147 @@
+"""`python -m mjxball.rig.retrain`: retrains a policy for a load that is put on in flight; started by mjxball.fly.
+
+It reads the running flight's log, finds the load (`rig.load`), polishes the policy for it from where the flight is
+(`train.polish`), and prints lines of JSON: {"text"} while it compiles, {"what": "ready"}, then "identified", and
+"polished" with the path of a policy file, or "kept" if nothing better was found. It ends when standard input does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mjxball.cli import make_parser
+from mjxball.config import Config
+from mjxball.errors import InputError
+from mjxball.fly.card import config_of
+from mjxball.fly.flight_log import Tail
+from mjxball.policy import Policy, PolicyFile, load_file, save_file
+from mjxball.rig.load import AddedLoad, LoadWatch
+from mjxball.rig.replay import FlightReplay
+
+NICE = 15
+POLL = 0.02  # [s] between two looks at the log
+LOOK = 0.5  # [s] of flight between two looks for a load
+SECONDS = 4.0  # [s] in which a policy is to be polished
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Compile, watch, identify, polish; return the exit code."""
+    parser = make_parser("python -m mjxball.rig.retrain", "Retrain a policy in flight; started by mjxball.fly.")
+    parser.add_argument("policy", type=Path, metavar="POLICY.npz")
+    parser.add_argument("log", type=Path, metavar="LOG", help="of the flight, may be yet to come")
+    parser.add_argument("out", type=Path, metavar="OUT.npz", help="to be written")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="in which a policy is to be polished")
+    options = parser.parse_args(arguments)
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    os.nice(NICE)
+    try:
+        return retrain(options)
+    except InputError as error:
+        _say(error=str(error))
+        return 2
+
+
+def retrain(options: argparse.Namespace) -> int:
+    """See the module. Raises InputError if policy or log cannot be used, or JAX is not installed."""
+    flown = load_file(options.policy)
+    config = config_of(flown.card)
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA warns of every program that its cache gives
+    # XLA's older emitters compile this in two thirds of the time, into programs as fast.
+    os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}"
+    _say(text="retraining: loading JAX")
+    try:
+        from mjxball.cache import enable_compilation_cache
+        from mjxball.train.polish import Polisher
+    except ModuleNotFoundError as error:
+        raise InputError(f"{error.name} is not installed; pip install 'mjxball[train]'") from None
+    enable_compilation_cache()
+    polisher = Polisher(config, flown)
+    polisher.compile(lambda text: _say(text=f"retraining: {text}"))
+    watch, replay = LoadWatch(config), FlightReplay(Policy(flown, "flown"))
+    _say(what="ready")
+    load = find(options.log, watch, replay)
+    _say(what="identified", text=describe(load), numbers=load._asdict())
+    known, place = situation(load, watch, replay, config)
+    polished = polisher.polish(known, place, options.seconds)
+    numbers = {name: getattr(polished, name) for name in ("before", "after", "steps", "seconds")}
+    text = f"{polished.steps} gradient steps in {polished.seconds:.1f} s, cost {polished.before:.3f} to "
+    text += f"{polished.after:.3f}"
+    if polished.contents is None:
+        _say(what="kept", text=f"{text}: hardly better, the policy stays", numbers=numbers)
+    else:
+        save_file(options.out, with_origin(polished.contents, load, numbers))
+        _say(what="polished", text=text, numbers=numbers, policy=str(options.out))
+    while True:  # until standard input ends
+        time.sleep(1.0)
+
+
+def situation(load: AddedLoad, watch: LoadWatch, replay: FlightReplay, config: Config) -> Any:
+    """(`KnownLoad`, `FlightState`) of `train.polish`: the object with the `load`, and where the flight is."""
+    from mjxball.train.polish import FlightState, KnownLoad
+
+    place, mass = replay.place, config.plant.object_mass + load.mass
+    assert place is not None  # a load is found in flight only
+    known = KnownLoad(
+        mass=mass,
+        cg_offset=(load.own_moment + load.moment) / mass,
+        cg_amplitude=load.swing / mass,
+        cg_speed=load.speed,
+        cg_phase=load.phase + load.speed * (watch.now - load.time),
+        battery=load.volts,
+        uncompensated=float(watch.curve == "older"),
+    )
+    return known, FlightState(*place.body, place.goal, place.integral, place.history)
+
+
+def find(log: Path, watch: LoadWatch, replay: FlightReplay) -> AddedLoad:
+    """Read the growing `log` until a load shows. Raises InputError if it is none."""
+    tail, looked = Tail(log), 0.0
+    while True:
+        records = tail.read()
+        for record in records or ():
+            watch.take(record)
+            replay.take(record)
+        if records is None:
+            time.sleep(POLL)
+        elif watch.now - looked >= LOOK:
+            looked = watch.now
+            load = watch.find()
+            if load is not None:
+                return load
+
+
+def describe(load: AddedLoad) -> str:
+    """The load in words."""
+    where = f"{1e3 * load.offset:+.0f} mm from O toward the leader"
+    spread = f"+- {1e3 * load.mass_spread:.1f} g, {1e6 * load.moment:+.0f} +- {1e6 * load.moment_spread:.0f} mg m"
+    return f"a load of {1e3 * load.mass:.1f} g, {where} ({spread})"
+
+
+def with_origin(contents: PolicyFile, load: AddedLoad, numbers: dict[str, Any]) -> PolicyFile:
+    """`contents` whose card says what it was retrained for."""
+    origin = {"mass": load.mass, "offset": load.offset, **numbers}
+    return dataclasses.replace(contents, card={**contents.card, "retrained": origin})
+
+
+def _end_with_input() -> None:
+    while os.read(0, 4096):
+        pass
+    os._exit(0)  # whatever it computes is of no use any more
+
+
+def _say(**message: Any) -> None:
+    os.write(sys.stdout.fileno(), (json.dumps(message) + "\n").encode())
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

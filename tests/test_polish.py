@@ -1,0 +1,79 @@
+"""Polishing a flown policy by gradients through the Crazyflies' cascade."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxball.control import crazyflie
+from mjxball.fly.card import config_of
+from mjxball.policy import Policy, load_file, shipped_policy
+from mjxball.train.polish import FlightState, KnownLoad, Polisher, nominal_load, resting
+
+
+def test_rounding_passes_a_gradient_and_rounds_all_the_same() -> None:
+    law = crazyflie.STOCK
+    draw = np.random.default_rng(0).normal(size=(400, 3)) * [0.1, 0.1, 2.0]
+
+    def sent(command: Any) -> Any:
+        mass = jnp.full(command.shape[:-1], 0.0377, jnp.float32)
+        return crazyflie.setpoints(law, jnp.asarray(command, jnp.float32), mass, 9.81)
+
+    thrust = np.asarray(jax.jit(sent)(draw))[:, 3]
+    assert (thrust == np.round(thrust)).all()
+    slope = jax.grad(lambda az: sent(jnp.stack([0.0, 0.0, az]))[3])(0.3)
+    # The calibrated law's own slope: a step of 0.1 m/s2 moves the rounded thrust by as much, to a unit.
+    step = float(sent(jnp.array([0.0, 0.0, 0.35]))[3] - sent(jnp.array([0.0, 0.0, 0.25]))[3])
+    assert slope == pytest.approx(step / 0.1, abs=10.0)
+    output = draw * 5000
+    # In the same numbers JAX and NumPy mix the same, bit by bit.
+    with jax.enable_x64(True):
+        same = crazyflie.mix(jnp.full(400, 40000.0), jnp.asarray(output))
+    np.testing.assert_array_equal(np.asarray(same), crazyflie.mix(np.full(400, 40000.0), output))
+
+
+@pytest.fixture(scope="module")
+def polisher() -> Polisher:
+    """Of the shipped policy; compiled once for this file."""
+    contents = load_file(shipped_policy("flight"))
+    made = Polisher(config_of(contents.card), contents, {"num_envs": 8, "horizon": 50})
+    said: list[str] = []
+    made.compile(said.append)
+    assert said == [f"{k} of 3 programs compiled" for k in (1, 2, 3)]
+    return made
+
+
+@pytest.mark.slow
+def test_it_starts_from_the_flown_policy(polisher: Polisher) -> None:
+    flown = load_file(shipped_policy("flight"))
+    again = polisher._contents(polisher._start)
+    draw = np.random.default_rng(1).normal(size=(50, 18)) * 0.05
+    old, new = (Policy(one, "one", np.float64) for one in (flown, again))
+    np.testing.assert_allclose([new(row) for row in draw], [old(row) for row in draw], atol=1e-5)
+    assert again.card == flown.card
+
+
+@pytest.mark.slow
+def test_polishing_lowers_the_cost_and_ends_in_time(polisher: Polisher) -> None:
+    load = KnownLoad(0.0215, -0.0112, 0.009, 0.7, 0.3, 3.84, 0.0)
+    flight = resting(polisher.config)
+    flight = flight._replace(integral=np.array([0, 0, 0.2, 0, 0, 0, 0], np.float32))
+    polished = polisher.polish(load, flight, 60.0)
+    assert polished.steps > 1
+    assert polished.contents is not None
+    assert polished.after < 0.9 * polished.before
+    Policy(polished.contents, "polished")
+    nothing = polisher.polish(load, flight, 0.0)  # no time: the old weights are as good as they are
+    assert (nothing.steps, nothing.contents) == (0, None)
+
+
+@pytest.mark.slow
+def test_what_is_not_finite_or_no_better_is_kept_back(polisher: Polisher) -> None:
+    flight, load = resting(polisher.config), nominal_load(polisher.config)
+    lost = FlightState(*(np.full_like(part, np.nan) for part in flight))
+    polished = polisher.polish(load, lost, 5.0)
+    assert polished.contents is None
