@@ -37,10 +37,10 @@ class State:
     """The fields of Brax's `State`. Brax itself takes a second to import, most of it for meshes."""
 
     pipeline_state: Any  # `World`
-    obs: Float[Array, " n"]  # the networks' input
-    reward: Float[Array, ""]
-    done: Float[Array, ""]  # 1 at an end
-    metrics: dict[str, Array]
+    obs: Any  # (n,) the networks' input; like all that follow with any leading batch shape, or without arrays as a tree
+    reward: Any  # ()
+    done: Any  # () 1 at an end
+    metrics: dict[str, Any]
     info: dict[str, Any]
 
     def replace(self, **fields: Any) -> State:
