@@ -23,7 +23,6 @@ from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}"
 
 import numpy as np
 
@@ -38,7 +37,7 @@ from mjxball.fly.twin.virtual import World
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.rig.load import LoadWatch
 from mjxball.rig.replay import FlightReplay
-from mjxball.rig.retrain import situation
+from mjxball.rig.retrain import compile_sooner, situation
 from mjxball.train.polish import Polished, Polisher
 
 ROOT = Path(__file__).parents[1]
@@ -160,6 +159,7 @@ def main() -> None:
     parser.add_argument("--clock", type=int, default=2, metavar="N", help="rehearsals by the clock of each kind")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
+    compile_sooner()
     enable_compilation_cache()
     contents = load_file(POLICY)
     polisher = Polisher(config_of(contents.card), contents)
