@@ -32,6 +32,16 @@ def small(transport: Config) -> Config:
     return with_settings(transport, sac=SMALL, timing={"episode_steps": 60})
 
 
+def test_only_programs_of_ours_are_kept() -> None:
+    """Traced programs are found again by what they depend on, which nobody knows of an object of the user's own."""
+    assert Extensions().ours()
+    assert Extensions(algorithm="gradient").ours()
+    assert Extensions(algorithm=SoftActorCritic).ours()
+    assert not Extensions(env=toys.DoubleIntegrator).ours()
+    assert not Extensions(env=toys.DoubleIntegrator()).ours()
+    assert not Extensions(reward=len).ours()
+
+
 @pytest.mark.slow
 def test_any_brax_environment_trains(small: Config) -> None:
     """From pushing at random to standing at 0: the return of 60 steps is about -1.5 for the optimal law."""

@@ -29,13 +29,19 @@ def large(x: Any) -> Any:
     return jnp.sort(wide[:, -1]) + jax.random.normal(jax.random.PRNGKey(0), x.shape)
 
 
+def retyped(x: Any) -> Any:
+    """A number as one integer of its size, and as two of half of it."""
+    whole, halves = (jax.lax.bitcast_convert_type(jnp.round(x), kind) for kind in (jnp.int32, jnp.int16))
+    return x * (whole < 0), x * halves.shape[-1], (halves[:, 0] == whole % 2**16 - 2**16 * (whole % 2**16 >= 2**15)) * x
+
+
 def looped(x: Any) -> Any:
     """A loop with inputs and outputs for each step, which stays a loop."""
     total, each = jax.lax.scan(lambda total, one: (total + one, total * one), 0.0, x)
     return total, each
 
 
-@pytest.mark.parametrize("function", [rotation, large, looped])
+@pytest.mark.parametrize("function", [rotation, large, looped, retyped])
 def test_values_and_gradients_are_those_of_the_function(function: Any) -> None:
     points = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
 

@@ -17,25 +17,11 @@ LARGEST = 128  # numbers; operations on larger arrays stay as they are
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 ELEMENTWISE = frozenset(
     (
-        *("abs", "acos", "add", "add_any", "and", "asin", "atan", "atan2", "ceil", "clamp", "convert_element_type"),
-        *(
-            "bitcast_convert_type",
-            "copy",
-            "cos",
-            "div",
-            "eq",
-            "exp",
-            "exp2",
-            "expm1",
-            "floor",
-            "ge",
-            "gt",
-            "integer_pow",
-            "is_finite",
-            "le",
-        ),
-        *("log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not", "or", "pow", "rem", "round"),
-        *("rsqrt", "select_n", "sign", "sin", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor"),
+        *("abs", "acos", "add", "add_any", "and", "asin", "atan", "atan2", "bitcast_convert_type", "ceil", "clamp"),
+        *("convert_element_type", "copy", "cos", "div", "eq", "exp", "exp2", "expm1", "floor", "ge", "gt"),
+        *("integer_pow", "is_finite", "le", "log", "log1p", "logistic", "lt", "max", "min", "mul", "ne", "neg", "not"),
+        *("or", "pow", "rem", "round", "rsqrt", "select_n", "sign", "sin", "sqrt", "square", "stop_gradient", "sub"),
+        *("tan", "tanh", "xor"),
     )
 )
 REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
@@ -91,14 +77,15 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
         return _evaluate(called.jaxpr, called.consts, inputs)
     if name == "scan" and _repeats(equation):
         return _scan(parameters["jaxpr"], parameters["length"], inputs)
-    shapes = [variable.aval for variable in (*equation.invars, *equation.outvars)]
-    rewritten = name in ELEMENTWISE or name in REDUCTIONS or name in REARRANGED
-    keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in shapes)
-    if keys or not rewritten or max(aval.size for aval in shapes) > LARGEST:
+    avals, shape = [variable.aval for variable in (*equation.invars, *equation.outvars)], equation.outvars[0].aval.shape
+    alike = all(aval.shape in ((), shape) for aval in avals)  # a change of type may turn one number into several
+    rewritten = (name in ELEMENTWISE and alike) or name in REDUCTIONS or name in REARRANGED
+    keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals)
+    if keys or not rewritten or max(aval.size for aval in avals) > LARGEST:
         arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
         outputs = equation.primitive.bind(*arrays, **parameters)
         return outputs if equation.primitive.multiple_results else [outputs]
-    parts, shape = [_parts(value) for value in inputs], equation.outvars[0].aval.shape
+    parts = [_parts(value) for value in inputs]
     if name in REARRANGED:
         result = REARRANGED[name](parameters, shape, parts)
         return result if equation.primitive.multiple_results else [result]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from mjxball.plant import parts
+
 Array = Any  # any array that implements the Python array API standard
 
 
@@ -25,18 +27,6 @@ def rotate_back(matrix: Array, vector: Array) -> Array:
 def dot(a: Array, b: Array) -> Array:
     """a . b for (..., 3) each, broadcast -> (...)."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-
-
-def point_inertia(r: Array) -> Array:
-    """|r|^2 I - r r^T (..., 3, 3) [m2] of a unit point mass at `r` (..., 3) [m]."""
-    xp = r.__array_namespace__()
-    x, y, z = (r[..., i] for i in range(3))
-    rows = [
-        xp.stack([y * y + z * z, -x * y, -x * z], axis=-1),
-        xp.stack([-x * y, x * x + z * z, -y * z], axis=-1),
-        xp.stack([-x * z, -y * z, x * x + y * y], axis=-1),
-    ]
-    return xp.stack(rows, axis=-2)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -140,12 +130,5 @@ def integrate_quaternion(quaternion: Array, rotation: Array) -> Array:
 
 def solve_symmetric(matrix: Array, vector: Array) -> Array:
     """Solve a symmetric 3 x 3 system by its adjugate: `matrix` (..., 3, 3), `vector` (..., 3)."""
-    xp = matrix.__array_namespace__()
-    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
-    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
-    aa, ab, ac = d * f - e * e, c * e - b * f, b * e - c * d
-    bb, bc, cc = a * f - c * c, b * c - a * e, a * d - b * b
-    determinant = a * aa + b * ab + c * ac
-    x, y, z = (vector[..., i] for i in range(3))
-    rows = [aa * x + ab * y + ac * z, ab * x + bb * y + bc * z, ac * x + bc * y + cc * z]
-    return xp.stack(rows, axis=-1) / determinant[..., None]
+    rows = (parts.split(matrix[..., 0, :]), parts.split(matrix[..., 1, :]), parts.split(matrix[..., 2, :]))
+    return parts.stacked(parts.solve_symmetric(rows, parts.split(vector)), vector[..., 0])

@@ -56,7 +56,7 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
         recoils = [_solve(mass[:n, :n], -mass[:n, n + k]) for k in slides]
         driving = [pushed[k] - bias[n + k] - mass[n + k, :n] @ driven for k in slides]
         inertia = [[mass[n + i, n + j] + mass[n + i, :n] @ recoils[j] for j in slides] for i in slides]
-        ball = _solve_ball(inertia, driving)
+        ball = parts.solve_small(inertia, driving)
         for acceleration, recoil in zip(ball, recoils, strict=True):
             driven = driven + acceleration * recoil
         return *stages.result(state, driven), ball[0] if stages.slides == 1 else jnp.stack(ball)
@@ -161,22 +161,10 @@ class _Stages:
         return jnp.stack([zero, zero, rise]), jnp.stack([solution[-1], zero, zero])
 
 
-def _solve_ball(inertia: list[list[Any]], force: list[Any]) -> list[Any]:
-    """Solve for the ball's accelerations, one or two."""
-    if len(force) == 1:
-        return [force[0] / inertia[0][0]]
-    (a, b), (c, d) = inertia
-    determinant = a * d - b * c
-    return [(d * force[0] - b * force[1]) / determinant, (a * force[1] - c * force[0]) / determinant]
-
-
 def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Float[Array, " root"]:
     """Solve M a = f for the root: 6 (free joint, whose linear block is the total mass times I), 2 or 1."""
-    if mass.shape[0] == 1:
-        return force / mass[0]
-    if mass.shape[0] == 2:
-        (a, b), (_, c) = mass
-        return jnp.stack([c * force[0] - b * force[1], a * force[1] - b * force[0]]) / (a * c - b * b)
+    if len(force) <= 2:
+        return jnp.stack(parts.solve_small(mass, force))
     total, coupling = mass[0, 0], mass[3:, :3]
     rows = [coupling[i] for i in range(3)]
     squares = jnp.stack([jnp.stack([rotations.dot(a, b) for b in rows]) for a in rows])

@@ -78,7 +78,7 @@ def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | 
             [(1 + ROLLING_INERTIA if i == j else 0.0) + columns[j][axis] for j in range(len(axes))]
             for i, axis in enumerate(axes)
         ]
-        ball = _solved(inertia, driving)
+        ball = parts.solve_small(inertia, driving)
         for one, (a, w) in zip(ball, recoils, strict=True):
             linear, angular = parts.add(linear, parts.scale(one, a)), parts.add(angular, parts.scale(one, w))
         return *_in_world(matrix, linear, angular, state), joined(ball)
@@ -172,12 +172,3 @@ def _solve_heave(balance: Balance) -> tuple[Parts, Parts]:
     rise = parts.over(parts.minus(parts.times(j, lift), parts.times(coupling, twist)), determinant)
     roll = parts.over(parts.minus(parts.times(mass, twist), parts.times(coupling, lift)), determinant)
     return parts.scale(rise, down), (roll, 0.0, 0.0)
-
-
-def _solved(matrix: list[list[Part]], vector: list[Part]) -> list[Part]:
-    """Solve for the ball's accelerations, one or two."""
-    if len(vector) == 1:
-        return [vector[0] / matrix[0][0]]
-    (a, b), (c, d) = matrix
-    determinant = a * d - b * c
-    return [(d * vector[0] - b * vector[1]) / determinant, (a * vector[1] - c * vector[0]) / determinant]

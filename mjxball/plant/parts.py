@@ -159,6 +159,15 @@ def solve_symmetric(matrix: Rows, vector: Parts) -> Parts:
     return over(found[0], determinant), over(found[1], determinant), over(found[2], determinant)
 
 
+def solve_small(matrix: Any, vector: Any) -> list[Part]:
+    """Solve a system of one or two equations, given as sequences of sequences."""
+    if len(vector) == 1:
+        return [vector[0] / matrix[0][0]]
+    (a, b), (c, d) = matrix
+    determinant = a * d - b * c
+    return [(d * vector[0] - b * vector[1]) / determinant, (a * vector[1] - c * vector[0]) / determinant]
+
+
 def split(vector: Any) -> Parts:
     """Components of an array (..., 3)."""
     return vector[..., 0], vector[..., 1], vector[..., 2]

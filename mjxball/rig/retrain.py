@@ -15,7 +15,6 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +62,6 @@ def retrain(options: argparse.Namespace) -> int:
         from mjxball.train.polish import Polisher
     except ModuleNotFoundError as error:
         raise InputError(f"{error.name} is not installed; pip install 'mjxball[train]'") from None
-    compile_sooner()
     enable_compilation_cache()
     polisher = Polisher(config, flown)
     polisher.compile(lambda text: _say(text=f"retraining: {text}"))
@@ -83,15 +81,6 @@ def retrain(options: argparse.Namespace) -> int:
         _say(what="polished", text=text, numbers=numbers, policy=str(options.out))
     while True:  # until standard input ends
         time.sleep(1.0)
-
-
-def compile_sooner() -> None:
-    """Have XLA use its older emitters where it has them: two thirds of the time to compile, programs as fast.
-
-    To be called before the first compilation. From jaxlib 0.11 on a flag that is not known ends the process.
-    """
-    if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
-        os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}"
 
 
 def situation(load: AddedLoad, watch: LoadWatch, replay: FlightReplay, config: Config) -> Any:

@@ -28,7 +28,8 @@ class Extensions(NamedTuple):
 
     def ours(self) -> bool:
         """Whether everything that they name is part of mjxball."""
-        names = {one if isinstance(one, str) else f"{one.__module__}:{one.__name__}" for one in self if one is not None}
+        given = [one for one in self if one is not None]
+        names = {one if isinstance(one, str) else f"{one.__module__}:{getattr(one, '__name__', '')}" for one in given}
         return names <= {*ALGORITHMS, *ALGORITHMS.values()}
 
 

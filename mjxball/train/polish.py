@@ -24,12 +24,14 @@ from mjxball.control.observation import observation_history
 from mjxball.env import CoupledPairEnv, World
 from mjxball.policy import PolicyFile
 from mjxball.sim.disturbances import Sample
+from mjxball.train.compilation import CPU_OPTIONS
 from mjxball.train.program import MATMUL_PRECISION, Environments
 
 Array = Any
 LEARN = Phase(np.asarray(False), np.asarray(False))
 AHEAD = 4.0  # [s] that the old weights fly before the new ones could
 CHECKED = 15.0  # [s] of flight in which old and new weights are compared
+COMPARED = 8  # worlds in which they are
 PLACES = 16  # that a CG visits in turns: an even number, so that it goes to and fro
 MOST_STEPS = 12  # of Adam
 SHARES = (0.0, 0.25, 0.5, 1.0)  # of the way from the old weights to the last ones: what is compared
@@ -53,7 +55,7 @@ SURROUNDINGS: dict[str, Any] = {  # of `config.scenario`: what the twin meets, a
 }
 OBJECTIVE: dict[str, Any] = {}  # of `config.reward`
 SETTINGS: dict[str, Any] = {  # of `config.gradient`
-    "num_envs": 32,
+    "num_envs": 16,
     "horizon": 150,
     "learning_rate": 1e-3,
     "learning_rate_end": 0.1,
@@ -176,24 +178,24 @@ class Polisher:
         # Traced one after the other, compiled side by side.
         lowered = {name: jax.jit(function).lower(*given) for name, (function, given) in asked.items()}
         with ThreadPoolExecutor(len(lowered)) as pool:
-            waiting = {pool.submit(one.compile): name for name, one in lowered.items()}
+            waiting = {pool.submit(one.compile, CPU_OPTIONS): name for name, one in lowered.items()}
             for count, done in enumerate(as_completed(waiting), start=1):
                 self._programs[waiting[done]] = done.result()
                 progress(f"{count} of {len(waiting)} programs compiled")
         for _ in range(2):  # so that nothing is made for the first time in flight, and the comparison's time is known
             self.polish(load, flight, 0.0)
 
-    def polish(self, load: KnownLoad, flight: FlightState, seconds: float, seed: int = 0) -> Polished:
-        """Polish for `load` from `flight` on, within `seconds` [s] by the clock or little more."""
+    def polish(self, load: KnownLoad, flight: FlightState, seconds: float, most: int = MOST_STEPS) -> Polished:
+        """Polish for `load` from `flight` on, within `seconds` [s] by the clock or little more, in `most` steps."""
         begun = time.monotonic()
         load, flight = _single(load), _single(flight)
-        key, own = jax.random.split(jax.random.PRNGKey(seed))
+        key, own = jax.random.split(jax.random.PRNGKey(0))
         at_handover = worlds = self._programs["flight ahead"](self._start, load, flight, own)
         jax.block_until_ready(worlds)
         state, count, longest = self._start, 0, 0.0
         # What the comparison takes is known from before the flight, where nothing else ran.
         last = begun + seconds - BUSY * self._comparing
-        while count < MOST_STEPS and last - time.monotonic() > RESERVE * longest:
+        while count < most and last - time.monotonic() > RESERVE * longest:
             key, own = jax.random.split(key)
             entered = time.monotonic()
             progress = np.float32(count / MOST_STEPS)
@@ -210,8 +212,8 @@ class Polisher:
         contents = self._contents(state._replace(layers=candidates[best])) if better else None
         return Polished(contents, float(costs[0]), float(costs[best]), SHARES[best], count, time.monotonic() - begun)
 
-    def _environments(self, load: KnownLoad, flight: FlightState) -> Environments:
-        return Environments(LoadedEnv(self.config, load, flight), self._worlds)
+    def _environments(self, load: KnownLoad, flight: FlightState, count: int | None = None) -> Environments:
+        return Environments(LoadedEnv(self.config, load, flight), count or self._worlds)
 
     def _state_of(self, flown: PolicyFile) -> GradientState:
         """What the algorithm knows if it has the weights of `flown`, whose normalisation goes into the first layer."""
@@ -249,7 +251,7 @@ class Polisher:
 
     def _fly(self, state: GradientState, worlds: Any, load: KnownLoad, flight: FlightState, seconds: float) -> Any:
         """(worlds, mean reward) after `seconds` [s] of flight by the weights in `state`."""
-        environments = self._environments(load, flight)
+        environments = self._environments(load, flight, len(worlds.done))
         policy = FirstOrderGradient(self.config, environments).policy(state)
 
         def step(envs: Any, _: None) -> tuple[Any, Array]:
@@ -265,7 +267,8 @@ class Polisher:
         return self._fly(state, self._begin(load, flight, key), load, flight, AHEAD)[0]
 
     def _costs(self, layers: Any, worlds: Any, load: KnownLoad, flight: FlightState) -> Array:
-        """Minus the mean reward of weights (n, ...), all from the same `worlds`."""
+        """Minus the mean reward of weights (n, ...), all from the same `COMPARED` of the `worlds`."""
+        worlds = jax.tree.map(lambda leaf: leaf[:COMPARED], worlds)
 
         def cost(one: Any) -> Array:
             return -self._fly(self._start._replace(layers=one), worlds, load, flight, CHECKED)[1]
