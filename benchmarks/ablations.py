@@ -36,7 +36,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "four-observations": {"follower.observation_averages": (), "follower.history": 4, "follower.previous_action": True},
     "third-average-1s": {"follower.observation_averages": (0.05, 0.2, 1.0)},
     "direct-action": {"follower.action": "direct"},
-    "critics-not-told": {"sac.privileged_critic": False},
+    "critics-not-told": {"follower.privileged_critic": False},
     "1-step": {"sac.n_step": 1},
     "5-step": {"sac.n_step": 5},
     "critic-layernorm": {"sac.critic_layer_norm": True},

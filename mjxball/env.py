@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball import rewards
-from mjxball.config import Config, Reward, ball_limit
+from mjxball.config import Config, ball_limit
 from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
 from mjxball.control.observation import observation_history
@@ -23,7 +22,6 @@ from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
 from mjxball.sim.disturbances import RandomDisturbances
 from mjxball.sim.randomization import ResetDistribution
 
-RewardFunction = Callable[[Reward, rewards.Transition], Array]
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 # [s] of an episode, after which its error counts as steady state in training's metrics. Episodes last 20 s, after which
@@ -65,14 +63,6 @@ class World(NamedTuple):
         return self.loop.plant
 
 
-class Applied(NamedTuple):
-    """What is done in one control period, and the network's action behind it."""
-
-    commands: Commands
-    action: Float[Array, "3"]  # the network's in [-1, 1], zeros if it was not finite
-    finite: Bool[Array, ""]  # whether it was
-
-
 class CoupledPairEnv:
     """Two drones, one object with a moving CG: the follower acts, the leader flies its PID. Brax's `Env` interface.
 
@@ -82,12 +72,11 @@ class CoupledPairEnv:
     EpisodeWrapper the wrapper keeps the time. A non-finite action counts as divergence.
     """
 
-    def __init__(self, config: Config, physics: str = "mjx", reward: RewardFunction = rewards.reward):
-        """`reward(config.reward, transition)` -> () replaces the task's and the paper's."""
+    def __init__(self, config: Config, physics: str = "mjx"):
         if physics not in TRAINING_ENGINES:
             raise ValueError(f"physics must be one of {TRAINING_ENGINES}, not {physics!r}")
         self.config = config
-        self._backend, self._reward = physics, reward
+        self._backend = physics
         self._disturbances = RandomDisturbances(config)
         self._loop = ClosedLoop(config, make_physics(config, physics), self._disturbances.sensors)
         self._ball_limit = ball_limit(config.plant)
@@ -97,7 +86,7 @@ class CoupledPairEnv:
         self._commanded = np.array(layout.commanded(config.follower.load_axis_only, config.plant.cg_axis))
         self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # of roll and pitch the one that no load turns
         self._privileged_size = 0
-        if config.sac.privileged_critic:
+        if config.follower.privileged_critic:
             self._privileged_size = jax.eval_shape(self._first_privileged, jax.random.key(0)).shape[0]
 
     @property
@@ -148,43 +137,51 @@ class CoupledPairEnv:
         metrics = dict.fromkeys(names, zero)
         return State(world, self._input(observation, world), zero, zero, metrics, {"truncation": zero})
 
-    def step(self, state: State, action: Float[Array, "3"]) -> State:
-        """Apply the network's `action` in [-1, 1] for one control period."""
-        return self._step(state, *self.command(state, action))
-
-    def step_with_command(self, state: State, follower_command: Float[Array, "3"]) -> State:
-        """`step` of a follower that is no network: `follower_command` is flown as it is."""
-        applied, load = self.command(state, jnp.zeros(layout.ACTION_SIZE))
-        commands = applied.commands._replace(follower=follower_command)
-        return self._step(state, applied._replace(commands=commands), load, 0.0)
-
-    def _step(self, state: State, applied: Applied, load: Load, shares: float = 1.0) -> State:
-        plant = self._loop.physics(state.pipeline_state.plant, self._loop.stack(applied.commands), load)
-        return self.after_physics(state, applied, plant, shares)
-
-    def command(self, state: State, action: Float[Array, "3"]) -> tuple[Applied, Load]:
-        """What the physics is given for one control period at the network's `action`."""
+    def step(self, state: State, action: Float[Array, "... 3"], physics: ControlStep | None = None) -> State:
+        """Apply the network's `action` in [-1, 1] for one control period, with `physics` in place of the engine."""
         world: World = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
-        observation = state.obs[: layout.OBSERVATION_SIZE]
-        commands = self._loop.commands(world.loop, observation, self._follower_command(action, observation), world.goal)
-        disturbed = self._disturbances.present
-        load = world.load._replace(external_force=world.disturbances.force) if disturbed else world.load
-        return Applied(commands, action, finite), load
+        command = self._follower_command(action, self._observed(state))
+        return self._step(state, command, action, ~finite | world.loop.diverged, 1.0, physics)
 
-    def after_physics(self, state: State, applied: Applied, plant: PlantState, shares: float = 1.0) -> State:
-        """The next state once the physics has brought the plant of `state` to `plant`.
+    def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
+        """`step` of a follower that is no network: `follower_command` is flown as it is."""
+        diverged = state.pipeline_state.loop.diverged
+        return self._step(state, follower_command, jnp.zeros_like(follower_command), diverged, 0.0)
 
-        `shares`: 1 for a follower that shares the integrals (`sim.closed_loop`), 0 for one with a law of its own.
-        """
+    def commands(self, state: State, action: Float[Array, "... 3"]) -> tuple[Float[Array, "drones 3"], Load]:
+        """What the physics is given for one control period at the network's `action`; see `step`."""
+        given: list[Any] = []
+
+        def physics(plant: PlantState, commands: Float[Array, "drones 3"], load: Load) -> PlantState:
+            given.extend((commands, load))
+            return plant
+
+        self.step(state, action, physics)
+        return given[0], given[1]
+
+    def _observed(self, state: State) -> Float[Array, "... 18"]:
+        return state.obs[..., : layout.OBSERVATION_SIZE]
+
+    def _step(
+        self,
+        state: State,
+        command: Float[Array, "... 3"],
+        action: Float[Array, "... 3"],
+        diverged: Bool[Array, ""],
+        shares: float,
+        physics: ControlStep | None = None,
+    ) -> State:
+        """The next state at the followers' `command`; `shares`: see `ClosedLoop.step`."""
         world: World = state.pipeline_state
-        commands, action, finite = applied
-        observation = state.obs[: layout.OBSERVATION_SIZE]
+        observation = self._observed(state)
+        load = world.load
+        if self._disturbances.present:
+            load = load._replace(external_force=world.disturbances.force)
         disturbances, sample = self._disturbances.step(world.disturbances)
-        before = world.loop._replace(diverged=world.loop.diverged | ~finite)
-        goals = (world.goal, world.goal)
-        loop, after = self._loop.after_physics(before, observation, commands, plant, goals, sample, shares)
+        before, goals = world.loop._replace(diverged=diverged), (world.goal, world.goal)
+        loop, after, commands = self._loop.step(before, observation, command, load, goals, sample, shares, physics)
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
@@ -198,10 +195,11 @@ class CoupledPairEnv:
         wrapped = "steps" in state.info
         truncated = jnp.logical_and(moved.steps >= self.config.timing.episode_steps, ~terminated) & (not wrapped)
         steady = (loop.plant.time > STEADY_IN_TRAINING_AFTER).astype(jnp.float32)
+        difference = commands.follower - commands.leader
         return state.replace(
             pipeline_state=moved,
             obs=self._input(after, moved),
-            reward=self._reward(self.config.reward, self._transition(world, moved, commands, terminated)),
+            reward=rewards.reward(self.config.reward, self._transition(world, moved, commands, terminated)),
             done=jnp.logical_or(terminated, truncated).astype(jnp.float32),
             metrics={
                 **state.metrics,
@@ -209,8 +207,8 @@ class CoupledPairEnv:
                 "steady_error": distance * steady,
                 "steady": steady,
                 "diverged": loop.diverged.astype(jnp.float32),
-                "tilt_error": jnp.mean((commands.follower - commands.leader)[:2] ** 2),
-                "vertical_error": (commands.follower - commands.leader)[2] ** 2,
+                "tilt_error": jnp.mean(difference[..., :2] ** 2),
+                "vertical_error": jnp.mean(difference[..., 2] ** 2),
             },
             info={**state.info, "truncation": truncated.astype(jnp.float32)},
         )
@@ -237,7 +235,7 @@ class CoupledPairEnv:
     def _input(self, observation: Float[Array, "18"], world: World) -> Float[Array, " input"]:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
         shown = self._history.network_input(observation, world.history) if self._history.size else observation
-        return jnp.concatenate([shown, self._privileged(world)]) if self.config.sac.privileged_critic else shown
+        return jnp.concatenate([shown, self._privileged(world)]) if self.config.follower.privileged_critic else shown
 
     def _first_privileged(self, rng: Array) -> Float[Array, " privileged"]:
         return self._privileged(self._fresh_world(rng, 1.0)[0])
@@ -294,8 +292,8 @@ class CoupledPairEnv:
             action_average=self._history.slowest_action(before.history) if remembers else None,
             leader_command=commands.leader,
             follower_command=commands.follower,
-            tilt_disagreement=(commands.follower - commands.leader)[self._unloaded],
-            ball=plant.ball_offset / self._ball_limit,
+            tilt_disagreement=(commands.follower - commands.leader)[..., self._unloaded],
+            ball=jnp.atleast_1d(plant.ball_offset / self._ball_limit),
             terminated=terminated,
         )
 

@@ -13,7 +13,11 @@ if TYPE_CHECKING:
 
 
 class Transition(NamedTuple):
-    """What a reward may depend on: the truth after one control step, and what was commanded in it."""
+    """What a reward may depend on: the truth after one control step, and what was commanded in it.
+
+    Of several followers `action`, `last_action`, `action_average`, `follower_command` and `tilt_disagreement` have an
+    axis for them, and so has the reward.
+    """
 
     error: Vector  # e_o, goal less position of O [m]
     velocity: Vector  # of O [m/s]
@@ -25,7 +29,7 @@ class Transition(NamedTuple):
     leader_command: Vector  # roll, pitch [rad], vertical acceleration [m/s2]
     follower_command: Vector  # likewise
     tilt_disagreement: Scalar  # follower's less leader's command about the axis that no load turns [rad]
-    ball: Scalar  # a rolling ball's offset over its end stop's
+    ball: Float[Array, "... directions"]  # a rolling ball's offset along the load's directions over its end stop's
     terminated: Bool[Array, "..."]  # whether the episode ended by leaving the termination distance or by diverging
 
 
@@ -57,7 +61,7 @@ def task_reward(weights: Reward, step: Transition) -> Scalar:
     if _used(weights.tilt_disagreement):
         total = total - weights.tilt_disagreement * step.tilt_disagreement**2
     if _used(weights.ball):
-        total = total - weights.ball * step.ball**2
+        total = total - weights.ball * square(step.ball)
     if _used(weights.steady_action) and step.action_average is not None:
         total = total - weights.steady_action * square(step.action_average)
     return total

@@ -298,7 +298,7 @@ class TestOldNames:
     def test_a_nested_record_with_old_names_is_the_same_configuration(self):
         config = configs.preset("flight")
         recorded = json.loads(configs.to_json(config))
-        for old, new in configs.RENAMED.items():
+        for new, old in {new: old for old, new in configs.RENAMED.items()}.items():
             (part, name), (*way, new_name) = old.split("."), new.split(".")
             place = recorded
             for step in way:

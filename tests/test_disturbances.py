@@ -78,7 +78,7 @@ def test_gusts_have_their_size_and_correlation() -> None:
 def test_a_steady_force_shifts_the_pair_as_statics_says(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against a held force F the PD leader and its copy rest where M kp e = F: e = F / (M kp) along y and z."""
     force = np.array([0.0, 0.11, -0.22])
-    monkeypatch.setattr(rollout, "record", lambda _, count, period: Sample(force=np.broadcast_to(force, (count, 1, 3))))
+    monkeypatch.setattr(rollout, "record", lambda _, count, *rest: Sample(force=np.broadcast_to(force, (count, 1, 3))))
     flight = simulate(CONFIG, copying(CONFIG), Scenario(amplitude=0.0, goal=(0, 0, 0), seconds=60), "newton-euler")
     # Thrust along body z makes the same force as commanded acceleration; 2.2 kg, kp 0.5; tilt's second order is 1e-4.
     np.testing.assert_allclose(flight.error[-1, 1:], -force[1:] / (2.2 * 0.5), atol=2e-3)

@@ -68,6 +68,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.rotate": (rotations.rotate, (MATRIX, normal(3))),
     "rotations.rotate_back": (rotations.rotate_back, (MATRIX, normal(3))),
     "rotations.cross": (rotations.cross, (normal(3), normal(3))),
+    "rotations.turned_about_z": (rotations.turned_about_z, (normal(18), EULER[:, 2])),
     "rotations.matrix_from_euler": (rotations.matrix_from_euler, (EULER,)),
     "rotations.euler_from_matrix": (rotations.euler_from_matrix, (MATRIX,)),
     "rotations.matrix_from_quaternion": (rotations.matrix_from_quaternion, (QUATERNION,)),
@@ -129,6 +130,7 @@ NOT_LAWS = {
     "crazyflie.cascade",
     "crazyflie.integral_shares",
     "observation.commanded",
+    "observation.mount_angles",
     "observation.observation_history",
     *(
         f"crazyflie.{name}"

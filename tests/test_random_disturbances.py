@@ -121,7 +121,9 @@ def disturbed(transport: Config) -> CompiledEnv:
         "mass_known": False,
         "object_mass": (0.3, 0.4),
     }
-    return compile_env(with_settings(transport, scenario=scenario, sac={"privileged_critic": True}), "newton-euler")
+    return compile_env(
+        with_settings(transport, scenario=scenario, follower={"privileged_critic": True}), "newton-euler"
+    )
 
 
 def test_critics_are_told_the_truth_and_policies_are_not(disturbed: CompiledEnv) -> None:

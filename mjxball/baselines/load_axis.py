@@ -26,7 +26,7 @@ class LoadAxis(NamedTuple):
     kd: float  # [N m s/rad]
     inertia: float  # of the assembly about O, CG at O, nominal object [kg m2]
     half_length: float  # from O to each drone [m]
-    drone_mass: tuple[float, float]  # leader, follower [kg]
+    drone_mass: tuple[float, float]  # leader, follower, each with its share of a carrier [kg]
     share: tuple[float, float]  # of the object's weight that each drone carries
     gravity: float  # [m/s2]
     slope: float  # thrust of the follower per commanded vertical acceleration [kg]
@@ -100,7 +100,7 @@ def load_axis(config: Config, name: str) -> LoadAxis:
         kd=kd,
         inertia=float(inertia[axis]),
         half_length=0.5 * (lead.mount[along] - follow.mount[along]),
-        drone_mass=(lead.mass, follow.mass),
+        drone_mass=(plant.known_masses[0], plant.known_masses[1]),
         share=(leader_share, follower_share),
         gravity=plant.gravity,
         slope=thrust_slopes(config)[1],

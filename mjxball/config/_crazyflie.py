@@ -44,7 +44,6 @@ LARGE_SAC = Sac(
     replay_size=512_000,
     policy_layers=(128, 128),
     critic_layers=(128, 128),
-    privileged_critic=True,
     n_step=15,
     learning_rate=2e-3,
     learning_rate_end=0.02,
@@ -69,6 +68,7 @@ def stand() -> Config:
             action_scale_vertical=3.0,
             observation_averages=(0.05, 0.2, 1.0),
             ignore_position=True,
+            privileged_critic=True,
         ),
         scenario=Scenario(
             goal_range=0.0,
@@ -109,6 +109,7 @@ def flight() -> Config:
             observation_averages=(0.05, 0.2, 1.0),
             shares_integrals=True,
             washout_time=8.0,
+            privileged_critic=True,
         ),
         scenario=Scenario(
             goal_range=0.5,

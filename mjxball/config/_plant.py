@@ -61,6 +61,11 @@ class Plant:
         return len(self.drones)
 
     @property
+    def followers(self) -> tuple[int, ...]:
+        """Numbers of the drones that follow, in order: all but the leader's."""
+        return tuple(number for number in range(len(self.drones)) if number != self.leader)
+
+    @property
     def pair(self) -> tuple[Drone, Drone]:
         """Leader and follower of a plant of two whose load moves along a line; InputError for any other.
 
@@ -94,6 +99,13 @@ class Plant:
         scatter = [[sum(row[i] * row[j] for row in off) for j in range(len(axes))] for i in range(len(axes))]
         weights = _solved(scatter, mean)
         return tuple(1 / count - sum(a * b for a, b in zip(row, weights, strict=True)) for row in off)
+
+    @property
+    def known_masses(self) -> tuple[float, ...]:
+        """What each drone lifts besides its share of the load [kg]: itself and the same share of the carrier."""
+        return tuple(
+            drone.mass + share * self.carrier_mass for drone, share in zip(self.drones, self.shares, strict=True)
+        )
 
     def of_drones(self, name: str) -> tuple[float, ...]:
         """`name` (arm, rotor_force_max, rotor_lag or yaw_per_thrust) of every drone."""

@@ -65,7 +65,7 @@ def _transport_large() -> Config:
     """What `transport` becomes with a GPU: all loads that one drone can trim, and a memory."""
     return Config(
         preset="transport-large",
-        follower=Follower(action_scale_tilt=0.3, observation_averages=(0.05, 0.2)),
+        follower=Follower(action_scale_tilt=0.3, observation_averages=(0.05, 0.2), privileged_critic=True),
         scenario=Scenario(
             cg_speed=(0.2, 3.2),
             cg_amplitude=(0.0, 0.17),

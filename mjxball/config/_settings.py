@@ -127,6 +127,7 @@ class Follower:
     observation_averages: tuple[float, ...] = setting(
         (), "time constants of exponential averages of observations and actions that the network sees [s]", above=1e-3
     )
+    privileged_critic: bool = setting(False, "in training, critics also see the CG, the true mass and the disturbances")
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,6 @@ class Sac:
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1)
     critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
-    privileged_critic: bool = setting(False, "the critics also see the CG and the true mass")
     num_critics: int = setting(2, "Q networks, of which the smallest value counts", low=1, high=2)
     state_value: bool = setting(
         False, "a state-value network with a slow copy gives the targets (the paper's eqs. 6-8), not slow Q networks"

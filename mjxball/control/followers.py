@@ -19,8 +19,9 @@ class PrivilegedInfo(NamedTuple):
     """
 
     believed_mass: Array  # (...) mass of the object that the hover thrust assumes [kg]
-    moment: Array  # (...) object mass x CG offset [kg m]
-    moment_acceleration: Array  # (...) object mass x second derivative of the CG offset [kg m/s2]
+    # (...) object mass x CG offset along the line; of teams and in the plane (..., 2) in each mount frame [kg m]
+    moment: Array
+    moment_acceleration: Array  # likewise, object mass x second derivative of the CG offset [kg m/s2]
     total_mass: Array  # (...) of the assembly [kg]
 
 
@@ -38,7 +39,10 @@ class Law(Protocol):
 
 
 class Follower(Protocol):
-    """What flies as the follower: a `Baseline`, or `mjxball.policy.Policy`."""
+    """What flies as the follower: a `Baseline`, or `mjxball.policy.Policy`.
+
+    Several followers of a team are called at once, as one batch axis more, each in its mount frame.
+    """
 
     name: str
 

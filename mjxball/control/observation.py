@@ -8,7 +8,9 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from mjxball.config import Config
+import numpy as np
+
+from mjxball.config import Config, Plant
 from mjxball.control import leader, rotations
 
 Array = Any
@@ -45,13 +47,31 @@ def observe(position: Array, matrix: Array, velocity: Array, rates: Array, goal:
     """The 18 numbers of `OBSERVATION` (..., 18) from the object's state.
 
     `position`, `velocity` of O in the world (..., 3), attitude `matrix` (..., 3, 3), body `rates` (..., 3),
-    `goal` of O (..., 3), follower `mount` in body axes (3,). The goal stands still, so de_o/dt = -velocity.
+    `goal` of O (..., 3), follower `mount` in body axes (..., 3); they broadcast. The goal stands still, so
+    de_o/dt = -velocity.
     """
     xp = position.__array_namespace__()
     follower = position + rotations.rotate(matrix, mount)
     follower_velocity = velocity + rotations.rotate(matrix, rotations.cross(rates, mount))
     euler = rotations.euler_from_matrix(matrix)
-    return xp.concat([follower, euler, follower_velocity, rates, goal - position, -velocity], axis=-1)
+    parts = (follower, euler, follower_velocity, rates, goal - position, -velocity)
+    return xp.concat([xp.broadcast_to(part, follower.shape) for part in parts], axis=-1)
+
+
+def mount_angles(plant: Plant, mounts: Array | None = None) -> Array | None:
+    """Angles (..., F) about body z by which the followers' mount frames are turned from the body axes [rad] (ours).
+
+    In its frame a follower's mount lies on the negative half of x. The frame turns world and body alike, so every
+    vector and (roll, pitch, yaw) of an observation turns as a vector, and (roll, pitch) of a command turns back. None
+    for a pair whose load moves along a line: its follower sees body axes. `mounts` (..., N, 3) if they are not the
+    plant's; without F where there is one follower.
+    """
+    if len(plant.followers) == 1 and len(plant.directions) == 1:
+        return None
+    places: Any = np.array([drone.mount for drone in plant.drones]) if mounts is None else mounts
+    followers = list(plant.followers) if len(plant.followers) > 1 else plant.followers[0]
+    own = places[..., followers, :]
+    return own.__array_namespace__().atan2(-own[..., 1], -own[..., 0])
 
 
 def copy_command(

@@ -24,6 +24,16 @@ def rotate_back(matrix: Array, vector: Array) -> Array:
     return xp.stack([dot(matrix[..., :, i], vector) for i in range(3)], axis=-1)
 
 
+def turned_about_z(vectors: Array, angle: Array) -> Array:
+    """Every three numbers of `vectors` (..., 3 k) as a vector, turned by `angle` (...) about z [rad]."""
+    xp = vectors.__array_namespace__()
+    angle = xp.asarray(angle, dtype=vectors.dtype)[..., None]
+    c, s = xp.cos(angle), xp.sin(angle)
+    each = xp.reshape(vectors, (*vectors.shape[:-1], -1, 3))
+    x, y, z = (each[..., i] for i in range(3))
+    return xp.reshape(xp.stack([c * x - s * y, s * x + c * y, z], axis=-1), vectors.shape)
+
+
 def dot(a: Array, b: Array) -> Array:
     """a . b for (..., 3) each, broadcast -> (...)."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]

@@ -23,7 +23,7 @@ from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
-from mjxball.sim.disturbances import Sample, SensorModel, record, sensors_of
+from mjxball.sim.disturbances import Sample, SensorModel, followers_axis, record, sensors_of
 from mjxball.sim.scenario import Scenario, check_scenario
 
 if TYPE_CHECKING:
@@ -72,11 +72,13 @@ class Batch:
         period = self._config.timing.control_period
         count = round(scenarios[0].seconds / period)
         disturbances = [scenario.disturbance for scenario in scenarios]
-        sensors, delays = sensors_of(disturbances, period)
+        followers = followers_axis(self._config)
+        sensors, delays = sensors_of(disturbances, period, followers)
         single = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf, _single(leaf)), tree)  # noqa: E731
-        load, start = single((rollout.load_of(scenarios), rollout.start_of(self._config, scenarios)))
+        flown = rollout.load_of(scenarios, self._config.plant.count), rollout.start_of(self._config, scenarios)
+        load, start = single(flown)
         goals, samples = single(
-            (rollout.targets(scenarios, count + 1, period), record(disturbances, count + 2, period))
+            (rollout.targets(scenarios, count + 1, period), record(disturbances, count + 2, period, followers))
         )
         force, later = samples.at(slice(count + 1)).force, samples.at(slice(1, None))
         inputs = Inputs(
@@ -106,7 +108,7 @@ class Batch:
         inputs: Inputs,
     ) -> metrics.RunningMetrics:
         state, observation = loop.start(start, goal, first, delays)
-        running = metrics.begin(start.position, goal, start.rotor_force)
+        running = metrics.begin(start.position, goal, start.rotor_force, self._config.plant.leader)
         carry = Carry(state, observation, self._law.start(observation), running)
         return jax.lax.scan(lambda c, i: (self._step(loop, load, c, i), None), carry, inputs)[0].running
 
@@ -119,7 +121,7 @@ class Batch:
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         time = inputs.number * jnp.float32(config.timing.control_period)
         flown = (time, plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)
-        limits = (config.scenario.termination_distance, config.plant.rotor_force_max)
+        limits = (config.scenario.termination_distance, config.plant.rotor_force_max, config.plant.leader)
         return Carry(moved, after, follower, metrics.update(carry.running, rollout.Tick(*flown), *limits))
 
 

@@ -33,12 +33,12 @@ class Metrics:
     y_peak: float | None  # [m]
     z_peak: float | None  # [m]
     max_tilt: float | None  # largest hypot(roll, pitch) [rad]
-    action_error: float | None  # rms over time and (roll, pitch, az) of follower minus leader command
+    action_error: float | None  # rms over time, followers and (roll, pitch, az) of follower minus leader command
     settling_time_10: float | None  # as settling_time, for 10 % [s]
     paper_return: float | None  # the paper's reward, summed over the first 1000 steps (20 s)
-    effort: float | None  # rms deviation of the follower's rotor forces from those at the start, hover [N]
-    smoothness: float | None  # rms change of the follower's pitch and roll command from step to step [rad]
-    saturation: float | None  # share of the follower's rotors and all steps at 0 or the largest force
+    effort: float | None  # rms deviation of the followers' rotor forces from those at the start, hover [N]
+    smoothness: float | None  # rms change of the followers' pitch and roll commands from step to step [rad]
+    saturation: float | None  # share of the followers' rotors and all steps at 0 or the largest force
     failed: bool  # |e_o| beyond d_term, or a value that is not finite
 
     @property
@@ -69,14 +69,15 @@ class RunningMetrics(NamedTuple):
     peaks: Array  # (n, 3) NaN before the first
     furthest: Array  # (n, 3) along each axis towards the goal [m]
     tilt: Array
-    hover: Array  # (n, 4) the follower's rotor forces at the start [N]
-    tilts: Array  # (n, 2) its last roll and pitch commands
+    hover: Array  # (n, F, 4) the followers' rotor forces at the start [N]
+    tilts: Array  # (n, F, 2) their last roll and pitch commands
     target: Array  # (n, 3)
 
 
-def begin(position: Array, target: Array, rotor_force: Array) -> RunningMetrics:
-    """Before the first step, at `position` (n, 3) with `target` (n, 3) and `rotor_force` (n, 2, 4)."""
+def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -> RunningMetrics:
+    """Before the first step, at `position` (n, 3) with `target` (n, 3) and `rotor_force` (n, N, 4)."""
     xp = position.__array_namespace__()
+    hover = _of_followers(rotor_force, leader)
     zero, none = xp.zeros_like(position[:, 0]), xp.full_like(position, xp.nan)
     scalar = xp.sum(zero[:0])
     return RunningMetrics(
@@ -89,14 +90,16 @@ def begin(position: Array, target: Array, rotor_force: Array) -> RunningMetrics:
         peaks=none,
         furthest=none,
         tilt=zero,
-        hover=rotor_force[:, 1],
-        tilts=zero[:, None] * position[:, :2],
+        hover=hover,
+        tilts=xp.zeros_like(hover[..., :2]),
         target=target,
     )
 
 
-def update(running: RunningMetrics, tick: Tick, termination_distance: float, rotor_force_max: float) -> RunningMetrics:
-    """Take one control step of all flights into account."""
+def update(
+    running: RunningMetrics, tick: Tick, termination_distance: float, rotor_force_max: float, leader: int = 0
+) -> RunningMetrics:
+    """Take one control step of all flights into account; `leader` is the number of the drone that leads."""
     xp = tick.position.__array_namespace__()
     error = tick.target - tick.position
     distance = _norm(error)
@@ -109,22 +112,24 @@ def update(running: RunningMetrics, tick: Tick, termination_distance: float, rot
     beyond = xp.stack([~(distance <= share * initial) for share in SETTLED], axis=-1)
     peaks = xp.where(new[:, None], xp.nan, running.peaks)
     steady = tick.time >= steady_from - TINY
-    rotors, tilts = tick.rotor_force[:, 1], tick.follower_command[:, :2]
+    rotors = _of_followers(tick.rotor_force, leader)
+    led, followed = tick.leader_command[:, None], xp.reshape(tick.follower_command, (*rotors.shape[:2], 3))
+    tilts, difference = followed[..., :2], followed - led
     slack = SATURATED_WITHIN * rotor_force_max
     at_a_limit = (rotors <= slack) | (rotors >= rotor_force_max - slack)
     early = tick.time <= RMSE_UNTIL + TINY
-    mimicry = paper_reward(tick.leader_command, tick.follower_command)
-    change = xp.mean((tilts - running.tilts) ** 2, axis=-1)
+    mimicry = xp.mean(paper_reward(led, followed), axis=-1)
+    change = xp.mean((tilts - running.tilts) ** 2, axis=(-2, -1))
     return RunningMetrics(
         steps=running.steps + 1,
         time=running.time * 0 + tick.time,
         early=running.early + xp.where(early, 1.0, 0.0),
         square=running.square + xp.where(early, distance**2, 0.0),
-        difference=running.difference + xp.mean((tick.follower_command - tick.leader_command) ** 2, axis=-1),
+        difference=running.difference + xp.mean(difference**2, axis=(-2, -1)),
         returned=running.returned + xp.where(running.steps < PAPER_STEPS, mimicry, 0.0),
-        effort=running.effort + xp.mean((rotors - running.hover) ** 2, axis=-1),
+        effort=running.effort + xp.mean((rotors - running.hover) ** 2, axis=(-2, -1)),
         change=running.change + xp.where(running.steps > 0, change, 0.0),
-        saturated=running.saturated + xp.mean(xp.where(at_a_limit, 1.0, 0.0), axis=-1),
+        saturated=running.saturated + xp.mean(xp.where(at_a_limit, 1.0, 0.0), axis=(-2, -1)),
         failed=running.failed | tick.diverged | ~(distance <= termination_distance),
         initial=initial,
         leg=xp.where(new, tick.time, running.leg),
@@ -169,18 +174,28 @@ def results(running: RunningMetrics) -> list[Metrics]:
     return [Metrics(**numbers, failed=bool(failed)) for numbers, failed in zip(named, t.failed, strict=True)]
 
 
-def measure(flight: Trajectory, termination_distance: float, rotor_force_max: float = 5.5) -> Metrics:
+def measure(flight: Trajectory, termination_distance: float, rotor_force_max: float = 5.5, leader: int = 0) -> Metrics:
     """Metrics of one recorded flight (no batch axis)."""
-    return measure_batch(flight.batched(), termination_distance, rotor_force_max)[0]
+    return measure_batch(flight.batched(), termination_distance, rotor_force_max, leader)[0]
 
 
-def measure_batch(flights: Trajectory, termination_distance: float, rotor_force_max: float = 5.5) -> list[Metrics]:
+def measure_batch(
+    flights: Trajectory, termination_distance: float, rotor_force_max: float = 5.5, leader: int = 0
+) -> list[Metrics]:
     """Metrics of every flight of a recorded batch."""
     first = flights.tick(0)
-    running = begin(first.position, first.target, first.rotor_force)
+    running = begin(first.position, first.target, first.rotor_force, leader)
     for number in range(len(flights.time)):
-        running = update(running, flights.tick(number), termination_distance, rotor_force_max)
+        running = update(running, flights.tick(number), termination_distance, rotor_force_max, leader)
     return results(running)
+
+
+def _of_followers(rotor_force: Array, leader: int) -> Array:
+    """(n, F, 4) of (n, N, 4)."""
+    if leader == 0:
+        return rotor_force[:, 1:]
+    xp = rotor_force.__array_namespace__()
+    return xp.concat([rotor_force[:, :leader], rotor_force[:, leader + 1 :]], axis=1)
 
 
 def _norm(vector: Array) -> Array:

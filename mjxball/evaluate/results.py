@@ -59,7 +59,8 @@ def fly_scenarios(
 ) -> list[Result]:
     """Fly every follower through every scenario; results are ordered by scenario, then by follower."""
     flights = simulate_batch(config, [(follower, scenarios) for follower in followers], physics)
-    measured = measure_batch(flights, config.scenario.termination_distance, config.plant.rotor_force_max)
+    plant, limit = config.plant, config.scenario.termination_distance
+    measured = measure_batch(flights, limit, plant.rotor_force_max, plant.leader)
     results = []
     for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
         index = j * len(scenarios) + i

@@ -119,7 +119,7 @@ def command_maps(config: Config, choice: ThrustChoice = ThrustChoice()) -> tuple
     curve = ForceCurve(*autopilot.motor_curve) if known else curve_of(config, choice.curve or "linear")
     hover = autopilot.hover_thrust if choice.hover is None else choice.hover
     law = choice.law or (autopilot.thrust_law if known else "calibrated")
-    own = [drone.mass for drone in plant.pair]
+    own = plant.known_masses
     carried = [mass + share * plant.object_mass for mass, share in zip(own, shares, strict=True)]
     if choice.mass is not None or not known:
         whole = UNKNOWN_MASS if choice.mass is None else choice.mass

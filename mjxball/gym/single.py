@@ -27,8 +27,8 @@ class Laws(NamedTuple):
 
     pair: CoupledPairEnv
     start: Any  # chain -> (chain, State)
-    command: Any  # (State, action (3,)) -> (Applied, Load)
-    after_physics: Any  # (State, Applied, PlantState) -> State
+    commands: Any  # (State, action (3,)) -> (commands (2, 3), Load)
+    arrive: Any  # (State, action (3,), PlantState that the physics came to) -> State
 
 
 @functools.lru_cache(maxsize=8)
@@ -41,7 +41,10 @@ def compiled_laws(config: Config) -> Laws:
         chain, key = worlds.next_world(chain)
         return chain, pair.reset(key)
 
-    return Laws(pair, jax.jit(start), jax.jit(pair.command), jax.jit(pair.after_physics))
+    def arrive(state: Any, action: Array, plant: PlantState) -> Any:
+        return pair.step(state, action, lambda *_: plant)
+
+    return Laws(pair, jax.jit(start), jax.jit(pair.commands), jax.jit(arrive))
 
 
 def engine_of(config: Config, physics: str | None) -> str:
@@ -105,14 +108,14 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Hold `action` (3,) in [-1, 1] for one control period."""
         if self._state is None or self._plant is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
+        action = np.asarray(action, np.float32)
         with on_the_host():
-            applied, load = self._laws.command(self._state, np.asarray(action, np.float32))
-        commands = np.stack(applied.commands).astype(float)[None]
+            commands, load = self._laws.commands(self._state, action)
         self._load = load
-        plant = self._move(self._plant, commands, _batch_of_one(load))
+        plant = self._move(self._plant, np.asarray(commands, float)[None], _batch_of_one(load))
         with on_the_host():
             arrived = plant.each(lambda leaf: leaf[0].astype(np.float32))
-            self._state = self._laws.after_physics(self._state, applied, arrived)
+            self._state = self._laws.arrive(self._state, action, arrived)
         if not self._state.metrics["diverged"]:
             self._plant = plant
         truncated = bool(self._state.info["truncation"])

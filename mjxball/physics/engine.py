@@ -92,6 +92,7 @@ class Load(NamedTuple):
     battery: Scalar | None = None  # voltage of all batteries [V]; None: motors follow the curve
     uncompensated: Scalar | None = None  # 1 where the firmware does not compensate for the battery, else 0
     cg_shape: PathShape | None = None  # of the path in a plane; None: a sine along x
+    stop_time: Float[Array, "... drones"] | None = None  # when each drone's rotors are let stop [s]; None: never
 
 
 class Wrench(NamedTuple):

@@ -71,6 +71,8 @@ def make_control_step(
         keep, mean = _rotor_shares(shared(numbers.rotor_lag, state.rotor_force), load.rotor_lag_scale, h)
         if load.thrust_scale is not None:
             target = target * load.thrust_scale[..., None]
+        if load.stop_time is not None:
+            target = target * (state.time[..., None] < load.stop_time)[..., None]
         acting = target + mean * (state.rotor_force - target)
         middle = _drift(state, h / 2)
         wrench = with_external_force(total_wrench(plant, numbers, acting), middle, load)
@@ -152,7 +154,7 @@ def hover_rotor_force(
     """Rotor forces [N] that hover the believed object mass [kg] with the CG at O."""
     xp = believed_mass.__array_namespace__()
     numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (numbers.drone_mass, numbers.share))
+    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (numbers.known_mass, numbers.share))
     per_rotor = (own + share * believed_mass[..., None]) * parts.entry(numbers.gravity) / 4
     per_rotor = xp.clip(per_rotor, 0.0, shared(numbers.rotor_force_max, per_rotor))
     return xp.stack([per_rotor] * 4, axis=-1)

@@ -37,6 +37,7 @@ class PlantParameters(NamedTuple):
     yaw_per_thrust: Array  # (N,) yaw moment of a rotor over its force [m]
     rotor_force_max: Array  # (N,) [N]
     rotor_lag: Array  # (N,) time constant of a rotor's force [s]
+    known_mass: Array  # (N,) that a drone believes it lifts besides the load: itself and its share of the carrier [kg]
     share: Array  # (N,) share of the load's weight that a drone believes it carries
     gains: AttitudeGains  # of each drone, about body axes
     carrier_mass: Array  # () [kg]
@@ -160,6 +161,7 @@ def plant_parameters(plant: Plant, attitude: Attitude) -> PlantParameters:
         yaw_per_thrust=np.array(plant.of_drones("yaw_per_thrust")),
         rotor_force_max=np.array(plant.of_drones("rotor_force_max")),
         rotor_lag=np.array(plant.of_drones("rotor_lag")),
+        known_mass=np.array(plant.known_masses),
         share=np.array(plant.shares),
         gains=nothing,
         carrier_mass=np.array(plant.carrier_mass),

@@ -15,15 +15,18 @@ if TYPE_CHECKING:
 
     from mjxball.physics.engine import Array, Load, PlantState, Scalar, Vector
     from mjxball.physics.step import ControlStep
+    from mjxball.plant import PlantParameters
     from mjxball.sim.disturbances import Observation, Sample, SensorModel, SensorState
     from mjxball.sim.laws import Integral
 
+    FollowerCommand = Float[Array, "... 3"]  # of several followers (..., F, 3)
+
 
 class Commands(NamedTuple):
-    """What both drones are sent: roll, pitch [rad], vertical acceleration [m/s2]."""
+    """What all drones are sent: roll, pitch [rad], vertical acceleration [m/s2], in body axes."""
 
     leader: Vector
-    follower: Vector
+    follower: FollowerCommand
 
 
 class LoopState(NamedTuple):
@@ -36,11 +39,13 @@ class LoopState(NamedTuple):
 
 
 class ClosedLoop(Laws):
-    """The laws with sensors and physics: `start`, then `step`, which is `commands`, the physics and `after_physics`."""
+    """The laws with sensors and physics: `start`, then `step` after `step`; shapes as in `sim.laws.Laws`."""
 
-    def __init__(self, config: Config, physics: ControlStep, sensors: SensorModel):
-        super().__init__(config)
-        self.physics, self._sensors = physics, sensors
+    def __init__(
+        self, config: Config, physics: ControlStep, sensors: SensorModel, parameters: PlantParameters | None = None
+    ):
+        super().__init__(config, parameters)
+        self._physics, self._sensors = physics, sensors
         self._period = config.timing.control_period
         self._leader_measures = config.scenario.leader_uses_measurements
 
@@ -64,58 +69,47 @@ class ClosedLoop(Laws):
         self,
         state: LoopState,
         observation: Observation,
-        follower: Vector,
+        follower: FollowerCommand,
         load: Load,
         goals: tuple[Vector, Vector],
         sample: Sample,
         shares: Scalar | float = 1.0,
+        physics: ControlStep | None = None,
     ) -> tuple[LoopState, Observation, Commands]:
-        """One control period: (state, observation at its end, commands); arguments as of its three parts.
+        """One control period: (state, observation at its end, commands).
 
-        `goals`: of O at its beginning and at its end [m]. `load` with the external force that acts in it.
+        `follower`: what the followers' law answers to `observation`, in their mount frames. `goals`: of O at the
+        period's beginning and at its end [m]. `load` with the external force that acts in it, `sample` of the
+        measurement at its end. `shares` (...): 1 for a follower that shares the integrals, a network; 0 for one with a
+        law of its own. `physics` in place of the loop's own.
         """
         commands = self.commands(state, observation, follower, goals[0], shares)
-        plant = self.physics(state.plant, self.stack(commands), load)
-        return *self.after_physics(state, observation, commands, plant, goals, sample, shares), commands
-
-    @staticmethod
-    def stack(commands: Commands) -> Float[Array, "... 2 3"]:
-        """Both commands as the physics takes them (..., 2, 3)."""
-        return commands.leader.__array_namespace__().stack(commands, axis=-2)
-
-    def commands(
-        self, state: LoopState, observation: Observation, follower: Vector, goal: Vector, shares: Scalar | float = 1.0
-    ) -> Commands:
-        """Both commands at `observation`, which the follower's law answers with `follower`.
-
-        `shares` (...): 1 for a follower that shares the integrals, a network; 0 for one with a law of its own.
-        """
-        leader_command = self.leader_command(self._leader_sees(state, observation, goal), goal, state.integral)
-        if not self._shares:
-            return Commands(leader_command, follower)
-        xp, shares = leader_command.__array_namespace__(), np.asarray(shares)
-        return Commands(
-            leader_command, xp.where(shares[..., None] > 0, self.follower_command(follower, state.integral), follower)
-        )
-
-    def after_physics(
-        self,
-        state: LoopState,
-        observation: Observation,
-        commands: Commands,
-        plant: PlantState,
-        goals: tuple[Vector, Vector],
-        sample: Sample,
-        shares: Scalar | float = 1.0,
-    ) -> tuple[LoopState, Observation]:
-        """(state, observation) once the physics has brought the plant of `state` to `plant`."""
+        plant = (physics or self._physics)(state.plant, self.stack(*commands), load)
         diverged = state.diverged | has_diverged(plant)
         plant = state.plant.each(lambda old, new: _where(diverged, old, new), plant)
         measured = self._leader_sees(state, observation, goals[0])
         shares = np.asarray(shares)[..., None]
         integral = self.integrate(state.integral, measured, goals[0], self._period, shares, commands.follower)
         sensors, observation = self._sensors.step(state.sensors, self.observe(plant, goals[1]), sample)
-        return LoopState(plant, integral, sensors, diverged), observation
+        return LoopState(plant, integral, sensors, diverged), observation, commands
+
+    def commands(
+        self,
+        state: LoopState,
+        observation: Observation,
+        follower: FollowerCommand,
+        goal: Vector,
+        shares: Scalar | float = 1.0,
+    ) -> Commands:
+        """All commands at `observation`; arguments as of `step`."""
+        leader_command = self.leader_command(self._leader_sees(state, observation, goal), goal, state.integral)
+        follower = self.in_body_axes(follower)
+        if not self._shares:
+            return Commands(leader_command, follower)
+        xp, shares = leader_command.__array_namespace__(), np.asarray(shares)
+        return Commands(
+            leader_command, xp.where(shares[..., None] > 0, self.follower_command(follower, state.integral), follower)
+        )
 
     def _leader_sees(self, state: LoopState, observation: Observation, goal: Vector) -> Body:
         return self.body_from_observation(observation, goal) if self._leader_measures else state.plant

@@ -1,9 +1,10 @@
 """Disturbances of a flight: sensor noise, estimator drift, quantization, a relayed object error, delay, external force.
 
-`SensorModel` is the one model of the follower's sensors, on NumPy and JAX arrays. What disturbs one control step is a
+`SensorModel` is the one model of a follower's sensors, on NumPy and JAX arrays. What disturbs one control step is a
 `Sample`: drawn beforehand from the seeds of scenarios (`record`; the same in every batch and on every engine), or on
-the fly from a JAX key (`RandomDisturbances`; training, where every world has its own). The leader flies on the truth,
-or on the same measurements with `scenario.leader_uses_measurements`.
+the fly from a JAX key (`RandomDisturbances`; training, where every world has its own). Of several followers each has
+errors of its own, and all have the same delay and messages. The leader flies on the truth, or on the first follower's
+measurements with `scenario.leader_uses_measurements`.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class Sample(NamedTuple):
     """Disturbances of one control step, or with a leading axis of all steps of a flight. The default is nothing."""
 
     errors: tuple[Observation, ...] = ()  # added to what is measured in this order
-    received: Bool[Array, "..."] | None = None  # whether a relayed message arrives; None: always
+    received: Bool[Array, "..."] | None = None  # whether a relayed message arrives, for each observation; None: always
     force: Vector | None = None  # external force on O in the world until the next step [N]; None: none
 
     def at(self, number: int | slice) -> Sample:
@@ -141,22 +142,33 @@ def quantize(observation: Observation) -> Observation:
     return xp.round(observation / steps) * steps
 
 
-def sensors_of(disturbances: Sequence[Disturbance], period: float) -> tuple[SensorModel, Int[np.ndarray, " n"]]:
-    """(sensors of n flights, delay of each in control steps)."""
-    delays = np.array([round(disturbance.delay / period) for disturbance in disturbances])
-    bias = np.array([disturbance.relay_bias for disturbance in disturbances])
-    quantized = np.array([[disturbance.quantize] for disturbance in disturbances])
+def followers_axis(config: Config) -> tuple[int, ...]:
+    """Shape of the followers' axis: () of a pair, (F,) of several."""
+    count = len(config.plant.followers)
+    return (count,) if count > 1 else ()
+
+
+def sensors_of(
+    disturbances: Sequence[Disturbance], period: float, followers: tuple[int, ...] = ()
+) -> tuple[SensorModel, Int[np.ndarray, "n ..."]]:
+    """(sensors of n flights, delay of each in control steps); `followers` from `followers_axis`."""
+    shape = (len(disturbances),) + (1,) * len(followers)
+    delays = np.array([round(disturbance.delay / period) for disturbance in disturbances]).reshape(shape)
+    bias = np.array([disturbance.relay_bias for disturbance in disturbances]).reshape(*shape, 3)
+    quantized = np.array([disturbance.quantize for disturbance in disturbances]).reshape(*shape, 1)
     return SensorModel(int(delays.max()), bias if bias.any() else None, quantized), delays
 
 
-def record(disturbances: Sequence[Disturbance], count: int, period: float) -> Sample:
+def record(disturbances: Sequence[Disturbance], count: int, period: float, followers: tuple[int, ...] = ()) -> Sample:
     """What disturbs n flights at `count` control steps, (count, n, ...), drawn from their seeds.
 
-    More steps leave the first ones as they are.
+    More steps leave the first ones as they are. `followers` from `followers_axis`.
     """
-    errors = _stack([_errors(disturbance, count, period) for disturbance in disturbances])
+    errors = _stack([_recorded_errors(disturbance, (count, *followers), period) for disturbance in disturbances])
     received = _stack([_received(disturbance, count, period) for disturbance in disturbances])
     force = _stack([_gusts(disturbance, count, period) for disturbance in disturbances])
+    if received is not None and followers:
+        received = received[..., None]
     return Sample(() if errors is None else (errors,), received, force)
 
 
@@ -173,16 +185,18 @@ def _random(disturbance: Disturbance, stream: int) -> np.random.Generator:
     return np.random.default_rng([disturbance.seed, stream])
 
 
-def _errors(disturbance: Disturbance, count: int, period: float) -> Float[np.ndarray, "count 18"] | None:
-    """Noise and estimator drift."""
+def _recorded_errors(
+    disturbance: Disturbance, shape: tuple[int, ...], period: float
+) -> Float[np.ndarray, "count ... 18"] | None:
+    """Noise and estimator drift, in float32."""
     if not (disturbance.noise or disturbance.estimator_drift):
         return None
-    drawn = _random(disturbance, 1).standard_normal((count, OBSERVATION_SIZE), np.float32)
-    white = drawn * (disturbance.noise * NOISE).astype(np.float32)
-    if not disturbance.estimator_drift:
-        return white
-    slow = _gauss_markov(_random(disturbance, 4).standard_normal((count, OBSERVATION_SIZE)), period / DRIFT_TIME)
-    return white + (disturbance.estimator_drift * DRIFT * slow).astype(np.float32)
+    white = _random(disturbance, 1).standard_normal((*shape, OBSERVATION_SIZE), np.float32)
+    slow = None
+    if disturbance.estimator_drift:
+        fresh = _random(disturbance, 4).standard_normal((*shape, OBSERVATION_SIZE))
+        slow = disturbance.estimator_drift * _walk(fresh, period / DRIFT_TIME)
+    return np.sum([error.astype(np.float32) for error in measurement_errors(disturbance.noise, white, slow)], axis=0)
 
 
 def _received(disturbance: Disturbance, count: int, period: float) -> Bool[np.ndarray, " count"] | None:
@@ -200,17 +214,34 @@ def _gusts(disturbance: Disturbance, count: int, period: float) -> Float[np.ndar
     """A first-order Gauss-Markov force [N] that starts in its steady state."""
     if not disturbance.gust:
         return None
-    return disturbance.gust * _gauss_markov(_random(disturbance, 3).standard_normal((count, 3)), period / GUST_TIME)
+    return disturbance.gust * _walk(_random(disturbance, 3).standard_normal((count, 3)), period / GUST_TIME)
 
 
-def _gauss_markov(drawn: Float[np.ndarray, "count slots"], share: float) -> Float[np.ndarray, "count slots"]:
-    """First-order Gauss-Markov process of deviation 1 from white `drawn`; `share` of its time a step."""
-    keep = math.exp(-share)
-    slow = np.empty_like(drawn)
-    slow[0] = drawn[0]
-    for number in range(1, len(drawn)):
-        slow[number] = keep * slow[number - 1] + math.sqrt(1 - keep * keep) * drawn[number]
+def _walk(fresh: Float[np.ndarray, "count ..."], share: float) -> Float[np.ndarray, "count ..."]:
+    """All steps of `gauss_markov` from white `fresh`, of which the first is the start."""
+    slow = fresh.copy()
+    for number in range(1, len(fresh)):
+        slow[number] = gauss_markov(slow[number - 1], fresh[number], share)
     return slow
+
+
+def gauss_markov(before: Array, fresh: Array, share: float, deviation: Array | float = 1.0) -> Array:
+    """The next step of a first-order Gauss-Markov process of that `deviation`.
+
+    `fresh` is white, of deviation 1; `share` of the process's time constant passes.
+    """
+    keep = math.exp(-share)
+    return keep * before + deviation * math.sqrt(1 - keep * keep) * fresh
+
+
+def measurement_errors(noise: Array | float, white: Array, drift: Array | None) -> tuple[Array, ...]:
+    """Errors of a measurement: `noise` () level times `white` (..., 18), and the slow `drift` (..., 18) if there is.
+
+    `white` is of deviation 1, `drift` of the deviation that is its level.
+    """
+    xp = white.__array_namespace__()
+    noisy = noise * xp.asarray(NOISE, dtype=white.dtype) * white
+    return (noisy,) if drift is None else (noisy, drift * xp.asarray(DRIFT, dtype=drift.dtype))
 
 
 class RandomState(NamedTuple):
@@ -221,7 +252,7 @@ class RandomState(NamedTuple):
     delay: Int[Array, ""]  # whole control steps
     gust: Float[Array, ""]  # rms of each axis of `force` [N]
     force: Float[Array, "3"]  # external force on O in the world, now [N]
-    drift: Any = ()  # (18,) slow error, now; () if there is none
+    drift: Any = ()  # (..., 18) slow error, now, in units of `DRIFT`; () if there is none
     drift_level: Any = ()  # () in units of `DRIFT`
 
 
@@ -234,8 +265,7 @@ class RandomDisturbances:
         self._drift = scenario.estimator_drift
         self.present = any(high > 0 for _, high in (*self._ranges, self._drift)) or scenario.quantize
         self.sensors = SensorModel(math.floor(scenario.delay[1] / self._period + 0.5), None, scenario.quantize)
-        self._keep = math.exp(-self._period / GUST_TIME)
-        self._keep_drift = math.exp(-self._period / DRIFT_TIME)
+        self._shape = (*followers_axis(config), OBSERVATION_SIZE)
 
     def start(self, key: Array) -> tuple[Any, Sample]:
         """(state, sample of the first step) of a world that is reset; state () if nothing is disturbed."""
@@ -253,7 +283,7 @@ class RandomDisturbances:
         if self._drift[1] > 0:
             low, high = self._drift
             level = low + (high - low) * random.uniform(random.fold_in(noise_key, 2))
-            drift = level * jnp.asarray(DRIFT) * random.normal(random.fold_in(noise_key, 3), (OBSERVATION_SIZE,))
+            drift = level * random.normal(random.fold_in(noise_key, 3), self._shape)
         steps = jnp.round(delay / self._period).astype(jnp.int32)
         state = RandomState(key, noise, steps, gust, gust * random.normal(force_key, (3,)), drift, level)
         return state, self._sample(state, noise_key)
@@ -267,17 +297,15 @@ class RandomDisturbances:
         key, noise_key, force_key = random.split(state.key, 3)
         drift = state.drift
         if self._drift[1] > 0:
-            fresh = random.normal(random.fold_in(noise_key, 1), (OBSERVATION_SIZE,))
-            spread = math.sqrt(1 - self._keep_drift**2)
-            drift = self._keep_drift * drift + state.drift_level * spread * fresh * DRIFT
-        fresh = random.normal(force_key, (3,))
-        force = self._keep * state.force + state.gust * math.sqrt(1 - self._keep**2) * fresh
+            fresh = random.normal(random.fold_in(noise_key, 1), self._shape)
+            drift = gauss_markov(drift, fresh, self._period / DRIFT_TIME, state.drift_level)
+        force = gauss_markov(state.force, random.normal(force_key, (3,)), self._period / GUST_TIME, state.gust)
         state = state._replace(key=key, force=force, drift=drift)
         return state, self._sample(state, noise_key)
 
     def _sample(self, state: RandomState, key: Array) -> Sample:
-        from jax import numpy as jnp
         from jax import random
 
-        white = state.noise * jnp.asarray(NOISE, state.noise.dtype) * random.normal(key, (OBSERVATION_SIZE,))
-        return Sample((white, state.drift) if self._drift[1] > 0 else (white,), None, state.force)
+        white = random.normal(key, self._shape)
+        drift = state.drift if self._drift[1] > 0 else None
+        return Sample(measurement_errors(state.noise, white, drift), None, state.force)

@@ -1,15 +1,18 @@
-"""Laws of both drones, which simulation and flight call alike: the leader's PID, shared integrals, stands.
+"""Laws of all drones, which simulation and flight call alike: the leader's PID, shared integrals, stands.
 
 Importing it needs NumPy alone.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import leader, rotations
 from mjxball.control import observation as layout
+from mjxball.plant import PlantParameters
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -33,7 +36,7 @@ class BodyState(NamedTuple):
 
 
 class Body(Protocol):
-    """What both drones' laws need of a state: a simulated one, or one that was put together from two drones'."""
+    """What all drones' laws need of a state: a simulated one, or one that was put together from the drones' own."""
 
     @property
     def position(self) -> Vector:
@@ -53,7 +56,12 @@ class Body(Protocol):
 
 
 class Laws:
-    """Laws of both drones for one configuration, on arrays of any batch shape and namespace.
+    """Laws of all drones for one configuration, on arrays of any batch shape and namespace.
+
+    Of several followers, F = N - 1, observations are (..., F, 18) and commands (..., F, 3), in the order of
+    `plant.followers`; a pair's one follower has no such axis. Followers see and command in their mount frames
+    (`observation.mount_angles`), which are the body axes for a pair; commands that leave here are in body axes.
+    `parameters`: the plant's numbers, if they are not those of `config.plant`.
 
     On a stand, where a drone's estimator invents motion along what is locked, neither law is fed it: position and
     velocity across, pitch, yaw and their rates are 0.
@@ -66,7 +74,7 @@ class Laws:
     off, for a lasting command of one drone is undone by the other's integrals and only costs both of them range.
     """
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, parameters: PlantParameters | None = None):
         self._law, self._gravity = config.leader, config.plant.gravity
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._shares = config.follower.shares_integrals
@@ -78,15 +86,23 @@ class Laws:
         # On a pivot height stays: a drone's own follows from roll, and flies on that.
         self._free = None if config.plant.stand == "free" else (0.0, 0.0, 1.0)
         self._follower_sees = config.follower.error
-        self._leader_mount, self._follower_mount = (drone.mount for drone in config.plant.pair)
+        plant, followers = config.plant, list(config.plant.followers)
+        mounts: Any = np.array([drone.mount for drone in plant.drones]) if parameters is None else parameters.mounts
+        self._leader, self._several = plant.leader, len(followers) > 1
+        self._leader_mount = mounts[..., plant.leader, :]
+        self._follower_mounts = mounts[..., followers if self._several else followers[0], :]
+        self._mount_angles = layout.mount_angles(plant, mounts)
 
     def observe(self, state: Body, goal: Vector) -> Observation:
-        """The follower's observation; `goal` of O."""
+        """What the followers see; `goal` of O."""
         xp = state.position.__array_namespace__()
         state, goal = self._without_locked_motion(state), self._along_free_axes(goal)
         matrix = rotations.matrix_from_quaternion(state.quaternion)
-        mount = xp.asarray(self._follower_mount, dtype=state.position.dtype)
-        observation = layout.observe(state.position, matrix, state.velocity, state.rates, goal, mount)
+        mount = xp.asarray(self._follower_mounts, dtype=state.position.dtype)
+        seen = (state.position, matrix, state.velocity, state.rates, goal)
+        if self._several:
+            seen = tuple(xp.expand_dims(part, axis=state.position.ndim - 1) for part in seen)
+        observation = layout.observe(*seen, mount)
         if self._free is not None:
             # The tilted mount's way across is locked as well: it is seen in roll.
             observation = xp.concat(
@@ -98,12 +114,31 @@ class Laws:
                 ],
                 axis=-1,
             )
-        if self._follower_sees == "object":
-            return observation
-        return xp.concat([observation[..., : layout.ERROR.start], *self._leader_place_error(state, goal)], axis=-1)
+        if self._follower_sees == "leader":
+            place = xp.concat(self._leader_place_error(state, goal), axis=-1)
+            place = place[..., None, :] if self._several else place
+            own = observation[..., : layout.ERROR.start]
+            observation = xp.concat([own, xp.broadcast_to(place, (*own.shape[:-1], 6))], axis=-1)
+        return observation if self._mount_angles is None else rotations.turned_about_z(observation, -self._mount_angles)
+
+    def in_body_axes(self, command: Array) -> Array:
+        """The followers' commands (..., 3), or (..., F, 3), from their mount frames."""
+        return command if self._mount_angles is None else rotations.turned_about_z(command, self._mount_angles)
+
+    def stack(self, leader_command: Vector, follower_command: Array) -> Float[Array, "... drones 3"]:
+        """Commands in body axes of the leader (..., 3) and the followers as the physics takes them."""
+        xp, place = leader_command.__array_namespace__(), self._leader
+        if not self._several:
+            both = (leader_command, follower_command)
+            return xp.stack(both if place == 0 else both[::-1], axis=-2)
+        ahead, behind = follower_command[..., :place, :], follower_command[..., place:, :]
+        return xp.concat([ahead, leader_command[..., None, :], behind], axis=-2)
 
     def body_from_observation(self, observation: Observation, goal: Vector) -> BodyState:
-        """The body that `observation` tells of, e_o or e_l in it; `goal` of O."""
+        """The body that `observation` tells of, the first follower's of several, e_o or e_l in it; `goal` of O."""
+        if self._mount_angles is not None:
+            observation = rotations.turned_about_z(observation, self._mount_angles)
+        observation = observation[..., 0, :] if self._several else observation
         euler, rates = observation[..., 3:6], observation[..., 9:12]
         position = self._along_free_axes(goal) - observation[..., layout.ERROR]
         quaternion = rotations.quaternion_from_euler(euler)
@@ -141,7 +176,7 @@ class Laws:
         """`integral` one `period` [s] on, in which its error was that at `state`.
 
         `shares`, if given: 1 where the follower shares it, 0 where it flies a law of its own. `follower_command`: the
-        command that a network's follower flew.
+        command that a network's follower flew, in body axes.
         """
         xp = goal.__array_namespace__()
         band = xp.asarray(self._law.integral_band, dtype=goal.dtype)
@@ -171,7 +206,7 @@ class Laws:
         return wanted if not self._shares else self._clip(self._with_lift_difference(wanted, integral, self._lift_sign))
 
     def follower_command(self, command: Vector, integral: Integral) -> Vector:
-        """A network's `command`, which holds the PD law, with its share of the integrals if it shares them."""
+        """A network's `command` in body axes, which holds the PD law, with its share of the integrals if it has one."""
         if not self._shares:
             return command
         xp, law = command.__array_namespace__(), self._law

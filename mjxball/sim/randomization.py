@@ -167,7 +167,7 @@ class ResetDistribution:
         if motors.compensates(law.motor_curve):
             cap = jnp.where(uncompensated > 0, cap, jnp.minimum(most, law.motor_curve[1] * CEILING / crazyflie.FULL))
         constants = self._constants
-        carried = jnp.asarray(constants.drone_mass) + jnp.asarray(constants.share) * object_mass
+        carried = jnp.asarray(constants.known_mass) + jnp.asarray(constants.share) * object_mass
         weight = carried * self.config.plant.gravity / 4
         enough = (scale * cap[:, None] >= (1 + LIFT) * weight) & (scale * most[:, None] >= (1 + LIFT + PULL) * weight)
         command = jnp.abs(self.hover_commands(object_mass, battery, uncompensated, scale))
@@ -181,8 +181,8 @@ class ResetDistribution:
         scale: Float[Array, "n 2"],
     ) -> Float[Array, "n 2"]:
         """(n, 2) vertical acceleration that each drone has to be told so that it hovers its share [m/s2]."""
-        carried = jnp.asarray(self._constants.drone_mass) + jnp.asarray(self._constants.share) * object_mass
-        believed = jnp.asarray(self._constants.drone_mass) + jnp.asarray(self._constants.share) * (
+        carried = jnp.asarray(self._constants.known_mass) + jnp.asarray(self._constants.share) * object_mass
+        believed = jnp.asarray(self._constants.known_mass) + jnp.asarray(self._constants.share) * (
             object_mass if self.config.scenario.mass_known else self.config.plant.object_mass
         )
         gravity, curve = self.config.plant.gravity, self.config.autopilot.motor_curve

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,9 +12,10 @@ import numpy as np
 from mjxball.config import Config, Plant, preset, validate
 from mjxball.control import rotations
 from mjxball.control.followers import Baseline, Follower, PrivilegedInfo
+from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
-from mjxball.physics.engine import Load, PlantState, contact_wrenches, total_wrench
+from mjxball.physics.engine import Load, PathShape, PlantState, contact_wrenches, coordinates, total_wrench
 from mjxball.physics.motion import make_prescribed, object_mass
 from mjxball.physics.step import (
     make_accelerations,
@@ -25,13 +26,16 @@ from mjxball.physics.step import (
 )
 from mjxball.plant import plant_parameters
 from mjxball.sim.closed_loop import ClosedLoop
-from mjxball.sim.disturbances import record, sensors_of
-from mjxball.sim.scenario import Scenario, check_scenario
+from mjxball.sim.disturbances import followers_axis, record, sensors_of
+from mjxball.sim.scenario import CgPath, Scenario, check_scenario
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-Act = Callable[[np.ndarray, PrivilegedInfo], np.ndarray]  # observations (n, 18), what is known -> commands (n, 3)
+    from mjxball.physics.engine import Array, Coordinates
+
+# Observations (n, 18), of several followers (n, F, 18), and what is known -> commands (n, 3), or (n, F, 3).
+Act = Callable[[np.ndarray, PrivilegedInfo], np.ndarray]
 
 Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with the scenarios that it flies
 
@@ -45,17 +49,19 @@ class Tick(NamedTuple):
     euler: Float[np.ndarray, "n 3"]  # roll, pitch, yaw [rad]
     rotor_force: Float[np.ndarray, "n drones 4"]  # [N]
     leader_command: Float[np.ndarray, "n 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
-    follower_command: Float[np.ndarray, "n 3"]  # likewise
+    follower_command: Float[np.ndarray, "n ... 3"]  # likewise, (n, F, 3) of several followers
     diverged: Bool[np.ndarray, " n"]
     state: PlantState | None = None
-    observation: Float[np.ndarray, "n 18"] | None = None
-    cg_offset: Float[np.ndarray, " n"] | None = None  # [m]
+    observation: Float[np.ndarray, "n ... 18"] | None = None  # (n, F, 18) of several followers
+    cg_offset: Float[np.ndarray, "n ..."] | None = None  # [m]
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """A flight, or a batch of flights with the batch axis second. NumPy float64, one row per control step.
 
+    Where there are several followers, `follower_command` and `observation` have their axis, in the order of
+    `plant.followers`, before the last one; `cg_offset` has a last axis of 2 where the load moves in the plane.
     T = round(seconds / control period) + 1 rows; row 0 is the start. A flight that diverges (|e_o| or a body
     rate beyond any bound, or a value that is not finite) is frozen there and marked in `diverged`.
     """
@@ -67,10 +73,10 @@ class Trajectory:
     rates: Float[np.ndarray, "T ... 3"]  # body rates [rad/s]
     quaternion: Float[np.ndarray, "T ... 4"]  # body -> world (w, x, y, z)
     rotor_force: Float[np.ndarray, "T ... drones 4"]  # [N]
-    leader_command: Float[np.ndarray, "T ... 3"]  # roll, pitch [rad], vertical acceleration [m/s2]
+    leader_command: Float[np.ndarray, "T ... 3"]  # roll, pitch [rad], vertical acceleration [m/s2], in body axes
     follower_command: Float[np.ndarray, "T ... 3"]  # likewise
-    observation: Float[np.ndarray, "T ... 18"]  # what the follower saw
-    cg_offset: Float[np.ndarray, "T ..."]  # along the CG axis from O [m]
+    observation: Float[np.ndarray, "T ... 18"]  # what the followers saw, in their mount frames
+    cg_offset: Float[np.ndarray, "T ..."]  # along the load's directions from O [m]
     object_mass: Float[np.ndarray, "T ..."]  # [kg]
     contact_force: Float[np.ndarray, "T ... drones 3"]  # of every drone on the carrier, body axes [N]
     contact_torque: Float[np.ndarray, "T ... drones 3"]  # likewise, about each drone's centre [N m]
@@ -181,25 +187,22 @@ def fly(
     shares = np.ones(len(scenarios)) if shares is None else shares
     cg_offset, privileged, period = make_cg_offset(config), make_privileged_info(config), config.timing.control_period
     count = round(scenarios[0].seconds / period)
-    load, target = load_of(scenarios), targets(scenarios, count + 1, period)
-    disturbances = [scenario.disturbance for scenario in scenarios]
-    samples = record(disturbances, count + 2, period)
-    sensors, delays = sensors_of(disturbances, period)
+    load, target = load_of(scenarios, config.plant.count), targets(scenarios, count + 1, period)
+    disturbances, followers = [scenario.disturbance for scenario in scenarios], followers_axis(config)
+    samples = record(disturbances, count + 2, period, followers)
+    sensors, delays = sensors_of(disturbances, period, followers)
     loop = ClosedLoop(config, make_stepper(config, physics), sensors)
     state, observation = loop.start(start_of(config, scenarios), target[0], samples.at(0), delays)
     for number in range(count + 1):
         plant, goals = state.plant, (target[number], target[number + 1])
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
-        commands = loop.commands(state, observation, act(observation, privileged(plant, load)), goals[0], shares)
+        answer = act(observation, privileged(plant, load))
+        acting = load._replace(external_force=samples.at(number).force)
+        after = loop.step(state, observation, answer, acting, goals, samples.at(number + 1), shares)
         # The time is exact, so that a mass change falls on the same row for every engine.
-        flown = (plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)
+        flown = (plant.position, goals[0], euler, plant.rotor_force, *after[2], state.diverged)
         yield Tick(number * period, *flown, plant, observation, cg_offset(plant, load))
-        if number < count:
-            acting = load._replace(external_force=samples.at(number).force)
-            moved = loop.physics(plant, loop.stack(commands), acting)
-            state, observation = loop.after_physics(
-                state, observation, commands, moved, goals, samples.at(number + 1), shares
-            )
+        state, observation, _ = after
 
 
 def _record(
@@ -207,7 +210,7 @@ def _record(
 ) -> Trajectory:
     ticks = list(fly(config, scenarios, act, physics, shares))
     grid = np.array([tick.time for tick in ticks])
-    load, count = load_of(scenarios), len(ticks)
+    load, count = load_of(scenarios, config.plant.count), len(ticks)
     force = record([s.disturbance for s in scenarios], count, config.timing.control_period).force
     target, euler, leader_command, follower_command, observation, offset = (
         np.stack([getattr(tick, name) for tick in ticks])
@@ -246,6 +249,7 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
     Of a rolling ball nobody can know the future: the oracle is told where it is.
     """
     plant = config.plant
+    angles, several = mount_angles(plant), len(plant.followers) > 1
     ahead = 0.5 * config.timing.control_period + plant.rotor_lag
     drones = sum(drone.mass for drone in plant.drones) + plant.carrier_mass
     prescribed = None if config.motion.kind == "rolling" else make_prescribed(config)
@@ -257,7 +261,24 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
             offset, acceleration = plant.moving_fraction * state.ball_offset, xp.zeros_like(state.ball_offset)
         else:
             offset, _, acceleration = prescribed(state.time + ahead, load)
-        return PrivilegedInfo(load.believed_mass, mass * offset, mass * acceleration, drones + mass)
+
+        def each(value: Array, axes: int = 0) -> Array:
+            """What is known of a flight, with the last `axes` of its own, for each of its followers."""
+            if not several:
+                return value
+            place = value.ndim - axes
+            shape = (*value.shape[:place], len(plant.followers), *value.shape[place:])
+            return xp.broadcast_to(xp.expand_dims(value, axis=place), shape)
+
+        def moment(found: Coordinates) -> Array:
+            along = coordinates(found, len(plant.directions))
+            if angles is None:
+                return mass * along[0]
+            parts = [mass * along[plant.directions.index(k)] if k in plant.directions else 0.0 * mass for k in (0, 1)]
+            flat = each(xp.stack([*parts, 0.0 * mass], axis=-1), axes=1)
+            return rotations.turned_about_z(flat, -angles)[..., :2]
+
+        return PrivilegedInfo(each(load.believed_mass), moment(offset), moment(acceleration), each(drones + mass))
 
     return privileged
 
@@ -298,11 +319,13 @@ def start_of(config: Config, scenarios: Sequence[Scenario]) -> PlantState:
     velocity = np.array([scenario.start_velocity for scenario in scenarios], float)
     tilt = np.array([(*scenario.start_tilt, 0.0) for scenario in scenarios])
     ball = np.array([scenario.ball_start for scenario in scenarios], float)
+    if len(config.plant.directions) == 2:
+        ball = np.stack([ball, np.array([scenario.ball_start_across for scenario in scenarios], float)], axis=-1)
     return start_state(config, position, tilt, velocity, believed, ball)
 
 
-def load_of(scenarios: Sequence[Scenario]) -> Load:
-    """Masses and CG motions of the scenarios, one world each."""
+def load_of(scenarios: Sequence[Scenario], drones: int = 2) -> Load:
+    """Masses, CG motions and drones that fail of the scenarios, one world each; N = `drones`."""
     mass = np.array([scenario.mass for scenario in scenarios], float)
     believed = [s.mass if s.believed_mass is None else s.believed_mass for s in scenarios]
     names = ("amplitude", "omega", "phase")
@@ -310,4 +333,13 @@ def load_of(scenarios: Sequence[Scenario]) -> Load:
     most = max(len(scenario.mass_changes) for scenario in scenarios)
     padded = [[*s.mass_changes, *[(np.inf, 0.0)] * (most - len(s.mass_changes))] for s in scenarios]
     changes = np.array(padded, float).reshape(len(scenarios), most, 2)
-    return Load(mass, np.array(believed, float), amplitude, omega, phase, changes[..., 1], changes[..., 0])
+    load = Load(mass, np.array(believed, float), amplitude, omega, phase, changes[..., 1], changes[..., 0])
+    if any(scenario.path != CgPath() for scenario in scenarios):
+        load = load._replace(cg_shape=PathShape(*np.array([astuple(s.path) for s in scenarios], float).T))
+    count = max((len(scenario.thrust) for scenario in scenarios), default=0)
+    if count:
+        load = load._replace(thrust_scale=np.array([s.thrust or (1.0,) * count for s in scenarios], float))
+    if any(scenario.lost for scenario in scenarios):
+        stops = [[dict(s.lost).get(number, np.inf) for number in range(drones)] for s in scenarios]
+        load = load._replace(stop_time=np.array(stops, float))
+    return load

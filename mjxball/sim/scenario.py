@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import astuple, dataclass, field
 from typing import Any
 
@@ -10,6 +11,19 @@ import numpy as np
 from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
 from mjxball.sim.disturbances import Disturbance, Vector3, check_disturbance
+
+
+@dataclass(frozen=True)
+class CgPath:
+    """Shape of the CG's path in the plane, see `physics.engine.PathShape`. The default is a sine along body x."""
+
+    direction: float = 0.0  # of the first sine from body x [rad]
+    width: float = 0.0  # amplitude of the second sine, across, over that of the first
+    ratio: float = 1.0  # angular speed of the second over that of the first
+    lead: float = 0.0  # phase of the second [rad]
+
+
+CIRCLE = CgPath(width=1.0, lead=math.pi / 2)
 
 
 @dataclass(frozen=True)
@@ -27,12 +41,16 @@ class Scenario:
     seconds: float = 45.0
     phase: float = 0.0  # of the CG's sine [rad]
     mass_changes: tuple[tuple[float, float], ...] = ()  # (time [s], mass added or, if negative, dropped [kg])
-    ball_start: float = 0.0  # of a rolling ball from O along the CG axis [m]
+    path: CgPath = field(default_factory=CgPath)  # of a CG that moves in the plane
+    ball_start: float = 0.0  # of a rolling ball from O along the CG axis, in the plane along x [m]
+    ball_start_across: float = 0.0  # in the plane along y [m]
     start_position: Vector3 = (0.0, 0.0, 0.0)  # of O [m]
     start_velocity: Vector3 = (0.0, 0.0, 0.0)  # of O [m/s]
     start_tilt: tuple[float, float] = (0.0, 0.0)  # roll, pitch [rad]
     waypoints: tuple[tuple[float, Vector3], ...] = ()  # (time [s], next goal of O [m]), in order
     disturbance: Disturbance = field(default_factory=Disturbance)
+    thrust: tuple[float, ...] = ()  # factor on every drone's rotor forces; (): 1
+    lost: tuple[tuple[int, float], ...] = ()  # (number of a drone, time at which its rotors stop [s])
 
 
 def check_scenario(config: Config, scenario: Scenario) -> None:
@@ -53,16 +71,27 @@ def check_scenario(config: Config, scenario: Scenario) -> None:
     if any(time < 0 for time, _ in scenario.mass_changes):
         raise InputError("the time of a mass change must not be negative")
     check_disturbance(scenario.disturbance, config.timing.control_period)
-    limit = cg_limit(config.plant)
-    if config.motion.kind == "sine" and scenario.amplitude > limit + 1e-12:
-        raise InputError(f"amplitude {scenario.amplitude:g} m leaves the object: the CG reaches {limit:.4g} m")
-    if abs(scenario.ball_start) > ball_limit(config.plant) + 1e-12:
-        raise InputError(
-            f"ball start {scenario.ball_start:g} m lies beyond the end stop at {ball_limit(config.plant):.4g} m"
-        )
+    limit, in_plane = cg_limit(config.plant), len(config.plant.directions) == 2
+    if not in_plane and (scenario.path != CgPath() or scenario.ball_start_across):
+        raise InputError(f"a path in the plane needs plant.cg_axis xy; this load moves along {config.plant.cg_axis}")
+    reached = scenario.amplitude * max(1.0, abs(scenario.path.width))
+    if config.motion.kind == "sine" and reached > limit + 1e-12:
+        raise InputError(f"amplitude {reached:g} m leaves the object: the CG reaches {limit:.4g} m")
+    ball = math.hypot(scenario.ball_start, scenario.ball_start_across)
+    if ball > ball_limit(config.plant) + 1e-12:
+        raise InputError(f"ball start {ball:g} m lies beyond the end stop at {ball_limit(config.plant):.4g} m")
+    _check_drones(config.plant.count, scenario)
     _check_goals(config, scenario)
     if scenario.seconds < config.timing.control_period or scenario.seconds > 86_400:
         raise InputError(f"seconds must be between one control period and a day, not {scenario.seconds:g}")
+
+
+def _check_drones(count: int, scenario: Scenario) -> None:
+    if scenario.thrust and (len(scenario.thrust) != count or min(scenario.thrust) < 0):
+        raise InputError(f"thrust must be {count} factors that are not negative, one for each drone")
+    for number, time in scenario.lost:
+        if number != int(number) or not 0 <= number < count or time < 0:
+            raise InputError(f"a lost drone must be a number from 0 to {count - 1} with a time, not {number}:{time:g}")
 
 
 def _check_goals(config: Config, scenario: Scenario) -> None:

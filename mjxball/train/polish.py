@@ -146,7 +146,7 @@ def polishing_config(flown: Config, gradient: dict[str, Any]) -> Config:
         flown,
         scenario=dataclasses.replace(flown.scenario, **SURROUNDINGS),
         reward=dataclasses.replace(flown.reward, **OBJECTIVE),
-        sac=dataclasses.replace(flown.sac, privileged_critic=False),
+        follower=dataclasses.replace(flown.follower, privileged_critic=False),
         gradient=dataclasses.replace(flown.gradient, **gradient),
         timing=dataclasses.replace(flown.timing, episode_steps=1_000_000),
     )
