@@ -17,8 +17,9 @@ from mjxball.config import Config, preset
 from mjxball.env import CoupledPairEnv
 from mjxball.train import program as programs
 from mjxball.train import train
-from mjxball.train.extensions import Extensions, make_env
+from mjxball.train.extensions import Extensions, find, make_env
 from mjxball.train.population import Population
+from mjxball.train.program import Program
 
 SMALL = {
     "total_steps": 6000, "num_envs": 16, "replay_size": 6400, "batch_size": 64, "warmup_steps": 400,
@@ -79,6 +80,19 @@ def test_the_pure_function_is_the_run(small: Config) -> None:
     policy, _ = jax.jit(lambda key: train(tiny, key, env=toys.DoubleIntegrator))(jax.random.PRNGKey(5))
     for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(population.policy(state, 0)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)  # two programs: XLA may fuse them differently
+
+
+@pytest.mark.parametrize("name", ["sac", "ppo"])
+def test_an_episode_that_ends_early_has_its_own_return(name: str, small: Config) -> None:
+    """An environment that earns 1 a step and ends after 7: not the 60 of an episode of the time limit."""
+    program = Program(small, "newton-euler", extensions=Extensions(toys.Brief, None, find(name, "--algorithm")))
+    state = jax.jit(program.create)(jax.random.PRNGKey(0))
+    state = state._replace(envs=program.evaluation_envs(jax.random.PRNGKey(0)))
+    steps = program.evaluation_steps
+    _, statistics, _ = jax.jit(program.advance)(state, programs.evaluate(steps))
+    assert float(statistics.reward) == steps == 60
+    # 60 steps are 8 whole episodes and the begin of a ninth.
+    assert float(program.evaluated_return(statistics.reward, statistics.ended)) == pytest.approx(60 / 9)
 
 
 def test_a_reward_of_the_users_own_replaces_ours() -> None:

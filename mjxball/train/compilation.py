@@ -18,9 +18,9 @@ from mjxball.cache import traced_directory
 OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
 # Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
 # (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/results.md.)
-GPU_OPTIONS: dict[str, bool | int | float | str] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
+GPU_OPTIONS: dict[str, Any] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
 # For algorithms that are done sooner than XLA, which then compiles twice as fast what runs a quarter slower.
-CPU_OPTIONS: dict[str, bool | int | float | str] = {"xla_backend_optimization_level": 1}
+CPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
 if jax.__version_info__ < (0, 11):
     CPU_OPTIONS["xla_cpu_use_fusion_emitters"] = False
 # One follower's products of layers of 64 are small enough for plain loops, which spare XLA a kernel in Triton for each

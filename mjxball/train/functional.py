@@ -48,7 +48,9 @@ def train(
         envs = jax.tree.map(lambda new, old: jnp.where(evaluating, new, old), fresh, carry.envs)
         after, statistics, metrics = program.advance(carry._replace(envs=envs), mode)
         kept = jax.tree.map(lambda old, new: jnp.where(evaluating, old, new), carry, after)
-        returned = statistics.reward / jnp.maximum(mode.steps, 1) * episode
+        explored = statistics.reward / jnp.maximum(mode.steps, 1) * episode
+        evaluated = program.evaluated_return(statistics.reward, statistics.ended)
+        returned = jnp.where(evaluating, evaluated, explored)
         count = mode.steps * program.schedule.num_envs
         own = {f"eval_{name}": total / jnp.maximum(count, 1) for name, total in statistics.totals.items()}
         return kept, {"steps": kept.steps, "return": returned, **metrics, **own}

@@ -17,7 +17,7 @@ from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
 from mjxball.algorithms.base import Algorithm, Phase, Policy, Schedule, Shards, Transition
 from mjxball.config import Config
-from mjxball.train.extensions import DEFAULTS, Extensions, find, make_env
+from mjxball.train.extensions import DEFAULTS, Extensions, find, is_pair, make_env
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -254,9 +254,22 @@ class Program:
 
     @property
     def evaluation_steps(self) -> int:
-        """Steps of an evaluation."""
-        timing = self.config.timing
-        return min(round(EVALUATION_SECONDS / timing.control_period), timing.episode_steps)
+        """Steps of an evaluation, whole collections: of another environment than the pair an episode's."""
+        timing, window = self.config.timing, self.algorithm.steps_per_collect
+        steps = timing.episode_steps
+        if is_pair(self.env):
+            steps = min(round(EVALUATION_SECONDS / timing.control_period), steps)
+        return max(steps // window, 1) * window
+
+    def evaluated_return(self, reward: Any, ended: Any) -> Any:
+        """Return of an episode, from `Statistics.reward` and `.ended` of an evaluation.
+
+        Of the pair, whose rewards are costs, what a whole episode sums up to; of another environment, for which going
+        on may be what earns, that over the number of episodes begun in the time of one.
+        """
+        episodes = self.config.timing.episode_steps / self.evaluation_steps
+        begun = 1 if is_pair(self.env) else 1 + episodes * ended / self.schedule.num_envs
+        return episodes * reward / begun
 
     @property
     def total_rounds(self) -> int:

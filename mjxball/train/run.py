@@ -220,8 +220,8 @@ class Run:
         lent = kept._replace(envs=envs, key=population.place_keys(keys))
         after, statistics, _ = self._advance(lent, programs.evaluate(steps))
         self.state = after._replace(envs=kept.envs, key=population.place_keys(keys))
-        returns = population.each(statistics.reward) / steps * self.config.timing.episode_steps
-        found = {"eval_return": returns}
+        reward, ended = population.each(statistics.reward), population.each(statistics.ended)
+        found = {"eval_return": population.program.evaluated_return(reward, ended)}
         found |= {f"eval_{name}": values for name, values in population.report(statistics, steps, True).items()}
         if population.members > 1:
             self.members.add(self._steps(), found)

@@ -1,0 +1,215 @@
+"""SAC and PPO on two Brax environments beside Brax's own trainers: return and wall clock.
+
+`python benchmarks/transfer.py [--envs inverted_pendulum ant] [--algorithms sac ppo] [--trainers ours stock]
+[--seeds K] [--backend NAME] [--scale S] [--json FILE]`
+
+Ours is `mjxball.train.train(config, key, env=..., algorithm=...)`, the function behind `train.py --env`; stock is
+`brax.training.agents.{sac,ppo}.train`. Both get Brax's published hyper-parameters (notebooks/training.ipynb) and
+backend (`positional`, as there), the same network sizes and steps, and evaluate once, at the end. Brax publishes PPO
+for both environments; its SAC has the settings of walker2d, the nearest that it publishes.
+
+One process, one after the other, each with an empty compilation cache of its own for the first seed (cold), which
+the other seeds find filled (warm). Seconds are those of the whole call: tracing, compiling, training. Every policy
+then flies the same 128 episodes of 1000 steps, without noise, up to its first termination.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mjxball import config as configs
+from mjxball.algorithms.ppo import ProximalPolicyOptimization
+from mjxball.algorithms.sac import SoftActorCritic
+from mjxball.quiet import import_brax_env
+from mjxball.train import train
+from stock_sac import replicated
+from training import say, versions
+
+EPISODE, EPISODES = 1000, 128
+SAC = {
+    "reward_scaling": 5,
+    "discounting": 0.997,
+    "learning_rate": 6e-4,
+    "num_envs": 128,
+    "batch_size": 128,
+    "grad_updates_per_step": 32,
+    "max_replay_size": 1_048_576,
+    "min_replay_size": 8192,
+}
+PPO = {
+    "reward_scaling": 10,
+    "discounting": 0.97,
+    "learning_rate": 3e-4,
+    "entropy_cost": 1e-2,
+    "unroll_length": 5,
+    "num_minibatches": 32,
+    "num_updates_per_batch": 4,
+}
+# Steps: Brax's for PPO on the pendulum; a part of them elsewhere, so that a run takes a minute.
+TASKS: dict[tuple[str, str], dict[str, Any]] = {
+    ("inverted_pendulum", "sac"): {"num_timesteps": 131_072, **SAC},
+    ("inverted_pendulum", "ppo"): {"num_timesteps": 2_000_000, **PPO, "num_envs": 2048, "batch_size": 1024},
+    ("ant", "sac"): {"num_timesteps": 393_216, **SAC},
+    ("ant", "ppo"): {"num_timesteps": 10_000_000, **PPO, "num_envs": 4096, "batch_size": 2048},
+}
+# What Brax's trainers take where nothing is said.
+SAC_LAYERS, PPO_POLICY, PPO_VALUE = (256, 256), (32,) * 4, (256,) * 5
+
+
+def our_config(algorithm: str, given: dict[str, Any]) -> configs.Config:
+    """The same settings by our names."""
+    config = configs.Config()
+    common = {
+        "total_steps": given["num_timesteps"],
+        "num_envs": given["num_envs"],
+        "discount": given["discounting"],
+        "learning_rate": given["learning_rate"],
+        "learning_rate_end": 1.0,
+        "reward_scale": float(given["reward_scaling"]),
+        "num_evaluations": 1,
+    }
+    if algorithm == "sac":
+        own = {
+            "batch_size": given["batch_size"],
+            "updates_per_step": given["grad_updates_per_step"],
+            "warmup_steps": given["min_replay_size"],
+            "replay_size": min(given["max_replay_size"], given["num_timesteps"]),
+            "policy_layers": SAC_LAYERS,
+            "critic_layers": SAC_LAYERS,
+            "tau": 0.005,
+            "alpha": 1.0,
+            "alpha_learning_rate": 3e-4,
+            "target_entropy": -0.5,
+        }
+    else:
+        # Brax flies several short unrolls of every environment for an update; ours flies one of their length together.
+        unrolls = given["batch_size"] * given["num_minibatches"] // given["num_envs"]
+        own = {
+            "unroll_length": given["unroll_length"] * unrolls,
+            "epochs": given["num_updates_per_batch"],
+            "minibatches": given["num_minibatches"],
+            "policy_layers": PPO_POLICY,
+            "value_layers": PPO_VALUE,
+            "entropy_cost": given["entropy_cost"],
+            "clipping": 0.3,
+        }
+    for name, value in (common | own).items():
+        config = configs.replace(config, f"{algorithm}.{name}", value)
+    return configs.replace(config, "timing.episode_steps", EPISODE)
+
+
+def ours(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Callable[[Any], Any]:
+    """Train; the policy as a function of observations."""
+    config = our_config(algorithm, given)
+    kind = {"sac": SoftActorCritic, "ppo": ProximalPolicyOptimization}[algorithm]
+    policy, _ = jax.jit(lambda key: train(config, key, env=env, algorithm=kind))(jax.random.PRNGKey(seed))
+    return jax.block_until_ready(policy)
+
+
+def stock(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Callable[[Any], Any]:
+    """The same with Brax's trainer."""
+    from brax.training.agents.ppo import train as ppo
+    from brax.training.agents.sac import train as sac
+
+    jax.device_put_replicated = replicated  # which JAX has removed
+    make_policy, parameters, _ = {"sac": sac, "ppo": ppo}[algorithm].train(
+        environment=env,
+        episode_length=EPISODE,
+        normalize_observations=True,
+        seed=seed,
+        num_evals=1,
+        max_devices_per_host=1,
+        **given,
+    )
+    policy = make_policy(jax.block_until_ready(parameters), deterministic=True)
+    return lambda observation: policy(observation, jax.random.PRNGKey(0))[0]
+
+
+def mean_return(env: Any, act: Callable[[Any], Any]) -> float:
+    """Mean return of the same episodes for every policy."""
+
+    def step(carry: Any, _: None) -> tuple[Any, None]:
+        states, alive, total = carry
+        states = jax.vmap(env.step)(states, act(states.obs))
+        return (states, alive * (1 - states.done), total + alive * states.reward), None
+
+    @jax.jit
+    def fly(keys: Any) -> Any:
+        start = (jax.vmap(env.reset)(keys), jnp.ones(EPISODES), jnp.zeros(EPISODES))
+        return jax.lax.scan(step, start, length=EPISODE)[0][2].mean()
+
+    return float(fly(jax.random.split(jax.random.PRNGKey(1), EPISODES)))
+
+
+def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """One row for each environment, algorithm and trainer: seconds cold and warm, median and worst return."""
+    found = []
+    for name in dict.fromkeys((row["env"], row["algorithm"], row["trainer"]) for row in rows):
+        runs = [row for row in rows if (row["env"], row["algorithm"], row["trainer"]) == name]
+        returns, warm = [row["return"] for row in runs], [row["seconds"] for row in runs[1:]]
+        row = dict(zip(("env", "algorithm", "trainer"), name, strict=True)) | {"steps": runs[0]["steps"]}
+        row |= {"cold": runs[0]["seconds"], "warm": statistics.median(warm) if warm else None}
+        found.append(row | {"return": statistics.median(returns), "worst": min(returns)})
+    return found
+
+
+def result(options: argparse.Namespace, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What the JSON file holds."""
+    settings = {f"{env} {algorithm}": given for (env, algorithm), given in TASKS.items()}
+    found = {"backend": options.backend, "scale": options.scale, "settings": settings}
+    return found | {"runs": rows, "table": summary(rows), "versions": versions()}
+
+
+def main() -> None:
+    """Train, fly, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--envs", nargs="+", default=["inverted_pendulum", "ant"])
+    parser.add_argument("--algorithms", nargs="+", default=["sac", "ppo"], choices=("sac", "ppo"))
+    parser.add_argument("--trainers", nargs="+", default=["ours", "stock"], choices=("ours", "stock"))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--backend", default="positional", help="of Brax's physics")
+    parser.add_argument("--scale", type=float, default=1.0, help="factor on the steps")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    options = parser.parse_args()
+    import_brax_env()
+    from brax import envs
+
+    trainers, rows = {"ours": ours, "stock": stock}, []
+    settings: Any = jax.config
+    settings.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    settings.update("jax_default_matmul_precision", "highest")  # what ours trains with
+    tasks = [name for name in TASKS if name[0] in options.envs and name[1] in options.algorithms]
+    with tempfile.TemporaryDirectory() as place:
+        for env_name, algorithm in tasks:
+            given = dict(TASKS[env_name, algorithm])
+            rounds = round(given["num_timesteps"] * options.scale / given["num_envs"])
+            given["num_timesteps"] = rounds * given["num_envs"]
+            env = envs.get_environment(env_name, backend=options.backend)
+            for trainer in options.trainers:
+                settings.update("jax_compilation_cache_dir", f"{place}/{env_name}-{algorithm}-{trainer}")
+                for seed in range(options.seeds):
+                    started = time.perf_counter()
+                    policy = trainers[trainer](env, algorithm, given, seed)
+                    seconds = time.perf_counter() - started
+                    row = {"env": env_name, "algorithm": algorithm, "trainer": trainer, "seed": seed}
+                    row |= {"steps": given["num_timesteps"], "seconds": seconds, "return": mean_return(env, policy)}
+                    rows.append(row)
+                    say(row)
+                if options.json:  # what is measured stays, whatever ends the rest
+                    options.json.write_text(json.dumps(result(options, rows), indent=2) + "\n")
+    for row in summary(rows):
+        say(row)
+
+
+if __name__ == "__main__":
+    main()
