@@ -4,7 +4,7 @@
 
 Fits motor lag, torque over inertia and force over mass to two flights of DIR and reports on all others: forecasts of
 attitude and rates from logged motor commands beside constant rates, the cascade's motor commands beside the logged
-ones, and specific force against command and voltage. Half a minute on one core. See docs/real-flights.md.
+ones, and specific force against command and voltage. Half a minute on one core. See docs/archive/real-flights.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Export a follower: `python -m mjxball.export RUN_DIR OUT`, of a run's newest checkpoint or of a policy file.
 
-OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header); see docs/export.md.
+OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header); see docs/policy-file.md.
 """
 
 from __future__ import annotations

@@ -239,7 +239,7 @@ def test_the_notebook_runs() -> None:
     printed = "".join(output.get("text", "") for output in outputs if output.get("name") == "stdout")
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
     swayed = {name: float(far) for name, far in re.findall(r"^(\w+) +sways (\S+) m +settles", printed, re.MULTILINE)}
-    assert swayed["copy"] > 0.29  # figures.md: 0.296 m
+    assert swayed["copy"] > 0.29  # docs/mimicking.md: 0.296 m
     assert max(swayed["lqg"], swayed["transport"]) < 0.01
     predicted, flown = map(float, re.search(r"predicted (\S+) m, flown (\S+) m", printed).groups())
     assert abs(predicted - flown) < 5e-4  # what the last of 45 s leaves of the swing

@@ -17,7 +17,7 @@ from mjxball.cache import traced_directory
 
 OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
 # Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
-# (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/results.md.)
+# (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/archive.)
 GPU_OPTIONS: dict[str, Any] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
 # For algorithms that are done sooner than XLA, which then compiles twice as fast what runs a quarter slower.
 CPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
