@@ -26,6 +26,7 @@ from mjxball.env import CoupledPairEnv
 from mjxball.policy import save_file
 from mjxball.policy.export import policy_file
 from mjxball.quiet import import_brax_env
+from mjxball.sim.follower import follower_law
 
 
 def replicated(tree: Any, devices: list[Any]) -> Any:
@@ -121,7 +122,7 @@ def main() -> None:
     def export(steps: int, parameters: Any) -> None:
         seen, mask = parameters[0], CoupledPairEnv(config, options.physics).input_mask
         learnt = Policy(parameters[1]["params"], seen.mean, seen.std, mask)
-        exported = policy_file(config, learnt, steps, card)
+        exported = policy_file(config, follower_law(config), learnt, steps, card)
         save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)
         if steps >= options.steps:
             save_file(options.out, exported)

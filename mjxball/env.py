@@ -13,13 +13,13 @@ from mjxball import rewards
 from mjxball.config import Config, ball_limit
 from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
-from mjxball.control.observation import observation_history
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
 from mjxball.physics.motion import object_mass
 from mjxball.physics.step import TRAINING_ENGINES, ControlStep, jax_repeat, make_cg_offset, make_control_step
 from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
 from mjxball.sim.disturbances import RandomDisturbances
+from mjxball.sim.follower import follower_law
 from mjxball.sim.randomization import ResetDistribution
 
 if TYPE_CHECKING:
@@ -53,8 +53,9 @@ class World(NamedTuple):
     load: Load
     goal: Float[Array, "3"]  # of O [m]
     disturbances: Any  # `sim.disturbances.RandomState`, () if nothing is disturbed
-    history: Any  # (m,) observation history; () if none: XLA's partitioner cannot bear arrays of no elements
+    history: Any  # (m,) what the follower remembers; () if none: XLA's partitioner cannot bear arrays of no elements
     action: Float[Array, "3"]  # last network action in [-1, 1]
+    command: Float[Array, "... 3"]  # the follower's last, roll, pitch [rad], vertical acceleration [m/s2]
     steps: Int[Array, ""]  # control steps since the reset
 
     @property
@@ -80,7 +81,7 @@ class CoupledPairEnv:
         self._disturbances = RandomDisturbances(config)
         self._loop = ClosedLoop(config, make_physics(config, physics), self._disturbances.sensors)
         self._ball_limit = ball_limit(config.plant)
-        self._history = observation_history(config)
+        self._law = follower_law(config)
         self._resets = ResetDistribution(config)
         self._cg = make_cg_offset(config)
         self._commanded = np.array(layout.commanded(config.follower.load_axis_only, config.plant.cg_axis))
@@ -97,17 +98,17 @@ class CoupledPairEnv:
     @property
     def policy_input_size(self) -> int:
         """How many numbers of the observation the follower sees and remembers; only critics are told the rest."""
-        return layout.OBSERVATION_SIZE + self._history.size
+        return layout.OBSERVATION_SIZE + self._law.size
 
     @property
     def input_mask(self) -> list[float]:
         """1 for each number of the observation that the policy uses, else 0."""
-        return [*self._history.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
+        return [*self._law.mask(self.config.follower.ignore_position), *[0.0] * self._privileged_size]
 
     @property
     def critic_mask(self) -> list[float]:
         """1 for each number of the observation that the critics use, else 0."""
-        return [*self._history.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
+        return [*self._law.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
 
     @property
     def action_size(self) -> int:
@@ -142,7 +143,7 @@ class CoupledPairEnv:
         world: World = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
-        command = self._follower_command(action, self._observed(state))
+        command = self._law.command(action, self._observed(state), world.history)
         return self._step(state, command, action, ~finite | world.loop.diverged, 1.0, physics)
 
     def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
@@ -185,8 +186,9 @@ class CoupledPairEnv:
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
-            history=self._history.next(world.history, observation, action) if self._history.size else (),
+            history=self._law.next(world.history, observation, action, command) if self._law.size else (),
             action=action,
+            command=command,
             steps=world.steps + 1,
         )
         distance = jnp.linalg.norm(world.goal - loop.plant.position)
@@ -226,15 +228,16 @@ class CoupledPairEnv:
             load=load,
             goal=goal,
             disturbances=disturbances,
-            history=self._history.start(observation) if self._history.size else (),
+            history=self._law.start(observation) if self._law.size else (),
             action=jnp.zeros(3),
+            command=jnp.zeros(3),
             steps=jnp.zeros((), jnp.int32),
         )
         return world, observation
 
     def _input(self, observation: Float[Array, "18"], world: World) -> Float[Array, " input"]:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
-        shown = self._history.network_input(observation, world.history) if self._history.size else observation
+        shown = self._law.network_input(observation, world.history) if self._law.size else observation
         return jnp.concatenate([shown, self._privileged(world)]) if self.config.follower.privileged_critic else shown
 
     def _first_privileged(self, rng: Array) -> Float[Array, " privileged"]:
@@ -264,19 +267,6 @@ class CoupledPairEnv:
             parts += [jnp.stack([battery, uncompensated])]
         return jnp.concatenate(parts)
 
-    def _follower_command(self, action: Float[Array, "3"], observation: Float[Array, "18"]) -> Float[Array, "3"]:
-        follower, law = self.config.follower, self.config.leader
-        return layout.follower_command(
-            action,
-            observation,
-            follower.action == "residual",
-            (follower.action_scale_tilt, follower.action_scale_vertical),
-            law.kp,
-            law.kd,
-            self.config.plant.gravity,
-            (self.config.command.tilt_limit, self.config.command.vertical_limit),
-        )
-
     def _transition(
         self, before: World, after: World, commands: Commands, terminated: Bool[Array, ""]
     ) -> rewards.Transition:
@@ -289,7 +279,8 @@ class CoupledPairEnv:
             rates=plant.rates,
             action=after.action,
             last_action=before.action,
-            action_average=self._history.slowest_action(before.history) if remembers else None,
+            command_change=after.command - before.command,
+            action_average=self._law.history.slowest_action(before.history) if remembers else None,
             leader_command=commands.leader,
             follower_command=commands.follower,
             tilt_disagreement=(commands.follower - commands.leader)[..., self._unloaded],

@@ -16,11 +16,14 @@ from mjxball.policy.file import PolicyFile, load_file, save_file, write_whole
 def policy_of_run(run: Path) -> PolicyFile:
     """The policy of the newest checkpoint in the run directory `run`."""
     from mjxball.policy.export import is_sound, policy_file
+    from mjxball.sim.follower import follower_law
     from mjxball.train.checkpoint import restore_policy
     from mjxball.train.curves import training_summary
 
     config, learnt, steps, origin = restore_policy(run)
-    policy = policy_file(config, learnt, steps, {**origin, **training_summary(run, origin["seed"])})
+    policy = policy_file(
+        config, follower_law(config), learnt, steps, {**origin, **training_summary(run, origin["seed"])}
+    )
     if not is_sound(policy):
         raise InputError(f"the newest checkpoint of {run} holds values that are not finite")
     return policy

@@ -25,6 +25,7 @@ class Transition(NamedTuple):
     rates: Vector  # about the body axes [rad/s]
     action: Vector  # of the network in [-1, 1]
     last_action: Vector  # the one before
+    command_change: Vector  # of the follower's command since the step before [rad, m/s2]
     action_average: Vector | None  # over the longest of `follower.observation_averages`; None: there is none
     leader_command: Vector  # roll, pitch [rad], vertical acceleration [m/s2]
     follower_command: Vector  # likewise
@@ -58,6 +59,10 @@ def task_reward(weights: Reward, step: Transition) -> Scalar:
         + weights.effort * square(step.action)
         + weights.smoothness * square(step.action - step.last_action)
     )
+    if _used(weights.command_change):
+        total = total - weights.command_change * (
+            square(step.command_change[..., :2]) + 0.01 * step.command_change[..., 2] ** 2
+        )
     if _used(weights.tilt_disagreement):
         total = total - weights.tilt_disagreement * step.tilt_disagreement**2
     if _used(weights.ball):

@@ -31,6 +31,7 @@ from mjxball.config import Config
 from mjxball.env import CoupledPairEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
+from mjxball.sim.follower import follower_law
 
 # XLA reads its flags when it first compiles; processes that tests start have those of users unless a test says so.
 with pytest.MonkeyPatch.context() as patched:
@@ -214,7 +215,9 @@ def make_trained(config: Config) -> Trained:
     spread, centre = random.uniform(0.05, 3.0, env.observation_size), random.normal(size=env.observation_size)
     seen = jnp.asarray(centre + spread * random.normal(size=(500, env.observation_size)), jnp.float32)
     learner = learner._replace(normaliser=sac.brax.running_statistics.update(learner.normaliser, seen))
-    return Trained(config, networks, learner, policy_file(config, policy_of(env, learner), steps=1234))
+    return Trained(
+        config, networks, learner, policy_file(config, follower_law(config), policy_of(env, learner), steps=1234)
+    )
 
 
 @pytest.fixture(scope="session")
@@ -228,6 +231,12 @@ def remembering(transport: Config) -> Trained:
     """A follower with everything that it can remember; its critics are told more than it."""
     follower = {"history": 3, "previous_action": True, "observation_averages": (0.1, 0.5), "privileged_critic": True}
     return make_trained(with_settings(transport, follower=follower))
+
+
+@pytest.fixture(scope="session")
+def estimating(transport: Config) -> Trained:
+    """A follower whose network's action is added to an offset-free LQG."""
+    return make_trained(with_settings(transport, follower={"base": "lqg", "observation_averages": (0.1,)}))
 
 
 @pytest.fixture(scope="session")

@@ -72,7 +72,10 @@ def limited(remembering: Trained) -> PolicyFile:
 
 
 @pytest.fixture(
-    params=["trained", "direct", "remembering", "limited", "transport", "robust", "flight", "stand", "paper"]
+    params=[
+        *("trained", "direct", "remembering", "limited", "estimating"),
+        *("transport", "robust", "flight", "stand", "paper"),
+    ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
     if request.param in ("transport", "robust", "flight", "stand", "paper"):

@@ -15,6 +15,7 @@ from conftest import Trained, policy_of
 from mjxball.control import observation as layout
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.export import policy_file
+from mjxball.sim.follower import follower_law
 from mjxball.train.extensions import DEFAULTS, make_env
 
 OBSERVATIONS = np.random.default_rng(0).normal(size=(40, 18))
@@ -182,6 +183,9 @@ def test_export_masks_what_the_network_ignores(trained):
 def test_export_takes_the_averaged_policy(trained):
     learner = trained.learner._replace(policy=jax.tree.map(jnp.zeros_like, trained.learner.policy))
     contents = policy_file(
-        trained.config, policy_of(make_env(DEFAULTS, trained.config, "newton-euler"), learner), steps=1
+        trained.config,
+        follower_law(trained.config),
+        policy_of(make_env(DEFAULTS, trained.config, "newton-euler"), learner),
+        steps=1,
     )
     jax.tree.map(np.testing.assert_array_equal, contents.weights, trained.contents.weights)

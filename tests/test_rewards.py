@@ -12,7 +12,7 @@ ZERO = np.zeros(3)
 ERROR_ONLY = Reward(error=2.0, error_scale=0.1, velocity=0, tilt=0, rates=0, effort=0, smoothness=0)
 
 
-STILL = Transition(*[ZERO] * 9, tilt_disagreement=0.0, ball=ZERO[:1], terminated=np.array(False))
+STILL = Transition(*[ZERO] * 10, tilt_disagreement=0.0, ball=ZERO[:1], terminated=np.array(False))
 
 
 def task(weights=ERROR_ONLY, **parts):

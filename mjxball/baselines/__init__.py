@@ -11,6 +11,7 @@ from collections.abc import Callable
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
 from mjxball.baselines.lqg import Lqg, Memoryless, SlowLqg
+from mjxball.baselines.offset_free import OffsetFree
 from mjxball.baselines.reference import Oracle, Random, Stay
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Copy, Law
@@ -24,6 +25,7 @@ __all__ = [
     "CrazyflieLqg",
     "Lqg",
     "Memoryless",
+    "OffsetFree",
     "Oracle",
     "Random",
     "SlowLqg",
@@ -42,9 +44,10 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "memoryless": Memoryless,
     "lqg": lambda config: CrazyflieLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
     "lqg-slow": SlowLqg,
+    "lqg-offset-free": OffsetFree,
 }
-# The default list of `eval.py`; benchmark suites fly the two variants as well.
-BASELINES = tuple(name for name in LAWS if name not in ("adaptive-mass", "lqg-slow"))
+# The default list of `eval.py`; benchmark suites fly the variants as well.
+BASELINES = tuple(name for name in LAWS if name not in ("adaptive-mass", "lqg-slow", "lqg-offset-free"))
 
 
 def make_law(name: str, config: Config) -> Law:

@@ -6,7 +6,7 @@ import types
 from dataclasses import replace
 
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
-from mjxball.config._settings import Bounds, Config, Follower, Reward, Sac, Scenario
+from mjxball.config._settings import Bounds, Config, Follower, Gradient, Reward, Sac, Scenario
 from mjxball.errors import InputError
 
 
@@ -108,8 +108,40 @@ def _robust() -> Config:
     )
 
 
+def _balance() -> Config:
+    """One follower for loads known and unknown: offset-free LQG and a network that is trained by gradients."""
+    large = _transport_large()
+    return replace(
+        large,
+        preset="balance",
+        follower=replace(large.follower, base="lqg", action_scale_tilt=0.3, action_scale_vertical=4.0),
+        scenario=replace(
+            large.scenario,
+            unknown_share=0.4,
+            gust=(0.0, 0.2),
+            # Half as much again as a user's delay may be: what is stable there is well damped at 60 ms.
+            delay=(0.0, 0.1),
+            rotor_lag_scale=(0.7, 1.5),
+            inertia_scale=(0.8, 1.2),
+            cg_random_visits=0.3,
+        ),
+        bounds=Bounds(x_peak=0.005, settling_time=2.2, rmse=0.335),
+        reward=replace(large.reward, velocity=12.0, smoothness=0.2, command_change=40.0),
+        gradient=Gradient(
+            gradient_steps=700,
+            num_envs=64,
+            windows_per_episode=5,
+            learning_rate=6e-3,
+            damping=0.97,
+        ),
+    )
+
+
 PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
-    {made.preset: made for made in (_transport(), _paper(), _transport_large(), _robust(), stand(), flight())}
+    {
+        made.preset: made
+        for made in (_transport(), _paper(), _transport_large(), _robust(), _balance(), stand(), flight())
+    }
 )
 
 

@@ -103,6 +103,9 @@ class Follower:
     action: Literal["residual", "direct"] = setting(
         "residual", "residual: added to the PD law on its own observation; direct: the command itself"
     )
+    base: Literal["pd", "lqg"] = setting(
+        "pd", "what a residual action is added to: the PD law, or an offset-free LQG that estimates the load's torque"
+    )
     action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", above=0, high=1.2)
     action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", above=0)
     shares_integrals: bool = setting(
@@ -173,6 +176,13 @@ class Scenario:
         0.0, "share of flights whose CG goes from place to place at random", low=0, high=1
     )
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
+    unknown_share: float = setting(
+        0.0,
+        "share of flights with an object mass that the hover thrust does not know, from unknown_mass",
+        low=0,
+        high=1,
+    )
+    unknown_mass: Range = drawn((0.1, 0.35), "true mass of the object in these flights [kg]", above=0)
     termination_distance: float = setting(2.5, "an episode ends when |e_o| exceeds this, d_term [m]", above=0)
 
 
@@ -188,6 +198,11 @@ class Reward:
     rates: float = setting(0.05, "weight of the squared body rates [s2/rad2]", low=0)
     effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0)
     smoothness: float = setting(0.02, "weight of the squared change of the network action", low=0)
+    command_change: float = setting(
+        0.0,
+        "weight of the squared change of the follower's roll, pitch [1/rad2] and vertical [1e-2 s4/m2] command",
+        low=0,
+    )
     ball: float = setting(0.0, "weight of the square of a rolling ball's offset over its end stop's", low=0)
     steady_action: float = setting(
         0.0, "weight of the squared slowest average of the network action: what stands is the integrals' part", low=0

@@ -97,27 +97,6 @@ def scale_action(scaled: Array, tilt_limit: float, vertical_limit: float) -> Arr
     return scaled * xp.asarray([tilt_limit, tilt_limit, vertical_limit], dtype=scaled.dtype)
 
 
-def follower_command(
-    scaled: Array,
-    observation: Array,
-    residual: bool,
-    action_scale: tuple[float, float],
-    kp: Array,
-    kd: Array,
-    gravity: float,
-    limits: tuple[float, float],
-) -> Array:
-    """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18).
-
-    `action_scale` = (tilt [rad], vertical [m/s2]) scales the action; with `residual` the PD law on the observed
-    error is added. The sum is clipped to `limits` = (tilt [rad], vertical [m/s2]).
-    """
-    command = scale_action(scaled, *action_scale)
-    if residual:
-        command = command + copy_command(observation, kp, kd, gravity, *limits)
-    return leader.clip_command(command, *limits)
-
-
 class ObservationHistory(NamedTuple):
     """What the network sees besides the newest observation. By default nothing.
 

@@ -19,6 +19,7 @@ SAME = (
     "history",
     "previous_action",
     "filters",
+    "lqg",
     "action_mode",
     "action_reach",
     "command_limits",

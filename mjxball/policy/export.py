@@ -12,30 +12,34 @@ import numpy as np
 
 from mjxball import __version__
 from mjxball.config import Config, config_hash, to_dict
+from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.motors import firmware
-from mjxball.control.observation import ACTION, OBSERVATION, commanded, observation_history
-from mjxball.policy.file import FORMAT_VERSION, PolicyFile, write_whole
+from mjxball.control.observation import ACTION, OBSERVATION, commanded
+from mjxball.policy.file import PolicyFile, write_whole
 
 
-def policy_file(config: Config, learnt: Any, steps: int, origin: dict[str, Any] | None = None) -> PolicyFile:
+def policy_file(
+    config: Config, law: FollowerLaw, learnt: Any, steps: int, origin: dict[str, Any] | None = None
+) -> PolicyFile:
     """The policy file of what has been learnt, see `mjxball.algorithms.base.Policy`.
 
-    `origin` (command, seed, commit, ...) is added to the card.
+    `law`: that of `config` (`baselines.follower_law`). `origin` (command, seed, commit, ...) is added to the card.
     """
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
-    mask = np.array(observation_history(config).mask(follower.ignore_position))
+    mask = np.array(law.mask(follower.ignore_position))
     size = len(mask)  # behind it stands what only the critics were told; the policy's weights for it never moved
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
     card = {
-        "format_version": FORMAT_VERSION,
+        "format_version": 1 if law.lqg is None else 2,
         "observation": [list(slot) for slot in OBSERVATION],
         "history": follower.history,
         "previous_action": follower.previous_action,
         "filters": list(follower.observation_averages),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
+        **({} if law.lqg is None else {"lqg": {k: np.asarray(v).tolist() for k, v in law.lqg._asdict().items()}}),
         "action_reach": action_scale,
         "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
         "leader_kp": list(leader.kp),

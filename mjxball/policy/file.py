@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, ObservationHistory
+from mjxball.control.offset_free import DRIVES, MEASURED, STATES, OffsetFreeLqg
 from mjxball.errors import InputError
 from mjxball.policy.container import PolicyFileError, read_arrays
 
-FORMAT_VERSION = 1
+FORMAT_VERSIONS = (1, 2)  # 2: with the numbers of an offset-free LQG, card field `lqg`
 FOLDER = "policies"  # of those that come with mjxball
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by the judge, where a card has the configuration
 MAX_CARD = 2**20  # characters
@@ -57,10 +59,34 @@ class PolicyFile:
     card: dict[str, Any]
 
 
-def history_of(card: dict[str, Any]) -> ObservationHistory:
-    """What the follower of a policy file remembers; `filters` is absent from the first files."""
+LQG_SHAPES: dict[str, tuple[int, ...]] = {
+    "transition": (STATES, STATES + DRIVES),
+    "gain": (STATES, MEASURED),
+    "tilt": (2, 4),
+    "height": (2,),
+    "limits": (3,),
+    "stiffness": (),
+    "half_length": (),
+    "carried": (2,),
+}
+
+
+def law_of(card: dict[str, Any]) -> FollowerLaw:
+    """The laws around the network of a policy file; `filters` is absent from the first files."""
     filters = tuple(card.get("filters", ()))
-    return ObservationHistory(card["history"], card["previous_action"], filters, float(card["control_period"]))
+    lqg = card.get("lqg")
+    return FollowerLaw(
+        history=ObservationHistory(card["history"], card["previous_action"], filters, float(card["control_period"])),
+        action_scale=tuple(card["action_reach"]),
+        limits=tuple(card["command_limits"]),
+        kp=tuple(card["leader_kp"]),
+        kd=tuple(card["leader_kd"]),
+        gravity=card["gravity"],
+        residual=card["action_mode"] == "residual",
+        lqg=None
+        if lqg is None
+        else OffsetFreeLqg(**{name: np.array(lqg[name]) if shape else lqg[name] for name, shape in LQG_SHAPES.items()}),
+    )
 
 
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
@@ -138,7 +164,7 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
 def check(policy: PolicyFile, name: str) -> None:
     """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
     _check_card(policy.card, name)
-    size = OBSERVATION_SIZE + history_of(policy.card).size
+    size = OBSERVATION_SIZE + law_of(policy.card).size
     vectors = [
         ("observation_mean", policy.observation_mean, size),
         ("observation_scale", policy.observation_scale, size),
@@ -177,8 +203,9 @@ def _check_array(name: str, label: str, array: np.ndarray, shape: tuple[int, ...
 
 def _check_card(card: dict[str, Any], name: str) -> None:
     version = card.get("format_version")
-    if version != FORMAT_VERSION or isinstance(version, bool):
-        raise PolicyFileError(f"{name} has policy format {version!r}; this version reads format {FORMAT_VERSION}")
+    if version not in FORMAT_VERSIONS or isinstance(version, bool):
+        known = " and ".join(map(str, FORMAT_VERSIONS))
+        raise PolicyFileError(f"{name} has policy format {version!r}; this version reads formats {known}")
     for field, kind in CARD_FIELDS.items():
         value = card.get(field)
         if isinstance(value, bool) and kind is not bool:
@@ -208,6 +235,7 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
         numbers = card[field]
         if len(numbers) != length or not all(_is_finite(value) and value >= 0 for value in numbers):
             raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
+    _check_lqg(card, name)
     for field in ("control_period", "gravity"):
         if not (_is_finite(card[field]) and card[field] >= 1e-6):
             raise PolicyFileError(f"{name}: card field {field} must be positive")
@@ -216,6 +244,26 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     odd = sorted(set(card["bounds"]) - set(BOUNDED))
     if odd:
         raise PolicyFileError(f"{name}: card field bounds names {odd[0]!r}; known are {', '.join(BOUNDED)}")
+
+
+def _check_lqg(card: dict[str, Any], name: str) -> None:
+    """Raise PolicyFileError unless format 2 has the numbers of an offset-free LQG and format 1 has none."""
+    lqg = card.get("lqg")
+    if card["format_version"] == 1:
+        if lqg is not None:
+            raise PolicyFileError(f"{name}: card field lqg belongs to policy format 2, not 1")
+        return
+    if not isinstance(lqg, dict) or lqg.keys() != LQG_SHAPES.keys() or card["action_mode"] != "residual":
+        raise PolicyFileError(f"{name}: a residual policy of format 2 needs card field lqg: {', '.join(LQG_SHAPES)}")
+    for field, shape in LQG_SHAPES.items():
+        try:
+            array = np.array(lqg[field], np.float64)
+        except (TypeError, ValueError):
+            array = np.full(1, np.nan)
+        if array.shape != shape or not (np.abs(array) <= MAX_NUMBER).all():
+            raise PolicyFileError(f"{name}: card field lqg.{field} must be finite numbers of shape {shape}")
+    if min(lqg["stiffness"], *lqg["limits"], *lqg["carried"]) <= 0:
+        raise PolicyFileError(f"{name}: card field lqg: stiffness, limits and carried must be positive")
 
 
 def _is_finite(value: Any) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.control import observation as layout
-from mjxball.policy.file import PolicyFile, history_of, load_file
+from mjxball.policy.file import PolicyFile, law_of, load_file
 
 Array = Any
 
@@ -50,16 +50,8 @@ class Policy:
         self._biases: list[np.ndarray] = [np.ascontiguousarray(bias, dtype) for bias in biases]
         self._mean: np.ndarray = contents.observation_mean.astype(dtype)
         self._scale: np.ndarray = contents.observation_scale.astype(dtype)
-        self._history = history_of(card)
+        self._law = law_of(card)
         self._memory: Array | None = None
-        self._law: tuple[Any, ...] = (
-            card["action_mode"] == "residual",
-            tuple(card["action_reach"]),
-            np.asarray(card["leader_kp"], dtype),
-            np.asarray(card["leader_kd"], dtype),
-            card["gravity"],
-            tuple(card["command_limits"]),
-        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:
@@ -72,7 +64,7 @@ class Policy:
 
     @property
     def memory(self) -> Array:
-        """What it remembers (..., m), see `control.observation.ObservationHistory`; None: nothing yet."""
+        """What it remembers (..., m), see `control.follower_law.FollowerLaw`; None: nothing yet."""
         return self._memory
 
     @memory.setter
@@ -81,23 +73,28 @@ class Policy:
 
     def scaled(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
+        return self._answer(observation)[0]
+
+    def __call__(self, observation: Array) -> Array:
+        """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18)."""
+        return self._answer(observation)[1]
+
+    def _answer(self, observation: Array) -> tuple[Array, Array]:
+        """(action in [-1, 1], command) for `observation`, remembered if need be."""
         observation = np.asarray(observation, self._dtype)
         if observation.shape[-1:] != (layout.OBSERVATION_SIZE,):
             raise ValueError(
                 f"observation must have {layout.OBSERVATION_SIZE} numbers last, not shape {observation.shape}"
             )
-        if not self._history.size:
-            return mean_action(self._weights, self._biases, self._mean, self._scale, observation)
-        if self._memory is None:
-            self._memory = self._history.start(observation)
-        full = self._history.network_input(observation, self._memory)
+        law, remembers = self._law, self._law.size > 0
+        if remembers and self._memory is None:
+            self._memory = law.start(observation)
+        full = law.network_input(observation, self._memory) if remembers else observation
         action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
-        self._memory = self._history.next(self._memory, observation, action)
-        return action
-
-    def __call__(self, observation: Array) -> Array:
-        """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18)."""
-        return layout.follower_command(self.scaled(observation), np.asarray(observation, self._dtype), *self._law)
+        command = law.command(action, observation, self._memory)
+        if remembers:
+            self._memory = law.next(self._memory, observation, action, command)
+        return action, command
 
 
 class NetworkLaw:
@@ -108,29 +105,24 @@ class NetworkLaw:
     def __init__(self, policy: Policy):
         self.name = policy.name
         self._parts = (policy._weights, policy._biases, policy._mean, policy._scale)
-        self._history, self._law = policy._history, policy._law
+        self._law = policy._law
 
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
-        return self._history.start(observation)
+        return self._law.start(observation)
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""
-        scaled = self.scaled(memory, observation)
-        return self.next_memory(memory, observation, scaled), self.command(scaled, observation)
+        _, command, memory = self.answer(memory, observation)
+        return memory, command
 
-    def scaled(self, memory: Array, observation: Array) -> Array:
-        """The network's action in [-1, 1] (..., 3)."""
+    def answer(self, memory: Array, observation: Array) -> tuple[Array, Array, Array]:
+        """(action in [-1, 1] (..., 3), command (..., 3), memory of the next step) at `observation` (..., 18)."""
         xp = observation.__array_namespace__()
         weights, biases, mean, scale = self._parts
         mean, scale = (xp.asarray(part, dtype=observation.dtype) for part in (mean, scale))
         weights, biases = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
-        return mean_action(weights, biases, mean, scale, self._history.network_input(observation, memory))
-
-    def command(self, scaled: Array, observation: Array) -> Array:
-        """Command (..., 3) of the action `scaled` (..., 3)."""
-        return layout.follower_command(scaled, observation, *self._law)
-
-    def next_memory(self, memory: Array, observation: Array, scaled: Array) -> Array:
-        """Memory of the next step."""
-        return self._history.next(memory, observation, scaled)
+        seen = self._law.network_input(observation, memory)
+        scaled = mean_action(weights, biases, mean, scale, seen)
+        command = self._law.command(scaled, observation, memory)
+        return scaled, command, self._law.next(memory, observation, scaled, command)

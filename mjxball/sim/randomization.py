@@ -73,6 +73,12 @@ class ResetDistribution:
         mass = between(*scenario.object_mass)
         nominal = jnp.full_like(mass, self.config.plant.object_mass)
         believed = mass if scenario.mass_known else nominal
+        if scenario.unknown_share > 0:
+            share, place = jax.random.uniform(jax.random.fold_in(rng, 7), (2,))
+            low, high = scenario.unknown_mass
+            unknown = share < scenario.unknown_share
+            mass = jnp.where(unknown, low + (high - low) * place, mass)
+            believed = jnp.where(unknown, nominal, believed)
         load = Load(
             object_mass=mass,
             believed_mass=believed,

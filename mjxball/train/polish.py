@@ -20,10 +20,10 @@ import numpy as np
 from mjxball.algorithms.base import Phase
 from mjxball.algorithms.gradient import LEAST_DEVIATION, FirstOrderGradient, GradientState
 from mjxball.config import Config
-from mjxball.control.observation import observation_history
 from mjxball.env import CoupledPairEnv, World
 from mjxball.policy import PolicyFile
 from mjxball.sim.disturbances import Sample
+from mjxball.sim.follower import follower_law
 from mjxball.train.compilation import CPU_OPTIONS
 from mjxball.train.program import MATMUL_PRECISION, Environments
 
@@ -86,7 +86,7 @@ class FlightState(NamedTuple):
     rates: Any  # (3,) body axes [rad/s]
     goal: Any  # (3,) of O [m]
     integral: Any  # of both laws, see `sim.laws.Laws`
-    history: Any  # (m,) the policy's, see `control.observation.ObservationHistory`
+    history: Any  # (m,) the policy's, see `control.follower_law.FollowerLaw`
 
 
 class Polished(NamedTuple):
@@ -135,7 +135,7 @@ class LoadedEnv(CoupledPairEnv):
         )
         delay = world.disturbances.delay if self._disturbances.present else 0
         loop, observation = self._loop.start(plant, flight.goal, Sample(), delay, flight.integral)
-        history = flight.history if self._history.size else ()
+        history = flight.history if self._law.size else ()
         moved = world._replace(loop=loop, load=load, goal=flight.goal, history=history)
         return state.replace(pipeline_state=moved, obs=self._input(observation, moved))
 
@@ -300,7 +300,7 @@ def nominal_load(config: Config) -> KnownLoad:
 def resting(config: Config) -> FlightState:
     """Hover at the goal."""
     integral = np.zeros(7 if config.follower.shares_integrals else 3)
-    history = np.zeros(observation_history(config).size)
+    history = np.zeros(follower_law(config).size)
     level = np.array([1.0, 0.0, 0.0, 0.0])
     return _single(FlightState(np.zeros(3), np.zeros(3), level, np.zeros(3), np.zeros(3), integral, history))
 

@@ -21,6 +21,7 @@ from mjxball.config import Config
 from mjxball.errors import TrainingDivergedError
 from mjxball.policy import save_file
 from mjxball.policy.export import is_sound, network_file, policy_file
+from mjxball.sim.follower import follower_law
 from mjxball.train import processes
 from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
@@ -271,7 +272,7 @@ class Run:
             if not is_pair(self.population.program.env):  # no policy file: its observation is another
                 exported |= network_file(self._network_path(member), learnt, steps, origin)
                 continue
-            policy = policy_file(config, learnt, steps, origin)
+            policy = policy_file(config, follower_law(config), learnt, steps, origin)
             if not is_sound(policy):
                 continue
             exported = True

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.observation import (
     ACTION_SIZE,
     ERROR,
     ERROR_RATE,
     OBSERVATION,
     OBSERVATION_SIZE,
-    ObservationHistory,
 )
-from mjxball.policy.file import PolicyFile, history_of
+from mjxball.policy.file import PolicyFile, law_of
 
 FLOAT = 4  # bytes
 
@@ -37,13 +37,16 @@ def footprint(policy: PolicyFile) -> Footprint:
     weights, biases = _mean_layers(policy)
     size = len(policy.observation_mean)
     widest = max(len(bias) for bias in biases)
+    lqg = law_of(policy.card).lqg
     constants = sum(array.size for array in (*weights, *biases)) + 2 * size + 2 * ACTION_SIZE
+    constants += 0 if lqg is None else sum(np.size(value) for value in lqg)
     return Footprint(FLOAT * constants, FLOAT * (size - OBSERVATION_SIZE) + 4, FLOAT * (size + 2 * widest))
 
 
 def c_header(policy: PolicyFile, name: str) -> str:
     """The header's text. `mjxball_follow` computes what `mjxball.Policy` computes, in float."""
-    history, card, cost = history_of(policy.card), policy.card, footprint(policy)
+    law, card, cost = law_of(policy.card), policy.card, footprint(policy)
+    history = law.history
     weights, biases = _mean_layers(policy)
     sizes = [len(policy.observation_mean), *map(len, biases)]
     arrays = [_array("mean", policy.observation_mean), _array("scale", policy.observation_scale)]
@@ -51,11 +54,17 @@ def c_header(policy: PolicyFile, name: str) -> str:
         arrays += [_array(f"weight_{number}", weight.T), _array(f"bias_{number}", bias)]
     tilt, vertical = card["command_limits"]
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
+    if law.lqg is not None:
+        arrays += [
+            _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
+            for name, value in law.lqg._asdict().items()
+        ]
     return HEADER.format(
         name=_plain(name),
         origin=_plain(f"preset {card['preset']}, configuration {card['config_hash']}, {card['training_steps']} steps"),
         version=_plain(card["package_version"]),
         period=f"{card['control_period']:g}",
+        gravity=_number(card["gravity"]),
         observation=_table(),
         layers=" x ".join(map(str, sizes)),
         flash=cost.flash,
@@ -63,15 +72,15 @@ def c_header(policy: PolicyFile, name: str) -> str:
         stack=cost.stack,
         size=sizes[0],
         widest=max(sizes[1:]),
-        memory_size=history.size,
-        memory_field=f"    mjxball_real memory[{history.size}];\n" if history.size else "",
-        helpers=APPROACH if history.filters else "",
-        memory_pointer="    mjxball_real *memory = follower->memory;\n" if history.size else "",
+        memory_size=law.size,
+        memory_field=f"    mjxball_real memory[{law.size}];\n" if law.size else "",
+        helpers=(APPROACH if history.filters else "") + (LQG if law.lqg is not None else ""),
+        memory_pointer="    mjxball_real *memory = follower->memory;\n" if law.size else "",
         arrays="\n".join(arrays),
-        history=_history(history),
-        history_update=_history_update(history),
+        history=_history(law, card),
+        history_update=_history_update(law),
         network=_network(sizes),
-        command=_command(card),
+        command=_command(law, card),
     )
 
 
@@ -102,28 +111,36 @@ def _table() -> str:
     return "\n".join(f" *   {slot:2d}  {name:<22}{unit}" for slot, (name, unit) in enumerate(OBSERVATION))
 
 
-def _history(history: ObservationHistory) -> str:
-    """Lines that make the network's input of observation and memory (see `control.observation.ObservationHistory`)."""
-    if not history.size:
+def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
+    """Lines that make the network's input of observation and memory (see `control.follower_law.FollowerLaw`)."""
+    history = law.history
+    if not law.size:
         return "    (void)follower;"
     older, width = (history.length - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
     lines = ["    if (!follower->running) {"]
-    lines += [f"        for (i = 0; i < {history.size}; i++) memory[i] = 0;"]
+    lines += [f"        for (i = 0; i < {law.size}; i++) memory[i] = 0;"]
     for k in range(history.length - 1):
         lines += [f"        mjxball_copy(memory + {k * OBSERVATION_SIZE}, observation, {OBSERVATION_SIZE});"]
     for k in range(len(history.filters)):
         lines += [f"        mjxball_copy(memory + {older + k * width}, observation, {OBSERVATION_SIZE});"]
+    if law.lqg is not None:
+        lines += [f"        mjxball_lqg_start(memory + {history.size}, observation);"]
     lines += ["        follower->running = 1;", "    }"]
-    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
+    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {law.size});"]
     for k in range(len(history.filters)):
         place = OBSERVATION_SIZE + older + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
+    if law.lqg is not None:
+        lines = ["    mjxball_real led[3];", *_leader(card, "led"), *lines]
+        lines += [f"    mjxball_lqg_estimate(memory + {history.size}, observation);"]
+        place = f"input + {OBSERVATION_SIZE + history.size}"
+        lines += [f"    mjxball_lqg_features(memory + {history.size}, observation, {place});"]
     return "\n".join(lines)
 
 
-def _history_update(history: ObservationHistory) -> str:
+def _history_update(law: FollowerLaw) -> str:
     """Lines that move the memory on by one step."""
-    lines = []
+    lines, history = [], law.history
     older, width = (history.length - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
     if older:
         lines += [
@@ -136,6 +153,8 @@ def _history_update(history: ObservationHistory) -> str:
         lines += [f"    mjxball_approach(memory + {place + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
     if history.previous_action:
         lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
+    if law.lqg is not None:
+        lines += [f"    mjxball_lqg_next(memory + {history.size}, observation, led, command);"]
     return "\n".join(lines)
 
 
@@ -153,23 +172,36 @@ def _network(sizes: Sequence[int]) -> str:
     return "\n".join(lines)
 
 
-def _command(card: dict[str, Any]) -> str:
-    """Lines that make the command of `action`: for a residual the PD law on the observed error is added."""
-    if card["action_mode"] == "direct":
-        return "    for (i = 0; i < 3; i++) command[i] = 0;"
+def _leader(card: dict[str, Any], to: str) -> list[str]:
+    """Lines that make the leader's PD law on the observed error, within the limits, in the array `to`."""
     g = _number(card["gravity"])
     wanted = [
         f"{_number(kp)} * observation[{ERROR.start + k}] + {_number(kd)} * observation[{ERROR_RATE.start + k}]"
         for k, (kp, kd) in enumerate(zip(card["leader_kp"], card["leader_kd"], strict=True))
     ]
-    return "\n".join(
-        [
-            f"    command[0] = -({wanted[1]}) / {g};",
-            f"    command[1] = ({wanted[0]}) / {g};",
-            f"    command[2] = {wanted[2]};",
-            "    for (i = 0; i < 3; i++) command[i] = mjxball_clip(command[i], mjxball_limit[i]);",
-        ]
-    )
+    return [
+        f"    {to}[0] = -({wanted[1]}) / {g};",
+        f"    {to}[1] = ({wanted[0]}) / {g};",
+        f"    {to}[2] = {wanted[2]};",
+        f"    for (i = 0; i < 3; i++) {to}[i] = mjxball_clip({to}[i], mjxball_limit[i]);",
+    ]
+
+
+def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
+    """Lines that make the command of `action`, which is added to a law unless it is direct."""
+    added = "mjxball_action_scale[i] * action[i]"
+    if law.lqg is not None:
+        lines = [f"    for (i = 0; i < 3; i++) command[i] = {added};"]
+        lines += [f"    mjxball_lqg_command(memory + {law.history.size}, observation, led, command);"]
+        return "\n".join(
+            [*lines, "    for (i = 0; i < 3; i++) command[i] = mjxball_clip(command[i], mjxball_limit[i]);"]
+        )
+    lines = _leader(card, "command") if law.residual else ["    for (i = 0; i < 3; i++) command[i] = 0;"]
+    lines += [
+        "    for (i = 0; i < 3; i++)",
+        f"        command[i] = mjxball_clip(command[i] + {added}, mjxball_limit[i]);",
+    ]
+    return "\n".join(lines)
 
 
 HEADER = """\
@@ -202,6 +234,7 @@ typedef MJXBALL_REAL mjxball_real;
 #define MJXBALL_ACTION_SIZE 3
 #define MJXBALL_MEMORY_SIZE {memory_size}
 #define MJXBALL_CONTROL_PERIOD {period}
+#define MJXBALL_GRAVITY {gravity}
 
 typedef struct {{
 {memory_field}    int running;
@@ -212,11 +245,10 @@ typedef struct {{
 static inline void mjxball_copy(mjxball_real *to, const mjxball_real *from, int count) {{
     for (int i = 0; i < count; i++) to[i] = from[i];
 }}
-{helpers}
 static inline mjxball_real mjxball_clip(mjxball_real value, mjxball_real limit) {{
     return value < -limit ? -limit : value > limit ? limit : value;
 }}
-
+{helpers}
 /* to = weight from + bias. Four sums side by side keep a pipelined FPU busy and round less than one long sum. */
 static inline void mjxball_layer(
     const float *weight, const float *bias, int inputs, int outputs, const mjxball_real *from, mjxball_real *to) {{
@@ -245,8 +277,6 @@ static inline void mjxball_follow(
 {network}
     for (i = 0; i < 3; i++) action[i] = (mjxball_real)tanh((double)action[i]);
 {command}
-    for (i = 0; i < 3; i++)
-        command[i] = mjxball_clip(command[i] + mjxball_action_scale[i] * action[i], mjxball_limit[i]);
 {history_update}
 }}
 
@@ -255,5 +285,68 @@ static inline void mjxball_follow(
 APPROACH = """
 static inline void mjxball_approach(mjxball_real *average, const mjxball_real *value, int count, float share) {
     for (int i = 0; i < count; i++) average[i] += share * (value[i] - average[i]);
+}
+"""
+LQG = """
+/* LQG with estimates of the load; its memory: the filter's state (8) and what drives it (2). */
+static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *observation) {
+    memory[0] = observation[4];
+    memory[1] = observation[10];
+    memory[5] = -observation[17];
+}
+
+static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
+    mjxball_real predicted[8], off[3];
+    for (int row = 0; row < 8; row++) {
+        predicted[row] = 0;
+        for (int k = 0; k < 10; k++) predicted[row] += mjxball_lqg_transition[10 * row + k] * memory[k];
+    }
+    off[0] = observation[4] - predicted[0];
+    off[1] = observation[10] - predicted[1];
+    off[2] = -observation[17] - predicted[5];
+    for (int row = 0; row < 8; row++) {
+        memory[row] = predicted[row];
+        for (int k = 0; k < 3; k++) memory[row] += mjxball_lqg_gain[3 * row + k] * off[k];
+    }
+}
+
+static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
+    to[0] = observation[4] - memory[0];
+    to[1] = observation[10] - memory[1];
+    to[2] = -observation[17] - memory[5];
+    mjxball_copy(to + 3, memory + 2, 3);
+    mjxball_copy(to + 6, memory + 6, 4);
+}
+
+static inline mjxball_real mjxball_lqg_tilt(int axis, int along, const mjxball_real *observation) {
+    const float *gain = mjxball_lqg_tilts + 4 * axis;
+    mjxball_real far = gain[0] * observation[12 + along] + gain[1] * observation[15 + along];
+    return mjxball_clip(far, mjxball_lqg_limits[0]) - gain[2] * observation[3 + axis] - gain[3] * observation[9 + axis];
+}
+
+static inline mjxball_real mjxball_lqg_difference(
+    mjxball_real led, mjxball_real vertical, const mjxball_real *observation) {
+    mjxball_real level = (mjxball_real)(cos((double)observation[3]) * cos((double)observation[4]));
+    mjxball_real ahead = mjxball_lqg_carried[0] * (MJXBALL_GRAVITY + led);
+    return (ahead - mjxball_lqg_carried[1] * (MJXBALL_GRAVITY + vertical)) / level;
+}
+
+/* command: what is added to the law's, then the sum, of which the vertical part is within its limit. */
+static inline void mjxball_lqg_command(
+    const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *command) {
+    mjxball_real rise = mjxball_lqg_height[0] * observation[14] + mjxball_lqg_height[1] * observation[17], against;
+    rise = mjxball_clip(rise, mjxball_lqg_limits[1]) - memory[7];
+    command[2] = mjxball_clip(2 * rise - led[2] + command[2], mjxball_limit[2]);
+    against = mjxball_lqg_half_length[0] * mjxball_lqg_difference(led[2], command[2], observation) - memory[2];
+    against = mjxball_clip(against / mjxball_lqg_stiffness[0], mjxball_lqg_limits[2]);
+    command[0] += 2 * mjxball_lqg_tilt(0, 1, observation) - led[0];
+    command[1] += 2 * mjxball_lqg_tilt(1, 0, observation) - led[1] + against;
+}
+
+static inline void mjxball_lqg_next(
+    mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, const mjxball_real *command) {
+    memory[8] = mjxball_lqg_stiffness[0] * (led[1] + command[1])
+        - mjxball_lqg_half_length[0] * mjxball_lqg_difference(led[2], command[2], observation);
+    memory[9] = (mjxball_real)0.5 * (led[2] + command[2]);
 }
 """

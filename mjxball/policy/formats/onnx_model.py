@@ -15,7 +15,7 @@ import onnx
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from mjxball.control import observation as layout
-from mjxball.policy.file import PolicyFile, history_of
+from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.policy import NetworkLaw, Policy
 
 Array = Any
@@ -96,7 +96,14 @@ _add_operators()
 class Namespace:
     """The part of the array namespace that a policy's laws use."""
 
-    sin, cos = staticmethod(np.sin), staticmethod(np.cos)  # of the desired yaw, a constant
+    sin = staticmethod(np.sin)  # of the desired yaw, a constant
+
+    @staticmethod
+    def cos(value: Any) -> Any:
+        """Elementwise; of a constant it is one."""
+        if not isinstance(value, TracedArray):
+            return np.cos(value)
+        return TracedArray(value.graph, value.graph.add("Cos", value), value.size)
 
     @staticmethod
     def asarray(values: Any, dtype: Any = None) -> Any:
@@ -147,16 +154,16 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
     roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m).
     """
-    graph, history = Graph(), history_of(contents.card)
+    graph, around = Graph(), law_of(contents.card)
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
-    memory = history.start(observation)
-    if history.size:
-        inputs += [_value("memory", TensorProto.FLOAT, history.size), _value("start", TensorProto.BOOL, 1)]
-        start, given = TracedArray(graph, "start", 1), TracedArray(graph, "memory", history.size)
-        memory = TracedArray(graph, graph.add("Where", start, memory, given), history.size)
+    memory = around.start(observation)
+    if around.size:
+        inputs += [_value("memory", TensorProto.FLOAT, around.size), _value("start", TensorProto.BOOL, 1)]
+        start, given = TracedArray(graph, "start", 1), TracedArray(graph, "memory", around.size)
+        memory = TracedArray(graph, graph.add("Where", start, memory, given), around.size)
     results = dict(zip(("action", "command", "next_memory"), _answers(contents, observation, memory), strict=True))
-    if not history.size:
+    if not around.size:
         del results["next_memory"]
     for label, value in results.items():
         graph.nodes.append(helper.make_node("Identity", [value.name], [label], name=label))
@@ -173,9 +180,7 @@ def _answers(
     contents: PolicyFile, observation: TracedArray, memory: TracedArray
 ) -> tuple[TracedArray, TracedArray, TracedArray]:
     """Action, command and next memory, by the laws that fly."""
-    law = NetworkLaw(Policy(contents, "traced", np.float32))
-    action = law.scaled(memory, observation)
-    return action, law.command(action, observation), law.next_memory(memory, observation, action)
+    return NetworkLaw(Policy(contents, "traced", np.float32)).answer(memory, observation)
 
 
 def _value(name: str, kind: int, size: int | None) -> Any:

@@ -1,0 +1,78 @@
+"""Offset-free LQG for the paper's pair: the numbers of `control.offset_free`, and the law as a follower (ours)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg import solve_discrete_are
+
+from mjxball.baselines.load_axis import pitch_axis
+from mjxball.baselines.lqg import (
+    CORRECTION_LIMIT,
+    RATE_NOISE,
+    THETA_NOISE,
+    VERTICAL_LIMIT,
+    Tuning,
+    discretise,
+    feedback,
+)
+from mjxball.config import Config
+from mjxball.control.followers import PrivilegedInfo, copy_gains
+from mjxball.control.leader import clip_command
+from mjxball.control.offset_free import DRIVES, STATES, OffsetFreeLqg
+
+Array = Any
+NAME = "lqg-offset-free"
+TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=0.003, tilt_limit=0.3)
+CLIMB_NOISE = 0.02  # deviation of a measurement [m/s]
+LIFT_WALK = 0.01  # intensity of the white noise that drives the lift error [(m/s2)2/s]
+
+
+def offset_free_lqg(config: Config) -> OffsetFreeLqg:
+    """The law for the plant of `config`; InputError unless it is a free pair along x with ideal attitude loops."""
+    pair = pitch_axis(config, NAME)
+    a, b = np.zeros((STATES, STATES)), np.zeros((STATES, DRIVES))
+    a[0, 1] = a[2, 3] = 1.0
+    a[1, 2] = a[1, 4] = 1.0 / pair.inertia
+    a[4, :5] = np.array([-2.0 * pair.kp, -2.0 * pair.kd, 0.0, 0.0, -1.0]) / pair.lag
+    a[5, 6] = a[5, 7] = 1.0
+    a[6, 6] = -1.0 / pair.lag
+    b[4, 0] = b[6, 1] = 1.0 / pair.lag
+    transition, drive = discretise(a, b, pair.period)
+    process = np.zeros((STATES, STATES))
+    process[3, 3], process[7, 7] = TUNING.torque_walk * pair.period, LIFT_WALK * pair.period
+    measured = np.eye(STATES)[[0, 1, 5]]
+    noise = np.diag([THETA_NOISE**2, RATE_NOISE**2, CLIMB_NOISE**2])
+    predicted = solve_discrete_are(transition.T, measured.T, process, noise)
+    gains, mass = feedback(pair, TUNING), config.plant.object_mass
+    return OffsetFreeLqg(
+        transition=np.hstack([transition, drive]),
+        gain=predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + noise),
+        tilt=np.array([gains.roll, gains.pitch]),
+        height=np.array(gains.height),
+        limits=np.array([TUNING.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
+        stiffness=pair.kp,
+        half_length=pair.half_length,
+        carried=np.array([m + share * mass for m, share in zip(pair.drone_mass, pair.share, strict=True)]),
+    )
+
+
+class OffsetFree:
+    """What a network with `follower.base = lqg` starts from, flying alone. It is not told the object's mass."""
+
+    name = NAME
+    needs_privileged = False
+
+    def __init__(self, config: Config):
+        self._law, self._leader = offset_free_lqg(config), copy_gains(config)
+
+    def start(self, observation: Array) -> Array:
+        """See `Law.start`."""
+        return self._law.start(observation)
+
+    def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
+        """See `Law.step`."""
+        nothing = observation.__array_namespace__().zeros_like(observation[..., :3])
+        command = clip_command(self._law.command(nothing, state, observation, self._leader), *self._leader[-2:])
+        return self._law.next(state, observation, command, self._leader), command

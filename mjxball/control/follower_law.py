@@ -1,0 +1,76 @@
+"""What surrounds a follower's network: what it sees and remembers, and how its action becomes a command.
+
+One for training, for flight and for every export; all functions run on NumPy and on JAX arrays.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from mjxball.control import leader
+from mjxball.control.observation import ObservationHistory, copy_command, scale_action
+from mjxball.control.offset_free import OffsetFreeLqg
+
+Array = Any
+
+
+class FollowerLaw(NamedTuple):
+    """The laws around the network of one follower.
+
+    Its memory (..., m) holds that of `history` and, behind it, that of `lqg`.
+    """
+
+    history: ObservationHistory
+    action_scale: tuple[float, float]  # at an action of 1: tilt [rad], vertical acceleration [m/s2]
+    limits: tuple[float, float]  # of a command: tilt [rad], vertical acceleration [m/s2]
+    kp: Array  # (3,) of the leader's PD law
+    kd: Array  # (3,)
+    gravity: float  # [m/s2]
+    residual: bool = True  # whether the action is added to a law: `lqg`, or the leader's PD law if that is None
+    lqg: OffsetFreeLqg | None = None
+
+    @property
+    def size(self) -> int:
+        """Length m of the memory, and what `network_input` is longer than an observation."""
+        return self.history.size + (0 if self.lqg is None else self.lqg.size)
+
+    def mask(self, ignore_position: bool) -> list[float]:
+        """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
+        return self.history.mask(ignore_position) + [1.0] * (self.size - self.history.size)
+
+    def start(self, observation: Array) -> Array:
+        """Memory (..., m) before the first `observation` (..., 18)."""
+        remembered = self.history.start(observation)
+        if self.lqg is None:
+            return remembered
+        return observation.__array_namespace__().concat([remembered, self.lqg.start(observation)], axis=-1)
+
+    def network_input(self, observation: Array, memory: Array) -> Array:
+        """Input of the network (..., 18 + m)."""
+        seen = self.history.network_input(observation, memory[..., : self.history.size])
+        if self.lqg is None:
+            return seen
+        features = self.lqg.features(memory[..., self.history.size :], observation)
+        return observation.__array_namespace__().concat([seen, features], axis=-1)
+
+    def command(self, scaled: Array, observation: Array, memory: Array) -> Array:
+        """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18)."""
+        command = scale_action(scaled, *self.action_scale)
+        if self.lqg is not None:
+            command = self.lqg.command(command, memory[..., self.history.size :], observation, self._leader)
+        elif self.residual:
+            command = command + copy_command(observation, *self._leader)
+        return leader.clip_command(command, *self.limits)
+
+    def next(self, memory: Array, observation: Array, scaled: Array, command: Array) -> Array:
+        """Memory for the next step, after `observation` was answered by `scaled`, which made `command`."""
+        remembered = self.history.next(memory[..., : self.history.size], observation, scaled)
+        if self.lqg is None:
+            return remembered
+        estimated = self.lqg.next(memory[..., self.history.size :], observation, command, self._leader)
+        return observation.__array_namespace__().concat([remembered, estimated], axis=-1)
+
+    @property
+    def _leader(self) -> tuple[Any, ...]:
+        """Arguments of `copy_command` after the observation."""
+        return self.kp, self.kd, self.gravity, *self.limits

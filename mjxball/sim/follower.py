@@ -1,0 +1,26 @@
+"""The laws around the follower's network for a configuration."""
+
+from __future__ import annotations
+
+from mjxball.config import Config
+from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.observation import observation_history
+
+
+def follower_law(config: Config) -> FollowerLaw:
+    """The laws around the network of `config.follower`; InputError if its plant has none of this kind."""
+    follower, leader, lqg = config.follower, config.leader, None
+    if follower.base == "lqg":
+        from mjxball.baselines.offset_free import offset_free_lqg  # needs SciPy
+
+        lqg = offset_free_lqg(config)
+    return FollowerLaw(
+        history=observation_history(config),
+        action_scale=(follower.action_scale_tilt, follower.action_scale_vertical),
+        limits=(config.command.tilt_limit, config.command.vertical_limit),
+        kp=leader.kp,
+        kd=leader.kd,
+        gravity=config.plant.gravity,
+        residual=follower.action == "residual",
+        lqg=lqg,
+    )
