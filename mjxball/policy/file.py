@@ -83,9 +83,7 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
         kd=tuple(card["leader_kd"]),
         gravity=card["gravity"],
         residual=card["action_mode"] == "residual",
-        lqg=None
-        if lqg is None
-        else OffsetFreeLqg(**{name: np.array(lqg[name]) if shape else lqg[name] for name, shape in LQG_SHAPES.items()}),
+        lqg=None if lqg is None else OffsetFreeLqg._make(np.array(lqg[name]) for name in LQG_SHAPES),
     )
 
 

@@ -133,8 +133,8 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
     if law.lqg is not None:
         lines = ["    mjxball_real led[3];", *_leader(card, "led"), *lines]
         lines += [f"    mjxball_lqg_estimate(memory + {history.size}, observation);"]
-        place = f"input + {OBSERVATION_SIZE + history.size}"
-        lines += [f"    mjxball_lqg_features(memory + {history.size}, observation, {place});"]
+        features = f"input + {OBSERVATION_SIZE + history.size}"
+        lines += [f"    mjxball_lqg_features(memory + {history.size}, observation, {features});"]
     return "\n".join(lines)
 
 
