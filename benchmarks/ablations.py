@@ -1,9 +1,9 @@
-"""What a follower needs: `transport-large` with one thing changed at a time, five seeds each, judged in every cell.
+"""What a follower needs: `transport-large` with one thing changed at a time, five seeds each, evaluated in every cell.
 
 `python benchmarks/ablations.py train --out DIR [--steps N] [--seeds K] [--rows NAME ...]`  (a GPU: a minute a row)
-`python benchmarks/ablations.py judge --out DIR [--noisy] [--json FILE]`                    (two cores: see --help)
+`python benchmarks/ablations.py evaluate --out DIR [--noisy] [--json FILE]`                    (two cores: see --help)
 
-`train` puts the members of each row into DIR/ROW. `judge` flies each of them once through the feasible cells of
+`train` puts the members of each row into DIR/ROW. `evaluate` flies each of them once through the feasible cells of
 `benchmarks/cells.py` (mass known) and prints, over the seeds of a row, least - median - most cells in which all four
 metrics are wanted, and medians of each metric's count, of the median peak and of the failed flights.
 """
@@ -36,7 +36,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "four-observations": {"follower.observation_averages": (), "follower.history": 4, "follower.previous_action": True},
     "third-average-1s": {"follower.observation_averages": (0.05, 0.2, 1.0)},
     "direct-action": {"follower.action": "direct"},
-    "critics-not-told": {"follower.privileged_critic": False},
+    "no-privileged-critic": {"follower.privileged_critic": False},
     "1-step": {"sac.n_step": 1},
     "5-step": {"sac.n_step": 5},
     "critic-layernorm": {"sac.critic_layer_norm": True},
@@ -102,7 +102,7 @@ def train(out: Path, rows: list[str], steps: int, seeds: int, physics: str) -> N
         print(f"{row}: {time.monotonic() - began:.0f} s", flush=True)
 
 
-def judge(out: Path, noisy: bool) -> list[dict[str, Any]]:
+def evaluate(out: Path, noisy: bool) -> list[dict[str, Any]]:
     """A row for each trained one."""
     config = preset("paper")
     cells = feasible(config)
@@ -143,9 +143,9 @@ def show(row: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Train or judge."""
+    """Train or evaluate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("train", "judge"))
+    parser.add_argument("part", choices=("train", "evaluate"))
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS), metavar="NAME")
     parser.add_argument("--steps", type=int, default=1_024_000)
@@ -159,7 +159,7 @@ def main() -> None:
         options.out.mkdir(parents=True, exist_ok=True)
         train(options.out, options.rows, options.steps, options.seeds, options.physics)
         return
-    found = judge(options.out, options.noisy)
+    found = evaluate(options.out, options.noisy)
     if options.json:
         options.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
 

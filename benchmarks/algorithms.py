@@ -59,7 +59,7 @@ def train(name: str, seed: int, flags: str, place: Path, out: Path) -> dict[str,
     return row | {"rate": statistics.median(rates) if rates else math.nan, "policy": out / "policy.npz"}
 
 
-def judge(rows: list[dict[str, Any]]) -> None:
+def evaluate(rows: list[dict[str, Any]]) -> None:
     """Add the metrics of the reference scenario, and whether they are at the bar, to every row."""
     from mjxball.config import preset
     from mjxball.evaluate.policies import load_policy
@@ -106,7 +106,7 @@ def main() -> None:
                 cache, out = place / f"cache-{algorithm}", place / f"{algorithm}{number}"
                 rows.append(train(algorithm, seed, flags[algorithm], cache, out))
                 say(rows[-1])
-            judge(rows)
+            evaluate(rows)
             found["runs"] += [row | {"cache": "warm" if number else "cold"} for number, row in enumerate(rows)]
             found["table"].append(summary(rows))
             say(found["table"][-1])

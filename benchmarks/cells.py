@@ -12,7 +12,7 @@ distribution is printed as well. Wanted, of medians over the phases; who fails i
 - settling: 2 %, at most LQG's plus 10 % or 0.1 s
 - rmse: at most LQG's plus 10 % or 5 mm
 
-LQG (`--told lqg`, or `lqg-slow` with the better filter) is always told the plant. Delay makes `lqg` limit-cycle, so
+LQG (`--reference lqg`, or `lqg-slow` with the better filter) always knows the plant. Delay makes `lqg` limit-cycle, so
 that settling and rmse are held against undisturbed flights everywhere. Cells in which one drone's pitch torque,
 2 (5.5 - T / 4) L, does not hold the object's weight at the CG's largest offset with 15 % left are infeasible, for every
 follower. Where the mass is unknown that of the follower must also hold what it lifts alone (`trim_limit`): those cells
@@ -47,7 +47,7 @@ WANTED = ("peak", "overshoot", "settling", "rmse")
 
 
 def numbers_of(metrics: Any) -> dict[str, float]:
-    """What a cell is judged by; infinite for a flight that never settled."""
+    """What a cell is evaluated by; infinite for a flight that never settled."""
     peaks = (metrics.x_peak, metrics.y_peak, metrics.z_peak)
     settling = math.inf if metrics.settling_time is None else metrics.settling_time
     return {"peak": max(peaks), "overshoot": metrics.overshoot, "settling": settling, "rmse": metrics.rmse}
@@ -133,11 +133,11 @@ def distribution(summaries: list[dict[str, Any]]) -> None:
             print(f"{where}: least - median - most of {len(rows)} policies, of {rows[0]['cells']} cells: {shown}")
 
 
-def judge(
-    config: Config, policies: list[Follower], robust: list[Follower], told: str, cells: list[Any], seeds: int
+def evaluate(
+    config: Config, policies: list[Follower], robust: list[Follower], reference: str, cells: list[Any], seeds: int
 ) -> Any:
     """(summaries, what is missed) of all policies where the mass is known, of the robust ones where it is not."""
-    calm, summaries, missed = fly(make_baseline(told, config), cells, {}, False, seeds), [], []
+    calm, summaries, missed = fly(make_baseline(reference, config), cells, {}, False, seeds), [], []
     for known, disturbed in ((True, False), (True, True), (False, False), (False, True)):
         rival = "adaptive" if known else "adaptive-mass"
         common = {} if known else {"believed_mass": BELIEVED}
@@ -148,7 +148,7 @@ def judge(
             mine = fly(policy, cells, common, disturbed, seeds)
             for cell, own, theirs, best in zip(cells, mine, other, calm, strict=True):
                 bar = wanted(theirs, best)
-                peaks = {"policy": own["peak"], rival: theirs["peak"], f"{told}, undisturbed": best["peak"]}
+                peaks = {"policy": own["peak"], rival: theirs["peak"], f"{reference}, undisturbed": best["peak"]}
                 rows.append({"cell": cell, **own, "bar": bar, "peaks": peaks, "wins": wins_of(own, bar)})
             summaries.append(show(where, policy.name, rows))
             if not known:
@@ -171,7 +171,7 @@ def main() -> None:
     parser.add_argument("policies", type=Path, nargs="*")
     parser.add_argument("--robust", type=Path, nargs="+", help="policies for unknown masses (default: the same)")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--told", choices=("lqg", "lqg-slow"), default="lqg", help="LQG of settling and rmse")
+    parser.add_argument("--reference", choices=("lqg", "lqg-slow"), default="lqg", help="LQG of settling and rmse")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
     config = preset("paper")
@@ -180,7 +180,7 @@ def main() -> None:
     print(f"{len(cells)} of {len(EVERY)} cells are feasible, not at any speed: {lost}")
     policies = [load_policy(path, config) for path in options.policies]
     robust = [load_policy(path, config) for path in options.robust] if options.robust else policies
-    summaries, missed = judge(config, policies, robust, options.told, cells, options.seeds)
+    summaries, missed = evaluate(config, policies, robust, options.reference, cells, options.seeds)
     distribution(summaries)
     if len(policies) + len(robust) <= 4:
         print("\n".join(missed))

@@ -28,7 +28,7 @@ from mjxball.plant import PlantParameters, plant_parameters
 TIMES = (0.0, 2.0, 3.0, 7.0, 12.0, 19.0)
 WAVEFORM = Motion(kind="waveform", times=TIMES, offsets=(0.0, 0.03, -0.02, 0.04, -0.03, 0.0))
 IN_PLANE = replace(WAVEFORM, offsets_across=(0.0, -0.02, 0.03, 0.01, -0.02, 0.01))
-LINE, PLANE = ("sine", "waveform", "visits", "rod"), ("ellipse", "figure of eight", "waveform", "visits", "plate")
+LINE, PLANE = ("sine", "waveform", "waypoints", "rod"), ("ellipse", "figure of eight", "waveform", "waypoints", "plate")
 SHAPES = {"ellipse": (0.6, 1.0), "figure of eight": (0.8, 2.0)}  # width and ratio of both sines
 FRACTIONS = (1.0, 0.4)  # of the object that moves
 
@@ -100,7 +100,7 @@ def random_load(plant: Plant, path: str, count: int, random: np.random.Generator
     if path in SHAPES:
         shape = (random.uniform(-3, 3, count), *np.full((count, 2), SHAPES[path]).T, random.uniform(0, 6, count))
         return load._replace(cg_shape=PathShape(*shape))
-    if path == "visits":
+    if path == "waypoints":
         places = random.uniform(-0.7, 0.7, (count, 8, *(() if len(plant.directions) == 1 else (2,))))
         return load._replace(cg_path=places, follows_path=np.ones(count))
     return load

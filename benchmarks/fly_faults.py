@@ -2,7 +2,7 @@
 
 `python benchmarks/fly_faults.py [--policy FILE] [--trials 200] [--jobs 2] [--seed 0] [--json FILE] [--only KIND ...]`
 
-The twin's own truth judges: safe means that both drones' motors are off and stay off for two seconds, beyond the
+By the twin's true state: safe means that both drones' motors are off and stay off for two seconds, beyond the
 firmware's own watchdog. The physics are the twin's (`mjxball/fly/twin/physics.py`); no radio is involved.
 """
 
@@ -136,12 +136,12 @@ def trial(job: tuple[int, str, int, Path]) -> dict[str, Any]:
                 time.sleep(moment)
                 injected_at = twin.truth.time
                 KINDS[kind](twin, runner, which)
-                judged = judge(twin, injected_at, expects_end=kind != "runner: stopped", runner=runner)
+                evaluated = evaluate(twin, injected_at, expects_end=kind != "runner: stopped", runner=runner)
             finally:
                 runner.kill()
                 assert runner.stderr is not None
                 errors = runner.stderr.read()
-        return {**row, **judged, **told(log, kind), "stderr": errors.decode(errors="replace")[-300:]}
+        return {**row, **evaluated, **told(log, kind), "stderr": errors.decode(errors="replace")[-300:]}
 
 
 def running(twin: Twin, runner: Runner) -> bool:
@@ -153,7 +153,7 @@ def running(twin: Twin, runner: Runner) -> bool:
     return True
 
 
-def judge(twin: Twin, injected_at: float, expects_end: bool, runner: Runner) -> dict[str, Any]:
+def evaluate(twin: Twin, injected_at: float, expects_end: bool, runner: Runner) -> dict[str, Any]:
     """Watch until the motors have been off for two seconds, for twenty at most, and say how it went."""
     off_since = None
     while twin.truth.time < injected_at + 20:

@@ -4,7 +4,7 @@
 [--starts 100] [--trials 4] [--json FILE]`
 
 The runner's own flight (supervisor, laws, watches) flies the twin of a pair of Crazyflie 2.1 as delivered, without
-sockets or clock. The twin's truth judges.
+sockets or clock. Numbers are of the twin's true state.
 
 - flights: 20 in a row of the same two drones without reboot; landed below 0.5 m/s, exit code 0.
 - hover: 20 s at 0.4 m, errors from 5 s on, for link delay, force curve, sensor noise, pose rate and thrust gains; the
@@ -39,7 +39,7 @@ from mjxball.fly.twin.conditions import (
     Surroundings,
     drone_kind,
 )
-from mjxball.fly.twin.virtual import MemoryLog, Moment, World
+from mjxball.fly.twin.virtual import MemoryLog, Moment, VirtualTwin
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
@@ -57,12 +57,12 @@ def settings_of(policy: Policy, seconds: float) -> FlightSettings:
     return FlightSettings(seconds, goal, stand=stand, limits=bounds, times=times_of(config))
 
 
-def world_of(path: Path, seconds: float, curve: str = "linear", record: bool = True, **around: Any) -> World:
+def world_of(path: Path, seconds: float, curve: str = "linear", record: bool = True, **around: Any) -> VirtualTwin:
     """A flight of the policy in `path` that is about to begin."""
     policy = Policy.load(path)
     drone = drone_kind("2.1", curve)
     surroundings = Surroundings(**around)
-    return World(
+    return VirtualTwin(
         policy,
         settings_of(policy, seconds),
         kind=drone,
@@ -72,7 +72,7 @@ def world_of(path: Path, seconds: float, curve: str = "linear", record: bool = T
     )
 
 
-def code_of(world: World) -> int:
+def code_of(world: VirtualTwin) -> int:
     """The exit code that the runner's command would have."""
     flight = world.flight
     return 0 if flight.supervisor.cause is None and flight.lifted and flight.supervisor.state is State.DONE else 1
@@ -160,7 +160,7 @@ def stand_start(path: Path, number: int) -> list[Row]:
     )
     policy = Policy.load(path)
     conditions = replace(Conditions.of(Controller(policy).config), ball=ball)
-    world = World(
+    world = VirtualTwin(
         policy,
         settings_of(policy, 60.0),
         conditions=conditions,
@@ -191,7 +191,7 @@ def stand_start(path: Path, number: int) -> list[Row]:
     ]
 
 
-Injection = Callable[[World, int], None]
+Injection = Callable[[VirtualTwin, int], None]
 
 
 def injected(kind: str) -> Injection:
@@ -202,7 +202,7 @@ def injected(kind: str) -> Injection:
 def both(kind: str) -> Injection:
     """The same fault of both drones at once."""
 
-    def inject(world: World, drone: int) -> None:
+    def inject(world: VirtualTwin, drone: int) -> None:
         for number in range(2):
             injected(kind)(world, number)
 
@@ -217,7 +217,7 @@ def link(**faults: float) -> Injection:
 def gap(seconds: float) -> Injection:
     """States of both drones break off for a while."""
 
-    def inject(world: World, drone: int) -> None:
+    def inject(world: VirtualTwin, drone: int) -> None:
         for number in range(2):
             world.fault_link(number, silent_down=True)
         world.flight.note("gap", world.now)
@@ -229,7 +229,7 @@ def gap(seconds: float) -> Injection:
 def asked(**how: Any) -> Injection:
     """What a person does."""
 
-    def inject(world: World, drone: int) -> None:
+    def inject(world: VirtualTwin, drone: int) -> None:
         for name, value in how.items():
             setattr(world.flight, name, value)
 
@@ -291,10 +291,10 @@ def fault(path: Path, kind: str, drone: int, number: int) -> list[Row]:
         world.advance(0.02)
         world.track.append(world.moment())
     after = [moment for moment in world.track if moment.time >= at]
-    return [{"policy": path.stem, "fault": kind, "drone": ("leader", "follower")[drone], **judged(world, after, at)}]
+    return [{"policy": path.stem, "fault": kind, "drone": ("leader", "follower")[drone], **evaluated(world, after, at)}]
 
 
-def judged(world: World, after: Sequence[Moment], at: float) -> Row:
+def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
     """What became of a flight after its fault at `at` [s]."""
     running = np.array([moment.pwm.max(axis=1) > 0 for moment in after])
     off = [float(after[int(np.nonzero(one)[0][-1])].time - at) if one.any() else 0.0 for one in running.T]

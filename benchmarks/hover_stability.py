@@ -2,8 +2,9 @@
 
 With the CG at rest at an offset, the loop over one control step is a smooth map of everything that it remembers: the
 object's position, attitude, velocity and rates, the rotors, the follower's memory, and the observations under way if
-its senses are late. Its fixed point is found by flying and by Newton's method, its Jacobian there by JAX, in float64. A
-network with ReLU units is linear around almost every point, so the eigenvalues say what a small error does, no more.
+its measurements are late. Its fixed point is found by flying and by Newton's method, its Jacobian there by JAX, in
+float64. A network with ReLU units is linear around almost every point, so the eigenvalues say what a small error
+does, no more.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class Hover:
 
     offset: float  # of the CG [m]
     mass: float  # of the object [kg]
-    delay: int  # control steps by which the follower's senses are late
+    delay: int  # control steps by which the follower's measurements are late
     residual: float  # change over a control step at the fixed point; above `SOUND` there is none
     error: float  # |e_o| at the fixed point [m]
     tilt: float  # hypot(roll, pitch) there [rad]

@@ -43,7 +43,7 @@ TUNINGS = (
 )
 
 
-def judged(tuning: Tuning, disturbed: bool, cells: list[Any]) -> dict[str, Any]:
+def evaluated(tuning: Tuning, disturbed: bool, cells: list[Any]) -> dict[str, Any]:
     """What all cells together say of one tuning."""
     config = preset("paper")
     law = type("TunedLqg", (Lqg,), {"tuning": tuning})(config)
@@ -63,7 +63,7 @@ def main() -> None:
     cells = feasible(config)
     for tuning in TUNINGS:
         for disturbed in (False, True):
-            row = judged(tuning, disturbed, cells)
+            row = evaluated(tuning, disturbed, cells)
             found.append(
                 {
                     **tuning._asdict(),

@@ -124,7 +124,7 @@ def first_failure(output: Path) -> str:
     return found[1] if found else ""
 
 
-def judge(scratch: Path, mutant: Mutant, suite: str, likely_only: bool) -> Verdict:
+def evaluate(scratch: Path, mutant: Mutant, suite: str, likely_only: bool) -> Verdict:
     """Run the tests against one fault until one of them notices it."""
     began, output = time.monotonic(), scratch.parent / "output.txt"
     marks = {"likely": TIERS["quick"] if suite == "quick" else "not release"}
@@ -173,7 +173,7 @@ def report(rows: list[dict[str, Any]], suite: str, likely_only: bool) -> dict[st
     return {
         "suite": "likely tests alone" if likely_only else suite,
         "mutants": len(rows),
-        "judged": len(asked),
+        "evaluated": len(asked),
         "killed": len(killed),
         "survivors": [row for row in asked if not row["killed"]],
         "rows": rows,
@@ -209,7 +209,7 @@ def main() -> int:
         for number, mutant in table:
             try:
                 mutant.applied((scratch / mutant.file).read_text(encoding="utf-8"))
-                verdict = judge(scratch, mutant, options.suite, options.likely)
+                verdict = evaluate(scratch, mutant, options.suite, options.likely)
             except (ValueError, FileNotFoundError):
                 verdict = None
             rows.append(row := row_of(number, mutant, verdict))
@@ -218,7 +218,7 @@ def main() -> int:
             if options.json:
                 options.json.write_text(json.dumps(report(rows, options.suite, options.likely), indent=1) + "\n")
     done = report(rows, options.suite, options.likely)
-    print(f"{done['killed']} of {done['judged']} killed by the {done['suite']}")
+    print(f"{done['killed']} of {done['evaluated']} killed by the {done['suite']}")
     return 1 if done["survivors"] else 0
 
 

@@ -34,7 +34,7 @@ from mjxball.fly.limits import FlightSettings
 from mjxball.fly.log_schema import decode
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import AddedLoad, Surroundings
-from mjxball.fly.twin.virtual import World
+from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.rig.load import LoadWatch
 from mjxball.rig.replay import FlightReplay
@@ -60,7 +60,9 @@ def fly(
 ) -> dict[str, Any]:
     """One flight in virtual time, polished in `most` steps; figures from `begin` [s], or from a new policy on."""
     contents = load_file(POLICY)
-    world = World(Policy(contents, "flown"), FlightSettings(seconds=seconds), surroundings=Surroundings(load=load))
+    world = VirtualTwin(
+        Policy(contents, "flown"), FlightSettings(seconds=seconds), surroundings=Surroundings(load=load)
+    )
     watch, replay, row = LoadWatch(world.config), FlightReplay(Policy(contents, "again")), {}
     new: Policy | None = None
     read, looked = 0, 0.0
@@ -99,7 +101,7 @@ def fly(
     return {**row, "begin": begin, **figures(world, begin), "ended": str(world.flight.supervisor.cause or "as planned")}
 
 
-def figures(world: World, begin: float) -> dict[str, float]:
+def figures(world: VirtualTwin, begin: float) -> dict[str, float]:
     """Of the truth under both laws from `begin` [s]: millimetres and milliradians."""
     rows = [one for one in world.track if one.state == State.FLY.value and one.time >= begin]
     if not rows:

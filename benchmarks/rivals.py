@@ -36,7 +36,7 @@ ROUNDED = 1e-6  # float32: what two followers' numbers may differ by and be call
 
 
 def fly(follower: Follower, cells: list[Any], disturbed: bool) -> list[dict[str, float]]:
-    """What each cell is judged by."""
+    """What each cell is evaluated by."""
     disturbance = Disturbance(noise=1.0, delay=0.04, seed=0) if disturbed else Disturbance()
     scenarios = [Scenario(omega=w, amplitude=a, mass=m, disturbance=disturbance) for w, a, m in cells]
     rows = []

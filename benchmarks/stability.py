@@ -4,7 +4,7 @@
 
 - For a grid of CG offsets and object masses that one drone can trim: the spectral radius of leader, policy and plant
   over one control step about hover (below 1: small errors die out), the time constant that goes with it, and the
-  largest delay of the follower's senses, in whole control steps, that keeps it below 1. LQG and adaptive beside it.
+  largest delay of the follower's measurements, in whole control steps, that keeps it below 1. LQG, adaptive beside it.
 - Random feasible flights: CG speed, amplitude, phase, mass, goal, start position, velocity and tilt, all uniform. None
   may fail. The ten with the largest steady-state peak are listed and drawn.
 """

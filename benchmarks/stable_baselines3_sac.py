@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 import mjxball.gym  # noqa: F401  registers the environments
 
-DRAWN = 1000  # seed of the worlds that every follower is judged in; training draws others
+DRAWN = 1000  # seed of the worlds that every follower is evaluated in; training draws others
 SETTINGS = {
     "learning_rate": lambda left: 2e-3 * max(left, 0.02),  # linear, as the preset's own
     "gamma": 0.97,
@@ -32,7 +32,7 @@ SETTINGS = {
 }
 
 
-def judged(act: Any, name: str, physics: str, episodes: int) -> dict[str, float]:
+def evaluated(act: Any, name: str, physics: str, episodes: int) -> dict[str, float]:
     """Mean return, and |e_o| [m] over the second half, of `act(observation) -> action` in `episodes` fixed worlds."""
     env = gymnasium.make(name, physics=physics)
     returns, errors = [], []
@@ -117,24 +117,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="mjxball/Transport-v0")
     parser.add_argument(
-        "--physics", default="mujoco", help="that the follower is judged on: mujoco, newton-euler or mjx"
+        "--physics", default="mujoco", help="that the follower is evaluated on: mujoco, newton-euler or mjx"
     )
     parser.add_argument("--steps", type=int, default=192_000)
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--updates", type=int, default=6, help="gradient updates after each step of all worlds")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--episodes", type=int, default=5, help="worlds that each follower is judged in")
+    parser.add_argument("--episodes", type=int, default=5, help="worlds that each follower is evaluated in")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
 
     random = np.random.default_rng(options.seed)
     untrained = {"copies its leader": lambda seen: np.zeros(3), "random": lambda seen: random.uniform(-1, 1, 3)}
     place = (options.env, options.physics, options.episodes)
-    rows = {label: judged(act, *place) for label, act in untrained.items()}
+    rows = {label: evaluated(act, *place) for label, act in untrained.items()}
     started = time.perf_counter()
     act = train(options.env, options)
     seconds = time.perf_counter() - started
-    rows["SB3 SAC"] = judged(act, *place)
+    rows["SB3 SAC"] = evaluated(act, *place)
     for label, row in rows.items():
         print(f"{label:<20}{row['return']:12.1f}{row['late_error']:10.4f} m")
     print(f"{options.steps} steps in {seconds:.0f} s")

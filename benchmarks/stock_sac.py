@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from mjxball import config as configs
-from mjxball.algorithms.base import Policy
+from mjxball.algorithms.base import PolicyNetwork
 from mjxball.cache import enable_compilation_cache
 from mjxball.env import CoupledPairEnv
 from mjxball.policy import save_file
@@ -121,7 +121,7 @@ def main() -> None:
 
     def export(steps: int, parameters: Any) -> None:
         seen, mask = parameters[0], CoupledPairEnv(config, options.physics).input_mask
-        learnt = Policy(parameters[1]["params"], seen.mean, seen.std, mask)
+        learnt = PolicyNetwork(parameters[1]["params"], seen.mean, seen.std, mask)
         exported = policy_file(config, follower_law(config), learnt, steps, card)
         save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)
         if steps >= options.steps:

@@ -6,7 +6,7 @@
   with that cache (warm). The clock starts before the process and stops when its policy file is written.
 - `stock`: Brax's `sac.train` on the same environment (`benchmarks/stock_sac.py`), timed the same way: seed 0 cold,
   then the other seeds with its cache, `--together` of them at once, which gives their quality but not their time. Its
-  policies at each of `--snapshots` parts of the way are judged, so that it may reach the bar before its end.
+  policies at each of `--snapshots` parts of the way are evaluated, so that it may reach the bar before its end.
   Before the first of the two each is run once for a moment, without a cache and uncounted: a fresh machine reads the
   libraries from its disk only once, which would else be charged to whoever comes first.
 - `population`: training rate of 1 and of `--members` followers in one program, compilation left out, and memory.
@@ -144,7 +144,7 @@ def _steps_of(snapshot: Path) -> int:
     return int(snapshot.stem.rpartition("-")[2])
 
 
-def judge(rows: list[dict[str, Any]]) -> None:
+def evaluate(rows: list[dict[str, Any]]) -> None:
     """Add the metrics of the reference scenario to every row."""
     from mjxball.config import preset
     from mjxball.evaluate.policies import load_policy
@@ -301,7 +301,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=128)
     parser.add_argument("--updates", type=int, default=4, help="gradient updates after each step of all worlds")
     parser.add_argument("--batch", type=int, default=256)
-    parser.add_argument("--snapshots", type=int, default=1, help="policies of each stock run that are judged")
+    parser.add_argument("--snapshots", type=int, default=1, help="policies of each stock run that are evaluated")
     parser.add_argument("--stock", nargs=argparse.REMAINDER, default=[], help="flags for stock_sac.py; must come last")
     parser.add_argument("--together", type=int, default=4, help="stock runs at once, after the first")
     parser.add_argument("--members", type=int, nargs="+", default=[64], help="followers at once")
@@ -320,7 +320,7 @@ def main() -> None:
         if "distributed" in options.parts:
             found["distributed"] = [distributed(options, place, count) for count in options.processes]
         if rows:
-            judge(rows)
+            evaluate(rows)
             found["runs"] = rows
             found["summary"] = {t: summary(rows, t) for t in ("ours", "stock") if t in options.parts}
     for part, measure in (("population", population), ("scaling", scaling)):

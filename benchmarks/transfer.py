@@ -74,7 +74,7 @@ def our_config(algorithm: str, given: dict[str, Any]) -> configs.Config:
         "num_envs": given["num_envs"],
         "discount": given["discounting"],
         "learning_rate": given["learning_rate"],
-        "learning_rate_end": 1.0,
+        "learning_rate_final_ratio": 1.0,
         "reward_scale": float(given["reward_scaling"]),
         "num_evaluations": 1,
     }

@@ -34,7 +34,7 @@ STEADY_IN_TRAINING_AFTER = 8.0
 class State:
     """The fields of Brax's `State`. Brax itself takes a second to import, most of it for meshes."""
 
-    pipeline_state: Any  # `World`
+    pipeline_state: Any  # `PipelineState`
     obs: Any  # (n,) the networks' input; like all that follow with any leading batch shape, or without arrays as a tree
     reward: Any  # ()
     done: Any  # () 1 at an end
@@ -46,7 +46,7 @@ class State:
         return dataclasses.replace(self, **fields)
 
 
-class World(NamedTuple):
+class PipelineState(NamedTuple):
     """Everything that one world carries from step to step."""
 
     loop: LoopState  # plant, leader's integral, sensors
@@ -140,7 +140,7 @@ class CoupledPairEnv:
 
     def step(self, state: State, action: Float[Array, "... 3"], physics: ControlStep | None = None) -> State:
         """Apply the network's `action` in [-1, 1] for one control period, with `physics` in place of the engine."""
-        world: World = state.pipeline_state
+        world: PipelineState = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
         command = self._law.command(action, self._observed(state), world.history)
@@ -175,7 +175,7 @@ class CoupledPairEnv:
         physics: ControlStep | None = None,
     ) -> State:
         """The next state at the followers' `command`; `shares`: see `ClosedLoop.step`."""
-        world: World = state.pipeline_state
+        world: PipelineState = state.pipeline_state
         observation = self._observed(state)
         load = world.load
         if self._disturbances.present:
@@ -215,15 +215,17 @@ class CoupledPairEnv:
             info={**state.info, "truncation": truncated.astype(jnp.float32)},
         )
 
-    def _fresh_world(self, rng: Array, difficulty: Float[Array, ""] | float) -> tuple[World, Float[Array, "18"]]:
+    def _fresh_world(
+        self, rng: Array, difficulty: Float[Array, ""] | float
+    ) -> tuple[PipelineState, Float[Array, "18"]]:
         """(world, observation at its start)."""
         load, plant, goal = self._resets.draw(rng, difficulty)
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         delay = disturbances.delay if self._disturbances.present else 0
-        begins = self._resets.powered and self.config.follower.shares_integrals
+        begins = self._resets.has_battery and self.config.follower.residual_on_pid
         integral = self._resets.initial_integrals(load, jax.random.fold_in(rng, 5)) if begins else None
         loop, observation = self._loop.start(plant, goal, sample, delay, integral)
-        world = World(
+        world = PipelineState(
             loop=loop,
             load=load,
             goal=goal,
@@ -235,7 +237,7 @@ class CoupledPairEnv:
         )
         return world, observation
 
-    def _input(self, observation: Float[Array, "18"], world: World) -> Float[Array, " input"]:
+    def _input(self, observation: Float[Array, "18"], world: PipelineState) -> Float[Array, " input"]:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
         shown = self._law.network_input(observation, world.history) if self._law.size else observation
         return jnp.concatenate([shown, self._privileged(world)]) if self.config.follower.privileged_critic else shown
@@ -243,7 +245,7 @@ class CoupledPairEnv:
     def _first_privileged(self, rng: Array) -> Float[Array, " privileged"]:
         return self._privileged(self._fresh_world(rng, 1.0)[0])
 
-    def _privileged(self, world: World) -> Float[Array, " privileged"]:
+    def _privileged(self, world: PipelineState) -> Float[Array, " privileged"]:
         """CG offset, first moment, object mass, error of the believed one; of disturbed worlds the truth as well."""
         offset, mass = self._cg(world.plant, world.load), object_mass(world.plant.time, world.load)
         parts: list[Any] = [jnp.stack([offset, mass * offset, mass, mass - world.load.believed_mass])]
@@ -259,7 +261,7 @@ class CoupledPairEnv:
             parts += [(integrals / jnp.asarray(crazyflie.RATE_LIMITS)).ravel()]
         if self.config.motion.kind == "rolling":
             parts += [world.plant.ball_rate[None]]
-        if self.config.follower.shares_integrals:
+        if self.config.follower.residual_on_pid:
             parts += [world.loop.integral]
         if world.load.battery is not None:
             battery: Array = world.load.battery
@@ -268,7 +270,7 @@ class CoupledPairEnv:
         return jnp.concatenate(parts)
 
     def _transition(
-        self, before: World, after: World, commands: Commands, terminated: Bool[Array, ""]
+        self, before: PipelineState, after: PipelineState, commands: Commands, terminated: Bool[Array, ""]
     ) -> rewards.Transition:
         plant = after.plant
         remembers = bool(self.config.follower.observation_averages)

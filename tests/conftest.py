@@ -26,7 +26,7 @@ from command_line import HASTY
 from mjxball import cache
 from mjxball import config as configs
 from mjxball.algorithms import sac
-from mjxball.algorithms.base import Policy
+from mjxball.algorithms.base import PolicyNetwork
 from mjxball.config import Config
 from mjxball.env import CoupledPairEnv
 from mjxball.policy import PolicyFile, save_file
@@ -192,9 +192,11 @@ def fast_pair(transport: Config) -> CompiledEnv:
     return compile_env(transport, "newton-euler")
 
 
-def policy_of(env: CoupledPairEnv, learner: sac.Learner) -> Policy:
+def policy_of(env: CoupledPairEnv, learner: sac.Learner) -> PolicyNetwork:
     """What SAC exports."""
-    return Policy(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, np.array(env.input_mask))
+    return PolicyNetwork(
+        learner.average["params"], learner.normaliser.mean, learner.normaliser.std, np.array(env.input_mask)
+    )
 
 
 class Trained(NamedTuple):

@@ -19,12 +19,12 @@ from mjxball.fly.twin.physics import Pair, StandIn, StandInPlant
 from mjxball.fly.twin.virtual import MemoryLog, VirtualLink
 from mjxball.policy import Policy, PolicyFile
 
-__all__ = ["ARMED_BY_HAND", "MASS", "MemoryLog", "VirtualLink", "World", "log_header", "thrusts"]
+__all__ = ["ARMED_BY_HAND", "MASS", "MemoryLog", "VirtualLink", "VirtualTwin", "log_header", "thrusts"]
 MASS = 0.07
 ARMED_BY_HAND = dataclasses.replace(DELIVERED, auto_arm=False)
 
 
-class World(virtual.World):
+class VirtualTwin(virtual.VirtualTwin):
     """A pair, its two drones, and a flight of them."""
 
     def __init__(
@@ -50,7 +50,7 @@ def log_header(contents: PolicyFile, name: str = "nobody") -> dict[str, Any]:
     return {"policy": name, "config": configs.to_dict(config), "curve": "linear", "gains": gains}
 
 
-def thrusts(world: virtual.World, number: int) -> list[tuple[float, int]]:
+def thrusts(world: virtual.VirtualTwin, number: int) -> list[tuple[float, int]]:
     """(time, thrust) of every setpoint that a drone was sent."""
     sent = world.links[number].packets
     return [(time, packets.unpack_setpoint(packet.data).thrust) for time, packet in sent if packet.port == 3]

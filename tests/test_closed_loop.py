@@ -1,4 +1,4 @@
-"""The pair's shared integrals, what a stand locks, and what the leader senses: one wiring for simulation and flight."""
+"""The pair's integrals, what a stand locks, and what the leader measures: one closed loop for simulation and flight."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def started(config: Config) -> tuple[Laws, np.ndarray]:
 class TestSharedIntegrals:
     def test_both_drones_are_told_the_leaders_whole_law(self) -> None:
         """A network that adds nothing: what the leader is told is what the follower is told, whatever has wound up."""
-        config = apply_overrides(preset("flight"), {"leader.level_gain": 0.0})
+        config = apply_overrides(preset("flight"), {"leader.tilt_integral_gain": 0.0})
         loop, integral = started(config)
         integral = integral + np.array([0.1, -0.2, 0.3, 0.0, 0.0, 0.0, 0.0])
         state, goal = body((0.1, -0.1, 0.05), (0.02, 0.0, 0.01)), np.zeros(3)
@@ -50,7 +50,7 @@ class TestSharedIntegrals:
             integral = loop.integrate(integral, hanging, goal, PERIOD)
         leader_command = loop.leader_command(hanging, goal, integral)[2]
         follower_command = loop.follower_command(np.zeros(3), integral)[2]
-        gain = preset("flight").leader.level_gain
+        gain = preset("flight").leader.tilt_integral_gain
         assert leader_command == pytest.approx(gain * 0.02 * 0.5, rel=1e-6)
         assert follower_command == pytest.approx(-leader_command, rel=1e-6)
 
@@ -92,8 +92,8 @@ class TestSharedIntegrals:
         config = preset("flight")
         loop, integral = started(config)
         for number in range(500):
-            error = 0.2 * math.exp(-number * PERIOD / config.leader.integral_lead)
-            state = body((0.0, 0.0, -error), (0.0, 0.0, error / config.leader.integral_lead))
+            error = 0.2 * math.exp(-number * PERIOD / config.leader.integral_lead_time)
+            state = body((0.0, 0.0, -error), (0.0, 0.0, error / config.leader.integral_lead_time))
             integral = loop.integrate(integral, state, np.zeros(3), PERIOD)
         assert abs(integral[2]) < 1e-9
 

@@ -276,9 +276,9 @@ class TestValidate:
 
 def test_a_record_of_an_older_version_gets_the_defaults() -> None:
     recorded = configs.to_dict(configs.preset("flight"))
-    del recorded["autopilot"]["follower_integrals"], recorded["scenario"]
+    del recorded["autopilot"]["follower_ki_scale"], recorded["scenario"]
     found = configs.from_record(recorded)
-    assert (found.autopilot.follower_integrals, found.scenario) == (1.0, configs.Scenario())
+    assert (found.autopilot.follower_ki_scale, found.scenario) == (1.0, configs.ScenarioRanges())
     assert found.plant == configs.preset("flight").plant
 
 

@@ -225,7 +225,7 @@ class TestRefused:
     def test_variants_hover(self, drone: str) -> None:
         config = apply_plant(preset("flight"), Path(drone))
         assert config.plant.rotor_force_max == pytest.approx(sum(config.autopilot.motor_curve))
-        assert config.autopilot.follower_integrals == 0.0  # only the leader's firmware integrates in any preset
+        assert config.autopilot.follower_ki_scale == 0.0  # only the leader's firmware integrates in any preset
 
     @pytest.mark.parametrize(
         ("drone", "mass", "force"), [("thrust-upgrade", 0.0345, 0.18), ("brushless", 0.0393, 0.20)]
@@ -234,7 +234,7 @@ class TestRefused:
         config = apply_plant(preset("flight"), Path(f"crazyflie-{drone}"))
         assert [one.mass for one in config.plant.drones] == [mass, mass]
         assert (config.plant.rotor_force_max, config.autopilot.motor_curve) == (force, (0.0, force))
-        assert (config.scenario.cg_amplitude, config.scenario.uncompensated_share) == ((0.0, 0.034), 0.0)
+        assert (config.scenario.cg_amplitude, config.scenario.uncompensated_probability) == ((0.0, 0.034), 0.0)
 
     def test_the_plain_drone_with_a_heavier_object_does_not(self) -> None:
         with pytest.raises(InputError, match="leaves 18%, where 20% are needed"):

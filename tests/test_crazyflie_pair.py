@@ -101,7 +101,7 @@ class TestPair:
         apart = [[0.0, np.radians(1.5), 0.0], [0.0, np.radians(-1.5), 0.0]]
 
         def spread(share: float, seconds: float) -> float:
-            autopilot = dataclasses.replace(PAIR.autopilot, follower_integrals=share)
+            autopilot = dataclasses.replace(PAIR.autopilot, follower_ki_scale=share)
             return float(np.ptp(flown(dataclasses.replace(PAIR, autopilot=autopilot), apart, seconds).rotor_force))
 
         assert spread(1.0, 10.0) > 1.2 * spread(1.0, 3.0) > 0.04  # of 0.09 N in hover

@@ -7,81 +7,81 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from fly_virtual import World, thrusts
+from fly_virtual import VirtualTwin, thrusts
 
 from mjxball.fly.limits import FlightSettings, Times
 from mjxball.fly.packets import THRUST_CEILING
 from mjxball.fly.supervisor import Event, State
 
 
-def silence_down(world: World, number: int) -> None:
+def silence_down(world: VirtualTwin, number: int) -> None:
     world.fault_link(number, silent_down=True)
 
 
-def silence_up(world: World, number: int) -> None:
+def silence_up(world: VirtualTwin, number: int) -> None:
     world.fault_link(number, silent_up=True)
 
 
-def silence(world: World, number: int) -> None:
+def silence(world: VirtualTwin, number: int) -> None:
     world.fault_link(number, silent_up=True, silent_down=True)
 
 
-def frozen(world: World, number: int) -> None:
+def frozen(world: VirtualTwin, number: int) -> None:
     world.fault_drone(number, frozen=True)
 
 
-def clock(world: World, number: int) -> None:
+def clock(world: VirtualTwin, number: int) -> None:
     world.fault_drone(number, clock_stopped=True)
 
 
-def slow(world: World, number: int) -> None:
+def slow(world: VirtualTwin, number: int) -> None:
     world.fault_link(number, delay=0.25)
 
 
-def jump(world: World, number: int) -> None:
+def jump(world: VirtualTwin, number: int) -> None:
     world.fault_drone(number, offset=(0.0, 0.0, 0.4))
 
 
-def away(world: World, number: int) -> None:
+def away(world: VirtualTwin, number: int) -> None:
     for drone in range(2):
         world.fault_drone(drone, offset=(3.0, 0.0, 0.0))
 
 
-def empty(world: World, number: int) -> None:
+def empty(world: VirtualTwin, number: int) -> None:
     world.fault_drone(number, battery=-1.2)
 
 
-def crash(world: World, number: int) -> None:
+def crash(world: VirtualTwin, number: int) -> None:
     world.drones[number].firmware.supervisor.crash()
 
 
-def reboot(world: World, number: int) -> None:
+def reboot(world: VirtualTwin, number: int) -> None:
     world.drones[number].reboot()
 
 
-def lost(world: World, number: int) -> None:
+def lost(world: VirtualTwin, number: int) -> None:
     world.links[number].lost = "dongle unplugged"
 
 
-def stuck(world: World, number: int) -> None:
+def stuck(world: VirtualTwin, number: int) -> None:
     world.links[number].stuck = 0.5
 
 
-def broken_policy(world: World, number: int) -> None:
+def broken_policy(world: VirtualTwin, number: int) -> None:
     world.flight.controller.policy.reset()
     world.flight.controller.policy._biases[-1][:] = math.nan
 
 
-def interrupt(world: World, number: int) -> None:
+def interrupt(world: VirtualTwin, number: int) -> None:
     world.flight.interrupts = 1
 
 
-def kill(world: World, number: int) -> None:
+def kill(world: VirtualTwin, number: int) -> None:
     world.flight.kill = True
 
 
 # What is done, whether at one drone or both, the event it shows as, the first state of the abort.
-FAULTS: dict[Callable[[World, int], None], tuple[Event | None, str]] = {
+FAULTS: dict[Callable[[VirtualTwin, int], None], tuple[Event | None, str]] = {
     silence_down: (Event.STALE, "hold"),
     silence: (Event.STALE, "hold"),
     slow: (Event.STALE, "hold"),
@@ -111,9 +111,9 @@ AT = [
 
 
 @pytest.mark.parametrize(("fault", "number"), AT)
-def test_any_fault_brings_both_down(fault: Callable[[World, int], None], number: int) -> None:
+def test_any_fault_brings_both_down(fault: Callable[[VirtualTwin, int], None], number: int) -> None:
     event, first = FAULTS[fault]
-    world = World(FlightSettings(seconds=SECONDS + 10, times=QUICK))
+    world = VirtualTwin(FlightSettings(seconds=SECONDS + 10, times=QUICK))
     world.fly_until(State.FLY)
     world.fly_for(1.0)
     fault(world, number)
@@ -133,9 +133,9 @@ def test_any_fault_brings_both_down(fault: Callable[[World, int], None], number:
 @pytest.mark.parametrize("fault", [silence, lost, silence_up], ids=lambda fault: fault.__name__)
 @pytest.mark.parametrize("number", [0, 1])
 def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
-    fault: Callable[[World, int], None], number: int
+    fault: Callable[[VirtualTwin, int], None], number: int
 ) -> None:
-    world = World(FlightSettings(seconds=20.0))
+    world = VirtualTwin(FlightSettings(seconds=20.0))
     world.fly_until(State.FLY)
     world.fly_for(2.5)
     fault(world, number)
@@ -151,7 +151,7 @@ def test_the_drone_that_is_heard_stays_level_with_the_lost_one(
 
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> None:
-    world = World(FlightSettings(seconds=20.0, times=QUICK))
+    world = VirtualTwin(FlightSettings(seconds=20.0, times=QUICK))
     world.fly_until(State.FLY)
     world.fly_for(2.0)
     silence(world, number)
@@ -166,7 +166,7 @@ def test_a_drone_without_power_does_not_keep_the_other_one_up(number: int) -> No
 
 
 def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -> None:
-    world = World(FlightSettings(seconds=20.0))
+    world = VirtualTwin(FlightSettings(seconds=20.0))
     world.fly_until(State.FLY)
     world.fly_for(1.0)
     silence_up(world, 1)
@@ -184,7 +184,7 @@ def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -
 
 @pytest.mark.parametrize("seconds", [0.4, pytest.param(0.11, marks=pytest.mark.slow)])
 def test_a_gap_in_the_states_is_flown_through(seconds: float) -> None:
-    world = World(FlightSettings(seconds=6.0))
+    world = VirtualTwin(FlightSettings(seconds=6.0))
     world.fly_until(State.FLY)
     world.fly_for(2.0)
     for number in range(2):
@@ -203,7 +203,7 @@ def test_a_gap_in_the_states_is_flown_through(seconds: float) -> None:
 )
 def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
     """States that come and go must not let hold and descent take turns for ever."""
-    world = World(FlightSettings(seconds=1.0))
+    world = VirtualTwin(FlightSettings(seconds=1.0))
     world.fly_until(state)
     world.fly_for(0.5)
     for number in range(2):
@@ -215,7 +215,7 @@ def test_a_link_that_is_almost_dead_ends_the_flight(state: State) -> None:
 
 
 def test_states_that_break_off_again_and_again_end_the_flight() -> None:
-    world = World(FlightSettings(seconds=60.0))
+    world = VirtualTwin(FlightSettings(seconds=60.0))
     world.fly_until(State.FLY)
     for _ in range(world.flight.settings.limits.gaps + 1):
         world.fly_for(0.5)
@@ -228,7 +228,7 @@ def test_states_that_break_off_again_and_again_end_the_flight() -> None:
 
 
 def test_a_frozen_estimator_is_found() -> None:
-    world = World(FlightSettings(seconds=20.0, goal=(0.8, 0.5, 0.8)))
+    world = VirtualTwin(FlightSettings(seconds=20.0, goal=(0.8, 0.5, 0.8)))
     world.fly_until(State.FLY)
     world.fly_for(0.4)
     frozen(world, 0)

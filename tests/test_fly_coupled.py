@@ -133,7 +133,7 @@ def test_uploaded_gains_matter() -> None:
 
 def test_each_drone_has_gains_of_its_own() -> None:
     config = configs.preset("flight")
-    alike = configs.replace(config, "autopilot.follower_integrals", 1.0)
+    alike = configs.replace(config, "autopilot.follower_ki_scale", 1.0)
     one, other = pair_of(alike), pair_of(alike)
     assert one.onboard._alike
     other.onboard._alike = False  # the way that is taken once gains differ

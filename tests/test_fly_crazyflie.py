@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fly_policies import untrained
-from fly_virtual import World
+from fly_virtual import VirtualTwin
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,11 +26,11 @@ vertical = st.floats(-4, 4)
 tilt = st.floats(-0.5, 0.5)
 
 
-def world_of(preset: str, seconds: float) -> World:
+def world_of(preset: str, seconds: float) -> VirtualTwin:
     contents = untrained(preset)
     config = card.config_of(contents.card)
     settings = FlightSettings(seconds=seconds, goal=card.goal_of(config))
-    return World(settings, contents=contents, physics=make_pair(contents.card))
+    return VirtualTwin(settings, contents=contents, physics=make_pair(contents.card))
 
 
 @pytest.mark.slow
@@ -77,16 +77,20 @@ def test_the_leader_flies_the_cards_law(preset: str) -> None:
     world.fly_for(1.0)
     commands = world.flight._commands
     own = preset == "stand"  # e_l of the leader's own place feels the roll, e_o does not
-    lead = config.leader.integral_lead
+    lead = config.leader.integral_lead_time
     error = commands.observation[14] + lead * commands.observation[17]
     integrated = world.flight.controller._integral[2] - world.flight.controller.period * error  # before it
     lift = config.leader.kp[2] * commands.observation[14] + config.leader.kd[2] * commands.observation[17]
-    apart = config.leader.level_gain * world.flight.controller._integral[3] if config.follower.shares_integrals else 0.0
+    apart = (
+        config.leader.tilt_integral_gain * world.flight.controller._integral[3]
+        if config.follower.residual_on_pid
+        else 0.0
+    )
     assert (abs(commands.leader[2] - apart - lift - config.leader.ki[2] * integrated) > 1e-3) == own
     # What lifts apart has moved on by one tick. The network says nothing:
     # the follower's command is the PD law on what it observes, or the leader's own.
     limit = config.command.vertical_limit
-    base = commands.leader[2] - 2 * apart if config.follower.shares_integrals else np.clip(lift, -limit, limit)
+    base = commands.leader[2] - 2 * apart if config.follower.residual_on_pid else np.clip(lift, -limit, limit)
     assert commands.follower[2] == pytest.approx(base, abs=5e-3 if apart else 1e-5)
 
 

@@ -15,20 +15,20 @@ from mjxball.fly.packets import FLYING, LOCKED
 from mjxball.fly.preflight import curve_of_version
 from mjxball.fly.supervisor import Event, State
 from mjxball.fly.twin.conditions import DRONES, Conditions, Surroundings, drone_kind
-from mjxball.fly.twin.virtual import MemoryLog, World
+from mjxball.fly.twin.virtual import MemoryLog, VirtualTwin
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 
 pytest.importorskip("mujoco")
 
 
-def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, **surroundings) -> World:
+def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, **surroundings) -> VirtualTwin:
     policy = Policy.load(shipped_policy(name))
     config = Controller(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
     limits = Limits().on_stand(goal[2]) if stand else Limits()
     settings = FlightSettings(seconds, goal, stand=stand, limits=limits, times=times_of(config))
-    return World(
+    return VirtualTwin(
         policy,
         settings,
         kind=drone_kind(curve=curve),
@@ -39,7 +39,7 @@ def world_of(name: str, seconds: float, curve: str = "linear", conditions=None, 
     )
 
 
-def error_of(world: World, after: float) -> np.ndarray:
+def error_of(world: VirtualTwin, after: float) -> np.ndarray:
     """(T, 3) of O from its goal, from `after` [s] of the flight on [m]."""
     flown = [moment for moment in world.track if moment.state == "fly"]
     late = np.array([moment.position for moment in flown if moment.time - flown[0].time >= after])
@@ -75,7 +75,7 @@ def test_either_firmware_is_recognised_and_flown_alike(curve: str) -> None:
     assert max(moment.tilt for moment in world.track) < np.radians(10)
 
 
-def pushed(world: World, monkeypatch: pytest.MonkeyPatch, *vertical: float) -> None:
+def pushed(world: VirtualTwin, monkeypatch: pytest.MonkeyPatch, *vertical: float) -> None:
     """Have both laws ask for `vertical` accelerations [m/s2] by turns."""
     flight, turns = world.flight, itertools.cycle(vertical)
     step = flight.controller.step
@@ -185,7 +185,7 @@ def test_delay_is_borne() -> None:
 def test_other_drones_have_gains_for_their_own_firmware_alone() -> None:
     for name, drone in (("flight-upgrade", "thrust-upgrade"), ("flight-brushless", "brushless")):
         policy = Policy.load(shipped_policy(name))
-        world = World(policy, FlightSettings(2.0), kind=DRONES[drone], settle=1.0)
+        world = VirtualTwin(policy, FlightSettings(2.0), kind=DRONES[drone], settle=1.0)
         assert [list(own) for own in world.variants] == [["linear"], ["linear"]]
         world.run(60.0)
         assert world.flight.supervisor.cause is None, (name, world.flight.supervisor)

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from fly_virtual import ARMED_BY_HAND, World, thrusts
+from fly_virtual import ARMED_BY_HAND, VirtualTwin, thrusts
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,7 +21,7 @@ NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
 
 
 def test_a_flight_from_start_to_end() -> None:
-    world = World(FlightSettings(seconds=5.0, goal=(0.2, -0.1, 0.5)))
+    world = VirtualTwin(FlightSettings(seconds=5.0, goal=(0.2, -0.1, 0.5)))
     world.fly_until(State.FLY)
     world.fly_for(4.9)
     there = world.state.position.mean(axis=0)
@@ -38,7 +38,7 @@ def test_a_flight_from_start_to_end() -> None:
 
 
 def test_a_brushless_pair_is_armed_under_zeros() -> None:
-    world = World(kind=ARMED_BY_HAND)
+    world = VirtualTwin(kind=ARMED_BY_HAND)
     assert not world.drones[0].firmware.supervisor.armed
     world.fly_until(State.SPIN)
     assert all(drone.firmware.supervisor.armed for drone in world.drones)
@@ -48,7 +48,7 @@ def test_a_brushless_pair_is_armed_under_zeros() -> None:
 
 
 def test_a_dry_run_sends_zeros_and_never_arms() -> None:
-    world = World(FlightSettings(seconds=1.0, dry_run=True), ARMED_BY_HAND)
+    world = VirtualTwin(FlightSettings(seconds=1.0, dry_run=True), ARMED_BY_HAND)
     world.fly_until(State.FLY)
     assert all(value.thrust > 10000 for value in world.flight.view.wanted)  # what it would have sent
     world.fly_until(State.DONE)
@@ -60,7 +60,7 @@ def test_a_dry_run_sends_zeros_and_never_arms() -> None:
 
 
 def test_one_interrupt_lands_and_a_second_one_kills() -> None:
-    world = World()
+    world = VirtualTwin()
     world.fly_until(State.FLY)
     world.flight.interrupts = 1
     world.fly_until(State.LAND)
@@ -75,7 +75,7 @@ def test_one_interrupt_lands_and_a_second_one_kills() -> None:
 
 @pytest.mark.parametrize(("missed", "gap"), [(50, 0.01), (0, 0.2)])
 def test_a_loop_that_cannot_keep_up_descends(missed: int, gap: float) -> None:
-    world = World()
+    world = VirtualTwin()
     world.fly_until(State.FLY)
     world.flight.tick(world.now, 0.0, missed, gap)
     assert world.flight.supervisor.state is State.DESCEND
@@ -83,7 +83,7 @@ def test_a_loop_that_cannot_keep_up_descends(missed: int, gap: float) -> None:
 
 
 def test_thrust_at_its_bound_for_too_long_descends() -> None:
-    world = World(FlightSettings(seconds=20.0))
+    world = VirtualTwin(FlightSettings(seconds=20.0))
     heavy = [Variant(dataclasses.replace(one, carried_mass=0.0434), {}) for one in world.flight.maps]
     world.flight.spin.chosen = lambda: (heavy[0], heavy[1])
     world.fly_until(State.FLY)
@@ -93,7 +93,7 @@ def test_thrust_at_its_bound_for_too_long_descends() -> None:
 
 
 def test_failed_checks_never_turn_a_motor() -> None:
-    world = World()
+    world = VirtualTwin()
     world.flight.ready, world.flight.refusal = False, "battery"
     world.fly_until(State.DONE)
     assert world.log.transitions() == ["stop", "done"]
@@ -102,7 +102,7 @@ def test_failed_checks_never_turn_a_motor() -> None:
 
 
 def test_a_watchdog_that_dies_ends_the_flight() -> None:
-    world = World(FlightSettings(seconds=20.0))
+    world = VirtualTwin(FlightSettings(seconds=20.0))
     alive = [True]
     beats: list[tuple[bool, LastKnownState]] = []
 
@@ -128,7 +128,7 @@ def test_a_watchdog_that_dies_ends_the_flight() -> None:
 
 
 def test_an_abort_during_the_ramp_does_not_jump_to_hover() -> None:
-    world = World()
+    world = VirtualTwin()
     world.fly_until(State.RAMP)
     world.fly_for(0.3)
     highest = max(thrust for _, thrust in thrusts(world, 0))
@@ -139,12 +139,12 @@ def test_an_abort_during_the_ramp_does_not_jump_to_hover() -> None:
 
 
 def test_every_state_has_a_time_limit_in_the_air() -> None:
-    world = World(FlightSettings(times=Times(), seconds=3.0))
+    world = VirtualTwin(FlightSettings(times=Times(), seconds=3.0))
     assert all(math.isfinite(world.flight._limit(state)) for state in AIRBORNE)
 
 
 def test_a_bug_in_the_runner_stops_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World()
+    world = VirtualTwin()
     world.fly_until(State.FLY)
     assert world.running() == [True, True]
 
@@ -173,7 +173,7 @@ def test_a_bug_in_the_runner_stops_both(monkeypatch: pytest.MonkeyPatch) -> None
 def test_asking_twice_to_land_is_no_kill_but_ctrl_c_twice_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The landing key repeats while it is held, and a closed terminal sends SIGHUP more than once."""
     for names, kills in ((("land", "land"), False), (("interrupt", "interrupt"), True), (("land", "interrupt"), True)):
-        world = World()
+        world = VirtualTwin()
         world.fly_until(State.FLY)
 
         @contextlib.contextmanager
@@ -197,7 +197,7 @@ def test_a_state_that_takes_too_long_is_a_fault(state: State) -> None:
 
 
 def test_a_kill_in_a_dry_run_locks_no_drone() -> None:
-    world = World(FlightSettings(dry_run=True))
+    world = VirtualTwin(FlightSettings(dry_run=True))
     world.fly_until(State.FLY)
     world.flight.kill = True
     world.fly_until(State.DONE)
@@ -212,7 +212,7 @@ def test_a_kill_in_a_dry_run_locks_no_drone() -> None:
 )
 def test_whatever_the_drones_report_no_command_leaves_its_bounds(raw: list[tuple[bytes, bytes]], paused: float) -> None:
     """A hostile pair that speaks the protocol well: states of any bytes in the middle of a flight."""
-    world = World()
+    world = VirtualTwin()
     world.fly_until(State.FLY)
     world.fly_for(paused)
     before = [len(link.packets) for link in world.links]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import TRANSPORT
-from fly_virtual import World
+from fly_virtual import VirtualTwin
 
 from mjxball.fly.handover import AWAY, BLEND, Handover, difference
 from mjxball.fly.limits import FlightSettings
@@ -89,7 +89,7 @@ def test_the_first_policy_comes_back_when_the_object_goes_astray(flown: PolicyFi
     assert both.share == 1.0
     shares = []
     for _ in range(ticks):
-        both.judge(NEAR + AWAY + 0.01)
+        both.check_distance(NEAR + AWAY + 0.01)
         command = both(observation)
         shares.append(both.share)
         old = alone(observation)
@@ -117,9 +117,9 @@ def test_only_a_policy_of_the_same_rig_and_laws_takes_over(flown: PolicyFile) ->
     assert difference(first, Policy.load(TRANSPORT)) != ""
 
 
-def flight(successor: Any, contents: PolicyFile) -> World:
+def flight(successor: Any, contents: PolicyFile) -> VirtualTwin:
     """A flight on the stand-in, in virtual time."""
-    world = World(FlightSettings(seconds=4.0), contents=contents)
+    world = VirtualTwin(FlightSettings(seconds=4.0), contents=contents)
     world.flight.succession._successor = successor
     world.run()
     return world
@@ -128,7 +128,7 @@ def flight(successor: Any, contents: PolicyFile) -> World:
 def test_in_flight(trained: Any) -> None:
     """Sent angles do not jump, and a policy that does the same as the first changes nothing."""
     contents = trained.contents
-    world = World(FlightSettings(seconds=4.0), contents=contents)
+    world = VirtualTwin(FlightSettings(seconds=4.0), contents=contents)
     calm = flight(None, contents)
     offers: list[Policy | None] = []
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import TRANSPORT, assert_one_line, call
-from fly_virtual import World
+from fly_virtual import VirtualTwin
 from vrpn_server import Poses, VrpnServer
 from wire import unpack_pose
 
@@ -263,7 +263,7 @@ class Seen:
     """A world whose flight has motion capture at 100 Hz, with what reached each drone's link."""
 
     def __init__(self, spoil: Spoil = lambda elapsed, frame: frame):
-        self.world = World(FlightSettings(seconds=3.0))
+        self.world = VirtualTwin(FlightSettings(seconds=3.0))
         self.mocap = Mocap(MocapSettings("mock", "", BODIES), self.world.rig.span)
         self.heard: list[list[tuple[np.ndarray, np.ndarray]]] = [[], []]
         self._noise, self._spoil, self._begin = np.random.default_rng(0), spoil, 0.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import assert_one_line, call
 from fly_policies import untrained
-from fly_virtual import World, log_header
+from fly_virtual import VirtualTwin, log_header
 
 from mjxball import config as configs
 from mjxball.commands import evaluate
@@ -38,7 +38,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Journal(path, **log_header(contents)) as notes:
         settings = FlightSettings(seconds=4.0, goal=(0.1, 0.0, 0.4))
         physics = make_pair(contents.card, OLDER, EXACT)
-        world = World(settings, contents=contents, physics=physics, log=notes)
+        world = VirtualTwin(settings, contents=contents, physics=physics, log=notes)
         world.fly_until(State.DONE)
     return path
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment, run
 from conftest import too_busy
-from fly_virtual import World
+from fly_virtual import VirtualTwin
 
 from mjxball.errors import InputError
 from mjxball.fly import retrain
@@ -177,7 +177,7 @@ def test_the_flight_is_the_same_whatever_becomes_of_it(
     save_file(flown, trained.contents)
 
     def sent(one: Retrainer | None) -> list[Any]:
-        world = World(FlightSettings(seconds=2.0), contents=trained.contents)
+        world = VirtualTwin(FlightSettings(seconds=2.0), contents=trained.contents)
         world.flight.succession._successor = None if one is None else one.take
         world.run()
         return [record["sent"] for record in world.log.records if record["kind"] == "tick"]
@@ -210,10 +210,10 @@ def test_the_runner_loads_no_jax() -> None:
 
 def test_a_card_says_what_it_was_retrained_for(tmp_path: Path) -> None:
     from mjxball.policy import load_file
-    from mjxball.rig.load import AddedLoad
+    from mjxball.rig.load import IdentifiedLoad
     from mjxball.rig.retrain import with_origin
 
-    load = AddedLoad(1.0, 0.004, 0.0002, 1e-4, 1e-5, 0.0, 0.0, 0.5, 0.0, 3.8)
+    load = IdentifiedLoad(1.0, 0.004, 0.0002, 1e-4, 1e-5, 0.0, 0.0, 0.5, 0.0, 3.8)
     contents: PolicyFile = with_origin(load_file(FLIGHT), load, {"steps": 3})
     save_file(tmp_path / "new.npz", contents)
     assert load_file(tmp_path / "new.npz").card["retrained"] == {"mass": 0.004, "offset": 0.05, "steps": 3}

@@ -20,7 +20,7 @@ from gymnasium.utils.seeding import np_random
 import mjxball.gym
 from mjxball.config import PRESETS, Config, preset
 from mjxball.errors import InputError
-from mjxball.gym import worlds
+from mjxball.gym import common
 from mjxball.gym.playground import PlaygroundEnv
 from mjxball.gym.single import FollowerEnv
 from mjxball.gym.vector import FollowerVectorEnv
@@ -80,7 +80,7 @@ def test_it_flies_as_the_brax_environment(name: str, request: pytest.FixtureRequ
     config = preset(name)
     env = FollowerEnv(config=config)
     first, _ = env.reset(seed=7)
-    _, key = worlds.next_world(jax.random.key(worlds.seed_number(np_random(7)[0])))
+    _, key = jax.random.split(jax.random.key(common.seed_number(np_random(7)[0])))
     pair = request.getfixturevalue("fast_pair") if name == "transport" else compile_env(config, "newton-euler")
     state = pair.reset(key)
     size = len(first)

@@ -30,7 +30,7 @@ EIGHT = PathShape(np.array(-0.4), np.array(0.8), np.array(2.0), np.array(0.3))
 IN_PLANE = {"ellipse": ELLIPSE, "figure of eight": EIGHT, "sine along x": None}
 
 
-@pytest.mark.parametrize("kind", [*IN_PLANE, "visits", "waveform"])
+@pytest.mark.parametrize("kind", [*IN_PLANE, "waypoints", "waveform"])
 def test_derivatives_of_paths_in_the_plane(kind: str) -> None:
     time = np.linspace(0.013, 18.9, 400)
     waves = dataclasses.replace(SAMPLES, offsets_across=tuple(reversed(SAMPLES.offsets)))
@@ -38,7 +38,7 @@ def test_derivatives_of_paths_in_the_plane(kind: str) -> None:
     none, many = np.zeros((400, 0)), np.full(400, 1.0)
     places = np.broadcast_to(np.stack([PLACES, PLACES[::-1]], axis=-1), (400, len(PLACES), 2))
     load = Load(many, many, 0.1 * many, 0.8 * many, 0.4 * many, none, none, cg_shape=IN_PLANE.get(kind))
-    load = load._replace(cg_path=places, follows_path=many) if kind == "visits" else load
+    load = load._replace(cg_path=places, follows_path=many) if kind == "waypoints" else load
     here, before, after = curve(time, load), curve(time - GAP, load), curve(time + GAP, load)
     assert here.offset.shape == (400, 2)
     np.testing.assert_allclose((after.offset - before.offset) / (2 * GAP), here.rate, atol=1e-6)
@@ -49,13 +49,13 @@ def test_derivatives_of_paths_in_the_plane(kind: str) -> None:
         np.testing.assert_allclose(u**2 + v**2 - 2 * u * v * np.cos(1.5), np.sin(1.5) ** 2, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["sine", "waveform", "visits"])
+@pytest.mark.parametrize("kind", ["sine", "waveform", "waypoints"])
 def test_rate_and_acceleration_are_the_offsets_derivatives(kind: str) -> None:
     time = np.linspace(0.013, 18.9, 400)
     if kind == "sine":
         curve = lambda t: motion.sine(t, 0.1, 2.7, 0.4)  # noqa: E731
-    elif kind == "visits":
-        curve = lambda t: motion.visits(t, 0.1, 0.8, 0.4, PLACES)  # noqa: E731
+    elif kind == "waypoints":
+        curve = lambda t: motion.waypoints(t, 0.1, 0.8, 0.4, PLACES)  # noqa: E731
     else:
         spline = motion.fit_spline(SAMPLES.times, SAMPLES.offsets)
         curve = lambda t: motion.follow_spline(spline, t)  # noqa: E731
@@ -69,11 +69,11 @@ def test_rate_and_acceleration_are_the_offsets_derivatives(kind: str) -> None:
 def test_visits_rest_at_every_place_and_are_hardly_faster_than_the_sine() -> None:
     amplitude, speed = 0.1, 2.0
     way = np.pi / speed
-    resting = motion.visits(np.arange(12) * way, amplitude, speed, 0.0, PLACES)
+    resting = motion.waypoints(np.arange(12) * way, amplitude, speed, 0.0, PLACES)
     np.testing.assert_allclose(resting.offset, amplitude * np.resize(PLACES, 12), atol=1e-12)
     np.testing.assert_allclose(resting.rate, 0, atol=1e-12)
     np.testing.assert_allclose(resting.acceleration, 0, atol=1e-10)
-    moving = motion.visits(np.linspace(0, 5 * way, 5001), amplitude, speed, 0.0, PLACES)
+    moving = motion.waypoints(np.linspace(0, 5 * way, 5001), amplitude, speed, 0.0, PLACES)
     assert np.abs(moving.offset).max() <= amplitude * (1 + 1e-12)
     # From end to end: 15/8 of the mean speed, 10/sqrt(3) of its change over the time.
     assert np.abs(moving.rate).max() == pytest.approx(15 / 8 * 2 * amplitude / way, rel=1e-4)

@@ -14,7 +14,7 @@ from mjxball.control import crazyflie, motors
 from mjxball.control.constants import drone_loop, hover
 from mjxball.control.motors import OLDER, compensates, firmware, with_curve
 from mjxball.env import CoupledPairEnv
-from mjxball.physics.autopilot import make_powered
+from mjxball.physics.autopilot import make_battery_autopilot
 from mjxball.physics.engine import Load
 from mjxball.physics.step import start_state
 from mjxball.sim.randomization import LIFT, ResetDistribution
@@ -72,7 +72,7 @@ class TestConversion:
         assert not compensates(OLDER)
 
 
-def powered_load(volts: float, uncompensated: float, scale: tuple[float, float] = (1.0, 1.0)) -> Load:
+def battery_load(volts: float, uncompensated: float, scale: tuple[float, float] = (1.0, 1.0)) -> Load:
     mass, zero, none = np.array(0.0175), np.array(0.0), np.zeros(0)
     return Load(mass, mass, zero, zero, zero, none, none, thrust_scale=np.array(scale), battery=np.array(volts),
                 uncompensated=np.array(uncompensated))  # fmt: skip
@@ -82,7 +82,9 @@ def asked(config: Config, volts: float, uncompensated: float, vertical: float) -
     """Rotor forces (2, 4) that a level pair at rest is given for a vertical command."""
     still = np.zeros(3)
     state = start_state(config, still, still, still, np.array(0.0175), np.array(0.0))
-    return make_powered(config)(state, np.array([[0.0, 0.0, vertical]] * 2), powered_load(volts, uncompensated))[1]
+    return make_battery_autopilot(config)(
+        state, np.array([[0.0, 0.0, vertical]] * 2), battery_load(volts, uncompensated)
+    )[1]
 
 
 class TestBattery:
@@ -117,7 +119,8 @@ class TestBattery:
             state = start_state(config, still, still, still, np.array(0.0175), np.array(0.0))
             commands = np.array([[0.0, 0.0, one] for one in command])
             force = (
-                make_powered(config)(state, commands, powered_load(volts, uncompensated))[1] * np.array(scale)[:, None]
+                make_battery_autopilot(config)(state, commands, battery_load(volts, uncompensated))[1]
+                * np.array(scale)[:, None]
             )
             # float32 and whole units of command
             assert force == pytest.approx(np.full((2, 4), 0.03775 * 9.81 / 4), rel=1e-4)

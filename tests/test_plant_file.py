@@ -68,7 +68,7 @@ def test_teams_stand_on_a_ring_with_neighbours_0_34_m_apart(count: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(places, axis=-1), radius, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(places - np.roll(places, 1, axis=0), axis=-1), 0.34, atol=2e-6)
     assert plant.of_drones("rotor_force_max") == (8.0,) * count
-    np.testing.assert_allclose(plant.shares, 1 / count, atol=1e-5)
+    np.testing.assert_allclose(plant.load_shares, 1 / count, atol=1e-5)
     assert plant.carrier_mass == pytest.approx(0.05 * count)
     assert config.scenario.object_mass == pytest.approx((0.1 * count, 0.1 * count))
     np.testing.assert_allclose(plant.carrier_inertia, 0.05 * count * radius**2 / np.array([4, 4, 2]), rtol=1e-3)
@@ -162,11 +162,11 @@ def test_what_flies_two_drones_refuses_more(name: str, tmp_path: Path, capsys: p
 def test_shares_hold_the_load_level() -> None:
     for name in ("team3", "plate4", "crazyflie"):
         plant = shipped(name).plant
-        shares, places = np.array(plant.shares), np.array([drone.mount for drone in plant.drones])
+        shares, places = np.array(plant.load_shares), np.array([drone.mount for drone in plant.drones])
         assert shares.sum() == pytest.approx(1)
         np.testing.assert_allclose(shares @ places, 0, atol=1e-6)
     crooked = configs.replace(Plant(), "drones.0.mount", (0.31, 0.0, 0.0))
     # The follower at -0.17 m carries more: the lever rule.
-    np.testing.assert_allclose(crooked.shares, [0.17 / 0.48, 0.31 / 0.48], rtol=1e-12)
+    np.testing.assert_allclose(crooked.load_shares, [0.17 / 0.48, 0.31 / 0.48], rtol=1e-12)
     with pytest.raises(InputError, match="nothing holds the load"):
         configs.validate(configs.replace(Config(), "plant.drones.0.mount", (-0.17, 0.3, 0.0)))

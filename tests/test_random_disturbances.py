@@ -1,4 +1,4 @@
-"""Disturbances that training draws in every world: senses, gusts, rotors; and what privileged critics are told."""
+"""Disturbances that training draws in every world: measurements, gusts, rotors; inputs of privileged critics."""
 
 from __future__ import annotations
 
@@ -168,14 +168,14 @@ def test_a_gust_pushes(disturbed: CompiledEnv) -> None:
 
 @pytest.mark.slow
 def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> None:
-    config = with_settings(transport, scenario={"cg_random_visits": 0.5, "cg_amplitude": (0.05, 0.1)})
+    config = with_settings(transport, scenario={"cg_waypoint_probability": 0.5, "cg_amplitude": (0.05, 0.1)})
     env = CoupledPairEnv(config, "newton-euler")
     load = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 400)).pipeline_state.load
     assert 160 < int(load.follows_path.sum()) < 240
     assert load.cg_path.shape == (400, 16)
     assert float(jnp.abs(load.cg_path).max()) <= 1.0
     times = jnp.linspace(0.0, 60.0, 400)
-    offsets = jax.vmap(lambda time: motion.sine_or_visits(jnp.full(400, time), load).offset)(times)
+    offsets = jax.vmap(lambda time: motion.sine_or_waypoints(jnp.full(400, time), load).offset)(times)
     assert bool((jnp.abs(offsets).max(axis=0) <= load.cg_amplitude * (1 + 1e-5)).all())
 
 

@@ -210,11 +210,11 @@ class TestCommand:
         changed = command.with_gains(PAIR, (leader, {"pid_rate.roll_kp": 500.0}))
         assert changed.autopilot.roll_rate == (500.0, *PAIR.autopilot.roll_rate[1:])
         assert changed.autopilot.yaw == (PAIR.autopilot.yaw[0], 0.5, PAIR.autopilot.yaw[2])
-        assert changed.autopilot.follower_integrals == 0.0
+        assert changed.autopilot.follower_ki_scale == 0.0
 
     @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
     def test_a_gain_file_says_how_much_the_follower_integrates(self, tmp_path: Path, share: float) -> None:
-        law = dataclasses.replace(PAIR.autopilot, follower_integrals=share)
+        law = dataclasses.replace(PAIR.autopilot, follower_ki_scale=share)
         (tmp_path / "gains.json").write_text(parameter_file(law))
         assert command.with_gains(PAIR, read_gains(tmp_path / "gains.json")).autopilot == law
 

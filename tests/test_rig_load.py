@@ -16,10 +16,9 @@ from mjxball.fly.log_schema import decode
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import AddedLoad, Surroundings, drone_kind
 from mjxball.fly.twin.coupled import CoupledPair, grounded_model, put_on
-from mjxball.fly.twin.virtual import World
+from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, shipped_policy
-from mjxball.rig.load import LONGEST, LoadWatch
-from mjxball.rig.load import AddedLoad as Found
+from mjxball.rig.load import LONGEST, IdentifiedLoad, LoadWatch
 from mjxball.rig.replay import FlightReplay
 
 LATE = 12.0  # [s] after the motors first turn
@@ -37,17 +36,17 @@ LOADS: list[tuple[float, float, dict[str, Any], float, float]] = [
 
 
 @functools.cache
-def flown(mass: float, offset: float, **more: Any) -> World:
+def flown(mass: float, offset: float, **more: Any) -> VirtualTwin:
     """A flight of the shipped policy with a load that comes after `LATE` seconds."""
     kind = drone_kind("2.1", more.pop("kind", "linear"))
     around = Surroundings(load=AddedLoad(mass, offset, LATE) if mass else None, **more)
     policy = Policy.load(shipped_policy("flight"))
-    world = World(policy, FlightSettings(seconds=LATE + LONGEST), kind=kind, surroundings=around)
+    world = VirtualTwin(policy, FlightSettings(seconds=LATE + LONGEST), kind=kind, surroundings=around)
     world.run()
     return world
 
 
-def found(world: World) -> tuple[Found | None, FlightReplay]:
+def found(world: VirtualTwin) -> tuple[IdentifiedLoad | None, FlightReplay]:
     """What the flight's records tell of the load, looked for twice a second; and the laws, flown again until then."""
     watch, replay = LoadWatch(world.config), FlightReplay(Policy.load(shipped_policy("flight")))
     looked = 0.0
@@ -94,7 +93,7 @@ def test_without_a_load_none_is_found() -> None:
 
 
 def test_the_laws_remember_the_same_when_the_log_is_flown_again() -> None:
-    world = World(Policy.load(shipped_policy("flight")), FlightSettings(seconds=20.0))
+    world = VirtualTwin(Policy.load(shipped_policy("flight")), FlightSettings(seconds=20.0))
     world.fly_until(State.FLY)
     world.fly_for(3.0)
     replay = FlightReplay(Policy.load(shipped_policy("flight")))

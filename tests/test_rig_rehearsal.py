@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from command_line import assert_one_line, call
-from fly_virtual import World, log_header
+from fly_virtual import VirtualTwin, log_header
 
 from mjxball import cli
 from mjxball import config as configs
@@ -70,7 +70,7 @@ def rehearse(path: Path, case: Case) -> None:
     pair = CoupledPair(configs.apply_overrides(CONFIG, case.rig), conditions, kind, around)
     settings, random = FlightSettings(seconds=case.seconds), np.random.default_rng(3)
     with Journal(path, **log_header(CONTENTS, "flight")) as journal:
-        world = World(settings, contents=CONTENTS, physics=pair, log=journal)
+        world = VirtualTwin(settings, contents=CONTENTS, physics=pair, log=journal)
         world.fly_until(State.FLY)
         while case.goals and world.flight.supervisor.state is State.FLY:
             goal = np.array(settings.goal) + random.uniform(-1, 1, 3) * REACH

@@ -51,7 +51,7 @@ def test_of_a_pair_it_is_the_closed_form(plant: Plant) -> None:
         expected = trim_limit(plant, mass, margin, given, (lead, own))
         found = largest_amplitude(plant, mass, margin, None, given, thrust=(lead, own))
         first, second = plant.drones
-        share = plant.shares[0] * (mass if given is None else given)
+        share = plant.load_shares[0] * (mass if given is None else given)
         follower = (first.mass + second.mass + mass - lead * (first.mass + share)) * plant.gravity / 4
         room, least = own * plant.rotor_force_max - follower, follower
         if room <= 0:
@@ -94,7 +94,7 @@ def test_the_forces_hold_all_weights_and_no_others_leave_more(
     assert (force[list(lost)] == 0).all()
     acts = [number for number in range(plant.count) if number not in lost and (helps or number != plant.leader)]
     if not helps:
-        asked = plant.known_masses[plant.leader] + plant.shares[plant.leader] * mass
+        asked = plant.known_masses[plant.leader] + plant.load_shares[plant.leader] * mass
         np.testing.assert_allclose(force[plant.leader], thrust[plant.leader] * asked * plant.gravity / 4)
     most = (thrust * plant.of_drones("rotor_force_max"))[acts, None]
     lifting = force[acts].sum() / (4 * most.sum())

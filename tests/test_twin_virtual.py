@@ -14,7 +14,7 @@ from mjxball.fly.card import Controller, goal_of, variants
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind
-from mjxball.fly.twin.virtual import World
+from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 
@@ -29,7 +29,7 @@ def settings_of(policy: Policy, seconds: float) -> FlightSettings:
     return FlightSettings(seconds=seconds, goal=goal_of(Controller(policy).config))
 
 
-def zeros(world: World, seconds: float) -> None:
+def zeros(world: VirtualTwin, seconds: float) -> None:
     """Both drones are sent zeros, for as long as they count as flying."""
     for _ in range(round(seconds / 0.05)):
         for link in world.links:
@@ -40,7 +40,7 @@ def zeros(world: World, seconds: float) -> None:
 @pytest.mark.parametrize("delay", [0.0, 0.01])
 def test_setpoints_and_states_are_late_by_the_links_delay(delay: float) -> None:
     policy = policy_of("flight")
-    world = World(policy, surroundings=Surroundings(delay=delay))
+    world = VirtualTwin(policy, surroundings=Surroundings(delay=delay))
     world.advance(0.2)
     states = [record for record in world.log.records if record["kind"] == "state"]
     stamps = [int.from_bytes(bytes.fromhex(record["raw"])[1:4], "little") / 1000 for record in states]
@@ -55,7 +55,7 @@ def test_setpoints_and_states_are_late_by_the_links_delay(delay: float) -> None:
 @pytest.mark.slow
 def test_two_flights_of_the_same_drones_and_how_they_touch_down() -> None:
     policy = policy_of("flight")
-    world = World(policy, settings_of(policy, 2.0), kind=drone_kind(curve="older"), settle=0.5, checks=True)
+    world = VirtualTwin(policy, settings_of(policy, 2.0), kind=drone_kind(curve="older"), settle=0.5, checks=True)
     for number in range(2):
         if number:
             world.next_flight(pause=1.0, settle=0.5)
@@ -69,7 +69,7 @@ def test_two_flights_of_the_same_drones_and_how_they_touch_down() -> None:
 
 def test_a_pair_that_locked_itself_is_refused() -> None:
     policy = policy_of("flight")
-    world = World(policy, settings_of(policy, 1.0), kind=drone_kind(curve="older"), settle=0.5, checks=True)
+    world = VirtualTwin(policy, settings_of(policy, 1.0), kind=drone_kind(curve="older"), settle=0.5, checks=True)
     world.fly_until(State.FLY)
     world.advance(4.0)  # the laptop is silent
     assert all(drone.firmware.locked for drone in world.drones)
@@ -94,7 +94,7 @@ def test_a_stand_that_starts_in_the_air_with_its_ball_anywhere() -> None:
     config = configs.preset("stand")
     policy = policy_of("stand")
     conditions = dataclasses.replace(Conditions.of(config), ball=-0.03)
-    world = World(policy, settings_of(policy, 1.0), kind=drone_kind(curve="older"), conditions=conditions)
+    world = VirtualTwin(policy, settings_of(policy, 1.0), kind=drone_kind(curve="older"), conditions=conditions)
     vectors = ([0.0, 0.0, 0.08], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     mass = np.float64(conditions.object_mass)
     world.start_in_air(start_state(config, *map(np.array, vectors), mass, np.float64(-0.03)))

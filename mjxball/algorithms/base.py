@@ -43,7 +43,7 @@ class Schedule(NamedTuple):
     curriculum: float  # share of the training over which the environment's difficulty grows to the whole, 0: none
 
 
-class Policy(NamedTuple):
+class PolicyNetwork(NamedTuple):
     """What is exported: a tanh-squashed network of ReLU layers on normalised observations. A pytree of arrays."""
 
     layers: Any  # Flax's {"hidden_0": {"kernel", "bias"}, ...}; the last gives mean and deviation of the action
@@ -117,7 +117,7 @@ class Environments(Protocol):
 class Algorithm(Protocol):
     """A learning algorithm. All its functions are pure, and can be jitted and vmapped.
 
-    One that is done on a CPU before it could be compiled well, or at all for a GPU, may say so: `brief = True`.
+    One that is done on a CPU before it could be compiled well, or at all for a GPU, may say so: `prefers_cpu = True`.
     """
 
     schedule: Schedule
@@ -143,7 +143,7 @@ class Algorithm(Protocol):
         """Learn, if `phase.learning`: (state, `metrics`). `progress` is the share of training done, 0 to 1."""
         ...
 
-    def policy(self, state: Any) -> Policy:
+    def policy(self, state: Any) -> PolicyNetwork:
         """The policy to evaluate and export."""
         ...
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mjxball.algorithms.base import Environments, Phase, Policy, Schedule
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
 from mjxball.algorithms.scalar_form import scalar_form
 from mjxball.config import Config
 from mjxball.errors import InputError
@@ -38,13 +38,13 @@ class FirstOrderGradient:
 
     `collect` flies a window and differentiates its mean reward with respect to the policy's weights; `update` takes
     the step. Windows follow one another in an episode of `gradient.windows_per_episode`; the environments begin theirs
-    in turn, so that every window has flights towards the goal and flights at it. `gradient.damping` multiplies the
-    gradient that passes from one control step to the one before.
+    in turn, so that every window has flights towards the goal and flights at it. `gradient.gradient_decay` multiplies
+    the gradient that passes from one control step to the one before.
     """
 
     metrics = ("loss", "gradient_norm")
     engines = ("newton-euler",)  # MJX iterates, and what iterates has no gradient backwards
-    brief = True
+    prefers_cpu = True
     collect_keys = 1
     update_keys = 0
 
@@ -94,10 +94,10 @@ class FirstOrderGradient:
         return known, envs
 
     def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
-        policy, damping = self.policy(state._replace(layers=layers)), self._config.damping
+        policy, decay = self.policy(state._replace(layers=layers)), self._config.gradient_decay
 
         def step(envs: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
-            envs = envs._replace(states=_damp(envs.states, damping)) if damping < 1 else envs
+            envs = envs._replace(states=_decayed(envs.states, decay)) if decay < 1 else envs
             seen = envs.states.obs
             envs, after = self._environments.step(envs, policy(seen), None)
             return _forget(envs), (after.reward, jax.lax.stop_gradient(seen))
@@ -116,7 +116,9 @@ class FirstOrderGradient:
         slope = jax.tree.map(
             lambda one: jnp.where(sound, one * jnp.minimum(1.0, own.max_grad_norm / (norm + 1e-9)), 0.0), state.slope
         )
-        fall = own.learning_rate_end + (1.0 - own.learning_rate_end) * 0.5 * (1.0 + jnp.cos(jnp.pi * progress))
+        fall = own.learning_rate_final_ratio + (1.0 - own.learning_rate_final_ratio) * 0.5 * (
+            1.0 + jnp.cos(jnp.pi * progress)
+        )
         direction, adam = ADAM.update(slope, state.adam)
         rate = own.learning_rate * fall
         moved = state._replace(
@@ -125,12 +127,12 @@ class FirstOrderGradient:
         moved = jax.tree.map(lambda new, old: jnp.where(sound, new, old), moved, state)
         return moved, dict(zip(self.metrics, (state.loss, norm), strict=True))
 
-    def policy(self, state: GradientState) -> Policy:
+    def policy(self, state: GradientState) -> PolicyNetwork:
         """The policy as it is."""
         xp = state.mean.__array_namespace__()  # NumPy's, when a policy file is written: nothing is compiled for that
         variance = state.square - state.mean**2
         deviation = xp.where(state.seen > 0, xp.sqrt(xp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
-        return Policy(state.layers, state.mean, deviation, self._mask)
+        return PolicyNetwork(state.layers, state.mean, deviation, self._mask)
 
     def partition(self, whole: Any, split: Any) -> Any:
         """Everything that is known is whole."""
@@ -152,7 +154,7 @@ def _forget(envs: Any) -> Any:
     return envs._replace(states=states.replace(**past), statistics=still(envs.statistics))
 
 
-def _damp(tree: Any, factor: float) -> Any:
+def _decayed(tree: Any, factor: float) -> Any:
     """`tree` as it is; a gradient that passes through its floats is multiplied by `factor`."""
 
     def one(leaf: Array) -> Array:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjxball.algorithms.base import Environments, Phase, Policy, Schedule, Transition
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, Transition
 from mjxball.algorithms.networks import normaliser
 from mjxball.config import Config, Ppo
 from mjxball.errors import InputError
@@ -87,7 +87,7 @@ class ProximalPolicyOptimization:
     ) -> tuple[PpoState, dict[str, Array]]:
         """`epochs` passes over the rollout in `minibatches` parts, each environment's steps together."""
         ppo, count = self._config, self._environments.count
-        rate = ppo.learning_rate * (1.0 + (ppo.learning_rate_end - 1.0) * progress)
+        rate = ppo.learning_rate * (1.0 + (ppo.learning_rate_final_ratio - 1.0) * progress)
         order_key, loss_key = jax.random.split(self._shards.own(keys[0]))
         orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(order_key, ppo.epochs))
         batches = orders.reshape(ppo.epochs * ppo.minibatches, -1)
@@ -122,10 +122,10 @@ class ProximalPolicyOptimization:
         parameters, adam, report = jax.lax.fori_loop(0, steps, one, start)
         return state._replace(parameters=parameters, adam=adam), dict(zip(self.metrics, report, strict=True))
 
-    def policy(self, state: PpoState) -> Policy:
+    def policy(self, state: PpoState) -> PolicyNetwork:
         """The policy, and what it knows of its observations."""
         mask = jnp.asarray(self._mask, jnp.float32)
-        return Policy(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
+        return PolicyNetwork(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> PpoState:
         """The rollout is cut, the rest is whole."""

@@ -12,7 +12,7 @@ import optax
 from jax import Array
 
 from mjxball.algorithms import replay
-from mjxball.algorithms.base import Environments, Phase, Policy, Schedule
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
 from mjxball.algorithms.networks import Networks, make_networks
 from mjxball.algorithms.replay import Replay, Transitions
 from mjxball.config import Config, Sac
@@ -265,7 +265,7 @@ class SoftActorCritic:
     ) -> tuple[SacState, dict[str, Float[Array, ""]]]:
         """`updates_per_step` gradient steps, each on a batch from the replay."""
         sac = self._config
-        rate = 1.0 + (sac.learning_rate_end - 1.0) * progress
+        rate = 1.0 + (sac.learning_rate_final_ratio - 1.0) * progress
         draws_key, update_key = map(self._shards.own, keys)
         shape = (sac.updates_per_step, sac.batch_size // self._shards.parts)
         draws = jax.random.bits(draws_key, shape, jnp.uint32)
@@ -283,11 +283,11 @@ class SoftActorCritic:
         report = (jnp.exp(learner.log_alpha), losses.entropy, losses.critic, losses.policy)
         return state._replace(learner=learner), dict(zip(self.metrics, report, strict=True))
 
-    def policy(self, state: SacState) -> Policy:
+    def policy(self, state: SacState) -> PolicyNetwork:
         """The running average of the policy, and what it knows of its observations."""
         learner = state.learner
         mask = jnp.asarray(self._mask, jnp.float32)
-        return Policy(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
+        return PolicyNetwork(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> SacState:
         """The replay's rows are cut, the learner is whole."""

@@ -48,7 +48,7 @@ class CopiedPid:
         law = config.leader
         self._pid = law.kp, law.kd, law.ki
         self._pd = copy_gains(config)
-        self._band, self._period = law.integral_band, config.timing.control_period
+        self._band, self._period = law.integral_error_limit, config.timing.control_period
 
     def start(self, observation: Array) -> Any:
         """Integral (..., 3) [m s] at the first `observation` (..., 18); () if the leader has none."""

@@ -1,4 +1,4 @@
-"""The command lines that join training, export and the judge. They stand above every other part of the package."""
+"""The command lines that join training, export and evaluation. They stand above every other part of the package."""
 
 import os
 

@@ -47,7 +47,7 @@ def parser() -> cli.Parser:
         usage="%(prog)s [PRESET] [--seed N] [--num-seeds K] [--sweep FILE] [--out DIR] [--resume DIR]\n"
         "                [--physics ENGINE] [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
         "                [--<config path> VALUE ...]",
-        description="Train a follower, export it to NumPy and judge it against `copy`.",
+        description="Train a follower, export it to NumPy and compare it with `copy`.",
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
     )
     names = ", ".join(config.PRESETS)
@@ -227,7 +227,7 @@ def _choose_processor(algorithm: Any) -> None:
     """Train on the CPU what is done there before a GPU has compiled it, unless JAX_PLATFORMS says otherwise."""
     import jax
 
-    if getattr(algorithm, "brief", False) and not os.environ.get("JAX_PLATFORMS"):
+    if getattr(algorithm, "prefers_cpu", False) and not os.environ.get("JAX_PLATFORMS"):
         settings: Any = jax.config
         settings.update("jax_platforms", "cpu")
 
@@ -266,13 +266,13 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
     cells = fly_scenarios(settings, policies, standard_scenarios(settings)[-1:], origin["physics"])
     print(table(cells))
-    judged = ("rmse", "settling_time", "x_peak", "overshoot")
+    compared = ("rmse", "settling_time", "x_peak", "overshoot")
     chosen = load_file(out / POLICY)
     seeds = [int(cell.follower.removeprefix("seed")) for cell in cells]
-    spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in cells] for name in judged}
+    spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in cells] for name in compared}
     spread["failed"] = [cell.metrics.failed for cell in cells]
     save_file(out / POLICY, dataclasses.replace(chosen, card={**chosen.card, "population": {"seed": seeds, **spread}}))
-    for name in judged:
+    for name in compared:
         values = sorted(math.inf if value is None else value for value in spread[name])
         low, middle, high = values[0], statistics.median(values), values[-1]
         print(f"{name}: median {middle:.4g}, best {low:.4g}, worst {high:.4g} of {len(values)}")
@@ -294,7 +294,7 @@ def _refuse_with_resume(options: argparse.Namespace) -> None:
 
 
 def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) -> int:
-    """Judge the exported policy against `copy` on its own plant and physics; figures go to DIR/eval."""
+    """Compare the exported policy with `copy` on its own plant and physics; figures go to DIR/eval."""
     from mjxball.baselines import make_baseline
     from mjxball.evaluate.plots import write_results
     from mjxball.evaluate.policies import check_bounds, load_policy

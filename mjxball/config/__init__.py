@@ -20,7 +20,7 @@ from mjxball.config._settings import (
     Ppo,
     Reward,
     Sac,
-    Scenario,
+    ScenarioRanges,
     Timing,
 )
 from mjxball.config._tree import (
@@ -57,7 +57,7 @@ __all__ = [
     "Ppo",
     "Reward",
     "Sac",
-    "Scenario",
+    "ScenarioRanges",
     "Timing",
     "apply_overrides",
     "ball_limit",

@@ -13,7 +13,7 @@ from mjxball.config._settings import (
     Leader,
     Reward,
     Sac,
-    Scenario,
+    ScenarioRanges,
     Timing,
 )
 from mjxball.config._tree import apply_overrides
@@ -27,9 +27,9 @@ PAIR = replace(
         kp=(1.0, 1.0, 2.5),
         kd=(1.6, 1.6, 3.5),
         ki=(0.2, 0.2, 1.5),
-        integral_band=(0.1, 0.1, 0.3),
-        integral_lead=1.0,
-        level_gain=10.0,
+        integral_error_limit=(0.1, 0.1, 0.3),
+        integral_lead_time=1.0,
+        tilt_integral_gain=10.0,
     ),
     command=Command(tilt_limit=0.26, vertical_limit=6.0),
 )
@@ -46,7 +46,7 @@ LARGE_SAC = Sac(
     critic_layers=(128, 128),
     n_step=15,
     learning_rate=2e-3,
-    learning_rate_end=0.02,
+    learning_rate_final_ratio=0.02,
 )
 
 
@@ -70,7 +70,7 @@ def stand() -> Config:
             ignore_position=True,
             privileged_critic=True,
         ),
-        scenario=Scenario(
+        scenario=ScenarioRanges(
             goal_range=0.0,
             start_position=0.03,
             start_tilt=0.1,
@@ -84,7 +84,7 @@ def stand() -> Config:
             leader_uses_measurements=True,
             rotor_lag_scale=(0.6, 2.0),
             thrust_scale=(0.99, 1.01),
-            thrust_common=(0.99, 1.01),
+            thrust_scale_common=(0.99, 1.01),
             inertia_scale=(0.6, 1.4),
             termination_distance=1.0,
         ),
@@ -107,11 +107,11 @@ def flight() -> Config:
             action_scale_tilt=0.12,
             action_scale_vertical=0.8,
             observation_averages=(0.05, 0.2, 1.0),
-            shares_integrals=True,
+            residual_on_pid=True,
             washout_time=8.0,
             privileged_critic=True,
         ),
-        scenario=Scenario(
+        scenario=ScenarioRanges(
             goal_range=0.5,
             start_velocity=0.1,
             start_tilt=0.05,
@@ -127,11 +127,11 @@ def flight() -> Config:
             gust=(0.0, 0.01),
             rotor_lag_scale=(0.6, 2.0),
             thrust_scale=(0.9, 1.1),
-            thrust_common=(0.95, 1.05),
+            thrust_scale_common=(0.95, 1.05),
             battery=(3.2, 4.2),
-            uncompensated_share=0.5,
+            uncompensated_probability=0.5,
             inertia_scale=(0.6, 1.4),
-            cg_random_visits=0.3,
+            cg_waypoint_probability=0.3,
             termination_distance=1.5,
         ),
         reward=Reward(error_scale=0.02, velocity=8.0, steady_action=0.2),

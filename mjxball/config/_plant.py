@@ -87,7 +87,7 @@ class Plant:
         return tuple("xy".index(axis) for axis in self.cg_axis)
 
     @property
-    def shares(self) -> tuple[float, ...]:
+    def load_shares(self) -> tuple[float, ...]:
         """Share of the load's weight that each drone carries with the CG at O: the most even ones that hold it level.
 
         Of all shares that add up to 1 and have no moment about O across the load's directions, those with the least sum
@@ -104,7 +104,7 @@ class Plant:
     def known_masses(self) -> tuple[float, ...]:
         """What each drone lifts besides its share of the load [kg]: itself and the same share of the carrier."""
         return tuple(
-            drone.mass + share * self.carrier_mass for drone, share in zip(self.drones, self.shares, strict=True)
+            drone.mass + share * self.carrier_mass for drone, share in zip(self.drones, self.load_shares, strict=True)
         )
 
     def of_drones(self, name: str) -> tuple[float, ...]:

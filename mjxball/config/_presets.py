@@ -6,7 +6,7 @@ import types
 from dataclasses import replace
 
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
-from mjxball.config._settings import Bounds, Config, Follower, Gradient, Reward, Sac, Scenario
+from mjxball.config._settings import Bounds, Config, Follower, Gradient, Reward, Sac, ScenarioRanges
 from mjxball.errors import InputError
 
 
@@ -27,7 +27,7 @@ def _paper() -> Config:
             policy_layers=(256, 256),
             critic_layers=(256, 256),
             learning_rate=3e-4,
-            learning_rate_end=1.0,
+            learning_rate_final_ratio=1.0,
             discount=0.99,
             tau=0.005,
             alpha=0.3,
@@ -42,7 +42,7 @@ def _paper() -> Config:
 def _transport() -> Config:
     return Config(
         preset="transport",
-        scenario=Scenario(
+        scenario=ScenarioRanges(
             cg_speed=(0.2, 3.2),
             cg_amplitude=(0.0, 0.10),
             object_mass=(0.1, 0.3),
@@ -56,7 +56,7 @@ def _transport() -> Config:
             discount=0.97,
             n_step=5,
             learning_rate=2e-3,
-            learning_rate_end=0.02,
+            learning_rate_final_ratio=0.02,
         ),
     )
 
@@ -66,7 +66,7 @@ def _transport_large() -> Config:
     return Config(
         preset="transport-large",
         follower=Follower(action_scale_tilt=0.3, observation_averages=(0.05, 0.2), privileged_critic=True),
-        scenario=Scenario(
+        scenario=ScenarioRanges(
             cg_speed=(0.2, 3.2),
             cg_amplitude=(0.0, 0.17),
             object_mass=(0.1, 0.6),
@@ -100,7 +100,7 @@ def _robust() -> Config:
             rotor_lag_scale=(0.5, 2.0),
             thrust_scale=(0.8, 1.2),
             inertia_scale=(0.6, 1.4),
-            cg_random_visits=0.3,
+            cg_waypoint_probability=0.3,
         ),
         bounds=Bounds(x_peak=0.03, settling_time=3.5, rmse=0.355),
         reward=replace(large.reward, velocity=12.0, smoothness=10.0),
@@ -123,7 +123,7 @@ def _balance() -> Config:
             delay=(0.0, 0.1),
             rotor_lag_scale=(0.7, 1.5),
             inertia_scale=(0.8, 1.2),
-            cg_random_visits=0.3,
+            cg_waypoint_probability=0.3,
         ),
         bounds=Bounds(x_peak=0.005, settling_time=2.2, rmse=0.335),
         reward=replace(large.reward, velocity=12.0, smoothness=0.2, command_change=40.0),
@@ -132,7 +132,7 @@ def _balance() -> Config:
             num_envs=64,
             windows_per_episode=5,
             learning_rate=6e-3,
-            damping=0.97,
+            gradient_decay=0.97,
         ),
     )
 

@@ -47,7 +47,7 @@ class Autopilot:
     roll_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.roll_kp, ki, kd [motor command per deg/s]", low=0)
     pitch_rate: Vector3 = setting((250.0, 500.0, 2.5), "pid_rate.pitch_kp, ki, kd", low=0)
     yaw_rate: Vector3 = setting((120.0, 16.7, 0.0), "pid_rate.yaw_kp, ki, kd", low=0)
-    follower_integrals: float = setting(
+    follower_ki_scale: float = setting(
         1.0, "factor on the follower's ki: two drones that integrate on one body work against each other", low=0, high=1
     )
     motor_curve: Range = setting(
@@ -71,16 +71,16 @@ class Leader:
     kp: Vector3 = setting((0.5, 0.5, 0.5), "proportional gain per axis [1/s2]", low=0)
     kd: Vector3 = setting((1.0, 1.0, 1.0), "derivative gain per axis [1/s]", low=0)
     ki: Vector3 = setting((0.0, 0.0, 0.0), "integral gain per axis [1/s3]", low=0)
-    integral_band: Vector3 = setting((1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", above=0)
-    integral_lead: float = setting(
+    integral_error_limit: Vector3 = setting((1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", above=0)
+    integral_lead_time: float = setting(
         0.0,
         "the error is integrated with its rate times this, within the band: nothing winds up on the way to a goal [s]",
         low=0,
     )
-    level_gain: float = setting(
+    tilt_integral_gain: float = setting(
         0.0,
-        "what both drones lift apart for the time integral of the stick's angle error about the axis that the load "
-        "turns, with a follower that shares the integrals [m/s2 per rad s]",
+        "difference of both drones' lift for the time integral of the carrier's tilt error about the axis that "
+        "the load turns, with follower.residual_on_pid [m/s2 per rad s]",
         low=0,
     )
     error: Literal["object", "own"] = setting(
@@ -108,13 +108,13 @@ class Follower:
     )
     action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", above=0, high=1.2)
     action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", above=0)
-    shares_integrals: bool = setting(
-        False, "a residual action is added to the leader's whole PID law, integrals included, not to its PD part"
+    residual_on_pid: bool = setting(
+        False, "a residual action is added to the leader's PID law, integrals included, not to its PD part alone"
     )
     washout_time: float = setting(
         0.0,
-        "time constant of the average that is taken off a residual action of a follower that shares the integrals, 0: "
-        "none is; what lasts is the integrals' part [s]",
+        "time constant of the high pass on a residual action, with follower.residual_on_pid: what lasts is the "
+        "integrals' part; 0: no high pass [s]",
         low=0,
     )
     load_axis_only: bool = setting(
@@ -143,7 +143,7 @@ class Timing:
 
 
 @dataclass(frozen=True)
-class Scenario:
+class ScenarioRanges:
     """What every reset draws anew, uniformly from each range."""
 
     goal_range: float = setting(1.0, "each coordinate of the goal is drawn from +- this [m]", low=0)
@@ -158,22 +158,26 @@ class Scenario:
     )
     mass_change: Range = drawn((0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]")
     ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0)
-    noise: Range = drawn((0.0, 0.0), "noise of the senses, in deviations of motion capture and IMU", low=0)
-    delay: Range = drawn((0.0, 0.0), "delay of the follower's senses [s]", low=0, high=0.5)
-    estimator_drift: Range = drawn((0.0, 0.0), "slow error of the senses, in deviations of a drone's estimator", low=0)
+    noise: Range = drawn((0.0, 0.0), "measurement noise, in standard deviations of motion capture and IMU", low=0)
+    delay: Range = drawn((0.0, 0.0), "delay of the follower's measurements [s]", low=0, high=0.5)
+    estimator_drift: Range = drawn(
+        (0.0, 0.0), "slow measurement error, in standard deviations of a drone's estimator", low=0
+    )
     quantize: bool = setting(False, "states arrive with the resolution of a Crazyflie's log packets")
-    leader_uses_measurements: bool = setting(False, "the leader flies on what the follower senses, else on the truth")
+    leader_uses_measurements: bool = setting(
+        False, "the leader flies on the follower's measurements, else on the true state"
+    )
     battery: Range = drawn((0.0, 0.0), "voltage of the battery; 0: motors follow the curve [V]", low=0)
-    uncompensated_share: float = setting(
-        0.0, "share of flights whose firmware does not compensate the battery", low=0, high=1
+    uncompensated_probability: float = setting(
+        0.0, "probability of a firmware that does not compensate for the battery", low=0, high=1
     )
     gust: Range = drawn((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0)
     rotor_lag_scale: Range = drawn((1.0, 1.0), "factor on the rotors' time constant", above=0)
     thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0)
-    thrust_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", above=0)
+    thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", above=0)
     inertia_scale: Range = drawn((1.0, 1.0), "one factor on the inertia of drones and object", above=0)
-    cg_random_visits: float = setting(
-        0.0, "share of flights whose CG goes from place to place at random", low=0, high=1
+    cg_waypoint_probability: float = setting(
+        0.0, "probability that the CG moves between random waypoints instead of in a sine", low=0, high=1
     )
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
     unknown_share: float = setting(
@@ -247,7 +251,9 @@ class Sac:
     reward_scale: float = setting(1.0, "factor on the reward inside the critic", above=0)
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
     policy_ema_rate: float = setting(0.002, "rate of the exported running average of the policy", above=0, high=1)
-    learning_rate_end: float = setting(0.1, "rate at the end of the run over the rate at its start", above=0, high=1)
+    learning_rate_final_ratio: float = setting(
+        0.1, "rate at the end of the run over the rate at its start", above=0, high=1
+    )
 
 
 @dataclass(frozen=True)
@@ -262,7 +268,9 @@ class Ppo:
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     value_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the state value", low=1)
     learning_rate: float = setting(1e-3, "Adam's rate at the start", above=0)
-    learning_rate_end: float = setting(0.05, "rate at the end of the run over the rate at its start", above=0, high=1)
+    learning_rate_final_ratio: float = setting(
+        0.05, "rate at the end of the run over the rate at its start", above=0, high=1
+    )
     discount: float = setting(0.97, "gamma", low=0, high=0.99999)
     gae_lambda: float = setting(0.95, "lambda of the generalised advantage estimate", low=0, high=1)
     clipping: float = setting(0.2, "largest change of an action's probability that is rewarded", above=0)
@@ -285,9 +293,11 @@ class Gradient:
     windows_per_episode: int = setting(4, "windows after which an environment starts anew", low=1)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     learning_rate: float = setting(2e-2, "Adam's rate at the start", above=0)
-    learning_rate_end: float = setting(0.02, "rate at the end of the run over the rate at its start", above=0, high=1)
+    learning_rate_final_ratio: float = setting(
+        0.02, "rate at the end of the run over the rate at its start", above=0, high=1
+    )
     max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
-    damping: float = setting(
+    gradient_decay: float = setting(
         1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1
     )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
@@ -316,7 +326,7 @@ class Config:
     command: Command = Command()
     follower: Follower = Follower()
     timing: Timing = Timing()
-    scenario: Scenario = Scenario()
+    scenario: ScenarioRanges = ScenarioRanges()
     reward: Reward = Reward()
     sac: Sac = Sac()
     ppo: Ppo = Ppo()

@@ -141,7 +141,7 @@ def thrust_margin(config: Config) -> float:
     """Share of the weaker drone's full thrust that hovering the heaviest object leaves; negative: it cannot hover."""
     plant, most = config.plant, 4 * sum(config.autopilot.motor_curve)
     mass = config.scenario.object_mass[1] + max(config.scenario.mass_change[1], 0.0)
-    carried = (own + share * mass for own, share in zip(plant.known_masses, plant.shares, strict=True))
+    carried = (own + share * mass for own, share in zip(plant.known_masses, plant.load_shares, strict=True))
     return 1 - max(carried) * plant.gravity / most
 
 

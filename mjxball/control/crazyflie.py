@@ -146,7 +146,7 @@ def cascade(
 
 def integral_shares(xp: Any, autopilot: Autopilot, dtype: Any, drones: int = 2, leader: int = 0) -> Array:
     """Factors (N, 1) on ki of every drone: the leader integrates in full."""
-    shares = [[1.0 if number == leader else autopilot.follower_integrals] for number in range(drones)]
+    shares = [[1.0 if number == leader else autopilot.follower_ki_scale] for number in range(drones)]
     return xp.asarray(shares, dtype=dtype)
 
 
@@ -214,9 +214,9 @@ def gains_of(autopilot: Autopilot) -> Gains:
 
 
 def pair_gains(autopilot: Autopilot) -> PairGains:
-    """Those of leader and follower, whose ki are the leader's times `autopilot.follower_integrals`."""
+    """Those of leader and follower, whose ki are the leader's times `autopilot.follower_ki_scale`."""
     leader = gains_of(autopilot)
-    share = autopilot.follower_integrals
+    share = autopilot.follower_ki_scale
     return leader, {name: value * share if name.endswith("_ki") else value for name, value in leader.items()}
 
 

@@ -76,7 +76,7 @@ class Baseline:
 
     def _nominal(self, observation: Array) -> PrivilegedInfo:
         if self.law.needs_privileged:
-            raise InputError(f"follower {self.name!r} must be told where the CG is; it flies in simulation only")
+            raise InputError(f"follower {self.name!r} needs to know where the CG is; it flies in simulation only")
         zero = observation.__array_namespace__().zeros_like(observation[..., 0])
         return PrivilegedInfo(zero + self._believed_mass, zero, zero, zero)
 

@@ -103,7 +103,7 @@ def run_benchmark(
     physics: str,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Score]:
-    """Fly everything. The followers are designed for `base` and are not told what a variant changes."""
+    """Fly everything. The followers are designed for `base` and do not know what a variant changes."""
     scores: list[Score] = []
     for number, suite in enumerate(suites):
         progress(f"{number + 1}/{len(suites)} {suite.name}: {len(suite.variants)} variants x {num_seeds} seeds")

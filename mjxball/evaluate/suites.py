@@ -177,7 +177,7 @@ SUITES: tuple[Suite, ...] = (
         "amplitude",
         _variants("amplitude", (0.05, 0.1, 0.17), " m"),
     ),
-    Suite("mass-known", "the hover thrust is told the object's mass", "object mass", _variants("mass", MASSES, " kg")),
+    Suite("mass-known", "the hover thrust knows the object's mass", "object mass", _variants("mass", MASSES, " kg")),
     Suite(
         GRID,
         "every CG speed with every object mass, known to the hover thrust",
@@ -192,7 +192,7 @@ SUITES: tuple[Suite, ...] = (
     ),
     Suite(
         "mass-change",
-        "mass is added to or dropped from the object in flight; nobody is told",
+        "mass is added to or dropped from the object in flight, unannounced",
         "change",
         (
             Variant("+0.1 kg at 15 s", Scenario(mass_changes=((15.0, 0.1),))),

@@ -11,7 +11,7 @@ from mjxball.fly import command, packets
 from mjxball.fly.card import Commands, Controller
 from mjxball.fly.command import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
 from mjxball.fly.display import View
-from mjxball.fly.handover import Succession, Successor
+from mjxball.fly.handover import HandoverMonitor, Successor
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.monitor import Monitor, Sustained, link_faults, tilt_angle
@@ -43,7 +43,7 @@ class Flight:
         """`variants` of leader and follower by force curve; `assumed` are the curves whose gains were uploaded."""
         self.links, self.controller, self.rig, self.settings = links, controller, rig, settings
         self.note, self.watchdog, self._mocap = note, watchdog, mocap
-        self.succession = Succession(controller.handover, successor, note)
+        self.succession = HandoverMonitor(controller.handover, successor, note)
         self.supervisor = Supervisor()
         self.interrupts, self.kill = 0, False
         self.ready: bool | None = None  # checks before flight: not known yet, passed, failed

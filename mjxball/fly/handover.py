@@ -68,7 +68,7 @@ class Handover:
         policy.memory = self.first.memory
         self.second, self._farthest = policy, distance + AWAY
 
-    def judge(self, distance: float) -> None:
+    def check_distance(self, distance: float) -> None:
         """Take the first policy back if O is too far from its goal, `distance` [m], for a goal that stands still."""
         if self.second is not None and not self.returned and distance > self._farthest:
             self.returned = f"the object was {distance:.2f} m from its goal"
@@ -90,7 +90,7 @@ class Handover:
         return command + self.share * (other - command)
 
 
-class Succession:
+class HandoverMonitor:
     """Asks for a policy that is to take over, and keeps the figures of what each one flew."""
 
     def __init__(self, handover: Handover, successor: Successor | None, note: Note):
@@ -104,7 +104,7 @@ class Succession:
         if policy is not None:
             self._handover.begin(policy, distance)
             self._note("retrain", now, what="taken", text=policy.name)
-        self._handover.judge(distance)
+        self._handover.check_distance(distance)
         if self._handover.returned and not self._returned:
             self._returned = True
             self._note("retrain", now, what="returned", text=self._handover.returned)

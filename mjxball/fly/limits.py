@@ -48,7 +48,7 @@ class Times:
 
     arm: float = 0.3  # zeros before the motors may turn [s]
     arm_limit: float = 3.0  # [s]
-    spin: float = 0.3  # at a third of hover before the motors are judged [s]
+    spin: float = 0.3  # at a third of hover before the motors are checked [s]
     spin_limit: float = 4.0  # [s]: gains may have to be written
     ramp: float = 1.5  # thrust from nothing to hover [s]
     land_speed: float = 0.25  # at which the goal sinks [m/s]

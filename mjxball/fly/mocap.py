@@ -217,7 +217,7 @@ class Mocap:
         return supervision.faults(tracks, now, self.limits)
 
     def take(self, frame: Frame, now: float | None = None) -> None:
-        """One frame, in the reader's thread: judge it, send what is fit to be sent."""
+        """One frame, in the reader's thread: check it, send what is fit to be sent."""
         before, now = self.tracks, time.monotonic() if now is None else now
         places = self._places(now) if self.guarding else (None, None)
         after = supervision.follow(before, frame, self.limits, self._span, places)

@@ -80,7 +80,7 @@ def link_faults(links: Sequence[DroneLink], ages: Sequence[float], limits: Limit
 
 
 class Monitor:
-    """Judges both drones. `update` once a tick."""
+    """Checks both drones. `update` once a tick."""
 
     def __init__(self, rig: Rig, settings: FlightSettings):
         self._rig, self._settings = rig, settings
@@ -129,7 +129,7 @@ class Monitor:
 
 
 class EstimatorWatch:
-    """Judges both estimators. `update` once a tick; `trusted` says whose position may be used."""
+    """Checks both estimators. `update` once a tick; `trusted` says whose position may be used."""
 
     def __init__(self, rig: Rig, sideways: bool = True):
         """`sideways` false: on a stand, where the estimators invent motion along the locked axes."""
@@ -219,7 +219,7 @@ class UplinkWatch:
         self._name = name
         self._sent: collections.deque[tuple[float, int]] = collections.deque()
         self._missing = 0
-        self._judged = -math.inf
+        self._checked = -math.inf
         self.heard = -math.inf  # [s] when the last thrust that it acted on was sent
 
     def sent(self, thrust: int, now: float) -> None:
@@ -227,10 +227,10 @@ class UplinkWatch:
         self._sent.append((now, thrust))
 
     def update(self, health: Health, arrival: float) -> list[Fault]:
-        """Judge a health packet that came at `arrival` [s]; the same one is judged once."""
-        if arrival <= self._judged or not math.isfinite(health.thrust):
+        """Check a health packet that came at `arrival` [s]; the same one is checked once."""
+        if arrival <= self._checked or not math.isfinite(health.thrust):
             return []
-        self._judged = arrival
+        self._checked = arrival
         while self._sent and self._sent[0][0] < arrival - ECHO:
             self._sent.popleft()
         times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < 1.5]

@@ -126,7 +126,7 @@ def reset_estimator(link: Link, required: Preflight) -> None:
     link.write_parameters({"kalman.resetEstimation": 1.0}, check=False)  # the firmware clears it by itself
     time.sleep(required.reset)
     link.write_parameters({"kalman.resetEstimation": 0.0}, check=False)
-    started, good, judged, found = time.monotonic(), 0, 0.0, math.inf
+    started, good, checked, found = time.monotonic(), 0, 0.0, math.inf
     while good < 5:
         if time.monotonic() - started > required.converge:
             raise LinkError(
@@ -135,9 +135,9 @@ def reset_estimator(link: Link, required: Preflight) -> None:
             )
         time.sleep(0.01)
         sample = link.telemetry.health
-        if sample is None or sample.arrival <= max(judged, started):
+        if sample is None or sample.arrival <= max(checked, started):
             continue
-        judged, found = sample.arrival, max(sample.health.variance)
+        checked, found = sample.arrival, max(sample.health.variance)
         # A filter that does not run reports 0.
         good = good + 1 if min(sample.health.variance) > 0 and found < required.variance else 0
 
@@ -237,7 +237,7 @@ class SpinCheck:
         return leader, follower
 
     def update(self, since: float, now: float, note: Note) -> list[Fault]:
-        """Judge what came after `since` [s], when the motors had settled; events once both are known."""
+        """Check what came after `since` [s], when the motors had settled; events once both are known."""
         for number in range(2):
             if not self._decided[number]:
                 self._look(number, since, now, note)

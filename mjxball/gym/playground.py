@@ -14,17 +14,17 @@ import numpy as np
 
 from mjxball.assembly import build_model
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv, State, World
-from mjxball.gym import worlds
+from mjxball.env import CoupledPairEnv, PipelineState, State
+from mjxball.gym import common
 
 Array = Any
 
 
 @flax.struct.dataclass
 class PlaygroundState:
-    """The fields of Playground's `State`; `data` is this project's `World` instead of an `mjx.Data`."""
+    """The fields of Playground's `State`; `data` is this project's `PipelineState` instead of an `mjx.Data`."""
 
-    data: World
+    data: PipelineState
     obs: Array  # (n,) the networks' input, critics' part included
     reward: Array  # ()
     done: Array  # () 1 at an end
@@ -40,7 +40,7 @@ class PlaygroundEnv:
     """
 
     def __init__(self, preset: str = "transport", config: Config | None = None, physics: str = "mjx"):
-        self.config = worlds.settings(preset, config)
+        self.config = common.settings(preset, config)
         self._pair = CoupledPairEnv(self.config, physics)
         self._model: mujoco.MjModel | None = None
 
@@ -97,7 +97,7 @@ class PlaygroundEnv:
 
     @property
     def mjx_model(self) -> Any:
-        """The assembly as an MJX model; the environment itself reads the object's mass from its `World`."""
+        """The assembly as an MJX model; the environment itself reads the object's mass from its `PipelineState`."""
         from mjxball.quiet import import_mjx
 
         return import_mjx().put_model(self.mj_model)

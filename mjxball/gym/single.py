@@ -13,7 +13,7 @@ from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
 from mjxball.env import CoupledPairEnv
 from mjxball.errors import InputError
-from mjxball.gym import worlds
+from mjxball.gym import common
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_cg_offset, make_stepper, on_the_host
 
@@ -38,7 +38,7 @@ def compiled_laws(config: Config) -> Laws:
     pair = CoupledPairEnv(config, "newton-euler")  # its own physics is never called
 
     def start(chain: Array) -> tuple[Array, Any]:
-        chain, key = worlds.next_world(chain)
+        chain, key = jax.random.split(chain)
         return chain, pair.reset(key)
 
     def arrive(state: Any, action: Array, plant: PlantState) -> Any:
@@ -77,14 +77,14 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or rgb_array, not {render_mode!r}")
-        self.config = worlds.settings(preset, config)
+        self.config = common.settings(preset, config)
         self.render_mode = render_mode
         self.metadata = {**METADATA, "render_fps": round(1 / self.config.timing.control_period)}
         with on_the_host():
             self._laws = compiled_laws(self.config)
         self._move = make_stepper(self.config, engine_of(self.config, physics))
         self._cg_offset = make_cg_offset(self.config)
-        self.observation_space, self.action_space = worlds.spaces(self._laws.pair)
+        self.observation_space, self.action_space = common.spaces(self._laws.pair)
         self._chain: Any = None
         self._state: Any = None
         self._load: Load | None = None
@@ -96,7 +96,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         with on_the_host():
             if seed is not None or self._chain is None:
-                self._chain = jax.random.key(worlds.seed_number(self.np_random))
+                self._chain = jax.random.key(common.seed_number(self.np_random))
             self._chain, self._state = self._laws.start(self._chain)
         self._plant = _batch_of_one(self._state.pipeline_state.plant)
         self._load = self._state.pipeline_state.load
@@ -120,7 +120,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             self._plant = plant
         truncated = bool(self._state.info["truncation"])
         terminated = bool(self._state.done) and not truncated
-        info = {name: float(value) for name, value in worlds.info_of(self._state).items()}
+        info = {name: float(value) for name, value in common.info_of(self._state).items()}
         return self._seen(), float(self._state.reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
 from mjxball.env import CoupledPairEnv
-from mjxball.gym import worlds
+from mjxball.gym import common
 
 Array = Any
 METADATA: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
@@ -36,7 +36,7 @@ def compiled_program(config: Config, physics: str) -> Program:
     pair = CoupledPairEnv(config, physics)
 
     def start(chain: Array) -> tuple[Array, Any]:
-        chain, key = worlds.next_world(chain)
+        chain, key = jax.random.split(chain)
         return chain, pair.reset(key)
 
     def step(state: Any, action: Array) -> Any:
@@ -85,10 +85,10 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError("the vector environment renders nothing; render one world with gymnasium.make")
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
-        self.config = worlds.settings(preset, config)
+        self.config = common.settings(preset, config)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._program = compiled_program(self.config, physics)
-        self.single_observation_space, self.single_action_space = worlds.spaces(self._program.pair)
+        self.single_observation_space, self.single_action_space = common.spaces(self._program.pair)
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, num_envs)
         self.action_space = batch(self.single_action_space, num_envs)
@@ -149,12 +149,12 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
             seeds: list[int | None] = [int(number) for number in self.np_random.integers(2**32, size=self.num_envs)]
         else:
             seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        return [worlds.seed_number(gymnasium.utils.seeding.np_random(each)[0]) for each in seeds]
+        return [common.seed_number(gymnasium.utils.seeding.np_random(each)[0]) for each in seeds]
 
 
 def _vector_info(state: Any, where: np.ndarray) -> dict[str, np.ndarray]:
     """Gymnasium's vector `info`: arrays (N,), 0 but `where` (N,) there is a value, and that mask."""
     info = {}
-    for name, value in worlds.info_of(state).items():
+    for name, value in common.info_of(state).items():
         info[name], info[f"_{name}"] = np.where(where, value, 0.0), where.copy()
     return info

@@ -61,17 +61,17 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
             rotor_targets(config, constants, state, commands, load.believed_mass),
         )
 
-    powered = make_powered(config, constants)
+    with_battery = make_battery_autopilot(config, constants)
 
     def firmware(
         state: PlantState, commands: Float[Array, "... drones 3"], load: Load
     ) -> tuple[Float[Array, "... drones 13"], Float[Array, "... drones 4"]]:
         if load.battery is not None:
-            return powered(state, commands, load)
+            return with_battery(state, commands, load)
         if config.autopilot.drone and motors.compensates(config.autopilot.motor_curve):
             # A motor gives more than a thrust command of 65 535 where the battery has it: full PWM is the limit.
             usual = commands[..., 0, 0] * 0.0
-            return powered(state, commands, load._replace(battery=usual + USUAL_BATTERY, uncompensated=usual))
+            return with_battery(state, commands, load._replace(battery=usual + USUAL_BATTERY, uncompensated=usual))
         xp, law, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
         sent = crazyflie.setpoints(law, commands, carried_mass(constants, state, load.believed_mass), gravity)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
@@ -84,7 +84,7 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
     return firmware
 
 
-def make_powered(config: Config, parameters: PlantParameters | None = None) -> Autopilot:
+def make_battery_autopilot(config: Config, parameters: PlantParameters | None = None) -> Autopilot:
     """The firmware's loops with motors that follow the battery, `load.battery`, with or without its compensation.
 
     Where `load.uncompensated`, what the firmware is sent and its gains are converted for its curve
@@ -97,7 +97,7 @@ def make_powered(config: Config, parameters: PlantParameters | None = None) -> A
     slower = uncompensated_law.roll_rate[0] / law.roll_rate[0]
     line = motors.compensates(law.motor_curve)
 
-    def powered(
+    def with_battery(
         state: PlantState, commands: Float[Array, "... drones 3"], load: Load
     ) -> tuple[Float[Array, "... drones 13"], Float[Array, "... drones 4"]]:
         xp = commands.__array_namespace__()
@@ -121,4 +121,4 @@ def make_powered(config: Config, parameters: PlantParameters | None = None) -> A
         loops, pwm = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals, duty, rate_share)
         return loops, motors.force(motor, pwm, battery)
 
-    return powered
+    return with_battery

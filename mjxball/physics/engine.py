@@ -85,8 +85,8 @@ class Load(NamedTuple):
     rotor_lag_scale: Scalar | None = None  # factor on the rotors' time constant; None: 1
     thrust_scale: Float[Array, "... drones"] | None = None  # factor on each drone's rotor forces; None: 1
     added_inertia: Vector | None = None  # about the body axes through O, without mass [kg m2]; None: none
-    # Places in units of the amplitude, (..., places) or (..., places, 2), see `motion.visits`; None: the CG follows the
-    # sine.
+    # Places in units of the amplitude, (..., places) or (..., places, 2), see `motion.waypoints`; None: the CG follows
+    # the sine.
     cg_path: Float[Array, "... places"] | None = None
     follows_path: Scalar | None = None  # 1 where it does, 0 where it follows the sine
     battery: Scalar | None = None  # voltage of all batteries [V]; None: motors follow the curve

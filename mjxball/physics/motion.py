@@ -33,7 +33,7 @@ def sine(time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar) -> CgSta
     return CgState(offset, amplitude * speed * xp.cos(angle), -speed * speed * offset)
 
 
-def visits(
+def waypoints(
     time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar, places: Float[Array, "... places"]
 ) -> CgState:
     """The CG goes from place to place, `places` in units of the amplitude, again and again (ours).
@@ -57,15 +57,15 @@ def visits(
     )
 
 
-def sine_or_visits(time: Scalar, load: Load) -> CgState:
-    """A flight's own motion: its sine, or the places that it visits instead."""
+def sine_or_waypoints(time: Scalar, load: Load) -> CgState:
+    """A flight's own motion: its sine, or random waypoints instead."""
     sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
     swinging = sine(time, *sines)
     if load.cg_path is None or load.follows_path is None:
         return swinging
     xp = time.__array_namespace__()
-    visiting = visits(time, *sines, load.cg_path)
-    return CgState(*(xp.where(load.follows_path > 0, b, a) for a, b in zip(swinging, visiting, strict=True)))
+    travelling = waypoints(time, *sines, load.cg_path)
+    return CgState(*(xp.where(load.follows_path > 0, b, a) for a, b in zip(swinging, travelling, strict=True)))
 
 
 def lissajous(time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar, shape: PathShape | None) -> CgState:
@@ -79,14 +79,14 @@ def lissajous(time: Scalar, amplitude: Scalar, speed: Scalar, phase: Scalar, sha
     return CgState(*(joined([c * u - s * v, s * u + c * v]) for u, v in zip(first, second, strict=True)))
 
 
-def lissajous_or_visits(time: Scalar, load: Load) -> CgState:
-    """As `sine_or_visits` in the plane, where the CG goes straight from one place to the next."""
+def lissajous_or_waypoints(time: Scalar, load: Load) -> CgState:
+    """As `sine_or_waypoints` in the plane, where the CG goes straight from one place to the next."""
     sines = (load.cg_amplitude, load.cg_speed, load.cg_phase)
     swinging = lissajous(time, *sines, load.cg_shape)
     if load.cg_path is None or load.follows_path is None:
         return swinging
     xp, follows = time.__array_namespace__(), load.follows_path[..., None] > 0
-    ways = zip(*(visits(time, *sines, load.cg_path[..., axis]) for axis in (0, 1)), strict=True)
+    ways = zip(*(waypoints(time, *sines, load.cg_path[..., axis]) for axis in (0, 1)), strict=True)
     return CgState(*(xp.where(follows, joined(b), a) for a, b in zip(swinging, ways, strict=True)))
 
 
@@ -136,7 +136,7 @@ def make_prescribed(config: Config) -> Prescribed:
     """
     in_plane, waves = len(config.plant.directions) == 2, config.motion
     if waves.kind == "sine":
-        return lissajous_or_visits if in_plane else sine_or_visits
+        return lissajous_or_waypoints if in_plane else sine_or_waypoints
     spline = fit_spline(waves.times, waves.offsets)
     across = fit_spline(waves.times, waves.offsets_across or (0.0,) * len(waves.times)) if in_plane else None
     limit, farthest = cg_limit(config.plant), largest_offset(spline) if across is None else _farthest(spline, across)

@@ -162,7 +162,7 @@ def plant_parameters(plant: Plant, attitude: Attitude) -> PlantParameters:
         rotor_force_max=np.array(plant.of_drones("rotor_force_max")),
         rotor_lag=np.array(plant.of_drones("rotor_lag")),
         known_mass=np.array(plant.known_masses),
-        share=np.array(plant.shares),
+        share=np.array(plant.load_shares),
         gains=nothing,
         carrier_mass=np.array(plant.carrier_mass),
         carrier_inertia=np.array(plant.carrier_inertia),

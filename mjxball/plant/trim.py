@@ -166,7 +166,7 @@ def _hover(
     believed = object_mass if believed_mass is None else believed_mass
     leader = 0.0
     if flies[plant.leader] and not leader_helps:
-        asked = plant.known_masses[plant.leader] + plant.shares[plant.leader] * believed
+        asked = plant.known_masses[plant.leader] + plant.load_shares[plant.leader] * believed
         leader = min(factor[plant.leader] * asked * gravity / 4, limit[plant.leader])
     weight = gravity * (masses.sum() + plant.carrier_mass + object_mass)
     lift = weight - 4 * leader

@@ -28,7 +28,7 @@ def policy_file(
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
     mask = np.array(law.mask(follower.ignore_position))
-    size = len(mask)  # behind it stands what only the critics were told; the policy's weights for it never moved
+    size = len(mask)  # behind it stands what only the critics saw; the policy's weights for it never moved
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
     card = {

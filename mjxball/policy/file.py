@@ -20,7 +20,7 @@ from mjxball.policy.container import PolicyFileError, read_arrays
 
 FORMAT_VERSIONS = (1, 2)  # 2: with the numbers of an offset-free LQG, card field `lqg`
 FOLDER = "policies"  # of those that come with mjxball
-READ_OF_CONFIG = ("leader", "attitude", "reward")  # by the judge, where a card has the configuration
+READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
 MAX_CARD = 2**20  # characters
 # Metrics that a card may bound, all of them the better the smaller.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")

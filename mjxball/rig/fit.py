@@ -38,7 +38,7 @@ SHORTEST_LAG, LONGEST_DELAY = 0.005, 0.06  # [s]
 USUAL_BATTERY = 3.7  # [V] in hover, where none was measured
 
 
-class PlantParameters(NamedTuple):
+class RigParameters(NamedTuple):
     """What is identified; each (n,)."""
 
     thrust: Array  # factor on the force of every motor
@@ -92,7 +92,7 @@ def motor_model(config: Config, log: Log) -> MotorModel:
     )
 
 
-def replay(config: Config, log: Log, parameters: PlantParameters) -> CascadeHistory:
+def replay(config: Config, log: Log, parameters: RigParameters) -> CascadeHistory:
     """Run both drones' cascades and motors through the log's own measurements, on one plant, `parameters` each (1,)."""
     law, motor = config.autopilot, motor_model(config, log)
     both = np.stack([log.euler] * 2, axis=1), np.stack([log.rates] * 2, axis=1)
@@ -119,7 +119,7 @@ def fly_windows(
     history: CascadeHistory,
     begins: Array,
     ticks: int,
-    parameters: PlantParameters,
+    parameters: RigParameters,
     start: WindowStart,
 ) -> Array:
     """Roll, roll rate, climb (ticks / every, n, 3) of n windows that begin at ticks `begins` (n,).
@@ -247,10 +247,10 @@ def _starts(log: Log, begins: Array) -> Array:
     return found
 
 
-def _parameters(common: Array) -> PlantParameters:
+def _parameters(common: Array) -> RigParameters:
     thrust, inertia, lag = np.exp(common[:, :3]).T
     uneven, delay = common[:, 3:].T
-    return PlantParameters(thrust, inertia, np.maximum(lag, SHORTEST_LAG), uneven, np.clip(delay, 0.0, LONGEST_DELAY))
+    return RigParameters(thrust, inertia, np.maximum(lag, SHORTEST_LAG), uneven, np.clip(delay, 0.0, LONGEST_DELAY))
 
 
 def _step(

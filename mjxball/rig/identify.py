@@ -132,7 +132,7 @@ def with_gains(settings: config.Config, gains: PairGains) -> config.Config:
     share = follower[largest] / leader[largest] if leader[largest] else 1.0
     if not 0 <= share <= 1:
         raise InputError("identification takes a follower whose ki are not above the leader's")
-    law = dataclasses.replace(crazyflie.with_gains(law, leader), follower_integrals=share)
+    law = dataclasses.replace(crazyflie.with_gains(law, leader), follower_ki_scale=share)
     if not all(math.isclose(value, follower[name], rel_tol=1e-3) for name, value in pair_gains(law)[1].items()):
         raise InputError("identification takes a follower whose gains are the leader's, all ki by one factor less")
     return dataclasses.replace(settings, autopilot=law)

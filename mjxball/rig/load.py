@@ -49,7 +49,7 @@ CLEARLY = 6.0  # in standard deviations
 OTHER_DRONE = 0.1  # [s] that one drone's motors may be older than the other's
 
 
-class AddedLoad(NamedTuple):
+class IdentifiedLoad(NamedTuple):
     """A load that was identified."""
 
     time: float  # [s] of the log's clock, when it came
@@ -146,7 +146,7 @@ class LoadWatch:
         """Time that can be used so far [s]."""
         return self._rows[-1].time - self._rows[0].time if self._rows else 0.0
 
-    def find(self) -> AddedLoad | None:
+    def find(self) -> IdentifiedLoad | None:
         """The load that came `AFTER` to `LONGEST` seconds ago; None if none did, or too little is known of it yet.
 
         Call it about twice a second.
@@ -170,7 +170,7 @@ class LoadWatch:
         off = abs(load.moment) > max(LEAST_MOMENT, CLEARLY * load.moment_spread)
         return load if heavy or off else None
 
-    def _fit(self, bins: _Bins, step: float, speeds: Array) -> tuple[float, AddedLoad] | None:
+    def _fit(self, bins: _Bins, step: float, speeds: Array) -> tuple[float, IdentifiedLoad] | None:
         """(misfit of both equations, the load) if it came at `step` [s]."""
         used = (bins.time > step - BEFORE) & (bins.time < step + LONGEST)
         part = bins.only(used)
@@ -191,7 +191,7 @@ class LoadWatch:
             shapes = [np.ones_like(since), loaded, np.sin(speed * since), np.cos(speed * since)]
             roll.append((speed, *_least_squares(weight[:, None] * np.stack(shapes, axis=1), turned)))
         speed, (own, moment, sine, cosine), spreads, roll_misfit = min(roll, key=lambda one: one[3])
-        load = AddedLoad(
+        load = IdentifiedLoad(
             time=step,
             mass=float(after - self._mass),
             moment=float(moment),

@@ -24,7 +24,7 @@ from mjxball.errors import InputError
 from mjxball.fly.card import config_of
 from mjxball.fly.flight_log import Tail
 from mjxball.policy import Policy, PolicyFile, load_file, save_file
-from mjxball.rig.load import AddedLoad, LoadWatch
+from mjxball.rig.load import IdentifiedLoad, LoadWatch
 from mjxball.rig.replay import FlightReplay
 
 NICE = 15
@@ -83,7 +83,7 @@ def retrain(options: argparse.Namespace) -> int:
         time.sleep(1.0)
 
 
-def situation(load: AddedLoad, watch: LoadWatch, replay: FlightReplay, config: Config) -> Any:
+def situation(load: IdentifiedLoad, watch: LoadWatch, replay: FlightReplay, config: Config) -> Any:
     """(`KnownLoad`, `FlightState`) of `train.polish`: the object with the `load`, and where the flight is."""
     from mjxball.train.polish import FlightState, KnownLoad
 
@@ -101,7 +101,7 @@ def situation(load: AddedLoad, watch: LoadWatch, replay: FlightReplay, config: C
     return known, FlightState(*place.body, place.goal, place.integral, place.history)
 
 
-def find(log: Path, watch: LoadWatch, replay: FlightReplay) -> AddedLoad:
+def find(log: Path, watch: LoadWatch, replay: FlightReplay) -> IdentifiedLoad:
     """Read the growing `log` until a load shows. Raises InputError if it is none."""
     tail, looked = Tail(log), 0.0
     while True:
@@ -118,14 +118,14 @@ def find(log: Path, watch: LoadWatch, replay: FlightReplay) -> AddedLoad:
                 return load
 
 
-def describe(load: AddedLoad) -> str:
+def describe(load: IdentifiedLoad) -> str:
     """The load in words."""
     where = f"{1e3 * load.offset:+.0f} mm from O toward the leader"
     spread = f"+- {1e3 * load.mass_spread:.1f} g, {1e6 * load.moment:+.0f} +- {1e6 * load.moment_spread:.0f} mg m"
     return f"a load of {1e3 * load.mass:.1f} g, {where} ({spread})"
 
 
-def with_origin(contents: PolicyFile, load: AddedLoad, numbers: dict[str, Any]) -> PolicyFile:
+def with_origin(contents: PolicyFile, load: IdentifiedLoad, numbers: dict[str, Any]) -> PolicyFile:
     """`contents` whose card says what it was retrained for."""
     origin = {"mass": load.mass, "offset": load.offset, **numbers}
     return dataclasses.replace(contents, card={**contents.card, "retrained": origin})

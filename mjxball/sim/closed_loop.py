@@ -80,8 +80,8 @@ class ClosedLoop(Laws):
 
         `follower`: what the followers' law answers to `observation`, in their mount frames. `goals`: of O at the
         period's beginning and at its end [m]. `load` with the external force that acts in it, `sample` of the
-        measurement at its end. `shares` (...): 1 for a follower that shares the integrals, a network; 0 for one with a
-        law of its own. `physics` in place of the loop's own.
+        measurement at its end. `shares` (...): 1 for a network whose residual is on the PID law, 0
+        for a law of its own. `physics` in place of the loop's own.
         """
         commands = self.commands(state, observation, follower, goals[0], shares)
         plant = (physics or self._physics)(state.plant, self.stack(*commands), load)

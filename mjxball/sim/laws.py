@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mjxball.physics.engine import Array, Vector
     from mjxball.sim.disturbances import Observation
 
-    Integral = Float[Array, "... integrals"]  # 3, or 7 where the follower shares the integrals
+    Integral = Float[Array, "... integrals"]  # 3, or 7 where the residual is on the PID law
 
 # Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
 MAX_LIFT_DIFFERENCE = 1.5
@@ -67,7 +67,7 @@ class Laws:
     velocity across, pitch, yaw and their rates are 0.
 
     `integral` (..., 3) of the leader's error [m s] is followed by that of the stick's angle error [rad s] where the
-    follower shares the integrals: two drones with integrals of their own wind up against each other, for only the
+    residual is on the PID law: two drones with integrals of their own wind up against each other, for only the
     whole lift and the whole moment show in the motion. The leader's PID is then both drones' base, and what keeps
     turning the stick is lifted away, one drone more, the other less, instead of being held by a lasting roll command.
     Behind them stands the average (..., 3) of what the network adds to that base (`follower.washout_time`): it is taken
@@ -77,8 +77,8 @@ class Laws:
     def __init__(self, config: Config, parameters: PlantParameters | None = None):
         self._law, self._gravity = config.leader, config.plant.gravity
         self._limits = config.command.tilt_limit, config.command.vertical_limit
-        self._shares = config.follower.shares_integrals
-        self._level_gain = config.leader.level_gain
+        self._shares = config.follower.residual_on_pid
+        self._tilt_integral_gain = config.leader.tilt_integral_gain
         self._washout = config.follower.washout_time
         self._axis = 0 if config.plant.cg_axis == "y" else 1  # roll or pitch, which the load turns
         # A leader at +y that lifts more rolls the stick up, one at +x pitches it down.
@@ -179,9 +179,9 @@ class Laws:
         command that a network's follower flew, in body axes.
         """
         xp = goal.__array_namespace__()
-        band = xp.asarray(self._law.integral_band, dtype=goal.dtype)
+        band = xp.asarray(self._law.integral_error_limit, dtype=goal.dtype)
         error, rate = self.leader_error(state, goal)
-        lead = self._law.integral_lead
+        lead = self._law.integral_lead_time
         error = error + lead * rate if lead else error
         own = integral[..., :3] + period * xp.clip(error, -band, band)
         if not self._shares:
@@ -189,7 +189,7 @@ class Laws:
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         axis = slice(self._axis, self._axis + 1)
         off = self._pid_command(state, goal, integral)[..., axis] - euler[..., axis]
-        most = MAX_LIFT_DIFFERENCE / self._level_gain if self._level_gain else 0.0
+        most = MAX_LIFT_DIFFERENCE / self._tilt_integral_gain if self._tilt_integral_gain else 0.0
         level = xp.clip(integral[..., 3:4] + period * off, -most, most)
         average = integral[..., 4:]
         if self._washout and follower_command is not None:
@@ -223,7 +223,9 @@ class Laws:
     def _with_lift_difference(self, command: Vector, integral: Integral, side: float) -> Vector:
         """`command` with what this drone lifts more than the other to turn the stick."""
         xp = command.__array_namespace__()
-        return xp.concat([command[..., :2], command[..., 2:] + side * self._level_gain * integral[..., 3:4]], axis=-1)
+        return xp.concat(
+            [command[..., :2], command[..., 2:] + side * self._tilt_integral_gain * integral[..., 3:4]], axis=-1
+        )
 
     def _clip(self, command: Vector) -> Vector:
         return leader.clip_command(command, *self._limits)

@@ -28,7 +28,7 @@ LIFT, PULL = 0.06, 0.05  # shares of its weight that every drone must lift more,
 DRAWN_BACK = 8  # times at most that a world's thrust is drawn back by three tenths
 CEILING = float(crazyflie.THRUST_CEILING)
 MASS_CHANGE_TIME = (5.0, 15.0)  # [s]
-PLACES = 16  # that a CG visits, where it does, before it begins again
+PLACES = 16  # random waypoints of a CG before it begins again
 
 
 class ResetDistribution:
@@ -43,15 +43,15 @@ class ResetDistribution:
         scales = (
             scenario.rotor_lag_scale,
             scenario.thrust_scale,
-            scenario.thrust_common,
+            scenario.thrust_scale_common,
             scenario.inertia_scale,
         )
         self.varies = any(scale != (1.0, 1.0) for scale in scales)
-        self.powered = scenario.battery[1] > 0
+        self.has_battery = scenario.battery[1] > 0
         self._constants = constants = plant_parameters(config.plant, config.attitude)
         self._motor = motors.MOTORS[config.autopilot.drone or "2.1"]
         self._lever = 2 * min(map(abs, constants.mounts[:, config.plant.directions[0]]))
-        self._levels = config.follower.shares_integrals and config.leader.level_gain > 0
+        self._levels = config.follower.residual_on_pid and config.leader.tilt_integral_gain > 0
         self._drones = constants.own_inertia.sum(axis=0)
         self._object = constants.object_inertia_per_mass
 
@@ -90,10 +90,10 @@ class ResetDistribution:
         )
         if self.varies:
             load = self._varied(load, jax.random.fold_in(rng, 2))
-        if self.powered:
-            load = self._powered(load, jax.random.fold_in(rng, 4))
-        if scenario.cg_random_visits > 0:
-            load = self._visiting(load, jax.random.fold_in(rng, 3))
+        if self.has_battery:
+            load = self._with_battery(load, jax.random.fold_in(rng, 4))
+        if scenario.cg_waypoint_probability > 0:
+            load = self._with_waypoints(load, jax.random.fold_in(rng, 3))
         load = load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude, jnp.maximum(self.trimmed(load), 0.0)))
         plant = start_state(
             self.config,
@@ -108,8 +108,8 @@ class ResetDistribution:
     def trimmed(self, load: Load) -> Scalar:
         """CG amplitude that can be trimmed before and after the mass changes [m]; negative: none."""
         masses = (load.object_mass, load.object_mass + load.mass_change[0])
-        if self.powered:
-            return jnp.minimum(*(self._powered_trim_limit(load, mass) for mass in masses))
+        if self.has_battery:
+            return jnp.minimum(*(self._battery_trim_limit(load, mass) for mass in masses))
         margin, plant = self.config.scenario.trim_margin, self.config.plant
         thrust = (1.0, 1.0) if load.thrust_scale is None else (load.thrust_scale[0], load.thrust_scale[1])
         if self.config.leader.ki[2] > 0:  # it finds the thrust for its share of the weight by itself
@@ -122,7 +122,7 @@ class ResetDistribution:
         """`load` with rotors and inertia of its own."""
         scenario, share = self.config.scenario, jax.random.uniform(key, (5,))
         each = (scenario.thrust_scale, scenario.thrust_scale)
-        ranges = (scenario.rotor_lag_scale, scenario.inertia_scale, *each, scenario.thrust_common)
+        ranges = (scenario.rotor_lag_scale, scenario.inertia_scale, *each, scenario.thrust_scale_common)
         drawn = (low + (high - low) * u for (low, high), u in zip(ranges, share, strict=True))
         lag, inertia, leader, follower, common = drawn
         thrust = common * jnp.stack([leader, follower])
@@ -130,7 +130,7 @@ class ResetDistribution:
         load = load._replace(
             rotor_lag_scale=lag, thrust_scale=thrust, added_inertia=((inertia - 1.0) * own).astype(own.dtype)
         )
-        if self.powered or scenario.thrust_scale == scenario.thrust_common == (1.0, 1.0):
+        if self.has_battery or scenario.thrust_scale == scenario.thrust_scale_common == (1.0, 1.0):
             return load
         # A leader that lifts too little can leave more than any follower trims: its world is drawn back towards 1.
         for _ in range(DRAWN_BACK):
@@ -139,24 +139,24 @@ class ResetDistribution:
             load = jax.tree.map(functools.partial(jnp.where, self.trimmed(load) < 0), milder, load)
         return load
 
-    def _powered_trim_limit(self, load: Load, mass: Scalar) -> Scalar:
+    def _battery_trim_limit(self, load: Load, mass: Scalar) -> Scalar:
         """As `trimmed` for drones that can be flown: one's rotors, and what one lifts more and the other less."""
         plant = self.config.plant
         weakest = 1.0 if load.thrust_scale is None else jnp.minimum(load.thrust_scale[0], load.thrust_scale[1])
         apart = LIFT * (sum(drone.mass for drone in plant.drones) + mass) * self._lever if self._levels else 0.0
         return trim_limit(plant, mass, self.config.scenario.trim_margin, None, (1.0, weakest)) + apart / mass
 
-    def draw_drives(
+    def draw_battery_and_thrust(
         self, load: Load, key: Array, count: int = CANDIDATES
     ) -> tuple[Float[Array, " count"], Float[Array, " count"], Float[Array, "count 2"], Bool[Array, " count"]]:
         """(battery [V], 1 for an older firmware, thrust factors (.., 2), whether it can be flown), (count,) of each."""
         scenario, share = self.config.scenario, jax.random.uniform(key, (5, count))
         each = (scenario.thrust_scale, scenario.thrust_scale)
-        ranges = (scenario.battery, *each, scenario.thrust_common)
+        ranges = (scenario.battery, *each, scenario.thrust_scale_common)
         battery, leader, follower, common = (
             low + (high - low) * u for (low, high), u in zip(ranges, share[:4], strict=True)
         )
-        uncompensated = (share[4] < scenario.uncompensated_share).astype(battery.dtype)
+        uncompensated = (share[4] < scenario.uncompensated_probability).astype(battery.dtype)
         scale = (common * jnp.stack([leader, follower])).T
         return battery, uncompensated, scale, self.flyable(load.object_mass, battery, uncompensated, scale)
 
@@ -208,13 +208,17 @@ class ResetDistribution:
         share = jax.random.uniform(key, (2,), minval=0.6, maxval=1.1)
         side = 1.0 if self.config.plant.cg_axis == "y" else -1.0
         height = share[0] * (command[0] + command[1]) / 2 / law.ki[2] if law.ki[2] > 0 else 0.0
-        level = share[1] * side * (command[0] - command[1]) / 2 / law.level_gain if law.level_gain > 0 else 0.0
+        level = (
+            share[1] * side * (command[0] - command[1]) / 2 / law.tilt_integral_gain
+            if law.tilt_integral_gain > 0
+            else 0.0
+        )
         initial_integrals = jnp.zeros(7)
         return initial_integrals.at[2].set(height).at[3].set(level)
 
-    def _powered(self, load: Load, key: Array) -> Load:
+    def _with_battery(self, load: Load, key: Array) -> Load:
         """`load` with a battery, a firmware and drones that can be flown; if all candidates cannot, nominal drones."""
-        battery, uncompensated, scale, good = self.draw_drives(load, key)
+        battery, uncompensated, scale, good = self.draw_battery_and_thrust(load, key)
         first = jnp.argmax(good)
         found = good[first]
         return load._replace(
@@ -223,12 +227,12 @@ class ResetDistribution:
             thrust_scale=jnp.where(found, scale[first], 1.0),
         )
 
-    def _visiting(self, load: Load, key: Array) -> Load:
+    def _with_waypoints(self, load: Load, key: Array) -> Load:
         """`load` whose CG perhaps goes from place to place."""
         path_key, key = jax.random.split(key)
         places = jax.random.uniform(path_key, (PLACES,), minval=-1.0, maxval=1.0)
-        visits = jax.random.uniform(key) < self.config.scenario.cg_random_visits
-        return load._replace(cg_path=places, follows_path=visits.astype(jnp.float32))
+        travels = jax.random.uniform(key) < self.config.scenario.cg_waypoint_probability
+        return load._replace(cg_path=places, follows_path=travels.astype(jnp.float32))
 
 
 def lower_part(ends: tuple[float, float], share: Scalar | float) -> tuple[float, Scalar | float]:

@@ -244,9 +244,9 @@ def _record(
 
 
 def make_privileged_info(config: Config) -> Callable[[PlantState, Load], PrivilegedInfo]:
-    """Return `privileged(state, load)`: what a classical follower is told, the truth half a step and a rotor lag ahead.
+    """Return `privileged(state, load)`: what a classical follower gets, the truth half a step and a rotor lag ahead.
 
-    Of a rolling ball nobody can know the future: the oracle is told where it is.
+    Of a rolling ball nobody can know the future: the oracle gets where it is.
     """
     plant = config.plant
     angles, several = mount_angles(plant), len(plant.followers) > 1

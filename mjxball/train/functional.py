@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from mjxball.algorithms.base import Phase, Policy
+from mjxball.algorithms.base import Phase, PolicyNetwork
 from mjxball.config import Config
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions
@@ -26,7 +26,7 @@ def train(
     reward: Any = None,
     algorithm: Any = None,
     overrides: Mapping[str, Any] | None = None,
-) -> tuple[Policy, dict[str, Array]]:
+) -> tuple[PolicyNetwork, dict[str, Array]]:
     """Train a follower from `key` (`jax.random.PRNGKey(seed)` gives the run of `train.py --seed`) without any file.
 
     `env`: a Brax environment, or a class or function of (config, physics) that makes one. `reward`: a function of

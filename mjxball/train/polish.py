@@ -20,7 +20,7 @@ import numpy as np
 from mjxball.algorithms.base import Phase
 from mjxball.algorithms.gradient import LEAST_DEVIATION, FirstOrderGradient, GradientState
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv, World
+from mjxball.env import CoupledPairEnv, PipelineState
 from mjxball.policy import PolicyFile
 from mjxball.sim.disturbances import Sample
 from mjxball.sim.follower import follower_law
@@ -32,7 +32,7 @@ LEARN = Phase(np.asarray(False), np.asarray(False))
 AHEAD = 4.0  # [s] that the old weights fly before the new ones could
 CHECKED = 15.0  # [s] of flight in which old and new weights are compared
 COMPARED = 8  # worlds in which they are
-PLACES = 16  # that a CG visits in turns: an even number, so that it goes to and fro
+PLACES = 16  # waypoints of a CG: an even number, so that it goes to and fro
 MOST_STEPS = 12  # of Adam
 SHARES = (0.0, 0.25, 0.5, 1.0)  # of the way from the old weights to the last ones: what is compared
 RESERVE = 1.2  # times a step's own time that must be left for the next one
@@ -49,16 +49,16 @@ SURROUNDINGS: dict[str, Any] = {  # of `config.scenario`: what the twin meets, a
     "gust": (0.0, 0.0),
     "rotor_lag_scale": (0.8, 1.25),
     "thrust_scale": (0.997, 1.003),  # how uneven the motors are is part of the CG's offset that was identified
-    "thrust_common": (1.0, 1.0),
+    "thrust_scale_common": (1.0, 1.0),
     "inertia_scale": (0.95, 1.05),
-    "cg_random_visits": 1.0,  # a motion about another place than O is a way to and fro between two places
+    "cg_waypoint_probability": 1.0,  # a motion about another place than O is a way to and fro between two places
 }
 OBJECTIVE: dict[str, Any] = {}  # of `config.reward`
 SETTINGS: dict[str, Any] = {  # of `config.gradient`
     "num_envs": 16,
     "horizon": 150,
     "learning_rate": 1e-3,
-    "learning_rate_end": 0.1,
+    "learning_rate_final_ratio": 0.1,
     "max_grad_norm": 1.0,
     "damping": 0.97,
     "windows_per_episode": 1_000_000,  # one flight, window after window
@@ -110,7 +110,7 @@ class LoadedEnv(CoupledPairEnv):
     def reset(self, rng: Array, difficulty: Any = 1.0) -> Any:
         """A world with that load; see `CoupledPairEnv.reset`."""
         state = super().reset(rng, difficulty)
-        world: World = state.pipeline_state
+        world: PipelineState = state.pipeline_state
         known, flight, draw = self._known, self._flight, jax.random.normal(jax.random.fold_in(rng, 11), (11,))
         mass = known.mass * (1.0 + MASS_SPREAD * draw[0])
         middle = known.cg_offset + OFFSET_SPREAD * draw[1]
@@ -299,7 +299,7 @@ def nominal_load(config: Config) -> KnownLoad:
 
 def resting(config: Config) -> FlightState:
     """Hover at the goal."""
-    integral = np.zeros(7 if config.follower.shares_integrals else 3)
+    integral = np.zeros(7 if config.follower.residual_on_pid else 3)
     history = np.zeros(follower_law(config).size)
     level = np.array([1.0, 0.0, 0.0, 0.0])
     return _single(FlightState(np.zeros(3), np.zeros(3), level, np.zeros(3), np.zeros(3), integral, history))

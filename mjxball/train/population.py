@@ -14,7 +14,7 @@ from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from mjxball import config as configs
-from mjxball.algorithms.base import Policy, Shards
+from mjxball.algorithms.base import PolicyNetwork, Shards
 from mjxball.config import Config
 from mjxball.train.compilation import (
     CPU_OPTIONS,
@@ -111,7 +111,7 @@ class Population:
 
     def compile(self, creating: bool) -> Executables:
         """Compile everything a run needs, side by side; `create` only if `creating`."""
-        options = CPU_OPTIONS if getattr(self.program.algorithm, "brief", False) else None
+        options = CPU_OPTIONS if getattr(self.program.algorithm, "prefers_cpu", False) else None
         if jax.default_backend() == "gpu":
             options = GPU_OPTIONS | (PLAIN_PRODUCTS if self._single else {})
         # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
@@ -169,7 +169,7 @@ class Population:
         values, key = self._as_argument(self._values, self._whole), self._as_argument(_first_key(), PartitionSpec())
         return executables.evaluation_envs(values, key)
 
-    def policy(self, state: TrainState, member: int) -> Policy:
+    def policy(self, state: TrainState, member: int) -> PolicyNetwork:
         """The policy of one member of a state of NumPy arrays."""
         return self.program.policy(self.member(state, member))
 

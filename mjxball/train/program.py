@@ -15,7 +15,7 @@ from jax import Array
 
 from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
-from mjxball.algorithms.base import Algorithm, Phase, Policy, Schedule, Shards, Transition
+from mjxball.algorithms.base import Algorithm, Phase, PolicyNetwork, Schedule, Shards, Transition
 from mjxball.config import Config
 from mjxball.train.extensions import DEFAULTS, Extensions, find, is_pair, make_env
 
@@ -248,7 +248,7 @@ class Program:
         """Newly reset environments, the same at every evaluation with `key`."""
         return self.environments.reset(jax.random.fold_in(key, EVALUATION_DRAW))
 
-    def policy(self, state: TrainState) -> Policy:
+    def policy(self, state: TrainState) -> PolicyNetwork:
         """The policy to evaluate and export."""
         return self.algorithm.policy(state.algorithm)
 

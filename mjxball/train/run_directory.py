@@ -113,7 +113,7 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
 
 
 PACKAGE = Path(__file__).parents[1]
-# What a training result depends on; the judge and the flight code are not among it.
+# What a training result depends on; evaluation and the flight code are not among it.
 SOURCES = (
     "config",
     "assembly.py",
@@ -177,7 +177,7 @@ def differences(recorded: Mapping[str, Any]) -> list[str]:
 
 
 # The program branches on whether they are 0 or 1.
-UNSWEPT = ("sac.curriculum", "ppo.curriculum", "gradient.damping")
+UNSWEPT = ("sac.curriculum", "ppo.curriculum", "gradient.gradient_decay")
 # Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
 SWEEPABLE = (
     *(

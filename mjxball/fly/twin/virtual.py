@@ -137,7 +137,7 @@ class Moment(NamedTuple):
     battery: float  # the lower one's [V]
 
 
-class World:
+class VirtualTwin:
     """A pair, its two drones, and flights of them one after the other."""
 
     def __init__(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
-import jax
 import numpy as np
 
 from mjxball import config as configs
@@ -30,12 +29,6 @@ def spaces(pair: CoupledPairEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces
 def seed_number(random: np.random.Generator) -> int:
     """The number that one world's keys come from, drawn from Gymnasium's generator."""
     return int(random.integers(2**32))
-
-
-def next_world(chain: Array) -> tuple[Array, Array]:
-    """(chain, key) for the next reset: world after world of one seed, the same in both environments."""
-    chain, key = jax.random.split(chain)
-    return chain, key
 
 
 def info_of(state: Any) -> dict[str, Array]:
