@@ -242,4 +242,5 @@ def test_a_missing_package_is_named_with_its_extra(saved: Path):
     script = "import sys; sys.modules['onnx'] = None; from mjxball.export import main; sys.exit(main(sys.argv[1:]))"
     done = run(["-c", script, saved, "out.onnx"], Path(__file__).parents[1])
     assert done.returncode == 2
-    assert done.stderr == "error: onnx is not installed; pip install 'mjxball[onnx]'\n"
+    assert "mjxball[onnx]" in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -185,20 +185,20 @@ REFUSED: dict[str, tuple[Callable[[list[bytes]], list[bytes]], str]] = {
     "newer": (changed(schema=SCHEMA + 1), f"has schema version {SCHEMA + 1}, this mjxball reads {SCHEMA}"),
     "older": (lambda lines: [json.dumps(OLD).encode() + b"\n", *lines[1:]], "has schema version 1, this mjxball"),
     "odd version": (changed(schema="two"), 'has schema version "two", this mjxball'),
-    "empty": (lambda lines: [], "is not a flight log: it is empty"),
-    "text": (lambda lines: [b"nothing\n"], "is not a flight log: it does not begin with a header"),
-    "bytes": (lambda lines: [b"PK\x03\x04\n\x00"], "is not a flight log: it does not begin with a header"),
-    "a long line": (lambda lines: [b"x" * (3 << 20)], "is not a flight log: it holds a line of more than 1 MiB"),
-    "no header": (lambda lines: lines[1:], "is not a flight log: it does not begin with a header"),
-    "cut in the header": (lambda lines: [lines[0][:70]], "is not a flight log: it ends within its header"),
+    "empty": (lambda lines: [], "it is empty"),
+    "text": (lambda lines: [b"nothing\n"], "does not begin with a header"),
+    "bytes": (lambda lines: [b"PK\x03\x04\n\x00"], "does not begin with a header"),
+    "a long line": (lambda lines: [b"x" * (3 << 20)], "line of more than 1 MiB"),
+    "no header": (lambda lines: lines[1:], "does not begin with a header"),
+    "cut in the header": (lambda lines: [lines[0][:70]], "ends within its header"),
     "cut before take-off": (lambda lines: [*lines[:2], lines[2][:9]], "holds no flight: no motor"),
-    "no config": (changed(config={}), "the config of its header is not settings by name: configuration does not fit"),
-    "odd config": (changed(config=3), "the config of its header is not settings by name"),
-    "odd gains": (changed(gains=["x"]), "the gains of its header is not parameters of both drones"),
-    "no time": (changed(t="now"), "the t of its header is not number"),
-    "never flew": (without("tick"), "holds no flight: no motor was ever told to turn"),
-    "no states": (without("state"), "holds no flight: it has no state of the leader"),
-    "a dry run": (changed(settings={"dry_run": True}), "holds no flight: it is of a dry run"),
+    "no config": (changed(config={}), "the config of its header"),
+    "odd config": (changed(config=3), "the config of its header"),
+    "odd gains": (changed(gains=["x"]), "the gains of its header"),
+    "no time": (changed(t="now"), "the t of its header"),
+    "never flew": (without("tick"), "no motor was ever told to turn"),
+    "no states": (without("state"), "no state of the leader"),
+    "a dry run": (changed(settings={"dry_run": True}), "a dry run"),
 }  # fmt: skip
 
 
@@ -241,10 +241,8 @@ def test_gaps_and_frozen_estimates_are_told(tmp_path: Path) -> None:
     assert (silent.drone, silent.frozen, frozen.drone, frozen.frozen) == ("leader", False, "follower", True)
     assert (silent.begin, silent.end) == pytest.approx((1.49, 2.0))  # between the states at either side
     assert (frozen.begin, frozen.end) == pytest.approx((2.2, 2.79))
-    assert log.remarks == (
-        f"{path.name}: there is no state of the leader for 0.51 s from 1.5 s on",
-        f"{path.name}: the follower's estimate is frozen for 0.59 s from 2.2 s on",
-    )
+    for remark, known in zip(log.remarks, ("no state of the leader for 0.51 s", "frozen for 0.59 s"), strict=True):
+        assert known in remark
     assert silent.end - silent.begin > SILENCE
     assert recording.outages("leader", np.arange(9) * 0.01, np.arange(9)[:, None], 1.0)[0].end == 1.0  # to the end
 

@@ -81,18 +81,18 @@ REFUSALS = [
     (["--mocap", "vrpn", *HERE, "--mocap-option", "port"], "is no KEY=VALUE"),
     (["--mocap", "optitrack", "--mocap-host", "no such host", "--bodies", "a", "b"], "has no address"),
     # The package itself, without any network: its mock shows the bodies that it is given, and they never move.
-    (MOCK, "(mock) does not answer with any body within 5 s"),
+    (MOCK, "(mock) does not answer"),
     (
         [*MOCK, "--mocap-option", "rigid_bodies=ball(0,0,0,1,0,0,0)"],
-        "no body named lead, or does not see it; it sends: ball",
+        "no body named lead, ",
     ),
     ([*MOCK, "--mocap-option", f"rigid_bodies={STILL.split(';')[0]}"], "no body named follow"),
     ([*MOCK, "--mocap-option", f"rigid_bodies={STILL}"], "its numbers stand still"),
     ([*MOCK, "--mocap-option", "rigid_bodies=lead(1,1,1,1,0,0,0);follow(1,1,1,1,0,0,0)"], "both bodies have one pose"),
     ([*MOCK, "--mocap-option", f"rigid_bodies={STILL}", "--mocap-option", "frequency=x"], "cannot be read"),
     # Its clients, where nobody answers: one waits for ever inside, one says so, one goes on without any body.
-    (["--mocap", "optitrack", *HERE], "(optitrack at 127.0.0.1) does not answer with any body within 5 s"),
-    (["--mocap", "vicon", *HERE], "(vicon at 127.0.0.1) does not answer with any body within 5 s"),
+    (["--mocap", "optitrack", *HERE], "(optitrack at 127.0.0.1) does not answer"),
+    (["--mocap", "vicon", *HERE], "(vicon at 127.0.0.1) does not answer"),
     (["--mocap", "qualisys", *HERE, "--mocap-option", "port=9"], "Error connecting QTM on address: 127.0.0.1:9"),
     (["--mocap", "nokov", *HERE], "cannot be read: Unknown motion capture type!"),
 ]
@@ -101,7 +101,7 @@ REFUSALS = [
 @pytest.mark.parametrize(
     ("flags", "reason"),
     [  # whoever waits for an answer belongs to the second tier
-        pytest.param(*row, id=f"{n} {row[1][:30]}", marks=pytest.mark.slow if row[1].endswith(" 5 s") else ())
+        pytest.param(*row, id=f"{n} {row[1][:30]}", marks=pytest.mark.slow if "does not answer" in row[1] else ())
         for n, row in enumerate(REFUSALS)
     ],
 )
@@ -119,8 +119,8 @@ def test_refusals(flags: list[str], reason: str, deaf: Any, tmp_path: Path, caps
 
 
 SERVED: list[tuple[str, Callable[[], Poses], dict[str, Any], str]] = [
-    ("mute", standing, {"mute": True}, "does not answer with any body within 5 s"),
-    ("unknown", lambda: {"ball": [0.0] * 3 + [*LEVEL]}, {}, "no body named lead, or does not see it; it sends: ball"),
+    ("mute", standing, {"mute": True}, "does not answer"),
+    ("unknown", lambda: {"ball": [0.0] * 3 + [*LEVEL]}, {}, "no body named lead, "),
     ("swapped", lambda: standing(swap=True), {}, "the two bodies are swapped"),
     ("one pose", lambda: standing(one=True), {}, "both bodies have one pose"),
     ("frozen", lambda: standing(noise=0.0), {}, "its numbers stand still"),

@@ -136,10 +136,8 @@ def test_what_is_damaged_in_a_log_is_left_out(log: Path, recording: Recording, t
     assert len(found.time) == len(recording.time) - 1
     said = [remark.partition(": ")[2].split(" for ")[0] for remark in found.remarks]
     assert said[0].endswith("is damaged: the goal of its tick is not 3 numbers")
-    assert said[1:] == [
-        "it has no end: the runner was killed, or the log was cut",
-        "there is no state of the leader",
-    ]
+    assert "no end" in said[1]
+    assert said[2:] == ["there is no state of the leader"]
     shared = np.isin(recording.time, found.time)
     held = (recording.time[shared] > 1.0) & (recording.time[shared] < 3.5)
     np.testing.assert_array_equal(found.position[~held], recording.position[shared][~held])

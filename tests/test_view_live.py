@@ -244,7 +244,7 @@ def test_a_page_follows_a_log(lines: list[bytes], browser: Any, tmp_path: Path) 
         assert tab.evaluate("player.now") == pytest.approx(newest(lines), abs=1.5 * STEP)
         assert {"Battery [V]", "Lateness of the loop [ms]"} <= set(tab.locator(".plot h2").all_inner_texts())
         assert not tab.is_visible("#now-cg")  # nobody measures it
-        assert process.stdout.readline() == "the flight has ended, exit code 0: time up; Ctrl-C ends the view\n"
+        assert "exit code 0: time up" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait(LIMIT) == 0
         assert process.stderr.read() == ""
