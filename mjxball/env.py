@@ -17,8 +17,9 @@ from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
 from mjxball.physics.motion import object_mass
 from mjxball.physics.step import TRAINING_ENGINES, ControlStep, jax_repeat, make_cg_offset, make_control_step
+from mjxball.plant import PlantParameters
 from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
-from mjxball.sim.disturbances import RandomDisturbances
+from mjxball.sim.disturbances import RandomDisturbances, followers_axis
 from mjxball.sim.follower import follower_law
 from mjxball.sim.randomization import ResetDistribution
 
@@ -54,9 +55,10 @@ class PipelineState(NamedTuple):
     goal: Float[Array, "3"]  # of O [m]
     disturbances: Any  # `sim.disturbances.RandomState`, () if nothing is disturbed
     history: Any  # (m,) what the follower remembers; () if none: XLA's partitioner cannot bear arrays of no elements
-    action: Float[Array, "3"]  # last network action in [-1, 1]
-    command: Float[Array, "... 3"]  # the follower's last, roll, pitch [rad], vertical acceleration [m/s2]
+    action: Float[Array, "... 3"]  # last network actions in [-1, 1]
+    command: Float[Array, "... 3"]  # the followers' last, roll, pitch [rad], vertical acceleration [m/s2]
     steps: Int[Array, ""]  # control steps since the reset
+    rig: Any = ()  # its own `plant.PlantParameters`; () if all worlds have the plant's
 
     @property
     def plant(self) -> PlantState:
@@ -65,7 +67,10 @@ class PipelineState(NamedTuple):
 
 
 class CoupledPairEnv:
-    """Two drones, one object with a moving CG: the follower acts, the leader flies its PID. Brax's `Env` interface.
+    """A team with one object whose CG moves: the followers act, the leader flies its PID. Brax's `Env` interface.
+
+    Of a pair observations are (n,), actions (3,) and the reward (). Of F > 1 followers they are (F, n), (F, 3) and
+    (F,), each in its mount frame; worlds of smaller teams are padded to the plant's drones (`scenario.team_sizes`).
 
     `reset` draws goal, start, CG motion and object mass anew. `step` takes the network's action in
     [-1, 1] (3,). An episode terminates at |e_o| > d_term or when the world diverges, and is truncated at
@@ -79,16 +84,18 @@ class CoupledPairEnv:
         self.config = config
         self._backend = physics
         self._disturbances = RandomDisturbances(config)
-        self._loop = ClosedLoop(config, make_physics(config, physics), self._disturbances.sensors)
+        self._resets = ResetDistribution(config)
+        self._followers = followers_axis(config)
+        self._loop = None if self._resets.rigs else self._make_loop()
         self._ball_limit = ball_limit(config.plant)
         self._law = follower_law(config)
-        self._resets = ResetDistribution(config)
         self._cg = make_cg_offset(config)
         self._commanded = np.array(layout.commanded(config.follower.load_axis_only, config.plant.cg_axis))
         self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # of roll and pitch the one that no load turns
+        self._in_plane = len(config.plant.directions) == 2
         self._privileged_size = 0
         if config.follower.privileged_critic:
-            self._privileged_size = jax.eval_shape(self._first_privileged, jax.random.key(0)).shape[0]
+            self._privileged_size = jax.eval_shape(self._first_privileged, jax.random.key(0)).shape[-1]
 
     @property
     def observation_size(self) -> int:
@@ -111,6 +118,11 @@ class CoupledPairEnv:
         return [*self._law.mask(self.config.follower.ignore_position), *[1.0] * self._privileged_size]
 
     @property
+    def team_sizes(self) -> tuple[int, ...] | None:
+        """Numbers of drones of worlds 0, 1, ..., again and again; None for a pair, which has no followers' axis."""
+        return (self.config.scenario.team_sizes or (self.config.plant.count,)) if self._followers else None
+
+    @property
     def action_size(self) -> int:
         """Roll, pitch, vertical acceleration."""
         return layout.ACTION_SIZE
@@ -130,13 +142,16 @@ class CoupledPairEnv:
         """Control period [s]."""
         return self.config.timing.control_period
 
-    def reset(self, rng: Array, difficulty: Float[Array, ""] | float = 1.0) -> State:
-        """A fresh world at rest or nearly so; `difficulty` as in `ResetDistribution.draw`."""
-        world, observation = self._fresh_world(rng, difficulty)
+    def reset(
+        self, rng: Array, difficulty: Float[Array, ""] | float = 1.0, number: Int[Array, ""] | None = None
+    ) -> State:
+        """A fresh world at rest or nearly so; `difficulty` and the world's `number` as in `ResetDistribution.draw`."""
+        world, observation = self._fresh_world(rng, difficulty, number)
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
-        return State(world, self._input(observation, world), zero, zero, metrics, {"truncation": zero})
+        reward = jnp.zeros(self._followers)
+        return State(world, self._input(observation, world), reward, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Float[Array, "... 3"], physics: ControlStep | None = None) -> State:
         """Apply the network's `action` in [-1, 1] for one control period, with `physics` in place of the engine."""
@@ -182,7 +197,8 @@ class CoupledPairEnv:
             load = load._replace(external_force=world.disturbances.force)
         disturbances, sample = self._disturbances.step(world.disturbances)
         before, goals = world.loop._replace(diverged=diverged), (world.goal, world.goal)
-        loop, after, commands = self._loop.step(before, observation, command, load, goals, sample, shares, physics)
+        own = self._loop_of(world.rig)
+        loop, after, commands = own.step(before, observation, command, load, goals, sample, shares, physics)
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
@@ -215,59 +231,88 @@ class CoupledPairEnv:
             info={**state.info, "truncation": truncated.astype(jnp.float32)},
         )
 
+    def _make_loop(self, rig: PlantParameters | None = None) -> ClosedLoop:
+        physics = make_physics(self.config, self._backend, rig)
+        return ClosedLoop(self.config, physics, self._disturbances.sensors, rig)
+
+    def _loop_of(self, rig: Any) -> ClosedLoop:
+        """The closed loop of a world with that `rig`."""
+        return self._loop or self._make_loop(rig)
+
     def _fresh_world(
-        self, rng: Array, difficulty: Float[Array, ""] | float
-    ) -> tuple[PipelineState, Float[Array, "18"]]:
+        self, rng: Array, difficulty: Float[Array, ""] | float, number: Int[Array, ""] | None = None
+    ) -> tuple[PipelineState, Float[Array, "... 18"]]:
         """(world, observation at its start)."""
-        load, plant, goal = self._resets.draw(rng, difficulty)
+        load, plant, goal, rig = self._resets.draw(rng, difficulty, number)
+        numbers = () if rig is None else rig.numbers
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         delay = disturbances.delay if self._disturbances.present else 0
         begins = self._resets.has_battery and self.config.follower.residual_on_pid
         integral = self._resets.initial_integrals(load, jax.random.fold_in(rng, 5)) if begins else None
-        loop, observation = self._loop.start(plant, goal, sample, delay, integral)
+        loop, observation = self._loop_of(numbers).start(plant, goal, sample, delay, integral)
         world = PipelineState(
             loop=loop,
             load=load,
             goal=goal,
             disturbances=disturbances,
             history=self._law.start(observation) if self._law.size else (),
-            action=jnp.zeros(3),
-            command=jnp.zeros(3),
+            action=jnp.zeros((*self._followers, 3)),
+            command=jnp.zeros((*self._followers, 3)),
             steps=jnp.zeros((), jnp.int32),
+            rig=numbers,
         )
         return world, observation
 
-    def _input(self, observation: Float[Array, "18"], world: PipelineState) -> Float[Array, " input"]:
+    def _input(self, observation: Float[Array, "... 18"], world: PipelineState) -> Float[Array, "... input"]:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
         shown = self._law.network_input(observation, world.history) if self._law.size else observation
-        return jnp.concatenate([shown, self._privileged(world)]) if self.config.follower.privileged_critic else shown
+        if not self.config.follower.privileged_critic:
+            return shown
+        return jnp.concatenate([shown, self._privileged(world)], axis=-1)
 
-    def _first_privileged(self, rng: Array) -> Float[Array, " privileged"]:
+    def _first_privileged(self, rng: Array) -> Float[Array, "... privileged"]:
         return self._privileged(self._fresh_world(rng, 1.0)[0])
 
-    def _privileged(self, world: PipelineState) -> Float[Array, " privileged"]:
+    def _privileged(self, world: PipelineState) -> Float[Array, "... privileged"]:
         """CG offset, first moment, object mass, error of the believed one; of disturbed worlds the truth as well."""
-        offset, mass = self._cg(world.plant, world.load), object_mass(world.plant.time, world.load)
-        parts: list[Any] = [jnp.stack([offset, mass * offset, mass, mass - world.load.believed_mass])]
+        loop, load = self._loop_of(world.rig), world.load
+        offset, mass = self._cg(world.plant, load), object_mass(world.plant.time, load)
+        if self._in_plane:
+            offset = loop.seen_by_followers(offset)
+        place = jnp.atleast_1d(offset)
+        masses = jnp.stack([mass, mass - load.believed_mass])
+        parts: list[Any] = [place, mass * place, masses]
         if self._disturbances.present:
-            truth, disturbed = self._loop.observe(world.plant, world.goal), world.disturbances
+            truth, disturbed = loop.observe(world.plant, world.goal), world.disturbances
             levels = jnp.stack([disturbed.noise, disturbed.delay.astype(jnp.float32)])
-            parts += [truth[3:], disturbed.force, levels]
+            force = loop.seen_by_followers(disturbed.force) if self._followers else disturbed.force
+            parts += [truth[..., 3:], force, levels]
         if self._resets.varies:
-            lag: Array = world.load.rotor_lag_scale
-            parts += [lag[None], world.load.thrust_scale, world.load.added_inertia]
+            lag: Array = load.rotor_lag_scale
+            thrust: Array = load.thrust_scale
+            parts += [lag[None], self._own_and_leaders(thrust), load.added_inertia]
         if world.plant.loops is not None:
             integrals = crazyflie.unpack(world.plant.loops).rate_integral
             parts += [(integrals / jnp.asarray(crazyflie.RATE_LIMITS)).ravel()]
         if self.config.motion.kind == "rolling":
-            parts += [world.plant.ball_rate[None]]
+            rate = world.plant.ball_rate
+            parts += [loop.seen_by_followers(rate) if self._in_plane else rate[None]]
         if self.config.follower.residual_on_pid:
             parts += [world.loop.integral]
-        if world.load.battery is not None:
-            battery: Array = world.load.battery
-            uncompensated: Array = world.load.uncompensated
+        if load.battery is not None:
+            battery: Array = load.battery
+            uncompensated: Array = load.uncompensated
             parts += [jnp.stack([battery, uncompensated])]
-        return jnp.concatenate(parts)
+        if self.config.scenario.team_sizes:
+            parts += [(world.rig.drone_mass > 0).sum()[None] / self.config.plant.count]
+        return jnp.concatenate([jnp.broadcast_to(part, (*self._followers, part.shape[-1])) for part in parts], axis=-1)
+
+    def _own_and_leaders(self, each: Float[Array, " drones"]) -> Float[Array, "... 2"]:
+        """Of a number of every drone the leader's and the follower's own."""
+        if not self._followers:
+            return each
+        own = each[np.array(self.config.plant.followers)]
+        return jnp.stack([jnp.broadcast_to(each[self.config.plant.leader], own.shape), own], axis=-1)
 
     def _transition(
         self, before: PipelineState, after: PipelineState, commands: Commands, terminated: Bool[Array, ""]
@@ -306,9 +351,12 @@ class CoupledPairEnv:
         return found
 
 
-def make_physics(config: Config, physics: str) -> ControlStep:
-    """The control step of the engine `physics`, mjx or newton-euler, for one world; use `jax.vmap` for many."""
+def make_physics(config: Config, physics: str, rig: PlantParameters | None = None) -> ControlStep:
+    """The control step of the engine `physics`, mjx or newton-euler, for one world; use `jax.vmap` for many.
+
+    `rig`: the world's own numbers, if they are not those of `config.plant`.
+    """
     make = newton_euler.make_engine
     if physics == "mjx":
         from mjxball.physics.mjx import make_engine as make  # takes a second to import
-    return make_control_step(config, make(config.plant, config.attitude), jax_repeat)
+    return make_control_step(config, make(config.plant, config.attitude, rig), jax_repeat, rig)

@@ -18,7 +18,7 @@ from mjxball.policy.file import shipped_policies
 FAST = ["--physics", "newton-euler"]
 # The fixed keys, with the types that JSON gives back.
 SCENARIO_KEYS = {"omega": float, "amplitude": float, "mass": float, "believed_mass": float}
-NUMBERS = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
+NUMBERS = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "plane_peak", "max_tilt", "action_error")
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 
 

@@ -106,7 +106,7 @@ REFUSED = {
     "nothing": ("", "must be one TOML object"),
     "no setting of a plant": ("[sac]\nalpha = 1", "may set"),
     "unknown base": ('base = "team5"', "base must be one of"),
-    "unknown preset": ('preset = "team"\n' + RING, "is none of"),
+    "unknown preset": ('preset = "nobody"\n' + RING, "is none of"),
     "unknown key": (RING.replace("carrier_mass", "carrier_weight"), "plant.carrier_weight is not a setting"),
     "unknown key of a drone": (RING + "weight = 1.0", "unknown weight"),
     "drones in one place": (RING.replace("[-0.1, -0.17, 0.0]", "[-0.1, 0.17, 0.0]"), "the same place"),
@@ -150,11 +150,15 @@ def test_mistakes_are_refused_in_one_sentence(mistake: str, tmp_path: Path, caps
 
 @rows("name", ["team4", "plate4"])
 def test_what_flies_two_drones_refuses_more(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    for main, more in ((train.main, []), (evaluate.main, []), (view.main, ["copy"])):
+    for main, more, said in (
+        (evaluate.main, ["--followers", "copy", "adaptive"], "4 drones and a load that moves in the plane"),
+        (view.main, ["copy"], "4 drones and a load that moves in the plane"),
+        (train.main, [], "make it a multiple of 3"),
+    ):
         out = tmp_path / ("out.html" if main is view.main else "out")
         assert main([*more, "--plant", name, "--out", str(out)]) == 2
         error = capsys.readouterr().err
-        assert "4 drones and a load that moves in the plane" in error
+        assert said in error
         assert error.count("\n") == 1
         assert not out.exists()
 

@@ -22,6 +22,7 @@ GOOD = Metrics(
     x_peak=0.01,
     y_peak=0.0,
     z_peak=0.0,
+    plane_peak=0.0,
     max_tilt=0.1,
     action_error=0.1,
     settling_time_10=2.0,

@@ -28,7 +28,6 @@ SCENARIO_FLAGS = (
 def setup_of(options: argparse.Namespace) -> config.Config:
     """The paper's plant and laws, or those of `--plant`, with the motion of the CG that is asked for."""
     setup = cli.plant_setup(options.plant)
-    _ = setup.plant.pair  # InputError for teams
     if options.wn_pitch is not None:
         roll, _, yaw = setup.attitude.natural_frequency
         setup = config.replace(setup, "attitude.natural_frequency", (roll, options.wn_pitch, yaw))
@@ -58,7 +57,11 @@ def scenarios_of(options: argparse.Namespace, setup: config.Config) -> Sequence[
         return standard_scenarios(setup)
     if not (given or options.policies or options.followers):
         return STANDARD
-    return _asked(options, setup, REFERENCE, ball_start=options.rolling or 0.0)
+    if len(setup.plant.directions) == 1:
+        return _asked(options, setup, REFERENCE, ball_start=options.rolling or 0.0)
+    reference = standard_scenarios(setup)[-1]
+    ball = reference.ball_start if options.rolling is None else options.rolling
+    return _asked(options, setup, reference, ball_start=ball, path=reference.path)
 
 
 def native_scenarios(options: argparse.Namespace, setup: config.Config) -> Sequence[Scenario]:

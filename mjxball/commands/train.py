@@ -161,7 +161,6 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
     out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
-    _ = settings.plant.pair  # InputError for teams
     standard_scenarios(settings)
     members = 1 if options.num_seeds is None else options.num_seeds
     if not 1 <= members <= MOST_MEMBERS:

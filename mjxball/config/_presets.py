@@ -6,7 +6,9 @@ import types
 from dataclasses import replace
 
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
+from mjxball.config._plant_file import read_plant
 from mjxball.config._settings import Bounds, Config, Follower, Gradient, Reward, Sac, ScenarioRanges
+from mjxball.config._tree import apply_overrides
 from mjxball.errors import InputError
 
 
@@ -137,10 +139,61 @@ def _balance() -> Config:
     )
 
 
+# Where loads are noisy and late, a gradient that is not damped grows without bounds.
+TEAM_GRADIENT = Gradient(
+    gradient_steps=600, num_envs=66, horizon=150, learning_rate=5e-3, max_grad_norm=5.0, gradient_decay=0.97
+)
+
+
+def _team() -> Config:
+    """Two to six drones on a ring, one policy for all followers of all teams; the load moves in the plane."""
+    large = _transport_large()
+    return replace(
+        apply_overrides(large, read_plant("team6").settings),
+        preset="team",
+        scenario=replace(
+            large.scenario,
+            team_sizes=(2, 3, 4, 6),
+            cg_amplitude=(0.0, 0.3),
+            cg_width=(0.0, 1.0),
+            cg_lissajous_probability=0.3,
+            cg_waypoint_probability=0.2,
+            object_mass=(0.3, 0.9),
+        ),
+        bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.36),
+        sac=replace(large.sac, num_envs=528, replay_size=528_000),
+        gradient=TEAM_GRADIENT,
+    )
+
+
+def _plate() -> Config:
+    """Four drones at the corners of a plate, on which a free ball rolls that nobody measures."""
+    large = _transport_large()
+    return replace(
+        apply_overrides(large, read_plant("plate4").settings),
+        preset="plate",
+        follower=replace(large.follower, observation_averages=(0.05, 0.2, 1.0)),
+        scenario=replace(
+            large.scenario,
+            cg_amplitude=(0.0, 0.0),
+            object_mass=(0.2, 0.2),
+            ball_start=0.1,
+            ball_speed=0.15,
+        ),
+        reward=replace(large.reward, ball=5.0),
+        bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.5),
+        sac=replace(large.sac, num_envs=510, replay_size=510_000),
+        gradient=TEAM_GRADIENT,
+    )
+
+
 PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
     {
         made.preset: made
-        for made in (_transport(), _paper(), _transport_large(), _robust(), _balance(), stand(), flight())
+        for made in (
+            *(_transport(), _paper(), _transport_large(), _robust(), _balance()),
+            *(_team(), _plate(), stand(), flight()),
+        )
     }
 )
 

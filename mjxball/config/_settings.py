@@ -158,6 +158,7 @@ class ScenarioRanges:
     )
     mass_change: Range = drawn((0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]")
     ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0)
+    ball_speed: float = setting(0.0, "rolling: it starts with up to this speed [m/s]", low=0)
     noise: Range = drawn((0.0, 0.0), "measurement noise, in standard deviations of motion capture and IMU", low=0)
     delay: Range = drawn((0.0, 0.0), "delay of the follower's measurements [s]", low=0, high=0.5)
     estimator_drift: Range = drawn(
@@ -176,8 +177,35 @@ class ScenarioRanges:
     thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0)
     thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", above=0)
     inertia_scale: Range = drawn((1.0, 1.0), "one factor on the inertia of drones and object", above=0)
+    cg_width: Range = drawn(
+        (0.0, 0.0), "in the plane: amplitude of the CG's second sine, across the first one, over that one's", low=0
+    )
+    cg_lissajous_probability: float = setting(
+        0.0,
+        "in the plane: probability that the second sine is twice as fast, else the path is an ellipse",
+        low=0,
+        high=1,
+    )
     cg_waypoint_probability: float = setting(
         0.0, "probability that the CG moves between random waypoints instead of in a sine", low=0, high=1
+    )
+    team_sizes: tuple[int, ...] = setting(
+        (),
+        "numbers of drones, one after the other from world to world: rings of the plant's drones, neighbours as far "
+        "apart, carrier and load in proportion; empty: the plant",
+        low=2,
+        high=16,
+    )
+    drone_mass_scale: Range = drawn((1.0, 1.0), "factor on the drones' masses, which their hover thrust knows", above=0)
+    drone_inertia_scale: Range = drawn((1.0, 1.0), "factor on all drones' own inertia", above=0)
+    mount_scale: Range = drawn((1.0, 1.0), "factor on all mounts' distances from O", above=0)
+    arm_scale: Range = drawn((1.0, 1.0), "factor on all rotors' arms", above=0)
+    yaw_per_thrust_scale: Range = drawn((1.0, 1.0), "factor on all rotors' yaw moment over force", above=0)
+    rotor_force_scale: Range = drawn((1.0, 1.0), "factor on all rotors' largest force", above=0)
+    carrier_scale: Range = drawn((1.0, 1.0), "factor on the carrier's mass and inertia, which is known", above=0)
+    attitude_gain_scale: Range = drawn((1.0, 1.0), "factor on all attitude gains", above=0)
+    lost_follower_probability: float = setting(
+        0.0, "probability that one follower's rotors stop, 3 to 15 s after the start", low=0, high=1
     )
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
     unknown_share: float = setting(

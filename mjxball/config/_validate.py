@@ -68,6 +68,7 @@ def validate(config: Config) -> Config:
             owner = owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
         _check_leaf(path, value, item, _types_of(owner)[item.name])
     _validate_plant(config.plant)
+    _validate_team(config)
     _validate_autopilot(config)
     _validate_motion(config)
     start, goal = config.scenario.start_position, config.scenario.goal_range
@@ -132,6 +133,34 @@ def _validate_plant(plant: Plant) -> None:
     end = length / 2 - plant.ball_radius
     if plant.ball_stop > end + 1e-12:
         raise InputError(f"plant.ball_stop {plant.ball_stop:g} m lies off the object, where a ball reaches {end:.4g} m")
+
+
+def _validate_team(config: Config) -> None:
+    """What is for teams, and what is for pairs alone."""
+    plant, scenario = config.plant, config.scenario
+    if config.follower.residual_on_pid and plant.count > 2:
+        raise InputError("follower.residual_on_pid is for a pair, whose two drones lift each other's integral away")
+    if len(plant.directions) == 1 and (scenario.cg_width[1] > 0 or scenario.cg_lissajous_probability > 0):
+        raise InputError(
+            "scenario.cg_width and cg_lissajous_probability are for a load that moves in the plane, plant.cg_axis xy"
+        )
+    if scenario.battery[1] > 0 and plant.count > 2:
+        raise InputError("scenario.battery is for a pair of Crazyflies")
+    if scenario.lost_follower_probability > 0 and plant.count < 3:
+        raise InputError("scenario.lost_follower_probability needs a plant of three drones or more")
+    if config.follower.load_axis_only and len(plant.directions) == 2:
+        raise InputError("follower.load_axis_only is for a load that moves along a line, not in the plane")
+    if not scenario.team_sizes:
+        return
+    if max(scenario.team_sizes) > plant.count:
+        raise InputError(
+            f"scenario.team_sizes go up to {max(scenario.team_sizes)} drones, and the plant has {plant.count}"
+        )
+    if plant.count < 3 or len(plant.directions) == 1 or plant.leader or config.autopilot.kind != "ideal":
+        raise InputError(
+            "scenario.team_sizes need a plant of three ideal drones or more, the first of which leads, and a load that "
+            "moves in the plane"
+        )
 
 
 THRUST_MARGIN = 0.2  # share of a Crazyflie's thrust that a hover must leave

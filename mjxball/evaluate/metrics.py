@@ -32,6 +32,7 @@ class Metrics:
     x_peak: float | None  # largest |e_x| at t >= 20 s [m]
     y_peak: float | None  # [m]
     z_peak: float | None  # [m]
+    plane_peak: float | None  # largest hypot(e_x, e_y) at t >= 20 s [m]
     max_tilt: float | None  # largest hypot(roll, pitch) [rad]
     action_error: float | None  # rms over time, followers and (roll, pitch, az) of follower minus leader command
     settling_time_10: float | None  # as settling_time, for 10 % [s]
@@ -66,7 +67,7 @@ class RunningMetrics(NamedTuple):
     steady_from: Array  # [s]
     steady: Array  # steps in steady state
     outside: Array  # (n, 2) last time |e_o| was beyond 2 % and 10 %, -inf: never [s]
-    peaks: Array  # (n, 3) NaN before the first
+    peaks: Array  # (n, 4) x, y, z and the plane, NaN before the first
     furthest: Array  # (n, 3) along each axis towards the goal [m]
     tilt: Array
     hover: Array  # (n, F, 4) the followers' rotor forces at the start [N]
@@ -79,6 +80,7 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
     xp = position.__array_namespace__()
     hover = _of_followers(rotor_force, leader)
     zero, none = xp.zeros_like(position[:, 0]), xp.full_like(position, xp.nan)
+    no_peaks = xp.concat([none, none[:, :1]], axis=-1)
     scalar = xp.sum(zero[:0])
     return RunningMetrics(
         *(scalar, scalar, scalar, zero, zero, zero, zero, zero, zero, zero > 1),
@@ -87,7 +89,7 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
         steady_from=zero + STEADY_AFTER,
         steady=zero,
         outside=xp.full_like(position[:, :2], -xp.inf),
-        peaks=none,
+        peaks=no_peaks,
         furthest=none,
         tilt=zero,
         hover=hover,
@@ -112,6 +114,7 @@ def update(
     beyond = xp.stack([~(distance <= share * initial) for share in SETTLED], axis=-1)
     peaks = xp.where(new[:, None], xp.nan, running.peaks)
     steady = tick.time >= steady_from - TINY
+    errors = xp.concat([xp.abs(error), xp.hypot(error[:, :1], error[:, 1:2])], axis=-1)
     rotors = _of_followers(tick.rotor_force, leader)
     led, followed = tick.leader_command[:, None], xp.reshape(tick.follower_command, (*rotors.shape[:2], 3))
     tilts, difference = followed[..., :2], followed - led
@@ -136,7 +139,7 @@ def update(
         steady_from=steady_from,
         steady=xp.where(new, 0.0, running.steady) + xp.where(steady, 1.0, 0.0),
         outside=xp.where(beyond, tick.time, outside),
-        peaks=xp.where(steady[:, None], xp.fmax(peaks, xp.abs(error)), peaks),
+        peaks=xp.where(steady[:, None], xp.fmax(peaks, errors), peaks),
         furthest=xp.fmax(running.furthest, tick.position * xp.sign(tick.target)),
         tilt=xp.fmax(running.tilt, xp.hypot(tick.euler[:, 0], tick.euler[:, 1])),
         hover=running.hover,
@@ -161,6 +164,7 @@ def results(running: RunningMetrics) -> list[Metrics]:
             "x_peak": peaks[:, 0],
             "y_peak": peaks[:, 1],
             "z_peak": peaks[:, 2],
+            "plane_peak": peaks[:, 3],
             "max_tilt": t.tilt,
             "action_error": np.sqrt(t.difference / t.steps),
             "settling_time_10": settled[:, 1],

@@ -20,6 +20,9 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     if abs(policy.control_period - period) > 1e-9:
         raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
     made_for = configs.from_record({"plant": policy.card["plant"]}).plant
+    if sizes := team_sizes(policy):
+        _refuse_other_teams(path, sizes, config)
+        return policy
     if made_for.count != config.plant.count:
         raise InputError(f"{path} was made for a plant of {made_for.count} drones, not {config.plant.count}")
     pairs = zip(configs.leaves(made_for), configs.leaves(config.plant), strict=True)
@@ -29,6 +32,23 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     if compare_laws:
         _refuse_other_laws(path, policy.card, config)
     return policy
+
+
+def team_sizes(policy: Policy) -> tuple[int, ...]:
+    """Numbers of drones of the teams that `policy` was trained in; () if it was made for one plant."""
+    trained = with_current_names(policy.card.get("config"))
+    scenario = trained.get("scenario") if isinstance(trained, dict) else None
+    sizes = scenario.get("team_sizes") if isinstance(scenario, dict) else None
+    return tuple(sizes) if isinstance(sizes, list) and all(isinstance(size, int) for size in sizes) else ()
+
+
+def _refuse_other_teams(path: Path, sizes: tuple[int, ...], config: Config) -> None:
+    """Refuse a plant that is none of the teams that a policy for several sizes was made for."""
+    plant, low, high = config.plant, min(sizes), max(sizes)
+    if not low <= plant.count <= high:
+        raise InputError(f"{path} was made for teams of {low} to {high} drones, not {plant.count}")
+    if len(plant.directions) == 1 or config.autopilot.kind != "ideal":
+        raise InputError(f"{path} was made for ideal drones that carry a load which moves in the plane")
 
 
 def _refuse_other_laws(path: Path, card: dict[str, Any], config: Config) -> None:

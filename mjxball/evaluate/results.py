@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics, measure_batch
@@ -18,7 +20,7 @@ from mjxball.sim.scenario import Scenario
 RESULTS = "cells.json"  # in the output directory
 # The metrics in `--json`, a fixed format; a benchmark's scores have all of them.
 JSON_METRICS = (
-    *("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak"),
+    *("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "plane_peak"),
     *("max_tilt", "action_error", "failed"),
 )
 
@@ -75,6 +77,7 @@ COLUMNS = (
     ("x_peak", "x-peak m", 1.0, 4),
     ("y_peak", "y-peak m", 1.0, 4),
     ("z_peak", "z-peak m", 1.0, 4),
+    ("plane_peak", "plane m", 1.0, 4),
     ("max_tilt", "tilt deg", 180 / math.pi, 1),
     ("action_error", "act.err", 1.0, 3),
 )
@@ -82,13 +85,16 @@ COLUMNS = (
 
 def table(results: Sequence[Result]) -> str:
     """One line per result; a dash where a metric does not exist."""
-    head = ["omega", "ampl.", "mass", "believed", "follower", *(title for _, title, _, _ in COLUMNS), ""]
+    # Where the load moves along a line, the error in the plane is hardly more than along it.
+    in_plane = any(np.ndim(result.flight.cg_offset) > 1 for result in results)
+    columns = [column for column in COLUMNS if in_plane or column[0] != "plane_peak"]
+    head = ["omega", "ampl.", "mass", "believed", "follower", *(title for _, title, _, _ in columns), ""]
     rows = [head]
     for result in results:
         record = result.record()
         numbers = (record[key] for key in ("omega", "amplitude", "mass", "believed_mass"))
         row = [*("-" if number is None else f"{number:g}" for number in numbers), result.follower]
-        for name, _, factor, digits in COLUMNS:
+        for name, _, factor, digits in columns:
             value = record[name]
             row.append("-" if value is None else f"{value * factor:.{digits}f}")
         rows.append([*row, "FAILED" if result.metrics.failed else ""])

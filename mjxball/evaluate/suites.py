@@ -16,7 +16,7 @@ from mjxball import config as configs
 from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.scenario import Scenario, check_scenario
+from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario
 
 REFERENCE = Scenario()
 # Copy without CG motion, then five speeds of the CG.
@@ -39,12 +39,15 @@ def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
     """The standard scenarios as far as the plant allows them, the reference one last; raise InputError if unsound.
 
     The object has the plant's mass, the CG keeps to the object and to what training draws, a stand's locked axes have
-    goal 0, and the goal is drawn in to what training may draw. A waveform or a rolling ball makes one scenario.
+    goal 0, and the goal is drawn in to what training may draw. A waveform or a rolling ball makes one scenario. In the
+    plane the CG goes round in a circle.
     """
     plant = settings.plant
     distance = min(REFERENCE.goal[0], settings.scenario.goal_range)
     free = {"free": (1, 1, 1), "pivot": (0, 0, 0), "heave": (0, 0, 1)}[plant.stand]
     common: dict[str, Any] = {"mass": plant.object_mass, "goal": tuple(distance * float(axis) for axis in free)}
+    if len(plant.directions) == 2:
+        common["path"] = CIRCLE
     reference = dataclasses.replace(
         REFERENCE,
         amplitude=min(REFERENCE.amplitude, cg_limit(plant), settings.scenario.cg_amplitude[1]),

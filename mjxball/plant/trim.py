@@ -22,7 +22,11 @@ import numpy as np
 
 from mjxball.config import Plant
 from mjxball.errors import InputError
+from mjxball.plant.parameters import PlantParameters
 from mjxball.plant.rotors import PLACES, SPIN, lever
+
+Array = Any
+TINY, LEAST_SCATTER = 1e-9, 1e-3  # [N], [m2] below which drones sit in one place
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -128,6 +132,68 @@ def largest_amplitude(
             return -math.inf
         ends.append(side * float(found[-1]))
     return min(ends)
+
+
+def safe_radius(
+    parameters: PlantParameters,
+    leader: int,
+    object_mass: Array,
+    margin: float,
+    believed_mass: Array | None = None,
+    thrust: Array | None = None,
+    flies: Array | None = None,
+) -> Array:
+    """Distance of the CG from O (...) [m] up to which followers trim the load in every direction; negative: not at O.
+
+    Arrays of any batch shape and namespace, for training: a closed form that is on the safe side of `largest_margin`
+    (ours). Every drone lifts its own share, with which most teams are level at c = 0. The load's moment is held by
+    equal torques of the F followers, at most 1 / (2 L F) of it on any rotor; or, along a principal axis of their
+    mounts' scatter C about their mean, by thrusts in proportion to the distances d from it, at most |d| / (4 C) on any
+    rotor. What a weak or lost drone does not lift is lifted by all others alike, and its moment about their mean held
+    like the load's. `thrust` (..., N) is what drones give of what they are asked for; drones that do not fly
+    (`flies` (..., N) is 0) give nothing: a lost one has to be lifted, one of no mass is none. The other arguments are
+    those of `largest_margin`.
+    """
+    xp = object_mass.__array_namespace__()
+    count = parameters.size
+    one = xp.ones_like(object_mass)[..., None] * xp.ones(count, dtype=object_mass.dtype)
+    factor = one if thrust is None else thrust * one
+    alive = (one if flies is None else flies * one) * (parameters.rotor_force_max > 0)
+    acts = alive * (xp.arange(count) != leader)
+    followers = xp.maximum(acts.sum(axis=-1), 1.0)
+    gravity = parameters.gravity
+    mass = object_mass[..., None]
+    believed = mass if believed_mass is None else believed_mass[..., None]
+    fair = gravity * (parameters.known_mass + parameters.share * mass)  # [N]
+    # What the leader and what does not fly lift too little, or the leader too much.
+    given = gravity * (parameters.known_mass + parameters.share * believed) * factor * alive
+    lacking = xp.where(acts > 0, 0.0, fair - given)
+    own = fair + (lacking.sum(axis=-1) / followers)[..., None]
+    places = parameters.mounts[..., :2] * one[..., None]
+    middle = (acts[..., None] * places).sum(axis=-2) / followers[..., None]
+    moment = (lacking[..., None] * (places - middle[..., None, :])).sum(axis=-2)
+    moment = moment - ((fair - gravity * parameters.drone_mass)[..., None] * places).sum(axis=-2)
+
+    most = factor * parameters.rotor_force_max
+    level = (acts * own).sum(axis=-1) / (4 * xp.maximum((acts * most).sum(axis=-1), TINY))
+    least = margin * level[..., None] * most
+    upper = most * (1 - margin * (1 - level[..., None]))
+    room = xp.where(acts > 0, xp.minimum(own / 4 - least, upper - own / 4), xp.inf).min(axis=-1)
+
+    off = acts[..., None] * (places - middle[..., None, :])
+    x, y = off[..., 0], off[..., 1]
+    xx, yy, xy = ((a * b).sum(axis=-1) for a, b in ((x, x), (y, y), (x, y)))
+    angle = 0.5 * xp.atan2(2 * xy, xx - yy)
+    c, s = xp.cos(angle)[..., None], xp.sin(angle)[..., None]
+    arms = xp.where(acts > 0, parameters.arm * one, xp.inf).min(axis=-1)
+    turning = 1 / (2 * arms * followers)
+    along = []
+    for distance in (c * x + s * y, c * y - s * x):
+        scatter = (distance * distance).sum(axis=-1)
+        lifting = xp.abs(distance).max(axis=-1) / (4 * xp.maximum(scatter, TINY))
+        along.append(xp.where(scatter > LEAST_SCATTER, xp.minimum(lifting, turning), turning))
+    effort = xp.minimum(turning, xp.hypot(*along))
+    return (room / effort - xp.hypot(moment[..., 0], moment[..., 1])) / (gravity * object_mass)
 
 
 def _in_plane(plant: Plant, cg: float | Sequence[float]) -> np.ndarray:

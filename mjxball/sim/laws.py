@@ -125,6 +125,16 @@ class Laws:
         """The followers' commands (..., 3), or (..., F, 3), from their mount frames."""
         return command if self._mount_angles is None else rotations.turned_about_z(command, self._mount_angles)
 
+    def seen_by_followers(self, vector: Array) -> Array:
+        """A vector (..., 2) or (..., 3) in body axes in all mount frames, (..., F, 2 or 3) of several followers."""
+        xp, size = vector.__array_namespace__(), vector.shape[-1]
+        whole = vector if size == 3 else xp.concat([vector, xp.zeros_like(vector[..., :1])], axis=-1)
+        if self._several:
+            shape = (*whole.shape[:-1], self._follower_mounts.shape[-2], 3)
+            whole = xp.broadcast_to(whole[..., None, :], shape)
+        turned = whole if self._mount_angles is None else rotations.turned_about_z(whole, -self._mount_angles)
+        return turned[..., :size]
+
     def stack(self, leader_command: Vector, follower_command: Array) -> Float[Array, "... drones 3"]:
         """Commands in body axes of the leader (..., 3) and the followers as the physics takes them."""
         xp, place = leader_command.__array_namespace__(), self._leader

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from mjxball.config import Config
+from mjxball.config import Config, cg_limit
 from mjxball.control import crazyflie, motors
 from mjxball.control.constants import trim_limit
-from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.engine import Load, PathShape, PlantState
 from mjxball.physics.step import start_state
-from mjxball.plant import plant_parameters
+from mjxball.plant import PlantParameters, plant_parameters, teams
+from mjxball.plant.trim import safe_radius
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
 
     from mjxball.physics.engine import Array, Scalar, Vector
 
@@ -28,13 +30,23 @@ LIFT, PULL = 0.06, 0.05  # shares of its weight that every drone must lift more,
 DRAWN_BACK = 8  # times at most that a world's thrust is drawn back by three tenths
 CEILING = float(crazyflie.THRUST_CEILING)
 MASS_CHANGE_TIME = (5.0, 15.0)  # [s]
+LOSS_TIME = (3.0, 15.0)  # [s]
 PLACES = 16  # random waypoints of a CG before it begins again
+
+
+class Rig(NamedTuple):
+    """What a world's own rig is."""
+
+    numbers: PlantParameters  # padded to the plant's drones
+    flies: Float[Array, " drones"]  # 1 for a drone that there is, 0 for one that pads
+    proportion: Scalar  # its radius over the plant's, by which CG amplitudes are multiplied
+    share: Scalar  # its number of drones over the plant's, by which the object's mass is multiplied
 
 
 class ResetDistribution:
     """Worlds of `config.scenario`, whose CG swings no further than can be trimmed.
 
-    `varies`: whether they have rotors or inertia of their own.
+    `varies`: whether they have rotors or inertia of their own; `rigs`: whether each has a whole rig of its own.
     """
 
     def __init__(self, config: Config):
@@ -48,19 +60,29 @@ class ResetDistribution:
         )
         self.varies = any(scale != (1.0, 1.0) for scale in scales)
         self.has_battery = scenario.battery[1] > 0
+        plant, self._ranges = config.plant, [getattr(scenario, name) for name in teams.Factors._fields]
+        self.rigs = bool(scenario.team_sizes) or any(ends != (1.0, 1.0) for ends in self._ranges)
+        self._in_plane, self._several = len(plant.directions) == 2, plant.count > 2
+        sizes = scenario.team_sizes or (plant.count,)
+        self._sizes = np.array(sizes)
+        self._table = teams.table(config) if scenario.team_sizes else None
         self._constants = constants = plant_parameters(config.plant, config.attitude)
         self._motor = motors.MOTORS[config.autopilot.drone or "2.1"]
-        self._lever = 2 * min(map(abs, constants.mounts[:, config.plant.directions[0]]))
+        self._lever = 2 * min(map(abs, constants.mounts[:, plant.directions[0]]))
         self._levels = config.follower.residual_on_pid and config.leader.tilt_integral_gain > 0
         self._drones = constants.own_inertia.sum(axis=0)
         self._object = constants.object_inertia_per_mass
 
-    def draw(self, rng: Array, difficulty: Scalar | float = 1.0) -> tuple[Load, PlantState, Vector]:
-        """(load, plant at rest or nearly so, goal (3,) of O [m]).
+    def draw(
+        self, rng: Array, difficulty: Scalar | float = 1.0, number: Int[Array, ""] | None = None
+    ) -> tuple[Load, PlantState, Vector, Rig | None]:
+        """(load, plant at rest or nearly so, goal (3,) of O [m], the world's own rig if it has one).
 
         `difficulty` () in [0, 1]: the lower share of the ranges of the CG's amplitude and speed, which is drawn from.
+        `number` of the world, of which its team's size follows; None: any of `scenario.team_sizes`.
         """
         scenario = self.config.scenario
+        rig = self._rig(jax.random.fold_in(rng, 6), number) if self.rigs else None
         # One draw for everything: a reset runs beside every training step, and each draw is kernels to launch.
         drawn = iter(jnp.split(jax.random.uniform(rng, (DRAWS,)), DRAWS))
 
@@ -72,12 +94,15 @@ class ResetDistribution:
 
         mass = between(*scenario.object_mass)
         nominal = jnp.full_like(mass, self.config.plant.object_mass)
+        if rig is not None:
+            mass, nominal = mass * rig.share, nominal * rig.share
         believed = mass if scenario.mass_known else nominal
         if scenario.unknown_share > 0:
             share, place = jax.random.uniform(jax.random.fold_in(rng, 7), (2,))
             low, high = scenario.unknown_mass
             unknown = share < scenario.unknown_share
-            mass = jnp.where(unknown, low + (high - low) * place, mass)
+            proportion: Scalar | float = 1.0 if rig is None else rig.share
+            mass = jnp.where(unknown, proportion * (low + (high - low) * place), mass)
             believed = jnp.where(unknown, nominal, believed)
         load = Load(
             object_mass=mass,
@@ -94,20 +119,34 @@ class ResetDistribution:
             load = self._with_battery(load, jax.random.fold_in(rng, 4))
         if scenario.cg_waypoint_probability > 0:
             load = self._with_waypoints(load, jax.random.fold_in(rng, 3))
-        load = load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude, jnp.maximum(self.trimmed(load), 0.0)))
+        if self._in_plane:
+            load = self._in_the_plane(load, jax.random.fold_in(rng, 12), rig)
+        else:
+            load = load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude, jnp.maximum(self.trimmed(load, rig), 0.0)))
+        if scenario.lost_follower_probability > 0:
+            load = self._losing(load, jax.random.fold_in(rng, 8), rig)
         plant = start_state(
             self.config,
             euler=jnp.append(symmetric(scenario.start_tilt, 2), 0.0),
             position=symmetric(scenario.start_position),
             velocity=symmetric(scenario.start_velocity),
             believed_mass=load.believed_mass,
-            ball_offset=symmetric(scenario.ball_start, 1)[0],
+            ball_offset=(self._direction(rng, 9) if self._in_plane else 1.0) * symmetric(scenario.ball_start, 1)[0],
+            parameters=None if rig is None else rig.numbers,
         )
-        return load, plant, symmetric(scenario.goal_range)
+        if scenario.ball_speed > 0:
+            speed = scenario.ball_speed * jax.random.uniform(jax.random.fold_in(rng, 10), minval=-1.0, maxval=1.0)
+            plant = plant._replace(ball_rate=self._direction(rng, 11) * speed if self._in_plane else speed)
+        return load, plant, symmetric(scenario.goal_range), rig
 
-    def trimmed(self, load: Load) -> Scalar:
+    def trimmed(self, load: Load, rig: Rig | None = None) -> Scalar:
         """CG amplitude that can be trimmed before and after the mass changes [m]; negative: none."""
         masses = (load.object_mass, load.object_mass + load.mass_change[0])
+        if self._several or self._in_plane or rig is not None:
+            numbers, leader = (self._constants if rig is None else rig.numbers), self.config.plant.leader
+            told = (self.config.scenario.trim_margin, load.believed_mass, load.thrust_scale)
+            rotors = jnp.minimum(*(safe_radius(numbers, leader, mass, *told) for mass in masses))
+            return jnp.minimum(rotors, self._commanded_radius(numbers, jnp.maximum(*masses)))
         if self.has_battery:
             return jnp.minimum(*(self._battery_trim_limit(load, mass) for mass in masses))
         margin, plant = self.config.scenario.trim_margin, self.config.plant
@@ -118,19 +157,30 @@ class ResetDistribution:
             limits = (trim_limit(plant, mass, margin, load.believed_mass, thrust) for mass in masses)
         return jnp.minimum(*limits)
 
+    def _commanded_radius(self, numbers: PlantParameters, object_mass: Scalar) -> Scalar:
+        """Distance of the CG from O that the followers' tilt commands hold by torque alone, `trim_margin` left [m].
+
+        Small teams are light about the axis through their drones, and their attitude gains with it.
+        """
+        margin, tilt = self.config.scenario.trim_margin, self.config.follower.action_scale_tilt
+        flying = (jnp.asarray(numbers.drone_mass) > 0).sum() - 1
+        gain = jnp.min(jnp.asarray(numbers.gains.kp)[..., :2], axis=-1)
+        return (1 - margin) * flying * gain * tilt / (numbers.gravity * object_mass)
+
     def _varied(self, load: Load, key: Array) -> Load:
         """`load` with rotors and inertia of its own."""
-        scenario, share = self.config.scenario, jax.random.uniform(key, (5,))
-        each = (scenario.thrust_scale, scenario.thrust_scale)
+        scenario, count = self.config.scenario, self.config.plant.count
+        share = jax.random.uniform(key, (3 + count,))
+        each = (scenario.thrust_scale,) * count
         ranges = (scenario.rotor_lag_scale, scenario.inertia_scale, *each, scenario.thrust_scale_common)
         drawn = (low + (high - low) * u for (low, high), u in zip(ranges, share, strict=True))
-        lag, inertia, leader, follower, common = drawn
-        thrust = common * jnp.stack([leader, follower])
+        lag, inertia, *apart, common = drawn
+        thrust = common * jnp.stack(apart)
         own = jnp.asarray(self._drones) + jnp.asarray(self._object) * load.object_mass
         load = load._replace(
             rotor_lag_scale=lag, thrust_scale=thrust, added_inertia=((inertia - 1.0) * own).astype(own.dtype)
         )
-        if self.has_battery or scenario.thrust_scale == scenario.thrust_scale_common == (1.0, 1.0):
+        if self.has_battery or self._several or scenario.thrust_scale == scenario.thrust_scale_common == (1.0, 1.0):
             return load
         # A leader that lifts too little can leave more than any follower trims: its world is drawn back towards 1.
         for _ in range(DRAWN_BACK):
@@ -138,6 +188,53 @@ class ResetDistribution:
             milder = load._replace(thrust_scale=1.0 + 0.7 * (scales - 1.0))
             load = jax.tree.map(functools.partial(jnp.where, self.trimmed(load) < 0), milder, load)
         return load
+
+    def _rig(self, key: Array, number: Int[Array, ""] | None) -> Rig:
+        """A rig of the size that follows from the world's `number`, with its factors."""
+        plant, attitude = self.config.plant, self.config.attitude
+        index = jax.random.randint(jax.random.fold_in(key, 1), (), 0, len(self._sizes)) if number is None else number
+        index = index % len(self._sizes)
+        numbers = jax.tree.map(jnp.float32, self._constants)
+        size = jnp.asarray(self._sizes, jnp.float32)[index]
+        if self._table is not None:
+            numbers = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32)[index], self._table)
+        share, drawn = size / plant.count, jax.random.uniform(key, (len(self._ranges),))
+        factors = teams.Factors(*(low + (high - low) * u for (low, high), u in zip(self._ranges, drawn, strict=True)))
+        numbers = teams.varied(numbers, factors, attitude, share * attitude.design_object_mass)
+        flies = (jnp.arange(plant.count) < size).astype(jnp.float32)
+        return Rig(numbers, flies, numbers.ball_limit / self._constants.ball_limit, share)
+
+    def _in_the_plane(self, load: Load, key: Array, rig: Rig | None) -> Load:
+        """`load` whose CG goes along a path of its own in the plane, within the carrier and what can be trimmed."""
+        scenario = self.config.scenario
+        turn, wide, late, kind = jax.random.uniform(key, (4,))
+        low, high = scenario.cg_width
+        ratio = jnp.where(kind < scenario.cg_lissajous_probability, 2.0, 1.0)
+        shape = PathShape(2 * jnp.pi * turn, low + (high - low) * wide, ratio, 2 * jnp.pi * late)
+        # Of an ellipse the longer half axis, of a Lissajous curve no more than the corner of its box.
+        w, across = shape.width**2, jnp.cos(2 * shape.lead)
+        ellipse = (1 + w + jnp.sqrt(jnp.maximum(1 + w * w + 2 * w * across, 0.0))) / 2
+        longest = jnp.sqrt(jnp.where(ratio > 1, 1 + w, ellipse))
+        if load.follows_path is not None:
+            longest = jnp.where(load.follows_path > 0, 1.0, longest)
+        proportion: Scalar | float = 1.0 if rig is None else rig.proportion
+        limit = jnp.minimum(cg_limit(self.config.plant) * proportion, jnp.maximum(self.trimmed(load, rig), 0.0))
+        return load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude * proportion, limit / longest), cg_shape=shape)
+
+    def _losing(self, load: Load, key: Array, rig: Rig | None) -> Load:
+        """`load` in whose flight perhaps the rotors of one follower stop."""
+        followers, scenario = np.array(self.config.plant.followers), self.config.scenario
+        lost, which, when = jax.random.uniform(key, (3,))
+        there = len(followers) if rig is None else rig.flies[followers].sum()
+        chosen = jnp.asarray(followers)[jnp.floor(which * there).astype(jnp.int32)]
+        low, high = LOSS_TIME
+        stops = (jnp.arange(self.config.plant.count) == chosen) & (lost < scenario.lost_follower_probability)
+        return load._replace(stop_time=jnp.where(stops, low + (high - low) * when, jnp.inf))
+
+    def _direction(self, rng: Array, stream: int) -> Float[Array, "2"]:
+        """Any direction in the plane."""
+        angle = 2 * jnp.pi * jax.random.uniform(jax.random.fold_in(rng, stream))
+        return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     def _battery_trim_limit(self, load: Load, mass: Scalar) -> Scalar:
         """As `trimmed` for drones that can be flown: one's rotors, and what one lifts more and the other less."""
@@ -230,9 +327,12 @@ class ResetDistribution:
     def _with_waypoints(self, load: Load, key: Array) -> Load:
         """`load` whose CG perhaps goes from place to place."""
         path_key, key = jax.random.split(key)
-        places = jax.random.uniform(path_key, (PLACES,), minval=-1.0, maxval=1.0)
-        travels = jax.random.uniform(key) < self.config.scenario.cg_waypoint_probability
-        return load._replace(cg_path=places, follows_path=travels.astype(jnp.float32))
+        places = jax.random.uniform(path_key, (PLACES, 2) if self._in_plane else (PLACES,), minval=-1.0, maxval=1.0)
+        if self._in_plane:  # within the circle
+            radius, angle = jnp.sqrt(jnp.abs(places[:, 0])), jnp.pi * places[:, 1]
+            places = radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+        visits = jax.random.uniform(key) < self.config.scenario.cg_waypoint_probability
+        return load._replace(cg_path=places, follows_path=visits.astype(jnp.float32))
 
 
 def lower_part(ends: tuple[float, float], share: Scalar | float) -> tuple[float, Scalar | float]:

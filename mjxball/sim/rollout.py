@@ -319,9 +319,12 @@ def start_of(config: Config, scenarios: Sequence[Scenario]) -> PlantState:
     velocity = np.array([scenario.start_velocity for scenario in scenarios], float)
     tilt = np.array([(*scenario.start_tilt, 0.0) for scenario in scenarios])
     ball = np.array([scenario.ball_start for scenario in scenarios], float)
+    rolling = np.array([scenario.ball_velocity for scenario in scenarios], float)
     if len(config.plant.directions) == 2:
         ball = np.stack([ball, np.array([scenario.ball_start_across for scenario in scenarios], float)], axis=-1)
-    return start_state(config, position, tilt, velocity, believed, ball)
+    else:
+        rolling = rolling[:, 0]
+    return start_state(config, position, tilt, velocity, believed, ball)._replace(ball_rate=rolling)
 
 
 def load_of(scenarios: Sequence[Scenario], drones: int = 2) -> Load:

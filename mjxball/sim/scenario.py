@@ -44,6 +44,7 @@ class Scenario:
     path: CgPath = field(default_factory=CgPath)  # of a CG that moves in the plane
     ball_start: float = 0.0  # of a rolling ball from O along the CG axis, in the plane along x [m]
     ball_start_across: float = 0.0  # in the plane along y [m]
+    ball_velocity: tuple[float, float] = (0.0, 0.0)  # at the start, along and across [m/s]
     start_position: Vector3 = (0.0, 0.0, 0.0)  # of O [m]
     start_velocity: Vector3 = (0.0, 0.0, 0.0)  # of O [m/s]
     start_tilt: tuple[float, float] = (0.0, 0.0)  # roll, pitch [rad]
@@ -72,7 +73,7 @@ def check_scenario(config: Config, scenario: Scenario) -> None:
         raise InputError("the time of a mass change must not be negative")
     check_disturbance(scenario.disturbance, config.timing.control_period)
     limit, in_plane = cg_limit(config.plant), len(config.plant.directions) == 2
-    if not in_plane and (scenario.path != CgPath() or scenario.ball_start_across):
+    if not in_plane and (scenario.path != CgPath() or scenario.ball_start_across or scenario.ball_velocity[1]):
         raise InputError(f"a path in the plane needs plant.cg_axis xy; this load moves along {config.plant.cg_axis}")
     reached = scenario.amplitude * max(1.0, abs(scenario.path.width))
     if config.motion.kind == "sine" and reached > limit + 1e-12:

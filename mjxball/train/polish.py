@@ -107,9 +107,9 @@ class LoadedEnv(CoupledPairEnv):
         super().__init__(config, "newton-euler")
         self._known, self._flight = load, flight
 
-    def reset(self, rng: Array, difficulty: Any = 1.0) -> Any:
+    def reset(self, rng: Array, difficulty: Any = 1.0, number: Any = None) -> Any:
         """A world with that load; see `CoupledPairEnv.reset`."""
-        state = super().reset(rng, difficulty)
+        state = super().reset(rng, difficulty, number)
         world: PipelineState = state.pipeline_state
         known, flight, draw = self._known, self._flight, jax.random.normal(jax.random.fold_in(rng, 11), (11,))
         mass = known.mass * (1.0 + MASS_SPREAD * draw[0])
@@ -134,7 +134,7 @@ class LoadedEnv(CoupledPairEnv):
             rates=flight.rates,
         )
         delay = world.disturbances.delay if self._disturbances.present else 0
-        loop, observation = self._loop.start(plant, flight.goal, Sample(), delay, flight.integral)
+        loop, observation = self._loop_of(()).start(plant, flight.goal, Sample(), delay, flight.integral)
         history = flight.history if self._law.size else ()
         moved = world._replace(loop=loop, load=load, goal=flight.goal, history=history)
         return state.replace(pipeline_state=moved, obs=self._input(observation, moved))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -17,6 +17,7 @@ from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
 from mjxball.algorithms.base import Algorithm, Phase, PolicyNetwork, Schedule, Shards, Transition
 from mjxball.config import Config
+from mjxball.errors import InputError
 from mjxball.train.extensions import DEFAULTS, Extensions, find, is_pair, make_env
 
 if TYPE_CHECKING:
@@ -54,11 +55,53 @@ def report(env: Any, totals: Mapping[str, Any], peaks: Mapping[str, Any], count:
     return {name: total / count for name, total in totals.items() if name != "reward"}
 
 
+class Agents:
+    """Which followers of worlds of several are data: those that fly, world after world.
+
+    A world has F slots for followers, of which one of N drones fills the first N - 1.
+    """
+
+    def __init__(self, sizes: Sequence[int], slots: int, count: int):
+        """`count` followers in worlds whose numbers of drones are `sizes`, again and again. May raise InputError."""
+        each = sum(sizes) - len(sizes)
+        if count % each:
+            raise InputError(
+                f"num_envs = {count} followers do not fill worlds of {', '.join(map(str, sizes))} drones in turn; "
+                f"make it a multiple of {each}"
+            )
+        self.worlds = count // each * len(sizes)
+        followers = [size - 1 for size in sizes] * (count // each)
+        self.world = np.repeat(np.arange(self.worlds), followers)
+        self.first = np.concatenate([[0], np.cumsum(followers)[:-1]])  # (worlds,) the agent in the first slot
+        self.slot = np.arange(count) - self.first[self.world]
+        # (worlds, F); slots that nobody fills show the first agent, whatever it does there has no effect.
+        filled = np.arange(slots) < np.array(followers)[:, None]
+        self.table = np.where(filled, self.first[:, None] + np.arange(slots), self.first[:, None])
+
+    def shown(self, states: Any) -> Any:
+        """States of worlds (worlds, [F,] ...) with all fields but `pipeline_state` for every agent (count, ...)."""
+        own = {name: getattr(states, name)[self.world, self.slot] for name in ("obs", "reward")}
+        shared = {name: jax.tree.map(lambda leaf: leaf[self.world], getattr(states, name)) for name in SHARED}
+        return states.replace(**own, **shared)
+
+    def inside(self, states: Any) -> Any:
+        """The inverse of `shown`."""
+        own = {name: getattr(states, name)[self.table] for name in ("obs", "reward")}
+        shared = {name: jax.tree.map(lambda leaf: leaf[self.first], getattr(states, name)) for name in SHARED}
+        return states.replace(**own, **shared)
+
+
+SHARED = ("done", "metrics", "info")  # fields of a state that all followers of a world have in common
+
+
 class Environments:
     """`count` environments on each shard; see `mjxball.algorithms.base.Environments`.
 
     Beyond Brax's `Env` an environment may have `input_mask` and `critic_mask` (n,), `report` (above), and a second
-    argument of `reset`, the difficulty of what is drawn.
+    argument of `reset`, the difficulty of what is drawn. One with `team_sizes` is of several followers (see
+    `mjxball.env`): each of them counts as one of `count`, and states hold (count, ...) but for their `pipeline_state`,
+    which holds worlds; a world starts anew as its first follower does. Its `reset` has a third argument, the world's
+    number.
     """
 
     def __init__(self, env: Any, count: int, shards: Shards | None = None):
@@ -68,17 +111,27 @@ class Environments:
         self.critic_mask = getattr(env, "critic_mask", None) or self.policy_mask
         self._graded = len(inspect.signature(env.reset).parameters) > 1
         self._step = jax.vmap(env.step)
+        sizes = getattr(env, "team_sizes", None)
+        self._agents = Agents(sizes, env.config.plant.count - 1, count) if sizes else None
+
+    @property
+    def _worlds(self) -> int:
+        return self._agents.worlds if self._agents else self.count
 
     def reset(self, key: Array, difficulty: Float[Array, ""] | float = 1.0) -> Any:
         """New states of all environments."""
-        keys = jax.random.split(self.shards.own(key), self.count)
+        keys = jax.random.split(self.shards.own(key), self._worlds)
+        if self._agents:
+            numbers = jnp.arange(self._worlds)
+            fresh = jax.vmap(lambda one, number: self.env.reset(one, difficulty, number))(keys, numbers)
+            return self._agents.shown(fresh)
         if not self._graded:
             return jax.vmap(self.env.reset)(keys)
         return jax.vmap(lambda one: self.env.reset(one, difficulty))(keys)
 
     def staggered(self, states: Any, key: Array, episode_steps: int) -> Any:
         """`states` with part of their episodes behind them, so that they do not end together."""
-        steps = jax.random.randint(self.shards.own(key), (self.count,), 0, episode_steps)
+        steps = jax.random.randint(self.shards.own(key), (self._worlds,), 0, episode_steps)
         if "steps" in states.info:
             kept = states.info["steps"]
             return states.replace(info={**states.info, "steps": steps.astype(kept.dtype)})
@@ -102,18 +155,30 @@ class Environments:
 
     def restart(self, envs: Envs, key: Array, others: Bool[Array, " envs"] | None = None) -> Envs:
         """See `mjxball.algorithms.base.Environments`."""
-        before = envs.states
+        before, agents = envs.states, self._agents
         ended = before.done.astype(bool) if others is None else before.done.astype(bool) | others
+        fresh = self.reset(key, envs.difficulty)
 
-        def reset_if_done(new: Array, old: Array) -> Array:
-            return jnp.where(ended.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
+        def reset_if(these: Array, new: Any, old: Any) -> Any:
+            def one(new: Array, old: Array) -> Array:
+                return jnp.where(these.reshape((-1,) + (1,) * (old.ndim - 1)), new, old)
 
-        return envs._replace(states=jax.tree.map(reset_if_done, self.reset(key, envs.difficulty), before))
+            return jax.tree.map(one, new, old)
+
+        if not agents:
+            return envs._replace(states=reset_if(ended, fresh, before))
+        worlds = reset_if(ended[agents.first], fresh.pipeline_state, before.pipeline_state)
+        shown = (one.replace(pipeline_state=()) for one in (fresh, before))
+        states = reset_if(ended[agents.first][agents.world], *shown)
+        return envs._replace(states=states.replace(pipeline_state=worlds))
 
     def step(self, envs: Envs, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Envs, Transition]:
         """See `mjxball.algorithms.base.Environments`."""
-        before = envs.states
-        after = self._step(before, action)
+        before, agents = envs.states, self._agents
+        if agents:
+            after = agents.shown(self._step(agents.inside(before), action[agents.table]))
+        else:
+            after = self._step(before, action)
         terminated = after.done * (1 - after.info["truncation"])
         statistics, metrics = envs.statistics, after.metrics
         statistics = Statistics(
@@ -191,7 +256,9 @@ class Program:
         self.env = make_env(extensions, config, physics)
         make: Any = extensions.algorithm or find(ALGORITHMS["sac"], "--algorithm")
         # The algorithm says how many environments there are, and is told the part of them that is here.
-        schedule: Schedule = make(config, Environments(self.env, 1, Shards())).schedule
+        sizes = getattr(self.env, "team_sizes", None)
+        fewest = sum(sizes) - len(sizes) if sizes else 1
+        schedule: Schedule = make(config, Environments(self.env, fewest, Shards())).schedule
         self.environments = Environments(self.env, schedule.num_envs // self._shards.parts, self._shards)
         self.algorithm: Algorithm = make(config, self.environments)
         self.schedule = schedule

@@ -1,0 +1,241 @@
+"""Worlds of teams: rigs of their own, padding, loads that can be held, followers as data of the algorithms."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from plants import team
+
+from mjxball import config as configs
+from mjxball.config import Config, preset, with_plant
+from mjxball.control import rotations
+from mjxball.control.observation import ERROR, mount_angles
+from mjxball.env import CoupledPairEnv
+from mjxball.errors import InputError
+from mjxball.plant import plant_parameters
+from mjxball.plant.teams import Factors, padded, ring, ring_config, table, varied
+from mjxball.plant.trim import largest_amplitude, safe_radius
+from mjxball.sim.randomization import ResetDistribution
+from mjxball.train.program import Agents, Environments
+
+PAPER = preset("paper")
+SIZES = (2, 3, 4, 6)
+QUIET = {
+    "scenario.noise": (0.0, 0.0),
+    "scenario.delay": (0.0, 0.0),
+    "scenario.rotor_lag_scale": (1.0, 1.0),
+    "follower.privileged_critic": False,
+    "follower.observation_averages": (),
+}
+
+
+def settings(name: str = "team", **changes: Any) -> Config:
+    dotted = {path.replace("__", "."): value for path, value in changes.items()}
+    return configs.apply_overrides(preset(name), QUIET | dotted)
+
+
+class TestRings:
+    @pytest.mark.parametrize("count", [3, 4, 6])
+    def test_they_are_the_shipped_teams(self, count: int) -> None:
+        """To the six digits of the plant files."""
+        mine, shipped = ring(with_plant(PAPER, "team6").plant, count), with_plant(PAPER, f"team{count}").plant
+        for (name, found, _), (_, value, _) in zip(configs.leaves(mine), configs.leaves(shipped), strict=True):
+            if isinstance(value, str):
+                assert found == value
+            elif name != "ball_stop":
+                assert found == pytest.approx(value, rel=1e-4, abs=1e-6), name
+
+    def test_a_padded_rig_moves_as_the_rig_itself(self) -> None:
+        """The same commands to three drones, alone and with three that pad: the same accelerations."""
+        config = settings(scenario__team_sizes=SIZES, scenario__cg_amplitude=(0.1, 0.1), scenario__start_tilt=0.3)
+        env = CoupledPairEnv(config, "newton-euler")
+        world = jax.jit(env.reset)(jax.random.key(1), 1.0, 1).pipeline_state
+        own = ring_config(config, 3)
+        alone = CoupledPairEnv(own, "newton-euler")
+        plant = world.plant._replace(rotor_force=world.plant.rotor_force[:3])
+        still = jnp.zeros((2, 3))
+        other = world._replace(loop=world.loop._replace(plant=plant), action=still, command=still, rig=())
+        action = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (5, 3)), jnp.float32)
+        state = env.reset(jax.random.key(1), 1.0, 1).replace(pipeline_state=world)
+        for _ in range(5):
+            state = jax.jit(env.step)(state, action)
+        start = alone.reset(jax.random.key(2))
+        seen = alone._loop_of(()).observe(plant, world.goal)
+        moved = start.replace(pipeline_state=other, obs=seen)
+        for _ in range(5):
+            moved = jax.jit(alone.step)(moved, action[:2])
+        mine, theirs = state.pipeline_state.plant, moved.pipeline_state.plant
+        for name in ("position", "velocity", "quaternion", "rates"):
+            np.testing.assert_allclose(getattr(mine, name), getattr(theirs, name), atol=2e-5)
+        np.testing.assert_allclose(mine.rotor_force[:3], theirs.rotor_force, atol=1e-3)
+        assert not mine.rotor_force[3:].any()
+        np.testing.assert_allclose(state.obs[:2], moved.obs, atol=1e-4)
+        np.testing.assert_allclose(state.reward[:2], moved.reward, rtol=1e-3)
+
+    def test_factors_of_one_change_nothing_and_gains_follow_the_rig(self) -> None:
+        plant, attitude = with_plant(PAPER, "team4").plant, with_plant(PAPER, "team4").attitude
+        found = plant_parameters(plant, attitude)
+        same = varied(found, Factors(), attitude, np.array(attitude.design_object_mass))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12), same, found)
+        wide = dataclasses.replace(
+            plant, drones=tuple(dataclasses.replace(d, mount=tuple(1.5 * x for x in d.mount)) for d in plant.drones)
+        )
+        wider = varied(found, Factors(mount_scale=1.5), attitude, np.array(attitude.design_object_mass))
+        np.testing.assert_allclose(wider.gains.kp, plant_parameters(wide, attitude).gains.kp, rtol=1e-12)
+        assert padded(found, 6).share.sum() == pytest.approx(1.0)
+
+
+def random_cases() -> list[tuple]:
+    random, found = np.random.default_rng(5), []
+    for number in range(60):
+        count = int(random.integers(2, 7))
+        plant = team(count, seed=number, cg_axis="xy", leader=int(random.integers(count)), rotor_force_max=9.0)
+        thrust = random.uniform(0.9, 1.1, count) if number % 2 else np.ones(count)
+        mass = random.uniform(0.1, 0.3) * count
+        lost = [f for f in plant.followers if f == random.integers(count)] if count == 6 else []
+        found.append((plant, mass, mass * random.uniform(0.8, 1.2), thrust, lost))
+    return found
+
+
+def test_the_safe_radius_is_safe_by_the_linear_program() -> None:
+    """In 8 directions, for random mounts, leaders, masses that are not known, weak drones and lost ones."""
+    held = 0
+    for plant, mass, believed, thrust, lost in random_cases():
+        flies = np.array([number not in lost for number in range(plant.count)], float)
+        numbers = plant_parameters(plant, PAPER.attitude)
+        radius = float(safe_radius(numbers, plant.leader, np.array(mass), 0.15, np.array(believed), thrust, flies))
+        if radius <= 0:
+            continue
+        held += 1
+        for angle in np.linspace(0, np.pi, 8, endpoint=False):
+            direction = (np.cos(angle), np.sin(angle))
+            bound = largest_amplitude(plant, mass, 0.15, direction, believed, lost, thrust=thrust)
+            assert radius <= bound * (1 + 1e-9) + 1e-9
+    assert held >= 20  # of 60
+
+
+def test_the_safe_radius_of_three_drones_is_the_linear_programs_own() -> None:
+    config = with_plant(PAPER, "team3")
+    numbers = plant_parameters(config.plant, config.attitude)
+    bound = min(largest_amplitude(config.plant, 0.3, 0.15, (np.cos(a), np.sin(a))) for a in np.linspace(0, 3.1, 32))
+    assert float(safe_radius(numbers, 0, np.array(0.3), 0.15)) == pytest.approx(bound, rel=1e-3)
+
+
+class TestWorlds:
+    def test_every_world_has_its_size_and_a_load_that_can_be_held(self) -> None:
+        config = settings(scenario__drone_mass_scale=(0.8, 1.2), scenario__mount_scale=(0.8, 1.2))
+        drawn = jax.jit(jax.vmap(ResetDistribution(config).draw, in_axes=(0, None, 0)))
+        keys, numbers = jax.random.split(jax.random.key(0), 400), jnp.arange(400)
+        load, plant, _, rig = drawn(keys, 1.0, numbers)
+        assert rig is not None
+        flies = np.asarray(rig.flies.sum(axis=1), int)
+        np.testing.assert_array_equal(flies, np.resize(SIZES, 400))
+        lifted = np.asarray(plant.rotor_force).sum(axis=(1, 2))
+        own = rig.numbers
+        weight = 9.81 * (np.asarray(own.drone_mass).sum(axis=1) + np.asarray(own.carrier_mass) + load.object_mass)
+        np.testing.assert_allclose(lifted, weight, rtol=1e-5)
+        assert (np.asarray(plant.rotor_force).any(axis=2).sum(axis=1) == flies).all()
+        radius = np.asarray(rig.numbers.ball_limit) + config.plant.ball_radius
+        time = jnp.linspace(0.0, 30.0, 200)
+        offset = jax.vmap(lambda one, t: jax.vmap(lambda s: paths(config, s, one))(t), in_axes=(0, None))(load, time)
+        far = np.linalg.norm(np.asarray(offset), axis=-1).max(axis=1)
+        safe = jax.vmap(lambda n, m: safe_radius(n, 0, m, 0.15))(own, load.object_mass)
+        assert (far <= np.minimum(radius, safe) * (1 + 1e-4)).all()
+        assert 0.1 < np.median(far / radius) < 0.9
+        scales = np.asarray(own.drone_mass[:, 0])
+        assert 0.8 <= scales.min() < 0.83
+        assert 1.17 < scales.max() <= 1.2
+
+    def test_a_follower_is_lost_at_the_share_that_was_asked_for(self) -> None:
+        config = settings(scenario__lost_follower_probability=0.5)
+        drawn = jax.jit(jax.vmap(ResetDistribution(config).draw, in_axes=(0, None, 0)))
+        load, _, _, rig = drawn(jax.random.split(jax.random.key(0), 400), 1.0, jnp.arange(400))
+        stops = np.isfinite(np.asarray(load.stop_time))
+        assert 0.4 < stops.any(axis=1).mean() < 0.6
+        assert stops.sum(axis=1).max() == 1
+        assert not stops[:, 0].any()  # never the leader
+        assert not (stops & (np.asarray(rig.flies) == 0)).any()
+        assert stops[:, 5].any()
+
+    def test_every_follower_sees_its_own_errors_and_the_reward_is_its_own(self) -> None:
+        env = CoupledPairEnv(settings(scenario__noise=(1.0, 1.0)), "newton-euler")
+        state = jax.jit(env.reset)(jax.random.key(0), 1.0, 3)
+        angles = mount_angles(env.config.plant)
+        seen = rotations.turned_about_z(np.asarray(state.obs[:, ERROR], float), angles)
+        assert np.abs(seen - seen[0]).max() < 0.03  # ten deviations of 3 mm
+        assert np.abs(seen - seen[0]).max() > 1e-4
+        action = jnp.zeros((5, 3)).at[2].set(1.0)
+        after = jax.jit(env.step)(state, action)
+        assert after.reward.shape == (5,)
+        assert after.reward[2] < after.reward[0]
+        assert after.reward[0] == after.reward[1]
+
+
+def paths(config: Config, time: Any, load: Any) -> Any:
+    from mjxball.physics.motion import make_prescribed
+
+    return make_prescribed(config)(time, load).offset
+
+
+class TestAgents:
+    def test_slots_that_nobody_fills_are_no_data(self) -> None:
+        agents = Agents(SIZES, 5, 22)
+        assert agents.worlds == 8
+        np.testing.assert_array_equal(agents.world[:11], [0, 1, 1, 2, 2, 2, 3, 3, 3, 3, 3])
+        np.testing.assert_array_equal(agents.slot[:11], [0, 0, 1, 0, 1, 2, 0, 1, 2, 3, 4])
+        np.testing.assert_array_equal(agents.table[1], [1, 2, 1, 1, 1])
+        for agent in range(22):
+            assert agents.table[agents.world[agent], agents.slot[agent]] == agent
+
+    def test_a_count_that_fills_no_worlds_is_refused(self) -> None:
+        with pytest.raises(InputError, match="multiple of 11"):
+            Agents(SIZES, 5, 32)
+
+    def test_actions_reach_their_followers_and_worlds_end_as_a_whole(self) -> None:
+        config = settings(timing__episode_steps=3)
+        env = CoupledPairEnv(config, "newton-euler")
+        environments = Environments(env, 11)
+        states = jax.jit(environments.reset)(jax.random.PRNGKey(0))
+        assert states.obs.shape == (11, env.observation_size)
+        action = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (11, 3)), jnp.float32)
+        step = jax.jit(environments.step)
+        envs, transition = step(environments.begin(states, 1.0), action, jax.random.PRNGKey(1))
+        world = jax.tree.map(lambda leaf: leaf[3], states.pipeline_state)
+        one = env.reset(jax.random.PRNGKey(2), 1.0, 3).replace(pipeline_state=world, obs=states.obs[6:])
+        alone = jax.jit(env.step)(one, action[6:])
+        np.testing.assert_allclose(transition.next_observation[6:], alone.obs, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(transition.reward[6:], alone.reward, rtol=1e-4)
+        for number in range(2):
+            envs, transition = step(envs, action, jax.random.PRNGKey(3 + number))
+        assert transition.done.all()
+        assert not transition.terminated.any()
+        assert (np.asarray(envs.states.pipeline_state.steps) == 0).all()
+        assert len(np.unique(np.asarray(envs.states.pipeline_state.goal)[:, 0])) == 4
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"scenario.team_sizes": (2, 8)}, "has 6"),
+        (
+            {"plant.cg_axis": "x", "scenario.cg_width": (0.0, 0.0), "scenario.cg_lissajous_probability": 0.0},
+            "in the plane",
+        ),
+        ({"follower.residual_on_pid": True}, "for a pair"),
+        ({"follower.load_axis_only": True}, "along a line"),
+    ],
+)
+def test_unsound_teams_are_refused(changes: dict, word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        configs.validate(configs.apply_overrides(preset("team"), changes))
+
+
+def test_the_table_of_rigs_has_one_row_for_each_size() -> None:
+    found = table(preset("team"))
+    assert found.mounts.shape == (4, 6, 3)
+    np.testing.assert_array_equal((found.drone_mass > 0).sum(axis=1), SIZES)
