@@ -10,8 +10,7 @@ sockets or clock. Numbers are of the twin's true state.
 - hover: 20 s at 0.4 m, errors from 5 s on, for link delay, force curve, sensor noise, pose rate and thrust gains; the
   steady command is the mean of what a drone is sent less what the pair flies, the larger of roll and pitch.
 - stand: 60 s from random balls, rolls and heights (ranges of the preset `stand`); kept if the ball touches no stop.
-- faults: hover at 0.4 m, a fault at a random moment of the flight or the landing; seconds until each drone's motors are
-  off, speed at the first contact, largest tilt and drift between the fault and then.
+- faults: see `fly_faults_virtual.py`.
 """
 
 from __future__ import annotations
@@ -29,53 +28,17 @@ from typing import Any
 
 import numpy as np
 
+import fly_faults_virtual
 from mjxball.config import preset
-from mjxball.fly.card import Controller, goal_of, times_of
-from mjxball.fly.limits import FlightSettings, Limits
-from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import (
-    FAULT_KINDS,
-    Conditions,
-    Surroundings,
-    drone_kind,
-)
-from mjxball.fly.twin.virtual import MemoryLog, Moment, VirtualTwin
+from mjxball.fly.card import Controller
+from mjxball.fly.twin.conditions import Conditions, Surroundings
+from mjxball.fly.twin.virtual import MemoryLog, VirtualTwin
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
+from virtual_flight import SETTLE, Row, cause_of, code_of, settings_of, world_of
 
 SETTLED, HOVER = 5.0, 20.0  # [s]
-SETTLE = 1.0  # [s] that estimators get before a flight, as the check before a real one gives them
-Row = dict[str, Any]
-
-
-def settings_of(policy: Policy, seconds: float) -> FlightSettings:
-    """What the command line would make of `policy`'s card."""
-    config = Controller(policy).config
-    goal, stand = goal_of(config), config.plant.stand != "free"
-    bounds = Limits().on_stand(goal[2]) if stand else Limits()
-    return FlightSettings(seconds, goal, stand=stand, limits=bounds, times=times_of(config))
-
-
-def world_of(path: Path, seconds: float, curve: str = "linear", record: bool = True, **around: Any) -> VirtualTwin:
-    """A flight of the policy in `path` that is about to begin."""
-    policy = Policy.load(path)
-    drone = drone_kind("2.1", curve)
-    surroundings = Surroundings(**around)
-    return VirtualTwin(
-        policy,
-        settings_of(policy, seconds),
-        kind=drone,
-        surroundings=surroundings,
-        log=MemoryLog(record),
-        settle=SETTLE,
-    )
-
-
-def code_of(world: VirtualTwin) -> int:
-    """The exit code that the runner's command would have."""
-    flight = world.flight
-    return 0 if flight.supervisor.cause is None and flight.lifted and flight.supervisor.state is State.DONE else 1
 
 
 # Parts: each yields jobs (function, arguments), each of which returns a row.
@@ -89,13 +52,12 @@ def flights_in_a_row(path: Path, count: int) -> list[Row]:
             world.track.clear()
             world.next_flight()
         world.run(60.0)
-        cause = world.flight.supervisor.cause
         rows.append(
             {
                 "policy": path.stem,
                 "flight": number + 1,
                 "code": code_of(world),
-                "cause": "" if cause is None else f"{cause.event.name} {cause.detail}",
+                "cause": cause_of(world),
                 "touchdown": world.touchdown_speed(),
                 "locked": any(drone.firmware.info & 0x40 for drone in world.drones),
             }
@@ -128,10 +90,9 @@ def hover(path: Path, name: str, around: dict[str, Any], seed: int) -> list[Row]
     flown = [moment for moment in world.track if moment.state == "fly"]
     row: Row = {"policy": path.stem, "case": name, "seed": seed, "code": code_of(world), "seconds": 0.0}
     if len(flown) < 100 or flown[-1].time - flown[0].time < HOVER - 1:
-        cause = world.flight.supervisor.cause
-        return [{**row, "cause": str(cause), "rmse": math.inf, "tilt": 180.0, "steady": 180.0}]
+        return [{**row, "cause": cause_of(world), "rmse": math.inf, "tilt": 180.0, "steady": 180.0}]
     late = [moment for moment in flown if moment.time - flown[0].time >= SETTLED]
-    goal = world.flight._origin + np.array(world.settings.goal)
+    goal = world.flight.goal(world.now)  # the landing is over, so that of the flight
     error = np.array([moment.position for moment in late]) - goal
     ticks = [r for r in world.log.records if r["kind"] == "tick" and r["state"] == "fly"]
     sent = np.array([[one[:2] for one in record["sent"]] for record in ticks if record["t"] >= late[0].time])
@@ -177,141 +138,17 @@ def stand_start(path: Path, number: int) -> list[Row]:
     seconds = flown[-1].time - flown[0].time
     row = {"start": number, "ball": ball, "roll": roll, "height": height, "seconds": seconds, "farthest": farthest}
     late = [moment for moment in flown if moment.time - flown[0].time > 10]
-    cause = world.flight.supervisor.cause
     return [
         {
             **row,
             "kept": bool(farthest < stop and seconds > 59.0),
             "ball_rms": _rms([moment.ball / share for moment in late]),
             "roll_rms": _rms([moment.roll for moment in late]),
-            "cause": "" if cause is None else f"{cause.event.name} {cause.detail}",
+            "cause": cause_of(world),
             "touchdown": world.touchdown_speed(),
             "code": code_of(world),
         }
     ]
-
-
-Injection = Callable[[VirtualTwin, int], None]
-
-
-def injected(kind: str) -> Injection:
-    """A fault of `FAULT_KINDS` in virtual time."""
-    return lambda world, drone: world.drones[drone].inject(FAULT_KINDS[kind])
-
-
-def both(kind: str) -> Injection:
-    """The same fault of both drones at once."""
-
-    def inject(world: VirtualTwin, drone: int) -> None:
-        for number in range(2):
-            injected(kind)(world, number)
-
-    return inject
-
-
-def link(**faults: float) -> Injection:
-    """A fault of one drone's link."""
-    return lambda world, drone: world.fault_link(drone, **faults)
-
-
-def gap(seconds: float) -> Injection:
-    """States of both drones break off for a while."""
-
-    def inject(world: VirtualTwin, drone: int) -> None:
-        for number in range(2):
-            world.fault_link(number, silent_down=True)
-        world.flight.note("gap", world.now)
-        world.later = (world.now + seconds, lambda: [world.fault_link(n, silent_down=False) for n in range(2)])  # type: ignore[attr-defined]
-
-    return inject
-
-
-def asked(**how: Any) -> Injection:
-    """What a person does."""
-
-    def inject(world: VirtualTwin, drone: int) -> None:
-        for name, value in how.items():
-            setattr(world.flight, name, value)
-
-    return inject
-
-
-FAULTS: dict[str, Injection] = {
-    "firmware stopped": injected("stopped"),
-    "drone without power": injected("power"),
-    "killed, outputs held": injected("killed"),
-    "IMU dead": injected("imu"),
-    "stabilizer dead": injected("stabilizer"),
-    "link silent": injected("silent"),
-    "uplink silent": injected("silent-up"),
-    "downlink silent": injected("silent-down"),
-    "both links silent": both("silent"),
-    "30 % of the packets lost": both("loss"),
-    "95 % of the packets lost": link(loss=0.95),
-    "50 ms late": link(delay=0.05),
-    "300 ms late": link(delay=0.3),
-    "jitter of 200 ms": link(jitter=0.2),
-    "gap of 110 ms in the states": gap(0.11),
-    "gap of 400 ms in the states": gap(0.4),
-    "pose frozen": injected("pose-frozen"),
-    "pose lost": injected("pose-lost"),
-    "both poses frozen": both("pose-frozen"),
-    "both poses lost": both("pose-lost"),
-    "pose jumps 0.4 m": injected("pose-jump"),
-    "reported position jumps 0.4 m": injected("jump"),
-    "reported state frozen": injected("frozen"),
-    "clock stopped": injected("clock"),
-    "battery sags to 3.0 V": injected("sag"),
-    "battery reads 1.2 V less": injected("battery"),
-    "thrust 10 % weaker": injected("weak"),
-    "drone crashed": injected("crash"),
-    "drone reboots": injected("reboot"),
-    "hostile datagrams": injected("garbage"),
-    "Ctrl-C": asked(interrupts=1),
-    "Ctrl-C twice": asked(interrupts=2),
-}
-
-
-def fault(path: Path, kind: str, drone: int, number: int) -> list[Row]:
-    """One flight with one fault."""
-    random = np.random.default_rng([list(FAULTS).index(kind), drone, number])
-    world = world_of(path, 6.0, seed=number)
-    world.later = (math.inf, None)  # type: ignore[attr-defined]
-    world.fly_until(State.FLY)
-    world.fly_for(float(random.uniform(3.0, 7.0)))
-    at = world.now
-    FAULTS[kind](world, drone)
-    while world.now < at + 25.0:
-        if world.now >= world.later[0]:  # type: ignore[attr-defined]
-            world.later[1]()  # type: ignore[attr-defined]
-            world.later = (math.inf, None)  # type: ignore[attr-defined]
-        if not world.tick():
-            break
-    for _ in range(250):  # whatever turns must stop by itself
-        world.advance(0.02)
-        world.track.append(world.moment())
-    after = [moment for moment in world.track if moment.time >= at]
-    return [{"policy": path.stem, "fault": kind, "drone": ("leader", "follower")[drone], **evaluated(world, after, at)}]
-
-
-def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
-    """What became of a flight after its fault at `at` [s]."""
-    running = np.array([moment.pwm.max(axis=1) > 0 for moment in after])
-    off = [float(after[int(np.nonzero(one)[0][-1])].time - at) if one.any() else 0.0 for one in running.T]
-    start = after[0].position
-    down = next((i for i, moment in enumerate(after) if moment.position[2] < world.rest + 0.006), len(after) - 1)
-    until = after[: down + 1]
-    cause = world.flight.supervisor.cause
-    return {
-        "height": float(start[2] - world.rest),
-        "off": off,
-        "stopped": not running[-1].any(),
-        "speed": float(max(0.0, *(-moment.velocity[2] for moment in after[max(down - 3, 0) : down + 1]))),
-        "tilt": math.degrees(max(moment.tilt for moment in until)),
-        "drift": float(np.linalg.norm(after[down].position[:2] - start[:2])),
-        "cause": "" if cause is None else cause.event.name,
-        "code": code_of(world),
-    }
 
 
 def _rms(values: Sequence[float]) -> float:
@@ -335,8 +172,8 @@ def jobs_of(options: argparse.Namespace) -> Iterator[tuple[str, Callable[..., li
         )
     if "faults" in options.parts:
         yield from (
-            ("faults", fault, (options.flight, kind, drone, number))
-            for kind in FAULTS
+            ("faults", fly_faults_virtual.fault, (options.flight, kind, drone, number))
+            for kind in fly_faults_virtual.FAULTS
             for drone in range(2)
             for number in range(options.trials)
         )
@@ -372,18 +209,7 @@ def table(part: str, rows: Sequence[Row]) -> None:
         good = sum(row["code"] == 0 for row in rows)
         print(f"exit code 0 in {good}, hardest touchdown {max(landed, default=math.nan):.2f} m/s")
     else:
-        print(f"{'fault':42} {'off L / F s':>12} {'speed m/s':>12} {'tilt deg':>12} {'drift m':>12}  median, worst")
-        for name in dict.fromkeys((row["fault"], row["drone"]) for row in rows):
-            own = [row for row in rows if (row["fault"], row["drone"]) == name]
-            off = [statistics.median(row["off"][n] for row in own) for n in range(2)]
-            parts = [
-                f"{statistics.median(row[key] for row in own):5.2f} {max(row[key] for row in own):6.2f}"
-                for key in ("speed", "tilt", "drift")
-            ]
-            bad = "" if all(row["stopped"] for row in own) else "  A MOTOR STILL TURNS"
-            print(
-                f"{' '.join((name[1], name[0])):32} {off[0]:6.2f} / {off[1]:5.2f} {parts[0]} {parts[1]} {parts[2]}{bad}"
-            )
+        fly_faults_virtual.table(rows)
 
 
 def main() -> int:

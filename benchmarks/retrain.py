@@ -106,7 +106,7 @@ def figures(world: VirtualTwin, begin: float) -> dict[str, float]:
     rows = [one for one in world.track if one.state == State.FLY.value and one.time >= begin]
     if not rows:
         return {}
-    goal = world.flight._monitor.origin + np.array(world.settings.goal)
+    goal = world.flight.goal(world.now)  # the landing is over, so that of the flight
     error = 1e3 * (np.array([one.position for one in rows]) - goal)
     tilt = 1e3 * np.array([one.tilt for one in rows])
     rms = lambda values: float(np.sqrt((values**2).mean()))  # noqa: E731

@@ -1,0 +1,156 @@
+"""Faults of the twin in virtual time: hover at 0.4 m, a fault at a random moment of the flight or the landing.
+
+Measured are the seconds until each drone's motors are off, speed at the first contact, largest tilt and drift between
+the fault and then. Run by `fly_firmware.py --parts faults`; `fly_faults.py` is the same by the clock, with sockets.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball.fly.supervisor import State
+from mjxball.fly.twin.conditions import FAULT_KINDS
+from mjxball.fly.twin.virtual import Moment, VirtualTwin
+from virtual_flight import Row, code_of, world_of
+
+Injection = Callable[[VirtualTwin, int], None]
+
+
+def injected(kind: str) -> Injection:
+    """A fault of `FAULT_KINDS` in virtual time."""
+    return lambda world, drone: world.drones[drone].inject(FAULT_KINDS[kind])
+
+
+def both(kind: str) -> Injection:
+    """The same fault of both drones at once."""
+
+    def inject(world: VirtualTwin, drone: int) -> None:
+        for number in range(2):
+            injected(kind)(world, number)
+
+    return inject
+
+
+def link(**faults: float) -> Injection:
+    """A fault of one drone's link."""
+    return lambda world, drone: world.fault_link(drone, **faults)
+
+
+def gap(seconds: float) -> Injection:
+    """States of both drones break off for a while."""
+
+    def inject(world: VirtualTwin, drone: int) -> None:
+        for number in range(2):
+            world.fault_link(number, silent_down=True)
+        world.flight.note("gap", world.now)
+        world.later = (world.now + seconds, lambda: [world.fault_link(n, silent_down=False) for n in range(2)])  # type: ignore[attr-defined]
+
+    return inject
+
+
+def asked(**how: Any) -> Injection:
+    """What a person does."""
+
+    def inject(world: VirtualTwin, drone: int) -> None:
+        for name, value in how.items():
+            setattr(world.flight, name, value)
+
+    return inject
+
+
+FAULTS: dict[str, Injection] = {
+    "firmware stopped": injected("stopped"),
+    "drone without power": injected("power"),
+    "killed, outputs held": injected("killed"),
+    "IMU dead": injected("imu"),
+    "stabilizer dead": injected("stabilizer"),
+    "link silent": injected("silent"),
+    "uplink silent": injected("silent-up"),
+    "downlink silent": injected("silent-down"),
+    "both links silent": both("silent"),
+    "30 % of the packets lost": both("loss"),
+    "95 % of the packets lost": link(loss=0.95),
+    "50 ms late": link(delay=0.05),
+    "300 ms late": link(delay=0.3),
+    "jitter of 200 ms": link(jitter=0.2),
+    "gap of 110 ms in the states": gap(0.11),
+    "gap of 400 ms in the states": gap(0.4),
+    "pose frozen": injected("pose-frozen"),
+    "pose lost": injected("pose-lost"),
+    "both poses frozen": both("pose-frozen"),
+    "both poses lost": both("pose-lost"),
+    "pose jumps 0.4 m": injected("pose-jump"),
+    "reported position jumps 0.4 m": injected("jump"),
+    "reported state frozen": injected("frozen"),
+    "clock stopped": injected("clock"),
+    "battery sags to 3.0 V": injected("sag"),
+    "battery reads 1.2 V less": injected("battery"),
+    "thrust 10 % weaker": injected("weak"),
+    "drone crashed": injected("crash"),
+    "drone reboots": injected("reboot"),
+    "hostile datagrams": injected("garbage"),
+    "Ctrl-C": asked(interrupts=1),
+    "Ctrl-C twice": asked(interrupts=2),
+}
+
+
+def fault(path: Path, kind: str, drone: int, number: int) -> list[Row]:
+    """One flight with one fault."""
+    random = np.random.default_rng([list(FAULTS).index(kind), drone, number])
+    world = world_of(path, 6.0, seed=number)
+    world.later = (math.inf, None)  # type: ignore[attr-defined]
+    world.fly_until(State.FLY)
+    world.fly_for(float(random.uniform(3.0, 7.0)))
+    at = world.now
+    FAULTS[kind](world, drone)
+    while world.now < at + 25.0:
+        if world.now >= world.later[0]:  # type: ignore[attr-defined]
+            world.later[1]()  # type: ignore[attr-defined]
+            world.later = (math.inf, None)  # type: ignore[attr-defined]
+        if not world.tick():
+            break
+    for _ in range(250):  # whatever turns must stop by itself
+        world.advance(0.02)
+        world.track.append(world.moment())
+    after = [moment for moment in world.track if moment.time >= at]
+    return [{"policy": path.stem, "fault": kind, "drone": ("leader", "follower")[drone], **evaluated(world, after, at)}]
+
+
+def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
+    """What became of a flight after its fault at `at` [s]."""
+    running = np.array([moment.pwm.max(axis=1) > 0 for moment in after])
+    off = [float(after[int(np.nonzero(one)[0][-1])].time - at) if one.any() else 0.0 for one in running.T]
+    start = after[0].position
+    down = next((i for i, moment in enumerate(after) if moment.position[2] < world.rest + 0.006), len(after) - 1)
+    until = after[: down + 1]
+    cause = world.flight.supervisor.cause
+    return {
+        "height": float(start[2] - world.rest),
+        "off": off,
+        "stopped": not running[-1].any(),
+        "speed": float(max(0.0, *(-moment.velocity[2] for moment in after[max(down - 3, 0) : down + 1]))),
+        "tilt": math.degrees(max(moment.tilt for moment in until)),
+        "drift": float(np.linalg.norm(after[down].position[:2] - start[:2])),
+        "cause": "" if cause is None else cause.event.name,
+        "code": code_of(world),
+    }
+
+
+def table(rows: Sequence[Row]) -> None:
+    """Print median and worst of each fault, of leader and follower."""
+    print(f"{'fault':42} {'off L / F s':>12} {'speed m/s':>12} {'tilt deg':>12} {'drift m':>12}  median, worst")
+    for name in dict.fromkeys((row["fault"], row["drone"]) for row in rows):
+        own = [row for row in rows if (row["fault"], row["drone"]) == name]
+        off = [statistics.median(row["off"][n] for row in own) for n in range(2)]
+        parts = [
+            f"{statistics.median(row[key] for row in own):5.2f} {max(row[key] for row in own):6.2f}"
+            for key in ("speed", "tilt", "drift")
+        ]
+        bad = "" if all(row["stopped"] for row in own) else "  A MOTOR STILL TURNS"
+        print(f"{' '.join((name[1], name[0])):32} {off[0]:6.2f} / {off[1]:5.2f} {parts[0]} {parts[1]} {parts[2]}{bad}")
