@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import pickle
 import struct
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -304,7 +305,17 @@ def loads_or_is_refused(path: Path) -> None:
         assert np.isfinite(policy(OBSERVATIONS)).all()
 
 
-# Each example restores the file, so one fixture serves them all.
+@contextlib.contextmanager
+def damaged(path: Path) -> Iterator[bytes]:
+    """The file's bytes; what the block left there loads or is refused, and is then undone, for the next example."""
+    original = path.read_bytes()
+    try:
+        yield original
+        loads_or_is_refused(path)
+    finally:
+        path.write_bytes(original)
+
+
 mutations = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 places = st.one_of(
     st.integers(0, 10**6),  # anywhere
@@ -315,22 +326,17 @@ places = st.one_of(
 @mutations
 @given(changes=st.lists(st.tuples(places, st.integers(0, 255)), min_size=1, max_size=4))
 def test_mutated_bytes_load_or_are_refused(saved, changes):
-    original = saved.read_bytes()
-    content = bytearray(original)
-    for place, value in changes:
-        content[place % len(content)] = value
-    saved.write_bytes(content)
-    try:
-        loads_or_is_refused(saved)
-    finally:
-        saved.write_bytes(original)
+    with damaged(saved) as original:
+        content = bytearray(original)
+        for place, value in changes:
+            content[place % len(content)] = value
+        saved.write_bytes(content)
 
 
 @mutations
 @given(data=st.data())
 def test_mutated_array_header_loads_or_is_refused(saved, data):
     """Behind an intact zip: any byte of an array's own header, where NumPy keeps dtype and shape."""
-    original = saved.read_bytes()
     name = data.draw(st.sampled_from([*ARRAYS, "card"]))
     with zipfile.ZipFile(saved) as archive:
         content = bytearray(archive.read(f"{name}.npy"))
@@ -338,26 +344,19 @@ def test_mutated_array_header_loads_or_is_refused(saved, data):
         st.lists(st.tuples(st.integers(0, 127), st.integers(0, 255)), min_size=1, max_size=3)
     ):
         content[place] = value
-    copy_zip(saved, {f"{name}.npy": bytes(content)})
-    try:
-        loads_or_is_refused(saved)
-    finally:
-        saved.write_bytes(original)
+    with damaged(saved):
+        copy_zip(saved, {f"{name}.npy": bytes(content)})
 
 
 @mutations
 @given(data=st.data())
 def test_mutated_card_loads_or_is_refused(saved, data):
     """Any JSON value in place of any field, behind an intact zip."""
-    original = saved.read_bytes()
     card = json.loads(str(arrays_of(saved)["card"]))
     number = st.one_of(st.integers(), st.floats(), st.just(HUGE), st.booleans(), st.none(), st.text(max_size=5))
     value = st.recursive(
         number, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3)
     )
     field = data.draw(st.sampled_from(sorted(card)))
-    rewrite_card(saved, lambda card: card.update({field: data.draw(value)}))
-    try:
-        loads_or_is_refused(saved)
-    finally:
-        saved.write_bytes(original)
+    with damaged(saved):
+        rewrite_card(saved, lambda card: card.update({field: data.draw(value)}))
