@@ -66,6 +66,7 @@ CONSTANT: dict[str, Any] = {
     "sac.policy_delay": 1,
     "sac.gradient_clip": 0.0,
     "sac.max_grad_norm": 0.0,
+    "ppo.curriculum": 0.0,
 }
 
 

@@ -305,9 +305,6 @@ class Ppo:
     entropy_cost: float = setting(1e-3, "weight of the policy's entropy", low=0)
     reward_scale: float = setting(0.02, "factor on the reward: the value's loss shares the gradient's norm", above=0)
     max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
-    curriculum: float = setting(
-        0.0, "share of training over which the CG's amplitude and speed grow to the scenario's", low=0, high=1
-    )
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
 
 
