@@ -48,6 +48,14 @@ def test_every_follower_sits_on_the_negative_half_of_its_own_x(name: str) -> Non
     )
 
 
+@pytest.mark.parametrize("leader", range(4))
+def test_commands_stand_in_the_order_of_the_drones(leader: int) -> None:
+    plant = dataclasses.replace(TEAM4.plant, leader=leader)
+    own = np.arange(12.0).reshape(4, 3)  # of drone 0, 1, 2, 3
+    laws = Laws(dataclasses.replace(TEAM4, plant=plant))
+    np.testing.assert_array_equal(laws.stack(own[leader], own[list(plant.followers)]), own)
+
+
 def test_a_follower_across_from_the_leader_sees_what_a_pairs_follower_sees() -> None:
     """Drone 2 of the ring of four sits where a pair's follower does, and its mount frame is the body's."""
     body, goal = some_body(), np.array([0.4, -0.3, 0.8])
