@@ -50,34 +50,51 @@ class LinearQuadratic(toys.Env):
         return state.replace(obs=A @ x + B @ action, reward=-cost)
 
 
-def linear(config: Config) -> tuple[FirstOrderGradient, Environments]:
-    """A policy without hidden layers on 32 worlds, 300 steps long; in the second window none begins anew."""
-    settings = dataclasses.replace(config.gradient, num_envs=32, horizon=300, windows_per_episode=33, policy_layers=())
+def gradient_of(config: Config, gain: np.ndarray, **settings: Any) -> tuple[np.ndarray, float, np.ndarray]:
+    """(start states (32, 2), loss, its gradient (1, 2)) of u = -gain x on 32 worlds, none of which begins anew."""
+    settings = {"num_envs": 32, "windows_per_episode": 33, "policy_layers": (), **settings}
     environments = Environments(LinearQuadratic(), 32, Shards())
-    return FirstOrderGradient(dataclasses.replace(config, gradient=settings), environments), environments
+    changed = dataclasses.replace(config, gradient=dataclasses.replace(config.gradient, **settings))
+    algorithm = FirstOrderGradient(changed, environments)
+    states = environments.reset(jax.random.PRNGKey(0))
+    kernel = jnp.concatenate([-jnp.asarray(gain.T, jnp.float32), jnp.zeros((2, 1))], axis=1)
+    state = algorithm.init(jax.random.PRNGKey(1))._replace(
+        layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=jnp.ones((), jnp.int32)
+    )
+    after, _ = algorithm.collect(state, environments.begin(states, 1.0), [jax.random.PRNGKey(2)], TRAIN)
+    return np.asarray(states.obs, float), float(after.loss), -np.asarray(after.slope["hidden_0"]["kernel"])[:, :1].T
 
 
 def test_the_gradient_of_a_linear_policy_is_that_of_the_lyapunov_equations(transport: Config) -> None:
     """Fazel et al. 2018, lemma 1: dC/dK = 2 ((R + B'P B) K - B'P A) S, which is 0 at the Riccati solution."""
-    algorithm, environments = linear(transport)
-    states = environments.reset(jax.random.PRNGKey(0))
-    start = np.asarray(states.obs, float)
     riccati = scipy.linalg.solve_discrete_are(A, B, Q, R)
     best = np.linalg.solve(R + B.T @ riccati @ B, B.T @ riccati @ A)
     for gain in (best, 0.7 * best, best + np.array([[0.5, -0.3]])):
+        start, _, found = gradient_of(transport, gain, horizon=300)
         closed = A - B @ gain
         value = scipy.linalg.solve_discrete_lyapunov(closed.T, Q + gain.T @ R @ gain)
         visited = scipy.linalg.solve_discrete_lyapunov(closed, start.T @ start / len(start))
         wanted = 2 * ((R + B.T @ value @ B) @ gain - B.T @ value @ A) @ visited / 300  # the loss is a mean over steps
-        state = algorithm.init(jax.random.PRNGKey(1))
-        kernel = jnp.concatenate([-jnp.asarray(gain.T, jnp.float32), jnp.zeros((2, 1))], axis=1)
-        state = state._replace(
-            layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=jnp.ones((), jnp.int32)
-        )
-        after, _ = algorithm.collect(state, environments.begin(states, 1.0), [jax.random.PRNGKey(2)], TRAIN)
-        found = -np.asarray(after.slope["hidden_0"]["kernel"])[:, :1].T
         # Float32; at the optimum what is left is a thousandth of what it is elsewhere.
         np.testing.assert_allclose(found, wanted, rtol=0.01, atol=1e-11)
+
+
+@pytest.mark.parametrize("decay", [1.0, 0.9])
+def test_a_gradient_decays_by_its_factor_at_every_step_and_the_loss_stays(decay: float, transport: Config) -> None:
+    gain, steps = np.array([[2.0, 1.5]]), 30
+    x, loss, found = gradient_of(transport, gain, horizon=steps, gradient_decay=decay)
+    states = [x]
+    for _ in range(steps):
+        states.append(states[-1] @ (A - B @ gain).T)
+    later, wanted, cost = np.zeros_like(x), np.zeros((1, 2)), 0.0
+    for x in states[-2::-1]:  # backwards: `later` is the gradient with respect to the next state
+        u = -x @ gain.T
+        pushed = 2 * u @ R + decay * later @ B
+        wanted -= pushed.T @ x / (steps * len(x))
+        later = 2 * x @ Q + decay * later @ A - pushed @ gain
+        cost += ((x @ Q) * x).sum() / (steps * len(x)) + ((u @ R) * u).sum() / (steps * len(x))
+    np.testing.assert_allclose(loss, cost, rtol=1e-3)
+    np.testing.assert_allclose(found, wanted, rtol=2e-3)
 
 
 def returns(config: Config, name: str, env: Any, seed: int = 0) -> np.ndarray:
