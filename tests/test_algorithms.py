@@ -97,6 +97,30 @@ def test_a_gradient_decays_by_its_factor_at_every_step_and_the_loss_stays(decay:
     np.testing.assert_allclose(found, wanted, rtol=2e-3)
 
 
+class Standing(LinearQuadratic):
+    """It stays at observations of mean 3 and deviation 0.5, whatever the action."""
+
+    def reset(self, rng: Any) -> Any:
+        return super().reset(rng).replace(obs=3.0 + 0.5 * jax.random.normal(rng, (2,)))
+
+    def step(self, state: Any, action: Any) -> Any:
+        return state
+
+
+def test_the_first_window_normalises_the_observations(transport: Config) -> None:
+    environments = Environments(Standing(), 32, Shards())
+    algorithm = FirstOrderGradient(transport, environments)
+    states = environments.reset(jax.random.PRNGKey(0))
+    first = Phase(jnp.asarray(True), jnp.asarray(False))
+    known, _ = algorithm.collect(
+        algorithm.init(jax.random.PRNGKey(1)), environments.begin(states, 1.0), [jax.random.PRNGKey(2)], first
+    )
+    policy = algorithm.policy(known)
+    # Some of the environments begin anew with the window, at states of the same distribution.
+    np.testing.assert_allclose(policy.mean, 3.0, atol=0.4)
+    np.testing.assert_allclose(policy.deviation, 0.5, atol=0.2)
+
+
 def returns(config: Config, name: str, env: Any, seed: int = 0) -> np.ndarray:
     """Mean reward a step of the policy after the whole training, and of the one before it."""
     program = Program(config, "newton-euler", extensions=Extensions(env, None, find(name, "--algorithm")))
