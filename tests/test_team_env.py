@@ -17,6 +17,9 @@ from mjxball.control import rotations
 from mjxball.control.observation import ERROR, mount_angles
 from mjxball.env import CoupledPairEnv
 from mjxball.errors import InputError
+from mjxball.physics import newton_euler
+from mjxball.physics.engine import Load, total_wrench
+from mjxball.physics.step import make_accelerations, start_state
 from mjxball.plant import plant_parameters
 from mjxball.plant.teams import Factors, padded, ring, ring_config, table, varied
 from mjxball.plant.trim import largest_amplitude, safe_radius
@@ -216,6 +219,24 @@ class TestAgents:
         assert not transition.terminated.any()
         assert (np.asarray(envs.states.pipeline_state.steps) == 0).all()
         assert len(np.unique(np.asarray(envs.states.pipeline_state.goal)[:, 0])) == 4
+
+
+def test_no_tilt_and_no_rotor_pushes_a_free_ball_towards_the_middle() -> None:
+    """A ball at rest on the plate: thrust is normal to it, so that its acceleration never points inwards."""
+    config, random, count = preset("plate"), np.random.default_rng(0), 2000
+    mass, none = np.full(count, config.plant.object_mass), np.zeros(count)
+    tilt = 0.3 * random.normal(size=(count, 3))
+    place, zero = random.uniform(-0.08, 0.08, (count, 2)), np.zeros((count, 3))
+    state = start_state(config, zero, tilt, zero, mass, place)._replace(
+        rates=random.normal(size=(count, 3)), rotor_force=random.uniform(0, 8, (count, 4, 4))
+    )
+    numbers = plant_parameters(config.plant, config.attitude)
+    wrench = total_wrench(config.plant, numbers, state.rotor_force)
+    accelerate = make_accelerations(config, newton_euler.make_engine(config.plant, config.attitude))
+    load = Load(mass, mass, none, none, none, np.zeros((count, 0)), np.zeros((count, 0)))
+    _, _, ball = accelerate(state, wrench, load)
+    assert ((ball * place).sum(axis=-1) >= -1e-12).all()
+    assert np.abs(ball).max() > 0.1  # [m/s2], outwards
 
 
 @pytest.mark.parametrize(

@@ -125,9 +125,9 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     here, others = (paths, []) if options.force or options.plant else group_by_plant(paths)
     if chosen and others:
         if asked:
-            raise InputError(f"--suite flies the paper's plant, and {others[0][1][0]} was made for two Crazyflies")
+            raise InputError(f"--suite flies the paper's plant, and {others[0][1][0]} was made for another")
         others = []
-    # Only policies for Crazyflies: then the baselines beside them fly their plant, and nothing the paper's.
+    # Only policies for other plants: then the baselines beside them fly theirs, and nothing the paper's.
     groups = [] if others and not here else [Group(setup, scenarios, named, here, asked)]
     groups += [Group(own, native_scenarios(options, own), named or ["copy"], files, True) for own, files in others]
     command = shlex.join(["python", "eval.py", *arguments])
@@ -190,7 +190,7 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
     for number, (group, baselines, policies) in enumerate(loaded):
         results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
         if number:
-            print(f"\n{group.setup.preset}: two Crazyflies, their own plant and scenarios")  # noqa: T201
+            print(f"\n{group.setup.preset}: its own plant and scenarios")  # noqa: T201
         print(table(results))  # noqa: T201
         if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
             every += results
@@ -289,7 +289,7 @@ def _refuse_same_names(names: list[str]) -> None:
 
 def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[Result], physics: str) -> int:
     """Hold every policy against its card on the reference scenario, flown anew if the results lack it."""
-    own = setup.autopilot.kind != "ideal"
+    own = setup.autopilot.kind != "ideal" or setup.plant.count > 2
     plain = setup if own else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
     reference = standard_scenarios(setup)[-1] if own else REFERENCE
     known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}

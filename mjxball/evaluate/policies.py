@@ -75,10 +75,14 @@ def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
 
 
 def native_config(path: Path) -> Config | None:
-    """The configuration in the card of a policy for Crazyflies, None for any other policy."""
+    """The configuration in the card of a policy for Crazyflies or for a team, None for any other policy."""
     settings = Policy.load(path).card.get("config")
-    autopilot = settings.get("autopilot") if isinstance(settings, dict) else None
-    if not isinstance(autopilot, dict) or autopilot.get("kind") != "crazyflie":
+    if not isinstance(settings, dict):
+        return None
+    autopilot, plant = settings.get("autopilot"), settings.get("plant")
+    crazyflies = isinstance(autopilot, dict) and autopilot.get("kind") == "crazyflie"
+    drones = plant.get("drones") if isinstance(plant, dict) else None
+    if not crazyflies and not (isinstance(drones, list) and len(drones) > 2):
         return None
     return configs.validate(configs.from_record(settings))
 

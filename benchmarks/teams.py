@@ -1,0 +1,145 @@
+"""Followers of teams: the load on paths in the plane on rings of 2 to 6 drones, and a free ball on a plate.
+
+    python benchmarks/teams.py policies/team.npz --json benchmarks/results/teams.json
+    python benchmarks/teams.py --plate policies/plate.npz --json benchmarks/results/plate.json
+
+Teams: N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A
+case counts where `mjxball.plant.trim` finds 15 % margin in every direction. 5 drones are in no training.
+
+Plate: random starts, the ball within 60 % of the rim with up to 0.1 m/s, both uniform in radius, 60 s, noise level 1.
+Beside them the share of these starts from which friction alone stops the ball before the rim of a level plate. No
+follower can do much better: thrust is normal to the plate, so tilting it accelerates plate and ball alike, and turning
+it only slings the ball outwards.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball import cli
+from mjxball.baselines import make_baseline
+from mjxball.config import ball_limit, preset
+from mjxball.control.followers import Follower
+from mjxball.evaluate.policies import load_policy
+from mjxball.evaluate.results import fly_scenarios
+from mjxball.physics.motion import ROLLING_FRICTION
+from mjxball.plant.teams import ring_config
+from mjxball.plant.trim import largest_amplitude
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.rollout import simulate_batch
+from mjxball.sim.scenario import CIRCLE, CgPath, Scenario
+
+SIZES, SPEEDS, AMPLITUDES, MASSES = (2, 3, 4, 5, 6), (0.31, 1.0, 2.0, 3.1), (0.15, 0.3, 0.6), (0.5, 1.0, 1.5)
+EIGHT = CgPath(direction=0.7, width=0.5, ratio=2.0, lead=0.3)
+STARTS, SECONDS, INNER, FASTEST = 100, 60.0, 0.6, 0.1
+ENGINE = "newton-euler"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly, print, write."""
+    parser = cli.make_parser("python benchmarks/teams.py", __doc__.split("\n\n")[0])
+    parser.add_argument("policies", nargs="+", type=Path, metavar="POLICY.npz")
+    parser.add_argument("--plate", action="store_true", help="the free ball instead of the paths")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args(arguments)
+    rows = (plate if options.plate else teams)(options.policies)
+    if options.json:
+        options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+    return 0
+
+
+def teams(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """Medians and worst cases for every number of drones and every follower."""
+    rows, base = [], preset("team")
+    for count in SIZES:
+        config = ring_config(base, count)
+        followers: list[Follower] = [make_baseline("copy", config), *(load_policy(path, config) for path in paths)]
+        radius, nominal = config.plant.object_size[0] / 2, config.plant.object_mass
+        cells = [
+            Scenario(omega=omega, amplitude=share * radius, mass=factor * nominal, path=path, seconds=30)
+            for factor, share, omega, path in itertools.product(MASSES, AMPLITUDES, SPEEDS, (CIRCLE, EIGHT))
+        ]
+        farthest = {mass: _trimmed(config, mass) for mass in {cell.mass for cell in cells}}
+        reach = {CIRCLE: 1.0, EIGHT: math.hypot(1.0, EIGHT.width)}
+        held = [cell for cell in cells if cell.amplitude * reach[cell.path] <= farthest[cell.mass]]
+        results = fly_scenarios(config, followers, held, ENGINE)
+        for follower in followers:
+            found = [result.metrics for result in results if result.follower == follower.name]
+            flown = [one for one in found if not one.failed]
+            row = {
+                "drones": count,
+                "follower": follower.name,
+                "cases": len(held),
+                "failed": len(found) - len(flown),
+                "plane_peak_median": float(np.median([one.plane_peak for one in flown])),
+                "plane_peak_worst": max(one.plane_peak for one in flown),
+                "settling_10_median": float(np.median([one.settling_time_10 or math.inf for one in flown])),
+                "rmse_median": float(np.median([one.rmse for one in flown])),
+            }
+            rows.append({name: None if value == math.inf else value for name, value in row.items()})
+            print(json.dumps(rows[-1]))
+            sys.stdout.flush()
+    return rows
+
+
+def _trimmed(config: Any, mass: float) -> float:
+    """CG offset [m] that can be trimmed in every direction."""
+    angles = np.linspace(0, math.pi, 12, endpoint=False)
+    margin = config.scenario.trim_margin
+    return min(largest_amplitude(config.plant, mass, margin, (math.cos(a), math.sin(a))) for a in angles)
+
+
+def plate(paths: Sequence[Path]) -> list[dict[str, Any]]:
+    """Flights in which the ball stays off the rim, and what friction alone allows."""
+    config, random = preset("plate"), np.random.default_rng(1)
+    rim, cells, alone = ball_limit(config.plant), [], 0
+    for number in range(STARTS):
+        place, speed = INNER * rim * random.uniform(), FASTEST * random.uniform()
+        at, towards = random.uniform(0, 2 * math.pi, 2)
+        start = place * np.array([math.cos(at), math.sin(at)])
+        velocity = speed * np.array([math.cos(towards), math.sin(towards)])
+        rolled = speed * 7 / 10 / (ROLLING_FRICTION * config.plant.gravity)  # [s] over 2, in which friction stops it
+        alone += float(np.linalg.norm(start + rolled * velocity)) < rim
+        cells.append(
+            Scenario(
+                mass=config.plant.object_mass,
+                amplitude=0.0,
+                ball_start=float(start[0]),
+                ball_start_across=float(start[1]),
+                ball_velocity=(float(velocity[0]), float(velocity[1])),
+                goal=tuple(random.uniform(-1, 1, 3)),
+                seconds=SECONDS,
+                disturbance=Disturbance(noise=1.0, seed=number),
+            )
+        )
+    rows: list[dict[str, Any]] = [{"follower": "friction alone, level", "off_the_rim": alone}]
+    followers: list[Follower] = [make_baseline("copy", config), *(load_policy(path, config) for path in paths)]
+    for follower in followers:
+        flown = simulate_batch(config, [(follower, cells)], ENGINE)
+        distance = np.hypot(flown.cg_offset[..., 0], flown.cg_offset[..., 1]).max(axis=0)
+        error = np.linalg.norm(flown.error[flown.time >= 20], axis=-1).max(axis=0)
+        far = np.linalg.norm(flown.error, axis=-1).max(axis=0) > config.scenario.termination_distance
+        rows.append(
+            {
+                "follower": follower.name,
+                "off_the_rim": int((distance < rim).sum()),
+                "failed": int((far | flown.diverged).sum()),
+                "error_median": float(np.median(error)),
+                "error_worst": float(error.max()),
+            }
+        )
+    for row in rows:
+        print(json.dumps(row))
+    return rows
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run_command(main))
