@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjxball.baselines import LAWS, lqg, make_baseline, make_law
-from mjxball.baselines.load_axis import pitch_axis
+from mjxball.baselines.assembly_model import ideal_model
 from mjxball.config import preset, replace
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure
@@ -80,7 +80,7 @@ def test_only_the_slow_filter_bears_late_commands() -> None:
 
 @pytest.mark.parametrize("law", [lqg.Lqg, lqg.SlowLqg])
 def test_feedback_is_that_of_the_hamiltonians_stable_subspace(law: type[lqg.Lqg]) -> None:
-    plant = pitch_axis(preset("paper"), "lqg")
+    plant = ideal_model(preset("paper"), "lqg")
     wn, zeta, g = 10.0, 0.9, 9.81
     a = np.array([[0, 1, 0, 0], [0, 0, g, 0], [0, 0, 0, 1], [0, 0, -wn * wn, -2 * zeta * wn]])
     b = np.array([[0.0], [0], [0], [wn * wn]])
@@ -93,8 +93,8 @@ def test_feedback_is_that_of_the_hamiltonians_stable_subspace(law: type[lqg.Lqg]
 
 @pytest.mark.parametrize("walk", [9.0, 0.003])
 def test_filter_is_the_fixed_point_of_the_kalman_recursion(walk: float) -> None:
-    plant = pitch_axis(preset("paper"), "lqg")
-    found = lqg.kalman(plant, walk)
+    plant = ideal_model(preset("paper"), "lqg")
+    found = lqg.kalman(plant, 1, walk)
     noise, measured, covariance = np.zeros((5, 5)), np.eye(2, 5), np.eye(5)
     noise[3, 3] = walk * plant.period
     for _ in range(3000):
@@ -124,24 +124,24 @@ def test_adaptive_polynomial_is_stable_as_designed() -> None:
     """J p^3 + K p^2 + K w p + K w^2 r / 2 is Hurwitz iff 2 K > J w r."""
     from mjxball.baselines.adaptive import BANDWIDTH, RATIO
 
-    plant = pitch_axis(preset("paper"), "adaptive")
-    k = 2 * plant.kd
-    roots = np.roots([plant.inertia, k, k * BANDWIDTH, k * BANDWIDTH**2 * RATIO / 2])
+    plant = ideal_model(preset("paper"), "adaptive")
+    k, inertia = 2 * plant.kd[1], plant.inertia[1]
+    roots = np.roots([inertia, k, k * BANDWIDTH, k * BANDWIDTH**2 * RATIO / 2])
     assert roots.real.max() < -1
-    assert 2 * k > plant.inertia * BANDWIDTH * RATIO
+    assert 2 * k > inertia * BANDWIDTH * RATIO
 
 
 def test_gains_follow_the_plant() -> None:
     """Section 3: per-drone Kp 3.22, Kd 0.579 in pitch; they move with the attitude loop's frequency."""
     config = preset("paper")
-    plant = pitch_axis(config, "lqg")
-    assert (plant.kp, plant.kd, plant.inertia) == pytest.approx((3.22, 0.579, 0.0644), rel=2e-3)
-    slower = pitch_axis(replace(config, "attitude.natural_frequency", (10.0, 5.0, 4.0)), "lqg")
-    assert slower.kp == pytest.approx(plant.kp / 4)
+    plant = ideal_model(config, "lqg")
+    assert (plant.kp[1], plant.kd[1], plant.inertia[1]) == pytest.approx((3.22, 0.579, 0.0644), rel=2e-3)
+    slower = ideal_model(replace(config, "attitude.natural_frequency", (10.0, 5.0, 4.0)), "lqg")
+    assert slower.kp[1] == pytest.approx(plant.kp[1] / 4)
 
 
 def test_stands_are_refused_in_one_sentence() -> None:
-    with pytest.raises(InputError, match="free pair along x"):
+    with pytest.raises(InputError, match="that fly freely"):
         make_law("lqg", replace(preset("paper"), "plant.stand", "heave"))
 
 

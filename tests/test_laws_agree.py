@@ -41,7 +41,8 @@ LQG_MEMORY = 0.1 * normal(LQG.size)
 HISTORY = ObservationHistory(length=3, previous_action=True, filters=(0.1, 0.5))
 SEEN, MEMORY, ACTION = normal(18), normal(HISTORY.size), random.uniform(-1, 1, (WORLDS, 3))
 MASSES = random.uniform(0.1, 0.3, WORLDS)
-PRIVILEGED = PrivilegedInfo(MASSES, 0.01 * normal(), 0.01 * normal(), random.uniform(2.1, 2.3, WORLDS))
+TOTAL, THRUST = random.uniform(2.1, 2.3, WORLDS), np.linspace(0.8, 1.0, 2 * WORLDS).reshape(WORLDS, 2)
+PRIVILEGED = PrivilegedInfo(MASSES, 0.01 * normal(), 0.01 * normal(), TOTAL, THRUST)
 FLIGHT = 0.1 * normal(2, 18)  # two observations in a row
 
 

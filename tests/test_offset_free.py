@@ -11,7 +11,7 @@ from command_line import assert_refused, write_arrays
 from conftest import Trained
 
 from mjxball.baselines import make_baseline
-from mjxball.baselines.load_axis import pitch_axis
+from mjxball.baselines.assembly_model import ideal_model
 from mjxball.baselines.offset_free import offset_free_lqg
 from mjxball.commands.train import main
 from mjxball.config import preset
@@ -57,14 +57,14 @@ def test_it_finds_what_a_mass_that_nobody_knows_pulls():
 
 def test_the_filter_predicts_a_pair_that_turns_and_climbs():
     """One period of a constant drive from rest, by the equations of motion integrated in small steps."""
-    pair, law = pitch_axis(preset("paper"), "test"), offset_free_lqg(preset("paper"))
+    pair, law = ideal_model(preset("paper"), "test"), offset_free_lqg(preset("paper"))
     state, steps = np.array([0.02, -0.1, 0.03, 0.2, 0.01, 0.3, 0.1, -0.2]), 20000
     drive, h = np.array([0.05, 0.4]), preset("paper").timing.control_period / 20000
     moved = state.copy()
     for _ in range(steps):
         angle, rate, torque, growth, rotors, _climb, lift, error = moved
-        asked = drive[0] - 2 * pair.kp * angle - 2 * pair.kd * rate
-        slope = (rate, (torque + rotors) / pair.inertia, growth, 0.0, (asked - rotors) / pair.lag)
+        asked = drive[0] - 2 * pair.kp[1] * angle - 2 * pair.kd[1] * rate
+        slope = (rate, (torque + rotors) / pair.inertia[1], growth, 0.0, (asked - rotors) / pair.lag)
         moved = moved + h * np.array([*slope, lift + error, (drive[1] - lift) / pair.lag, 0.0])
     np.testing.assert_allclose(law.transition @ np.append(state, drive), moved, atol=2e-6)
 

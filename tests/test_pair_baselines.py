@@ -9,8 +9,8 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from mjxball.baselines import crazyflie_lqg, lqg, make_baseline, make_law
+from mjxball.baselines.assembly_model import assembly_model
 from mjxball.baselines.crazyflie_lqg import MEASURED, linear_model
-from mjxball.baselines.load_axis import load_axis
 from mjxball.config import apply_overrides, preset, replace
 from mjxball.control import crazyflie
 from mjxball.control.constants import drone_loop, thrust_slopes
@@ -50,9 +50,10 @@ def test_loop_of_one_drone_by_hand() -> None:
     loop = drone_loop(FLIGHT, 0)
     expected = (torque * 937 * 3.25, torque * 937, torque * 28.1, torque * 454)
     assert (loop.kp, loop.kd, loop.kdd, loop.integral_gain) == pytest.approx(expected, rel=1e-4)
-    gains = load_axis(FLIGHT, "adaptive")
-    assert (gains.axis, gains.sign, gains.kp) == (0, -1.0, loop.kp)
-    assert gains.inertia == pytest.approx(2 * 1.66e-5 + 2 * 0.029 * 0.15**2 + 0.01 * (0.3**2 + 0.01**2) / 12, rel=1e-3)
+    model = assembly_model(FLIGHT, "adaptive")
+    assert (model.axes, model.kp[0]) == ((0,), loop.kp)
+    inertia = 2 * 1.66e-5 + 2 * 0.029 * 0.15**2 + 0.01 * (0.3**2 + 0.01**2) / 12
+    assert model.inertia[0] == pytest.approx(inertia, rel=1e-3)
 
 
 def test_motors_that_work_apart_lift_besides() -> None:
@@ -157,7 +158,7 @@ def test_lqg_brings_the_ball_back_on_the_stand() -> None:
 
 
 def test_what_does_not_fly_this_rig_says_so() -> None:
-    with pytest.raises(InputError, match="free pair along x"):
+    with pytest.raises(InputError, match="ideal loops"):
         make_law("memoryless", FLIGHT)
     with pytest.raises(InputError, match="along y"):
         make_law("lqg", replace(FLIGHT, "plant.cg_axis", "x"))

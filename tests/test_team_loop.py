@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from plants import copying, team
 
-from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset, with_plant
 from mjxball.control import observation as layout
 from mjxball.control import rotations
@@ -162,12 +161,6 @@ def test_unsound_scenarios_of_teams_are_refused(config: Config, change: dict, wo
 
     with pytest.raises(InputError, match=word):
         simulate(config, copying(config), Scenario(seconds=1, **change), "newton-euler")
-
-
-def test_baselines_of_pairs_refuse_teams_in_one_sentence() -> None:
-
-    with pytest.raises(InputError, match="one follower"):
-        make_baseline("adaptive", TEAM4)
 
 
 def test_random_teams_fly_at_all() -> None:

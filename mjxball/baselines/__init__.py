@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
-from mjxball.baselines.lqg import Lqg, Memoryless, SlowLqg
+from mjxball.baselines.lqg import Lqg, Memoryless, SlowLqg, ToldLqg
 from mjxball.baselines.offset_free import OffsetFree
 from mjxball.baselines.reference import Oracle, Random, Stay
 from mjxball.config import Config
@@ -20,6 +20,7 @@ from mjxball.errors import InputError
 __all__ = [
     "BASELINES",
     "LAWS",
+    "SUITE_BASELINES",
     "Adaptive",
     "Copy",
     "CrazyflieLqg",
@@ -30,6 +31,7 @@ __all__ = [
     "Random",
     "SlowLqg",
     "Stay",
+    "ToldLqg",
     "make_baseline",
     "make_law",
 ]
@@ -45,9 +47,12 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "lqg": lambda config: CrazyflieLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
     "lqg-slow": SlowLqg,
     "lqg-offset-free": OffsetFree,
+    "lqg-told": ToldLqg,
 }
-# The default list of `eval.py`; benchmark suites fly the variants as well.
-BASELINES = tuple(name for name in LAWS if name not in ("adaptive-mass", "lqg-slow", "lqg-offset-free"))
+# Where no drone fails `lqg-told` is `lqg`.
+SUITE_BASELINES = tuple(name for name in LAWS if name != "lqg-told")  # of benchmark suites
+VARIANTS = ("adaptive-mass", "lqg-slow", "lqg-offset-free")
+BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # of `eval.py`
 
 
 def make_law(name: str, config: Config) -> Law:

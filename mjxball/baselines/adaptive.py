@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from mjxball.baselines.load_axis import CopiedPid, load_axis
+import numpy as np
+
+from mjxball.baselines.assembly_model import CopiedPid, assembly_model
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.leader import clip_command
@@ -12,21 +14,22 @@ from mjxball.control.observation import ERROR, ERROR_RATE
 
 Array = Any
 BANDWIDTH = 6.0  # w_b [rad/s]; the loop limit-cycles from 16
-RATIO = 0.5  # r
-MOMENT_LIMIT, RATE_LIMIT = 0.15, 0.3  # [kg m], [kg m/s]
+RATIO, TEAM_RATIO = 0.5, 1.0  # r of a pair's and of several followers
+MOMENT_LIMIT, RATE_LIMIT = 0.15, 0.3  # for each follower [kg m], [kg m/s]
 CRAZYFLIE_BANDWIDTH = 4.0  # of two Crazyflies; in the middle of 2 to 9 tried on random rigs; at 9 more crash [rad/s]
 CRAZYFLIE_RATE = 4.0  # what their load may change in a second over the largest that one tilt limit holds [1/s]
-MASS_GAIN, MASS_SLOPE, MASS_LIMIT = 0.5, 0.35, 0.5  # Gamma, [1/s], [kg]
-CORRECTION_LIMIT = 0.5  # [rad] of pitch, with mass adaptation
+MASS_GAIN, TEAM_MASS_GAIN = 0.5, 4.0  # Gamma of a pair's and of several followers
+MASS_SLOPE, MASS_LIMIT = 0.35, 0.5  # [1/s], for each follower [kg]
+CORRECTION_LIMIT = 0.5  # [rad] of roll and pitch, with mass adaptation
 
 
 class State(NamedTuple):
-    """State of the adaptive follower."""
+    """State of the adaptive follower, in body axes; A axes about which the load turns the assembly."""
 
     integral: Any  # (..., 3) see `CopiedPid`
-    desired: Array  # (...) last command of the copied law about the load's axis [rad]
-    moment: Array  # (...) estimate of the load's moment about that axis over gravity, m_o c for pitch [kg m]
-    rate: Array  # (...) estimate of its rate [kg m/s]
+    desired: Array  # (..., A) last command of the copied law about the load's axes [rad]
+    moment: Array  # (..., A) estimate of the load's torque about them over gravity, m_o c for pitch [kg m]
+    rate: Array  # (..., A) estimate of its rate [kg m/s]
     extra_mass: Array  # (...) estimate of the object's mass beyond what is believed [kg]
     error: Array  # (...) height error of an ideal PD response [m]
     error_rate: Array  # (...) [m/s]
@@ -34,13 +37,17 @@ class State(NamedTuple):
 
 
 class Adaptive:
-    """s = (q - theta_d') + lam (theta - theta_d); d' = v + G1 (g + az) s, v' = G2 (g + az) s.
+    """s = (q - theta_d') + lam (theta - theta_d); d' = v + G1 (g + az) s, v' = G2 (g + az) s, about each load's axis.
 
-    theta_d is the copied pitch command, lam = Kp / Kd of a drone's pitch loop, K = 2 Kd, G1 = K w_b / g^2,
-    G2 = G1 w_b r / 2; theta_f = theta_d - (g + az) d / Kp. With `adapts_mass` the object's mass is estimated from
-    the height against an ideal PD response, and its weight and the torque of carrying it alone are compensated.
-    With the CG along y the same of roll. A leader that integrates is copied with its integral, so that both lift alike;
-    what a Crazyflie's motors lift besides when they work apart is taken off.
+    theta_d is the copied command, lam = Kp / Kd of a drone's attitude loop, K = N Kd of all N drones, G1 = K w_b / g^2,
+    G2 = G1 w_b r / 2. Every follower gives its share against the torque (g + az) d, by its rotors and by lifting more
+    or less than the others (`AssemblyModel.corrections`): the one of a pair theta_f = theta_d - (g + az) d / Kp. With
+    `adapts_mass` the object's mass is estimated from the height against an ideal PD response, and the followers lift
+    its weight without turning the assembly. The other axis of a pair is copied. A leader that integrates is copied with
+    its integral, so that all lift alike; what a Crazyflie's motors lift besides when they work apart is taken off.
+
+    Of several followers r = 1 and Gamma = 4 were best: at r = 0.5 their largest error is up to twice that, and at
+    w_b = 8 they diverge under noise and 40 ms of delay (`benchmarks/teams.py`).
     """
 
     needs_privileged = False
@@ -50,62 +57,66 @@ class Adaptive:
         self._pid = CopiedPid(config)
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._height = (config.leader.kp[2], config.leader.kd[2])
-        self._gains = gains = load_axis(config, self.name)
+        self._model = model = assembly_model(config, self.name)
         self._adapts_mass = adapts_mass
-        self._bandwidth, self._estimate_limits = BANDWIDTH, (MOMENT_LIMIT, RATE_LIMIT)
+        drones, followers = len(model.own_mass), model.followers
+        kp, kd = np.array(model.kp)[model.turned], np.array(model.kd)[model.turned]
+        bandwidth, self._estimate_limits = BANDWIDTH, (followers * MOMENT_LIMIT, followers * RATE_LIMIT)
         if config.autopilot.kind == "crazyflie":
-            trimmed = gains.kp * config.command.tilt_limit / gains.gravity
-            self._bandwidth, self._estimate_limits = CRAZYFLIE_BANDWIDTH, (trimmed, CRAZYFLIE_RATE * trimmed)
+            trimmed = float(kp[0]) * config.command.tilt_limit / model.gravity
+            bandwidth, self._estimate_limits = CRAZYFLIE_BANDWIDTH, (trimmed, CRAZYFLIE_RATE * trimmed)
+        first, ratio = drones * kd * bandwidth / model.gravity**2, RATIO if followers == 1 else TEAM_RATIO
+        self._gains = kp / kd, first, first * bandwidth * ratio / 2.0  # lam, G1, G2 of each axis
+        self._mass_gain = (MASS_GAIN if followers == 1 else TEAM_MASS_GAIN) / model.gravity
+        self._mass_limit = followers * MASS_LIMIT
 
     def start(self, observation: Array) -> State:
         """See `Law.start`."""
-        zero = observation.__array_namespace__().zeros_like(observation[..., 0])
+        xp, observation = observation.__array_namespace__(), self._model.seen(observation)
+        zero = xp.zeros_like(observation[..., 0])
+        zeros = xp.zeros_like(observation[..., : len(self._model.axes)])
         error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]
-        return State(self._pid.start(observation), zero, zero, zero, zero, error, error_rate, zero)
+        return State(self._pid.start(observation), zeros, zeros, zeros, zero, error, error_rate, zero)
 
     def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
         """See `Law.step`."""
-        xp = observation.__array_namespace__()
-        gains = self._gains
+        xp, model, axes = observation.__array_namespace__(), self._model, self._model.turned
+        slope, first, second = (xp.asarray(gain, dtype=observation.dtype) for gain in self._gains)
+        observation = model.seen(observation)
         integral, copied = self._pid.step(state.integral, observation)
-        desired, vertical = copied[..., gains.axis], copied[..., 2]
-        theta, rate = observation[..., 3 + gains.axis], observation[..., 9 + gains.axis]
-        desired_rate = state.started * (desired - state.desired) / gains.period
-        s = (rate - desired_rate) + gains.kp / gains.kd * (theta - desired)
-        lift = gains.gravity + vertical
-        first = 2.0 * gains.kd * self._bandwidth / gains.gravity**2
-        second = first * self._bandwidth * RATIO / 2.0
-        moment = state.moment + gains.period * (state.rate + first * lift * s)
+        desired, vertical = copied[..., axes], copied[..., 2]
+        theta, rate = observation[..., 3:5][..., axes], observation[..., 9:11][..., axes]
+        desired_rate = state.started[..., None] * (desired - state.desired) / model.period
+        s = (rate - desired_rate) + slope * (theta - desired)
+        weight = (model.gravity + vertical)[..., None]
         most, most_rate = self._estimate_limits
-        moment = xp.clip(moment, -most, most)
-        moment_rate = xp.clip(state.rate + gains.period * second * lift * s, -most_rate, most_rate)
-        correction = -lift * moment / gains.kp
+        moment = xp.clip(state.moment + model.period * (state.rate + first * weight * s), -most, most)
+        moment_rate = xp.clip(state.rate + model.period * second * weight * s, -most_rate, most_rate)
         moved = state._replace(
             integral=integral, desired=desired, moment=moment, rate=moment_rate, started=xp.ones_like(state.started)
         )
+        carried, lift = model.carried(model.of_flight(privileged.believed_mass)), xp.zeros_like(vertical)
         if self._adapts_mass:
-            moved, more, push = self._mass(moved, observation, privileged)
-            vertical = vertical + push
-            correction = xp.clip(correction + more, -CORRECTION_LIMIT, CORRECTION_LIMIT)
-        tilts = [copied[..., 0], copied[..., 1]]
-        tilts[gains.axis] = desired + correction
-        vertical = gains.less_extra_lift(vertical, correction)
-        return moved, clip_command(xp.stack([*tilts, vertical], axis=-1), *self._limits)
+            moved = self._mass(moved, observation, carried)
+            lift = model.gravity * moved.extra_mass
+        wrench = xp.concat([lift[..., None], model.on_axes(-weight * moment)], axis=-1)
+        correction = model.corrections(wrench, carried)
+        tilt = correction[..., :2]
+        if self._adapts_mass:
+            tilt = xp.clip(tilt, -CORRECTION_LIMIT, CORRECTION_LIMIT)
+        lift = model.less_extra_lift(vertical[..., None] + correction[..., 2], tilt)
+        command = xp.concat([copied[..., None, :2] + tilt, lift[..., None]], axis=-1)
+        return moved, model.sent(clip_command(command, *self._limits))
 
-    def _mass(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array, Array]:
-        """(state, tilt [rad], vertical acceleration [m/s2]) that carry the estimated extra mass."""
-        xp = observation.__array_namespace__()
-        gains = self._gains
-        carried = gains.drone_mass[1] + gains.share[1] * privileged.believed_mass
+    def _mass(self, state: State, observation: Array, carried: Array) -> State:
+        """`state` with the extra mass that explains the height, for drones that believe to have `carried` (..., N)."""
+        xp, period = observation.__array_namespace__(), self._model.period
         error, error_rate = observation[..., ERROR][..., 2], observation[..., ERROR_RATE][..., 2]
         s = (state.error_rate - error_rate) + MASS_SLOPE * (state.error - error)
-        mass = state.extra_mass - gains.period * 2.0 * carried * MASS_GAIN / gains.gravity * s
-        mass = xp.clip(mass, -MASS_LIMIT, MASS_LIMIT)
+        mass = state.extra_mass - period * carried.sum(axis=-1) * self._mass_gain * s
         kp, kd = self._height
-        ideal = -kp * state.error - kd * state.error_rate
-        moved = state._replace(
-            extra_mass=mass,
-            error=state.error + gains.period * state.error_rate,
-            error_rate=state.error_rate + gains.period * ideal,
+        return state._replace(
+            extra_mass=xp.clip(mass, -self._mass_limit, self._mass_limit),
+            error=state.error + period * state.error_rate,
+            error_rate=state.error_rate + period * (-kp * state.error - kd * state.error_rate),
         )
-        return moved, -gains.sign * gains.half_length * mass * gains.gravity / gains.kp, mass * gains.gravity / carried

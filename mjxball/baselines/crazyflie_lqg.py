@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.baselines.load_axis import CopiedPid, load_axis
+from mjxball.baselines.assembly_model import CopiedPid, assembly_model
 from mjxball.baselines.lqg import discretise
 from mjxball.config import Config, ball_limit
 from mjxball.control.constants import drone_loop, thrust_slopes
@@ -70,8 +70,8 @@ class LinearModel(NamedTuple):
 def linear_model(config: Config, delay: float) -> LinearModel:
     """The model for the nominal plant of `config`; `delay` [s] of the sensors is added to the rotors' lag."""
     plant, law = config.plant, config.leader
-    pair, loop = load_axis(config, "lqg"), drone_loop(config, 0)
-    lag, half = plant.rotor_lag + delay, pair.half_length
+    assembly, loop = assembly_model(config, "lqg"), drone_loop(config, 0)
+    lag, half = plant.rotor_lag + delay, 0.5 * float(assembly.mounts[0, 1] - assembly.mounts[1, 1])
     n, at = len(STATES), {name: place for place, name in enumerate(STATES)}
     eye = np.eye(n)
     row = {name: eye[place] for name, place in at.items()}
@@ -85,14 +85,14 @@ def linear_model(config: Config, delay: float) -> LinearModel:
     a[at["y"]], a[at["vy"]] = row["vy"], -plant.gravity * row["roll"]
     a[at["roll"]] = row["rate"]
     thrust_torque = half * (row["leader_thrust"] - row["follower_thrust"])
-    a[at["rate"]] = (row["torque"] + thrust_torque + row["load"]) / pair.inertia
+    a[at["rate"]] = (row["torque"] + thrust_torque + row["load"]) / assembly.inertia[0]
     commanded = loop.kp * (leader_roll - 2 * row["roll"]) - 2 * loop.kd * row["rate"] - 2 * loop.kdd * a[at["rate"]]
     a[at["torque"]] = (commanded + loop.integral_gain * row["rate_integral"] - row["torque"]) / lag
     b[at["torque"], 0] = loop.kp / lag
     a[at["rate_integral"]] = loop.stiffness * (leader_roll - row["roll"]) - row["rate"]
 
     a[at["height"]] = row["climb"]
-    total = sum(pair.drone_mass) + plant.object_mass
+    total = float(assembly.known_mass.sum()) + plant.object_mass
     a[at["climb"]] = (row["leader_thrust"] + row["follower_thrust"] + row["lift"]) / total
     leader_slope, follower_slope = thrust_slopes(config)
     a[at["leader_thrust"]] = (leader_slope * leader_vertical - row["leader_thrust"]) / lag
@@ -140,7 +140,7 @@ class CrazyflieLqg:
     def __init__(self, config: Config):
         if config.plant.cg_axis != "y" or config.plant.stand == "pivot":
             raise InputError("follower 'lqg' flies two Crazyflies along y, free or on the stand with height free")
-        self._axis = load_axis(config, self.name)
+        self._assembly = assembly_model(config, self.name)
         self._model = linear_model(config, DELAY)
         self._design = design(self._model, config.timing.control_period)
         self._pid = CopiedPid(config)
@@ -171,7 +171,7 @@ class CrazyflieLqg:
         change = -xp.concat([near, state.command], axis=-1) @ feedback.T
         command = _clip(state.command + change, self._limits)
         integral, copied = self._pid.step(state.integral, observation)
-        vertical = self._axis.less_extra_lift(command[..., 1], command[..., 0])
+        vertical = self._assembly.less_extra_lift(command[..., 1], self._assembly.on_axes(command[..., :1]))
         vertical = _clip(vertical, self._limits[1])
         sent = xp.stack([command[..., 0], copied[..., 1], vertical], axis=-1)
         return State(estimate, command, integral, xp.ones_like(state.started)), sent

@@ -1,7 +1,7 @@
-"""LQG for the paper's pair: the follower takes over the loop by LQR and a Kalman filter for the CG's torque (ours).
+"""LQG for plants with ideal loops: the followers take over the loop by LQR and Kalman filters for what disturbs (ours).
 
-The pair follows the sum of both drones' commands. The follower therefore commands twice what the pair should do, less
-the leader's command, which it computes from its own observation.
+The assembly follows the sum of all drones' commands. The followers therefore command what N drones should do less the
+leader's command, which they compute from what they see, each its part.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
 
-from mjxball.baselines.load_axis import LoadAxis, pitch_axis
+from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
@@ -19,9 +19,9 @@ from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 Array = Any
 TILT, VERTICAL = 0.15, 1.0  # [rad], [m/s2] that cost 1
 VERTICAL_LIMIT = 2.0  # of the position and velocity part [m/s2]
-CORRECTION_LIMIT = 0.6  # of pitch against the CG's torque [rad]
-LIMITS = (0.6, 1.0, 6.0)  # of roll, pitch [rad] and vertical acceleration [m/s2]
-THETA_NOISE, RATE_NOISE = 2e-3, 2e-2  # deviations of a measurement [rad], [rad/s]
+CORRECTION_LIMIT = 0.6  # of all followers' roll and pitch against the load's torque [rad]
+LIMITS = (1.0, 0.6)  # of a command, about an axis that the load turns and about another [rad]
+THETA_NOISE, RATE_NOISE, CLIMB_NOISE = 2e-3, 2e-2, 2e-2  # deviations of a measurement [rad], [rad/s], [m/s]
 
 
 class Tuning(NamedTuple):
@@ -47,23 +47,30 @@ class Gains(NamedTuple):
 
 
 class Filter(NamedTuple):
-    """Steady-state Kalman filter: x <- A x + B u, then x <- x + L (y - C x), on (theta, q, d, d', rotor torque)."""
+    """Steady-state Kalman filter: x <- A x + B u, then x <- x + L (y - C x), on (angle, rate, d, d', rotor torque)."""
 
-    transition: np.ndarray  # (5, 5)
+    transition: np.ndarray  # (5, 5), of A axes (A, 5, 5)
     drive: np.ndarray  # (5,)
     gain: np.ndarray  # (5, 2)
 
 
 class State(NamedTuple):
-    """Estimate and the torque command that acts until the next step."""
+    """Estimates and what acts until the next step, body axes; A axes about which the load turns the assembly."""
 
-    estimate: Array  # (..., 5)
-    drive: Array  # (...) [N m]
+    estimate: Array  # (..., A, 5) of each axis, see `Filter`
+    torque: Array  # (..., A) that all drones command [N m]
     started: Array  # (...) 1 after the first step
 
 
+class Plan(NamedTuple):
+    """What all drones should do, body axes."""
+
+    followed: Array  # (..., F, 3) the followers' commands
+    torque: Array  # (..., 2) that the commands of all give about roll and pitch [N m]
+
+
 class Takeover:
-    """What `lqg` and `memoryless` share: everything but how the CG's torque d is found."""
+    """What `lqg` and `memoryless` share: everything but how the load's torque d is found."""
 
     needs_privileged = False
     name = ""
@@ -71,11 +78,14 @@ class Takeover:
 
     def __init__(self, config: Config):
         self._law = copy_gains(config)
-        self._plant = pitch_axis(config, self.name)
-        self._feedback = feedback(self._plant, self.tuning)
+        self._model = model = ideal_model(config, self.name)
+        self._feedback = feedback(model, self.tuning)
+        tilts = [LIMITS[0] if axis in model.axes else LIMITS[1] for axis in (0, 1)]
+        self._largest = CORRECTION_LIMIT * model.followers * np.array(model.kp)
+        self._limits = np.array([*tilts, config.command.vertical_limit])
 
     def _desired(self, observation: Array) -> Array:
-        """What the pair should do: roll, pitch, vertical acceleration (..., 3)."""
+        """What the assembly should do: roll, pitch, vertical acceleration (..., 3)."""
         xp = observation.__array_namespace__()
         ex, ey, ez = (observation[..., ERROR][..., k] for k in range(3))
         vx, vy, vz = (-observation[..., ERROR_RATE][..., k] for k in range(3))
@@ -90,25 +100,60 @@ class Takeover:
         vertical = xp.clip(f.height[0] * ez - f.height[1] * vz, -VERTICAL_LIMIT, VERTICAL_LIMIT)
         return xp.stack([roll, pitch, vertical], axis=-1)
 
-    def _command(
-        self, observation: Array, desired: Array, torque: Array, privileged: PrivilegedInfo
-    ) -> tuple[Array, Array, Array]:
-        """(command, sum of both pitch commands, thrust difference T_l - T_f) against the CG's `torque` (...)."""
-        xp = observation.__array_namespace__()
-        p = self._plant
-        led = copy_command(observation, *self._law)
-        level = xp.cos(observation[..., 3]) * xp.cos(observation[..., 4])
-        vertical = xp.clip(2.0 * desired[..., 2] - led[..., 2], -LIMITS[2], LIMITS[2])
-        carried = [m + s * privileged.believed_mass for m, s in zip(p.drone_mass, p.share, strict=True)]
-        difference = (carried[0] * (p.gravity + led[..., 2]) - carried[1] * (p.gravity + vertical)) / level
-        correction = xp.clip((p.half_length * difference - torque) / p.kp, -CORRECTION_LIMIT, CORRECTION_LIMIT)
-        pitch = xp.clip(2.0 * desired[..., 1] - led[..., 1] + correction, -LIMITS[1], LIMITS[1])
-        roll = xp.clip(2.0 * desired[..., 0] - led[..., 0], -LIMITS[0], LIMITS[0])
-        return xp.stack([roll, pitch, vertical], axis=-1), led[..., 1] + pitch, difference
+    def _plan(self, observation: Array, desired: Array, torque: Array, privileged: PrivilegedInfo) -> Plan:
+        """Commands for `desired` (..., 3) against the load's `torque` (..., A) [N m].
+
+        The followers lift alike. On top each gives its share of the torque that the assembly wants and the leader does
+        not give: its N attitude loops at `desired`, against the load and against thrusts that are uneven.
+        """
+        xp, model, count = observation.__array_namespace__(), self._model, len(self._model.own_mass)
+        kp, kd, limits, most = (
+            xp.asarray(part, dtype=observation.dtype) for part in (model.kp, model.kd, self._limits, self._largest)
+        )
+        thrust = self._thrust(privileged)
+        carried = model.carried(model.of_flight(privileged.believed_mass))
+        given = xp.ones_like(carried) if thrust is None else thrust
+        lifting, level = given * carried, xp.cos(observation[..., 3]) * xp.cos(observation[..., 4])
+        led, first = copy_command(observation, *self._law), given[..., model.leader, None]
+
+        left = carried.sum(axis=-1) * (model.gravity + desired[..., 2])
+        left = left - lifting[..., model.leader] * (model.gravity + led[..., 2])
+        alike = xp.clip(left / model.of_followers(lifting).sum(axis=-1) - model.gravity, -limits[2], limits[2])
+        # Where the rotors of a drone that is commanded there give no torque.
+        rest = observation[..., 3:5] + kd / kp * observation[..., 9:11]
+        base = xp.concat([rest, alike[..., None]], axis=-1)[..., None, :]
+        base = xp.broadcast_to(base, (*base.shape[:-2], model.followers, 3))
+        turns = self._lever_torque(led, base, lifting, level)[..., model.turned] + torque
+        wanted = kp * (count * (desired[..., :2] - rest) - first * (led[..., :2] - rest))
+        wanted = wanted - xp.clip(model.on_axes(turns), -most, most)
+        wrench = xp.concat([0.0 * wanted[..., :1], wanted], axis=-1)
+        followed = xp.clip(base + model.corrections(wrench, carried, thrust), -limits, limits)
+
+        angles = first * led[..., :2] + (model.of_followers(given)[..., None] * followed[..., :2]).sum(axis=-2)
+        # The filter knows N loops; what drones do not give of theirs is taken off.
+        commanded = kp * (angles + (count - given.sum(axis=-1))[..., None] * rest)
+        return Plan(followed, commanded + self._lever_torque(led, followed, lifting, level))
+
+    def _thrust(self, privileged: PrivilegedInfo) -> Array | None:
+        """What drones give of what they are asked for (..., N), if that is known."""
+        return None
+
+    def _in_order(self, led: Array, followed: Array) -> Array:
+        """Commands of all drones (..., N, 3)."""
+        place = self._model.leader
+        parts = [followed[..., :place, :], led[..., None, :], followed[..., place:, :]]
+        return led.__array_namespace__().concat(parts, axis=-2)
+
+    def _lever_torque(self, led: Array, followed: Array, lifting: Array, level: Array) -> Array:
+        """(..., 2) roll and pitch torque about O of all thrusts less the drones' own weight."""
+        xp, model = led.__array_namespace__(), self._model
+        own = xp.asarray(model.own_mass, dtype=led.dtype) * model.gravity
+        asked = model.gravity + self._in_order(led, followed)[..., 2]
+        return model.lever_torque(lifting * asked / level[..., None] - own)
 
 
 class Memoryless(Takeover):
-    """d from the balance of torques at standstill: 2 Kp (theta - theta*) + 2 Kd q."""
+    """d from the balance of torques at standstill: N Kp (theta - theta*) + N Kd q."""
 
     name = "memoryless"
 
@@ -118,40 +163,49 @@ class Memoryless(Takeover):
 
     def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
         """See `Law.step`."""
+        xp, model = observation.__array_namespace__(), self._model
+        observation = model.seen(observation)
         desired = self._desired(observation)
-        theta, rate = observation[..., 4], observation[..., 10]
-        torque = 2.0 * self._plant.kp * (theta - desired[..., 1]) + 2.0 * self._plant.kd * rate
-        return state, self._command(observation, desired, torque, privileged)[0]
+        kp, kd = (xp.asarray(gain, dtype=observation.dtype) for gain in (model.kp, model.kd))
+        torque = kp * (observation[..., 3:5] - desired[..., :2]) + kd * observation[..., 9:11]
+        torque = len(model.own_mass) * torque[..., model.turned]
+        plan = self._plan(observation, desired, torque, privileged)
+        return state, model.sent(plan.followed)
 
 
 class Lqg(Takeover):
-    """d from a steady-state Kalman filter on pitch, pitch rate, d, d' and the rotors' torque."""
+    """d from steady-state Kalman filters on angle, rate, d, d' and the rotors' torque about each of the load's axes."""
 
     name = "lqg"
 
     def __init__(self, config: Config):
         super().__init__(config)
-        self._filter = kalman(self._plant, self.tuning.torque_walk)
+        filters = [kalman(self._model, axis, self.tuning.torque_walk) for axis in self._model.axes]
+        self._filter = Filter(*(np.stack(parts) for parts in zip(*filters, strict=True)))
 
     def start(self, observation: Array) -> State:
         """See `Law.start`."""
-        xp = observation.__array_namespace__()
-        zero = xp.zeros_like(observation[..., 0])
-        theta, rate = observation[..., 4], observation[..., 10]
-        return State(xp.stack([theta, rate, zero, zero, zero], axis=-1), zero, zero)
+        xp, observation = observation.__array_namespace__(), self._model.seen(observation)
+        theta, rate = (observation[..., part] for part in self._seen())
+        zero = xp.zeros_like(theta)
+        estimate = xp.stack([theta, rate, zero, zero, zero], axis=-1)
+        return State(estimate, zero, xp.zeros_like(observation[..., 0]))
 
     def step(self, state: State, observation: Array, privileged: PrivilegedInfo) -> tuple[State, Array]:
         """See `Law.step`."""
-        xp = observation.__array_namespace__()
-        transition, drive, gain = (xp.asarray(part, dtype=observation.dtype) for part in self._filter)
-        predicted = state.estimate @ transition.T + state.drive[..., None] * drive
-        predicted = xp.where(state.started[..., None] > 0, predicted, state.estimate)
-        measured = xp.stack([observation[..., 4], observation[..., 10]], axis=-1)
-        estimate = predicted + (measured - predicted[..., :2]) @ gain.T
-        desired = self._desired(observation)
-        command, pitches, difference = self._command(observation, desired, estimate[..., 2], privileged)
-        torque = self._plant.kp * pitches - self._plant.half_length * difference
-        return State(estimate, torque, xp.ones_like(state.started)), command
+        xp, model = observation.__array_namespace__(), self._model
+        observation = model.seen(observation)
+        measured = xp.stack([observation[..., part] for part in self._seen()], axis=-1)
+        started = state.started[..., None, None]
+        estimate = filtered(self._filter, state.estimate, state.torque, measured, started)
+        plan = self._plan(observation, self._desired(observation), estimate[..., 2], privileged)
+        moved = State(estimate, plan.torque[..., model.turned], xp.ones_like(state.started))
+        return moved, model.sent(plan.followed)
+
+    def _seen(self) -> tuple[slice, slice]:
+        """Where an observation has the angles and rates about the load's axes."""
+        axes = self._model.turned
+        return slice(3 + axes.start, 3 + axes.stop), slice(9 + axes.start, 9 + axes.stop)
 
 
 class SlowLqg(Lqg):
@@ -161,15 +215,37 @@ class SlowLqg(Lqg):
     tuning = SLOW
 
 
-def feedback(plant: LoadAxis, tuning: Tuning) -> Gains:
+class ToldLqg(Lqg):
+    """`lqg` that is told, besides the plant, what every drone gives of its thrust: which are lost, and when."""
+
+    name = "lqg-told"
+    needs_privileged = True
+
+    def _thrust(self, privileged: PrivilegedInfo) -> Array | None:
+        return None if privileged.thrust is None else self._model.of_flight(privileged.thrust, axes=1)
+
+
+def filtered(kalman: Filter, estimate: Array, drive: Array, measured: Array, started: Array) -> Array:
+    """Estimate (..., A, 5) after `drive` (..., A) has acted for a step and `measured` (..., A, 2) is seen.
+
+    `started` (..., 1, 1): 0 at the first step, where `estimate` is as of now.
+    """
+    xp = measured.__array_namespace__()
+    transition, enters, gain = (xp.asarray(part, dtype=measured.dtype) for part in kalman)
+    predicted = (transition @ estimate[..., None])[..., 0] + drive[..., None] * enters
+    predicted = xp.where(started > 0, predicted, estimate)
+    return predicted + (gain @ (measured - predicted[..., :2])[..., None])[..., 0]
+
+
+def feedback(model: AssemblyModel, tuning: Tuning) -> Gains:
     """LQR of both tilt axes, each with its closed attitude loop, and of the height."""
     costs = tuning.position**-2, tuning.velocity**-2
 
     def tilt(frequency: float, sign: float) -> tuple[float, ...]:
         a = np.zeros((4, 4))
         a[0, 1] = a[2, 3] = 1.0
-        a[1, 2] = sign * plant.gravity
-        a[3, 2], a[3, 3] = -(frequency**2), -2.0 * plant.damping * frequency
+        a[1, 2] = sign * model.gravity
+        a[3, 2], a[3, 3] = -(frequency**2), -2.0 * model.damping * frequency
         b = np.array([[0.0], [0.0], [0.0], [frequency**2]])
         return lqr(a, b, np.diag([*costs, 0.0, 0.0]), np.array([[TILT**-2]]))
 
@@ -179,7 +255,7 @@ def feedback(plant: LoadAxis, tuning: Tuning) -> Gains:
         np.diag(costs),
         np.array([[VERTICAL**-2]]),
     )
-    roll, pitch = plant.natural_frequency
+    roll, pitch = model.natural_frequency
     return Gains(tilt(roll, -1.0), tilt(pitch, 1.0), height)
 
 
@@ -189,16 +265,17 @@ def lqr(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> tuple[flo
     return tuple(map(float, np.linalg.solve(r, b.T @ cost)[0]))
 
 
-def kalman(plant: LoadAxis, torque_walk: float) -> Filter:
-    """The matrices of the steady-state filter."""
+def kalman(model: AssemblyModel, axis: int, torque_walk: float) -> Filter:
+    """The matrices of the steady-state filter about `axis`, driven by the commanded torque [N m]."""
+    drones = len(model.own_mass)
     a = np.zeros((5, 5))
     a[0, 1] = a[2, 3] = 1.0
-    a[1, 2] = a[1, 4] = 1.0 / plant.inertia
-    a[4] = np.array([-2.0 * plant.kp, -2.0 * plant.kd, 0.0, 0.0, -1.0]) / plant.lag
-    b = np.array([[0.0], [0.0], [0.0], [0.0], [1.0 / plant.lag]])
-    transition, drive = discretise(a, b, plant.period)
+    a[1, 2] = a[1, 4] = 1.0 / model.inertia[axis]
+    a[4] = np.array([-drones * model.kp[axis], -drones * model.kd[axis], 0.0, 0.0, -1.0]) / model.lag
+    b = np.array([[0.0], [0.0], [0.0], [0.0], [1.0 / model.lag]])
+    transition, drive = discretise(a, b, model.period)
     process_noise = np.zeros((5, 5))
-    process_noise[3, 3] = torque_walk * plant.period
+    process_noise[3, 3] = torque_walk * model.period
     measured = np.eye(2, 5)
     measurement_noise = np.diag([THETA_NOISE**2, RATE_NOISE**2])
     predicted = solve_discrete_are(transition.T, measured.T, process_noise, measurement_noise)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
-from mjxball.baselines.load_axis import pitch_axis
+from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
 from mjxball.baselines.lqg import (
     CORRECTION_LIMIT,
     RATE_NOISE,
@@ -21,6 +21,7 @@ from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.leader import clip_command
 from mjxball.control.offset_free import DRIVES, STATES, OffsetFreeLqg
+from mjxball.errors import InputError
 
 Array = Any
 NAME = "lqg-offset-free"
@@ -29,13 +30,23 @@ CLIMB_NOISE = 0.02  # deviation of a measurement [m/s]
 LIFT_WALK = 0.01  # intensity of the white noise that drives the lift error [(m/s2)2/s]
 
 
+def pair_model(config: Config) -> AssemblyModel:
+    """`ideal_model`; InputError unless the plant is a free pair along x with ideal loops."""
+    plant = config.plant
+    alike = plant.count == 2 and plant.leader == 0 and plant.cg_axis == "x" and plant.stand == "free"
+    if not alike or config.autopilot.kind != "ideal":
+        raise InputError(f"follower {NAME!r} balances a free pair along x with ideal loops; this plant is another")
+    return ideal_model(config, NAME)
+
+
 def offset_free_lqg(config: Config) -> OffsetFreeLqg:
     """The law for the plant of `config`; InputError unless it is a free pair along x with ideal attitude loops."""
-    pair = pitch_axis(config, NAME)
+    pair = pair_model(config)
+    kp, kd = pair.kp[1], pair.kd[1]
     a, b = np.zeros((STATES, STATES)), np.zeros((STATES, DRIVES))
     a[0, 1] = a[2, 3] = 1.0
-    a[1, 2] = a[1, 4] = 1.0 / pair.inertia
-    a[4, :5] = np.array([-2.0 * pair.kp, -2.0 * pair.kd, 0.0, 0.0, -1.0]) / pair.lag
+    a[1, 2] = a[1, 4] = 1.0 / pair.inertia[1]
+    a[4, :5] = np.array([-2.0 * kp, -2.0 * kd, 0.0, 0.0, -1.0]) / pair.lag
     a[5, 6] = a[5, 7] = 1.0
     a[6, 6] = -1.0 / pair.lag
     b[4, 0] = b[6, 1] = 1.0 / pair.lag
@@ -52,9 +63,9 @@ def offset_free_lqg(config: Config) -> OffsetFreeLqg:
         tilt=np.array([gains.roll, gains.pitch]),
         height=np.array(gains.height),
         limits=np.array([TUNING.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
-        stiffness=pair.kp,
-        half_length=pair.half_length,
-        carried=np.array([m + share * mass for m, share in zip(pair.drone_mass, pair.share, strict=True)]),
+        stiffness=kp,
+        half_length=0.5 * float(pair.mounts[0, 0] - pair.mounts[1, 0]),
+        carried=pair.known_mass + pair.share * mass,
     )
 
 

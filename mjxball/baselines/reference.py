@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.baselines.load_axis import CopiedPid, LoadAxis, load_axis
+from mjxball.baselines.assembly_model import SIGNS, CopiedPid, assembly_model
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.leader import clip_command
@@ -57,10 +57,11 @@ class Random:
 
 
 class Oracle:
-    """Feed-forward of the true CG (ours), for a CG along x:
+    """Feed-forward of the true CG (ours), for a CG along x of a pair:
 
     theta_f = theta_l - (g + az) m_o c / Kp_theta + 2 m_o c'' / (M g), roll and az as the leader.
-    With the CG along y the same of roll, both terms with the other sign.
+    About roll the same of a CG along y, both terms with the other sign. Several followers share the CG's torque as
+    `AssemblyModel.corrections` says, and each gives N / F in place of 2.
     """
 
     name = "oracle"
@@ -69,20 +70,30 @@ class Oracle:
     def __init__(self, config: Config):
         self._pid = CopiedPid(config)
         self._limits = config.command.tilt_limit, config.command.vertical_limit
-        self._load_axis: LoadAxis = load_axis(config, self.name)
+        self._model = assembly_model(config, self.name)
 
     def start(self, observation: Array) -> Any:
         """See `Law.start`."""
-        return self._pid.start(observation)
+        return self._pid.start(self._model.seen(observation))
 
     def step(self, state: Any, observation: Array, privileged: PrivilegedInfo) -> tuple[Any, Array]:
         """See `Law.step`."""
-        xp = observation.__array_namespace__()
-        state, copied = self._pid.step(state, observation)
-        axis, sign, gravity = self._load_axis.axis, self._load_axis.sign, self._load_axis.gravity
-        tilts, vertical = [copied[..., 0], copied[..., 1]], copied[..., 2]
-        trim = -sign * (gravity + vertical) * privileged.moment / self._load_axis.kp
-        tilts[axis] = tilts[axis] + trim
-        tilts[axis] = tilts[axis] + sign * 2.0 * privileged.moment_acceleration / (privileged.total_mass * gravity)
-        vertical = self._load_axis.less_extra_lift(vertical, trim)
-        return state, clip_command(xp.stack([*tilts, vertical], axis=-1), *self._limits)
+        xp, model = observation.__array_namespace__(), self._model
+        state, copied = self._pid.step(state, model.seen(observation))
+        weight = (model.gravity + copied[..., 2:]) * self._torques(privileged.moment)
+        wrench = xp.concat([0.0 * weight[..., :1], -weight], axis=-1)
+        trim = model.corrections(wrench, model.carried(model.of_flight(privileged.believed_mass)))
+        ahead = len(model.own_mass) / model.followers / (model.of_flight(privileged.total_mass) * model.gravity)
+        reaction = ahead[..., None] * self._torques(privileged.moment_acceleration)
+        vertical = model.less_extra_lift(copied[..., None, 2] + trim[..., 2], trim[..., :2])
+        tilt = copied[..., None, :2] + trim[..., :2] + reaction[..., None, :]
+        command = xp.concat([tilt, vertical[..., None]], axis=-1)
+        return state, model.sent(clip_command(command, *self._limits))
+
+    def _torques(self, moment: Array) -> Array:
+        """(..., 2) roll and pitch torque over gravity of the load's `moment`, as `PrivilegedInfo` has it."""
+        xp, model = moment.__array_namespace__(), self._model
+        if model.angles is None:
+            return model.on_axes(SIGNS[model.axes[0]] * moment[..., None])
+        flat = model.seen(xp.concat([moment, 0.0 * moment[..., :1]], axis=-1))
+        return xp.stack([-flat[..., 1], flat[..., 0]], axis=-1)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mjxball import cli, config
-from mjxball.baselines import BASELINES, LAWS, make_baseline
+from mjxball.baselines import BASELINES, LAWS, SUITE_BASELINES, make_baseline
 from mjxball.commands.flight_log import evaluate_log
 from mjxball.commands.scenarios import SCENARIO_FLAGS, native_scenarios, scenarios_of, setup_of
 from mjxball.control.followers import Baseline, Follower
@@ -163,7 +163,7 @@ class Group:
 def _benchmark(group: Group, suites: list[Suite], options: argparse.Namespace, command: str) -> int:
     """Fly benchmark suites, with progress on stderr."""
     policies = group.policies(options)
-    followers: list[Follower] = [*group.baselines(list(LAWS)), *policies]
+    followers: list[Follower] = [*group.baselines(SUITE_BASELINES), *policies]
     _refuse_same_names([follower.name for follower in followers])
     num_seeds, started = options.num_seeds or 3, time.monotonic()
 

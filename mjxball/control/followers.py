@@ -14,8 +14,8 @@ Array = Any
 class PrivilegedInfo(NamedTuple):
     """What the simulator knows and an observation does not show; every leaf has the observation's batch shape.
 
-    Followers may read `believed_mass`. The rest is the truth half a control step and one rotor lag ahead, for
-    followers with `needs_privileged` alone.
+    Followers may read `believed_mass`. The rest is the truth, of the load half a control step and one rotor lag ahead,
+    for followers with `needs_privileged` alone.
     """
 
     believed_mass: Array  # (...) mass of the object that the hover thrust assumes [kg]
@@ -23,6 +23,7 @@ class PrivilegedInfo(NamedTuple):
     moment: Array
     moment_acceleration: Array  # likewise, object mass x second derivative of the CG offset [kg m/s2]
     total_mass: Array  # (...) of the assembly [kg]
+    thrust: Array | None = None  # (..., N) share of its asked forces that each drone gives now; None: all of them
 
 
 class Law(Protocol):

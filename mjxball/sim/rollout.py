@@ -165,7 +165,7 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
         commands = []
         for follower, part in zip(followers, parts, strict=True):
             if isinstance(follower, Baseline):
-                follower.privileged = PrivilegedInfo(*(leaf[part] for leaf in privileged))
+                follower.privileged = PrivilegedInfo(*(None if leaf is None else leaf[part] for leaf in privileged))
             commands.append(np.asarray(follower(observation[part]), float))
         return np.concatenate(commands)
 
@@ -278,7 +278,12 @@ def make_privileged_info(config: Config) -> Callable[[PlantState, Load], Privile
             flat = each(xp.stack([*parts, 0.0 * mass], axis=-1), axes=1)
             return rotations.turned_about_z(flat, -angles)[..., :2]
 
-        return PrivilegedInfo(each(load.believed_mass), moment(offset), moment(acceleration), each(drones + mass))
+        thrust = load.thrust_scale
+        if load.stop_time is not None:
+            turns = xp.astype(state.time[..., None] < load.stop_time, state.time.dtype)
+            thrust = turns if thrust is None else turns * thrust
+        known = each(load.believed_mass), moment(offset), moment(acceleration), each(drones + mass)
+        return PrivilegedInfo(*known, None if thrust is None else each(thrust, axes=1))
 
     return privileged
 
