@@ -4,7 +4,8 @@
     python benchmarks/house.py ../before . --repeats 3 --json benchmarks/results/house.json
 
 Both are timed in turn with the same interpreter, each training in a process of its own with README's command; cold:
-an empty cache of compiled programs, warm: the cache that the cold run left. Seconds are medians.
+an empty cache of compiled programs, warm: the cache that the cold run left. Medians of seconds by the clock, and of CPU
+seconds, which other programs on the machine change less; the load averages are written to the JSON file.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -21,7 +23,7 @@ from pathlib import Path
 
 SETTINGS = "from mjxball import config; from dataclasses import fields, is_dataclass as d; c = config.Config();" \
     "print(sum(len(fields(getattr(c, f.name))) for f in fields(c) if d(getattr(c, f.name))))"  # fmt: skip
-IMPORTS = {"import of a policy [s]": "import mjxball.policy", "import of training [s]": "import mjxball.train.program"}
+IMPORTS = {"import of a policy": "import mjxball.policy", "import of training": "import mjxball.train.program"}
 
 
 def sizes(tree: Path) -> dict[str, float]:
@@ -39,18 +41,20 @@ def sizes(tree: Path) -> dict[str, float]:
         "words of README": words([tree / "README.md"]),
         "words of the docs": words(pages),
         "words of the docs' archive": words(archived),
-        "settings": int(run(tree, ["-c", SETTINGS])[1]),
+        "settings": int(run(tree, ["-c", SETTINGS])[-1]),
     }
 
 
-def run(tree: Path, arguments: list[str], **variables: str) -> tuple[float, str]:
-    """(seconds, standard output) of `python ARGUMENTS` on the package of `tree`. Raises CalledProcessError."""
+def run(tree: Path, arguments: list[str], **variables: str) -> tuple[float, float, str]:
+    """(seconds, CPU seconds, standard output) of `python ARGUMENTS` in `tree`. Raises CalledProcessError."""
     environment = {**os.environ, "PYTHONPATH": str(tree), "JAX_PLATFORMS": "cpu", **variables}
-    began = time.perf_counter()
+    began, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
         [sys.executable, *arguments], cwd=tree, env=environment, check=True, capture_output=True, text=True
     )
-    return time.perf_counter() - began, done.stdout
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return time.perf_counter() - began, busy, done.stdout
 
 
 def main() -> None:
@@ -64,14 +68,21 @@ def main() -> None:
     trees = {"before": options.before.resolve(), "after": options.after.resolve()}
     found = {name: sizes(tree) for name, tree in trees.items()}
     times: dict[str, dict[str, list[float]]] = {name: {} for name in trees}
+    loads = [os.getloadavg()[0]]
     for _ in range(options.repeats):
         for name, tree in trees.items():
-            for what, code in IMPORTS.items():
-                times[name].setdefault(what, []).append(run(tree, ["-c", code])[0])
             with tempfile.TemporaryDirectory() as place:
-                for what in ("training, cold [s]", "training, warm [s]"):
-                    command = ["train.py", "--seed", "0", "--out", f"{place}/{what[10:14]}"]
-                    times[name].setdefault(what, []).append(run(tree, command, MJXBALL_CACHE=f"{place}/cache")[0])
+                tasks: dict[str, tuple[list[str], dict[str, str]]] = {
+                    what: (["-c", code], {}) for what, code in IMPORTS.items()
+                }
+                for what in ("training, cold", "training, warm"):
+                    command = ["train.py", "--seed", "0", "--out", f"{place}/{what[10:]}"]
+                    tasks[what] = (command, {"MJXBALL_CACHE": f"{place}/cache"})
+                for what, (command, variables) in tasks.items():
+                    seconds, busy, _ = run(tree, command, **variables)
+                    times[name].setdefault(f"{what} [s]", []).append(seconds)
+                    times[name].setdefault(f"{what} [CPU s]", []).append(busy)
+            loads.append(os.getloadavg()[0])
             print(name, {what: round(values[-1], 1) for what, values in times[name].items()}, flush=True)
     rows = {
         name: {**found[name], **{w: round(statistics.median(v), 2) for w, v in times[name].items()}} for name in trees
@@ -81,7 +92,9 @@ def main() -> None:
         print(f"{what:28} {rows['before'][what]:>10} {rows['after'][what]:>10}")
     if options.json:
         commits = {name: run_git(tree) for name, tree in trees.items()}
-        options.json.write_text(json.dumps({"commits": commits, "medians": rows, "all": times}, indent=1) + "\n")
+        options.json.write_text(
+            json.dumps({"commits": commits, "load": loads, "medians": rows, "all": times}, indent=1) + "\n"
+        )
 
 
 def run_git(tree: Path) -> str:
