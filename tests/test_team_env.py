@@ -12,6 +12,7 @@ import pytest
 from plants import team
 
 from mjxball import config as configs
+from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config, preset, with_plant
 from mjxball.control import rotations
 from mjxball.control.observation import ERROR, mount_angles
@@ -24,7 +25,9 @@ from mjxball.plant import plant_parameters
 from mjxball.plant.teams import Factors, padded, ring, ring_config, table, varied
 from mjxball.plant.trim import largest_amplitude, safe_radius
 from mjxball.sim.randomization import ResetDistribution
-from mjxball.train.program import Agents, Environments
+from mjxball.train import program as programs
+from mjxball.train.extensions import Extensions, find
+from mjxball.train.program import Agents, Environments, Program
 
 PAPER = preset("paper")
 SIZES = (2, 3, 4, 6)
@@ -260,3 +263,29 @@ def test_the_table_of_rigs_has_one_row_for_each_size() -> None:
     found = table(preset("team"))
     assert found.mounts.shape == (4, 6, 3)
     np.testing.assert_array_equal((found.drone_mass > 0).sum(axis=1), SIZES)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["sac", "ppo", "gradient"])
+def test_every_algorithm_learns_from_all_followers(algorithm: str) -> None:
+    """A few steps of each: 11 followers in four worlds, finite numbers, weights that move."""
+    sizes = {"num_envs": 11, "policy_layers": (8,)}
+    own = {
+        "sac": {"batch_size": 11, "replay_size": 1100, "warmup_steps": 22, "total_steps": 220, "critic_layers": (8,)},
+        "ppo": {"minibatches": 1, "unroll_length": 5, "total_steps": 220, "value_layers": (8,)},
+        "gradient": {"gradient_steps": 3, "horizon": 5},
+    }[algorithm]
+    changes = {f"{algorithm}.{name}": value for name, value in (sizes | own).items()}
+    config = configs.apply_overrides(settings(), changes)
+    kind = find(ALGORITHMS[algorithm], "--algorithm")
+    program = Program(config, "newton-euler", extensions=Extensions(algorithm=kind))
+    state = jax.jit(program.create)(jax.random.PRNGKey(0))
+    before = program.policy(state).layers
+    advance = jax.jit(program.advance)
+    state, _, _ = advance(state, programs.warmup(10))
+    state, statistics, metrics = advance(state, programs.train(10))
+    after = program.policy(state).layers
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, metrics, statistics)))
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), before, after)
+    assert max(jax.tree.leaves(moved)) > 0
+    assert statistics.peaks["error"].shape == (11,)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
 from mjxball.config._plant_file import read_plant
-from mjxball.config._settings import Bounds, Config, Follower, Gradient, Reward, Sac, ScenarioRanges
+from mjxball.config._settings import Bounds, Config, Follower, Gradient, Ppo, Reward, Sac, ScenarioRanges
 from mjxball.config._tree import apply_overrides
 from mjxball.errors import InputError
 
@@ -162,6 +162,7 @@ def _team() -> Config:
         ),
         bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.36),
         sac=replace(large.sac, num_envs=528, replay_size=528_000),
+        ppo=Ppo(num_envs=528),
         gradient=TEAM_GRADIENT,
     )
 
@@ -183,6 +184,7 @@ def _plate() -> Config:
         reward=replace(large.reward, ball=5.0),
         bounds=Bounds(x_peak=0.0, settling_time=0.0, rmse=0.5),
         sac=replace(large.sac, num_envs=510, replay_size=510_000),
+        ppo=Ppo(num_envs=528),
         gradient=TEAM_GRADIENT,
     )
 
