@@ -119,7 +119,7 @@ def _balance() -> Config:
         follower=replace(large.follower, base="lqg", action_scale_tilt=0.3, action_scale_vertical=4.0),
         scenario=replace(
             large.scenario,
-            unknown_share=0.4,
+            unknown_mass_probability=0.4,
             gust=(0.0, 0.2),
             # Half as much again as a user's delay may be: what is stable there is well damped at 60 ms.
             delay=(0.0, 0.1),

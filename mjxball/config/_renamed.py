@@ -42,6 +42,7 @@ RENAMED = {
     "follower.tilt_limit": "follower.action_scale_tilt",
     "follower.vertical_limit": "follower.action_scale_vertical",
     "follower.filters": "follower.observation_averages",
+    "scenario.unknown_share": "scenario.unknown_mass_probability",
     "follower.washout": "follower.washout_time",
     "follower.shares_integrals": "follower.residual_on_pid",
     "leader.level_gain": "leader.tilt_integral_gain",

@@ -61,7 +61,7 @@ class Autopilot:
     )
     hover_thrust: float = setting(46000.0, "thr_hov of the paper's law, calibrated for each rig", low=0, high=60000)
     thrust_per_acceleration: float = setting(1000.0, "k_pz of the paper's law [1/(m/s2)]", low=0)
-    sag: float = setting(0.0, "share of the force lost in a second of flight as the battery empties [1/s]", low=0)
+    sag: float = setting(0.0, "share of the thrust lost in a second of flight as the battery empties [1/s]", low=0)
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Leader:
     integral_error_limit: Vector3 = setting((1e3, 1e3, 1e3), "largest error per axis that is integrated [m]", above=0)
     integral_lead_time: float = setting(
         0.0,
-        "the error is integrated with its rate times this, within the band: nothing winds up on the way to a goal [s]",
+        "the integrated error is error + this * its rate, within the limit: nothing winds up on the way to a goal [s]",
         low=0,
     )
     tilt_integral_gain: float = setting(
@@ -208,9 +208,9 @@ class ScenarioRanges:
         0.0, "probability that one follower's rotors stop, 3 to 15 s after the start", low=0, high=1
     )
     mass_known: bool = setting(True, "hover thrust uses the true object mass, else the plant's nominal one")
-    unknown_share: float = setting(
+    unknown_mass_probability: float = setting(
         0.0,
-        "share of flights with an object mass that the hover thrust does not know, from unknown_mass",
+        "probability of an object mass that the hover thrust does not know, from unknown_mass",
         low=0,
         high=1,
     )

@@ -97,10 +97,10 @@ class ResetDistribution:
         if rig is not None:
             mass, nominal = mass * rig.share, nominal * rig.share
         believed = mass if scenario.mass_known else nominal
-        if scenario.unknown_share > 0:
+        if scenario.unknown_mass_probability > 0:
             share, place = jax.random.uniform(jax.random.fold_in(rng, 7), (2,))
             low, high = scenario.unknown_mass
-            unknown = share < scenario.unknown_share
+            unknown = share < scenario.unknown_mass_probability
             proportion: Scalar | float = 1.0 if rig is None else rig.share
             mass = jnp.where(unknown, proportion * (low + (high - low) * place), mass)
             believed = jnp.where(unknown, nominal, believed)
