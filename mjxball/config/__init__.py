@@ -3,6 +3,7 @@
 Importing it needs the standard library only.
 """
 
+from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant import Drone, Plant
 from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
 from mjxball.config._presets import PRESETS, preset
@@ -14,12 +15,9 @@ from mjxball.config._settings import (
     Command,
     Config,
     Follower,
-    Gradient,
     Leader,
     Motion,
-    Ppo,
     Reward,
-    Sac,
     ScenarioRanges,
     Timing,
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from mjxball.config._learning import Sac
 from mjxball.config._plant_file import read_plant
 from mjxball.config._settings import (
     Bounds,
@@ -12,7 +13,6 @@ from mjxball.config._settings import (
     Follower,
     Leader,
     Reward,
-    Sac,
     ScenarioRanges,
     Timing,
 )

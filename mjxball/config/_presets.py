@@ -6,8 +6,9 @@ import types
 from dataclasses import replace
 
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
+from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant_file import read_plant
-from mjxball.config._settings import Bounds, Config, Follower, Gradient, Ppo, Reward, Sac, ScenarioRanges
+from mjxball.config._settings import Bounds, Config, Follower, Reward, ScenarioRanges
 from mjxball.config._tree import apply_overrides
 from mjxball.errors import InputError
 

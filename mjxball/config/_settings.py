@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mjxball.config._leaf import Range, Vector3, drawn, setting
+from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant import Plant
 
 
@@ -243,89 +244,6 @@ class Reward:
         0.0, "weight of the squared difference of both drones' tilt commands about the axis that no load turns", low=0
     )
     termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0)
-
-
-@dataclass(frozen=True)
-class Sac:
-    """Soft actor-critic and the loop around it."""
-
-    total_steps: int = setting(1_000_000, "environment steps in all", low=1)
-    num_envs: int = setting(128, "environments that are stepped at once", low=1)
-    batch_size: int = setting(256, "transitions in an update", low=1)
-    updates_per_step: int = setting(4, "gradient updates after each step of all environments", low=1)
-    warmup_steps: int = setting(12_800, "environment steps with random actions before the first update", low=0)
-    replay_size: int = setting(1_024_000, "transitions kept, a multiple of num_envs", low=1)
-    policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
-    critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1)
-    critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
-    num_critics: int = setting(2, "Q networks, of which the smallest value counts", low=1, high=2)
-    state_value: bool = setting(
-        False, "a state-value network with a slow copy gives the targets (the paper's eqs. 6-8), not slow Q networks"
-    )
-    learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", above=0)
-    alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
-    discount: float = setting(0.99, "gamma", low=0, high=0.99999)
-    n_step: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
-    curriculum: float = setting(
-        0.0,
-        "share of training over which the CG's amplitude and speed grow to the scenario's, 0: all from the start",
-        low=0,
-        high=1,
-    )
-    tau: float = setting(0.02, "rate of the slow copies that give the targets", above=0, high=1)
-    alpha: float = setting(0.02, "temperature at the start", above=0)
-    alpha_fixed: bool = setting(False, "keep the temperature at its start")
-    target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]")
-    reward_scale: float = setting(1.0, "factor on the reward inside the critic", above=0)
-    num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
-    policy_ema_rate: float = setting(0.002, "rate of the exported running average of the policy", above=0, high=1)
-    learning_rate_final_ratio: float = setting(
-        0.1, "rate at the end of the run over the rate at its start", above=0, high=1
-    )
-
-
-@dataclass(frozen=True)
-class Ppo:
-    """Proximal policy optimisation, with `train.py --algorithm ppo`."""
-
-    total_steps: int = setting(4_000_000, "environment steps in all", low=1)
-    num_envs: int = setting(512, "environments that are stepped at once", low=1)
-    unroll_length: int = setting(20, "steps of every environment between two updates", low=1)
-    epochs: int = setting(4, "passes over these steps in an update", low=1)
-    minibatches: int = setting(8, "parts of the environments that each pass is cut into", low=1)
-    policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
-    value_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the state value", low=1)
-    learning_rate: float = setting(1e-3, "Adam's rate at the start", above=0)
-    learning_rate_final_ratio: float = setting(
-        0.05, "rate at the end of the run over the rate at its start", above=0, high=1
-    )
-    discount: float = setting(0.97, "gamma", low=0, high=0.99999)
-    gae_lambda: float = setting(0.95, "lambda of the generalised advantage estimate", low=0, high=1)
-    clipping: float = setting(0.2, "largest change of an action's probability that is rewarded", above=0)
-    entropy_cost: float = setting(1e-3, "weight of the policy's entropy", low=0)
-    reward_scale: float = setting(0.02, "factor on the reward: the value's loss shares the gradient's norm", above=0)
-    max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
-    num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
-
-
-@dataclass(frozen=True)
-class Gradient:
-    """First-order gradients through the closed form, with `train.py --algorithm gradient`."""
-
-    gradient_steps: int = setting(120, "steps of Adam, each on one window of all environments", low=1)
-    num_envs: int = setting(32, "environments that are flown at once", low=1)
-    horizon: int = setting(100, "control steps of a window, through which the reward is differentiated", low=1)
-    windows_per_episode: int = setting(4, "windows after which an environment starts anew", low=1)
-    policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
-    learning_rate: float = setting(2e-2, "Adam's rate at the start", above=0)
-    learning_rate_final_ratio: float = setting(
-        0.02, "rate at the end of the run over the rate at its start", above=0, high=1
-    )
-    max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
-    gradient_decay: float = setting(
-        1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1
-    )
-    num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
 
 
 @dataclass(frozen=True)
