@@ -1,6 +1,6 @@
 """Followers of teams: the load on paths in the plane on rings of 2 to 6 drones, and a free ball on a plate.
 
-    python benchmarks/teams.py policies/team.npz --json benchmarks/results/teams.json
+    python benchmarks/teams.py policies/team.npz --followers copy adaptive lqg --json benchmarks/results/teams.json
     python benchmarks/teams.py --plate policies/plate.npz --json benchmarks/results/plate.json
 
 Teams: N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A
@@ -26,7 +26,7 @@ import numpy as np
 
 from mjxball import cli
 from mjxball.baselines import make_baseline
-from mjxball.config import ball_limit, preset
+from mjxball.config import Config, ball_limit, preset
 from mjxball.control.followers import Follower
 from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.results import fly_scenarios
@@ -47,21 +47,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Fly, print, write."""
     parser = cli.make_parser("python benchmarks/teams.py", __doc__.split("\n\n")[0])
     parser.add_argument("policies", nargs="+", type=Path, metavar="POLICY.npz")
+    parser.add_argument("--followers", nargs="+", default=["copy"], metavar="NAME", help="baselines (default copy)")
     parser.add_argument("--plate", action="store_true", help="the free ball instead of the paths")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    rows = (plate if options.plate else teams)(options.policies)
+    rows = (plate if options.plate else teams)(options.policies, options.followers)
     if options.json:
         options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     return 0
 
 
-def teams(paths: Sequence[Path]) -> list[dict[str, Any]]:
+def teams(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
     """Medians and worst cases for every number of drones and every follower."""
     rows, base = [], preset("team")
     for count in SIZES:
         config = ring_config(base, count)
-        followers: list[Follower] = [make_baseline("copy", config), *(load_policy(path, config) for path in paths)]
+        followers = _followers(config, paths, named)
         radius, nominal = config.plant.object_size[0] / 2, config.plant.object_mass
         cells = [
             Scenario(omega=omega, amplitude=share * radius, mass=factor * nominal, path=path, seconds=30)
@@ -90,14 +91,18 @@ def teams(paths: Sequence[Path]) -> list[dict[str, Any]]:
     return rows
 
 
-def _trimmed(config: Any, mass: float) -> float:
+def _followers(config: Config, paths: Sequence[Path], named: Sequence[str]) -> list[Follower]:
+    return [*(make_baseline(name, config) for name in named), *(load_policy(path, config) for path in paths)]
+
+
+def _trimmed(config: Config, mass: float) -> float:
     """CG offset [m] that can be trimmed in every direction."""
     angles = np.linspace(0, math.pi, 12, endpoint=False)
     margin = config.scenario.trim_margin
     return min(largest_amplitude(config.plant, mass, margin, (math.cos(a), math.sin(a))) for a in angles)
 
 
-def plate(paths: Sequence[Path]) -> list[dict[str, Any]]:
+def plate(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
     """Flights in which the ball stays off the rim, and what friction alone allows."""
     config, random = preset("plate"), np.random.default_rng(1)
     rim, cells, alone = ball_limit(config.plant), [], 0
@@ -121,8 +126,7 @@ def plate(paths: Sequence[Path]) -> list[dict[str, Any]]:
             )
         )
     rows: list[dict[str, Any]] = [{"follower": "friction alone, level", "off_the_rim": alone}]
-    followers: list[Follower] = [make_baseline("copy", config), *(load_policy(path, config) for path in paths)]
-    for follower in followers:
+    for follower in _followers(config, paths, named):
         flown = simulate_batch(config, [(follower, cells)], ENGINE)
         distance = np.hypot(flown.cg_offset[..., 0], flown.cg_offset[..., 1]).max(axis=0)
         error = np.linalg.norm(flown.error[flown.time >= 20], axis=-1).max(axis=0)
