@@ -55,7 +55,7 @@ def compiled(config: Sac, updates: int) -> Any:
 
         def body(learner: sac.Learner, key: Any) -> tuple[sac.Learner, sac.Losses]:
             data_key, update_key = jax.random.split(key)
-            return update(learner, loop.batch(data_key), jax.random.split(update_key, 3), rate)
+            return update(learner, loop.batch(data_key), jax.random.normal(update_key, (2, BATCH, 1)), rate)
 
         return jax.lax.scan(body, learner, jax.random.split(jax.random.key(5), updates))
 
@@ -217,12 +217,12 @@ def test_two_halves_of_a_batch_make_the_update_of_the_whole():
     networks, before = parts(SMALL)
     config = dataclasses.replace(SMALL, discount=0.0)
     batch = Loop(weight=2.0, best=0.3).batch(jax.random.key(1))
-    keys = jax.random.split(jax.random.key(2), 3)
-    whole = jax.jit(sac.make_update(networks, config, 1))(before, batch, keys, RATE)[0]
+    noise = jax.random.normal(jax.random.key(2), (2, BATCH, 1))
+    whole = jax.jit(sac.make_update(networks, config, 1))(before, batch, noise, RATE)[0]
     update = sac.make_update(networks, config, 1, lambda tree: jax.lax.pmean(tree, "parts"))
     halves = jax.tree.map(lambda leaf: leaf.reshape(2, BATCH // 2, *leaf.shape[1:]), batch)
-    split = jax.vmap(lambda half, keys: update(before, half, keys, RATE)[0], axis_name="parts")
-    after = jax.jit(split)(halves, jax.random.split(jax.random.key(3), (2, 3)))
+    split = jax.vmap(lambda half, noise: update(before, half, noise, RATE)[0], axis_name="parts")
+    after = jax.jit(split)(halves, jax.random.normal(jax.random.key(3), (2, 2, BATCH // 2, 1)))
     for leaf in jax.tree.leaves(after.policy):
         np.testing.assert_array_equal(leaf[0], leaf[1])  # both stay the same learner, noise included
     first = jax.tree.map(lambda leaf: leaf[0], after.critic)

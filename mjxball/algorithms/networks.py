@@ -30,7 +30,7 @@ def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = N
     `mask` (n,) of 0 and 1 hides slots of the observation from the policy, `critic_mask` from critics and value
     (None: the same).
     """
-    distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
+    distribution = TanhGaussian(event_size=action_size)
     observation_size = len(mask)
     normalise, normalise_all = normaliser(mask), normaliser(mask if critic_mask is None else critic_mask)
     value_network = brax.networks.make_value_network(
@@ -56,6 +56,15 @@ def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = N
         value_network=value_network if config.state_value else None,
         parametric_action_distribution=distribution,
     )
+
+
+class TanhGaussian(brax.distribution.NormalTanhDistribution):  # type: ignore[name-defined]
+    """Brax's, which where it samples takes standard normal numbers of the sample's shape instead of a key."""
+
+    def sample_no_postprocessing(self, parameters: Array, seed: Array) -> Array:
+        """A sample before tanh."""
+        made = self.create_dist(parameters)
+        return made.loc + made.scale * seed
 
 
 def normaliser(mask: Any) -> Callable[[Array, Any], Array]:

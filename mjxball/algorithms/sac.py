@@ -75,8 +75,9 @@ def create(networks: Networks, config: Sac, observation_size: int, key: Array) -
 def make_update(
     networks: Networks, config: Sac, action_size: int, mean: Callable[[Any], Any] = lambda value: value
 ) -> Any:
-    """Return `update(learner, transitions, three keys, rate) -> (learner, losses)`; `rate` scales all learning rates.
+    """Return `update(learner, transitions, noise, rate) -> (learner, losses)`; `rate` scales all learning rates.
 
+    `noise` (2, batch, actions) is standard normal: one part for the critic's next actions, one for the policy's.
     `mean` averages gradients and entropies over learners that share their parameters (data parallel).
     """
     _, critic_loss, policy_loss = brax.losses.make_losses(networks, config.reward_scale, config.discount, action_size)
@@ -84,15 +85,17 @@ def make_update(
     distribution = networks.parametric_action_distribution
     target_entropy = config.target_entropy * action_size
 
-    def entropy_of(learner: Learner, observation: Float[Array, "batch n"], key: Array) -> Float[Array, ""]:
+    def entropy_of(
+        learner: Learner, observation: Float[Array, "batch n"], noise: Float[Array, "batch actions"]
+    ) -> Float[Array, ""]:
         parameters = networks.policy_network.apply(learner.normaliser, learner.policy, observation)
-        return -jnp.mean(distribution.log_prob(parameters, distribution.sample_no_postprocessing(parameters, key)))
+        return -jnp.mean(distribution.log_prob(parameters, distribution.sample_no_postprocessing(parameters, noise)))
 
     def value_step(
-        learner: Learner, batch: Any, key: Array, step: Float[Array, ""]
+        learner: Learner, batch: Any, noise: Float[Array, "batch actions"], step: Float[Array, ""]
     ) -> tuple[Learner, Float[Array, ""]]:
         """The paper's eqs. 6 and 7: V follows Q and the entropy, Q follows the reward and the slow V."""
-        value_gradient = mean(jax.grad(value_loss)(learner.value, learner, batch, key))
+        value_gradient = mean(jax.grad(value_loss)(learner.value, learner, batch, noise))
         loss, gradient = jax.value_and_grad(q_loss)(learner.critic, learner, batch)
         value, value_adam = _descend(learner.value, value_gradient, learner.value_adam, step)
         critic, adam = _descend(learner.critic, mean(gradient), learner.critic_adam, step)
@@ -101,24 +104,24 @@ def make_update(
         return moved, loss
 
     def critic_step(
-        learner: Learner, batch: Any, key: Array, step: Float[Array, ""]
+        learner: Learner, batch: Any, noise: Float[Array, "batch actions"], step: Float[Array, ""]
     ) -> tuple[Learner, Float[Array, ""]]:
         alpha = jnp.exp(learner.log_alpha)
         value, gradient = jax.value_and_grad(critic_loss)(
-            learner.critic, learner.policy, learner.normaliser, learner.target, alpha, batch, key
+            learner.critic, learner.policy, learner.normaliser, learner.target, alpha, batch, noise
         )
         critic, adam = _descend(learner.critic, mean(gradient), learner.critic_adam, step)
         target = optax.incremental_update(critic, learner.target, config.tau)
         return learner._replace(critic=critic, critic_adam=adam, target=target), value
 
     def policy_step(
-        before: Learner, learner: Learner, batch: Any, keys: Any, rate: Float[Array, ""]
+        before: Learner, learner: Learner, batch: Any, noise: Float[Array, "batch actions"], rate: Float[Array, ""]
     ) -> tuple[Learner, Losses]:
         """Policy and temperature move against the critic `before` the batch's own critic step, as in Brax."""
-        alpha_key, policy_key = keys
-        alpha, entropy = jnp.exp(before.log_alpha), mean(entropy_of(before, batch.observation, alpha_key))
+        # The entropy is that of the actions of the policy's own loss: XLA computes them once.
+        alpha, entropy = jnp.exp(before.log_alpha), mean(entropy_of(before, batch.observation, noise))
         value, gradient = jax.value_and_grad(policy_loss)(
-            before.policy, before.normaliser, before.critic, alpha, batch, policy_key
+            before.policy, before.normaliser, before.critic, alpha, batch, noise
         )
         step = rate * config.learning_rate
         policy, policy_adam = _descend(before.policy, mean(gradient), before.policy_adam, step)
@@ -134,28 +137,29 @@ def make_update(
         )
         return moved, Losses(jnp.zeros(()), value, entropy)
 
-    def update(learner: Learner, batch: Transitions, keys: Array, rate: Float[Array, ""]) -> tuple[Learner, Losses]:
-        alpha_key, critic_key, policy_key = keys
+    def update(
+        learner: Learner, batch: Transitions, noise: Float[Array, "2 batch actions"], rate: Float[Array, ""]
+    ) -> tuple[Learner, Losses]:
         transitions = _brax_transitions(batch)
         evaluate = value_step if config.state_value else critic_step
-        moved, critic_value = evaluate(learner, transitions, critic_key, rate * config.learning_rate)
-        moved, losses = policy_step(learner, moved, transitions, (alpha_key, policy_key), rate)
+        moved, critic_value = evaluate(learner, transitions, noise[0], rate * config.learning_rate)
+        moved, losses = policy_step(learner, moved, transitions, noise[1], rate)
         return moved, losses._replace(critic=critic_value)
 
     return update
 
 
 def make_value_losses(networks: Networks, config: Sac) -> tuple[Any, Any]:
-    """`(value_loss(value, learner, batch, key), q_loss(critic, learner, batch))`, the paper's eqs. 6 and 7.
+    """`(value_loss(value, learner, batch, noise), q_loss(critic, learner, batch))`, the paper's eqs. 6 and 7.
 
     The paper prints them without the temperature; here it stands where Haarnoja et al. (2018) put it:
     V(s) -> E[min Q(s, a) - alpha log pi(a|s)], Q(s, a) -> r + gamma V'(s'), with V' the slow copy of V.
     """
     distribution = networks.parametric_action_distribution
 
-    def value_loss(value: Any, learner: Learner, batch: Any, key: Array) -> Float[Array, ""]:
+    def value_loss(value: Any, learner: Learner, batch: Any, noise: Float[Array, "batch actions"]) -> Float[Array, ""]:
         parameters = networks.policy_network.apply(learner.normaliser, learner.policy, batch.observation)
-        action = distribution.sample_no_postprocessing(parameters, key)
+        action = distribution.sample_no_postprocessing(parameters, noise)
         log_probability = distribution.log_prob(parameters, action)
         chosen = distribution.postprocess(action)
         q = networks.q_network.apply(learner.normaliser, learner.critic, batch.observation, chosen).min(axis=-1)
@@ -255,8 +259,9 @@ class SoftActorCritic:
         policy = jax.tree.map(lambda mean, new: jnp.where(phase.evaluate, mean, new), learner.average, learner.policy)
         parameters = self.networks.policy_network.apply(learner.normaliser, policy, observation)
         distribution = self.networks.parametric_action_distribution
-        sampled = distribution.sample(parameters, sample_key)
-        uniform = jax.random.uniform(random_key, sampled.shape, minval=-1.0, maxval=1.0)
+        shape = (self._environments.count, self._sizes[1])
+        sampled = distribution.sample(parameters, jax.random.normal(sample_key, shape))
+        uniform = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
         chosen = jnp.where(phase.random, uniform, sampled)
         return jnp.where(phase.evaluate, distribution.mode(parameters), chosen)
 
@@ -264,24 +269,37 @@ class SoftActorCritic:
         self, state: SacState, keys: Sequence[Array], progress: Float[Array, ""], phase: Phase
     ) -> tuple[SacState, dict[str, Float[Array, ""]]]:
         """`updates_per_step` gradient steps, each on a batch from the replay."""
-        sac = self._config
-        rate = 1.0 + (sac.learning_rate_final_ratio - 1.0) * progress
-        draws_key, update_key = map(self._shards.own, keys)
-        shape = (sac.updates_per_step, sac.batch_size // self._shards.parts)
-        draws = jax.random.bits(draws_key, shape, jnp.uint32)
-        update_keys = jax.random.split(update_key, (sac.updates_per_step, 3))
-
-        def one(number: Int[Array, ""], carry: tuple[Learner, Losses]) -> tuple[Learner, Losses]:
-            batch = replay.sample(
-                state.replay, draws[number], self._environments.count, *self._sizes, sac.n_step, sac.discount
-            )
-            return self._update(carry[0], batch, update_keys[number], rate)
-
-        updates = jnp.where(phase.learning, sac.updates_per_step, 0)
+        rate = 1.0 + (self._config.learning_rate_final_ratio - 1.0) * progress
+        draws_key, noise_key = map(self._shards.own, keys)
         zero = jnp.zeros(())
-        learner, losses = jax.lax.fori_loop(0, updates, one, (state.learner, Losses(zero, zero, zero)))
+        learner, losses = jax.lax.cond(
+            phase.learning,
+            lambda: self._learn(state, draws_key, noise_key, rate),
+            lambda: (state.learner, Losses(zero, zero, zero)),
+        )
         report = (jnp.exp(learner.log_alpha), losses.entropy, losses.critic, losses.policy)
         return state._replace(learner=learner), dict(zip(self.metrics, report, strict=True))
+
+    def _learn(
+        self, state: SacState, draws_key: Array, noise_key: Array, rate: Float[Array, ""]
+    ) -> tuple[Learner, Losses]:
+        sac = self._config
+        shape = (sac.updates_per_step, sac.batch_size // self._shards.parts)
+        draws = jax.random.bits(draws_key, shape, jnp.uint32)
+        noise = jax.random.normal(noise_key, (shape[0], 2, shape[1], self._sizes[1]))
+        batches = jax.vmap(
+            lambda drawn: replay.sample(
+                state.replay, drawn, self._environments.count, *self._sizes, sac.n_step, sac.discount
+            )
+        )(draws)
+        # Drawn once for all updates, and kept: XLA would draw, gather and sum anew wherever a number is used.
+        batches, noise = jax.lax.optimization_barrier((batches, noise))
+
+        def one(number: Int[Array, ""], carry: tuple[Learner, Losses]) -> tuple[Learner, Losses]:
+            return self._update(carry[0], jax.tree.map(lambda part: part[number], batches), noise[number], rate)
+
+        zero = jnp.zeros(())
+        return jax.lax.fori_loop(0, sac.updates_per_step, one, (state.learner, Losses(zero, zero, zero)))
 
     def policy(self, state: SacState) -> PolicyNetwork:
         """The running average of the policy, and what it knows of its observations."""

@@ -104,7 +104,7 @@ class _Stages:
         mjx = self._mjx
         for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.com_vel, mjx.rne):
             data = stage(model, data)
-        mass, bias = mjx.full_m(model, data), data.qfrc_bias
+        mass, bias = _mass_matrix(model, data), data.qfrc_bias
         return (mass, bias) if added is None else self._spun(state, mass, bias, added)
 
     def _spun(
@@ -159,6 +159,24 @@ class _Stages:
         zero = jnp.zeros((), solution.dtype)
         rise = solution[0] if self._stand == "heave" else zero
         return jnp.stack([zero, zero, rise]), jnp.stack([solution[-1], zero, zero])
+
+
+def _mass_matrix(model: Any, data: Any) -> Float[Array, "nv nv"]:
+    """`mjx.full_m` of degrees of freedom in one chain, from MJX's composite inertias.
+
+    As sums instead of a product of small matrices, one for each world, which takes XLA a third of the step on a CPU.
+    """
+    composite, motion = data._impl.crb[np.asarray(model.dof_bodyid)], data.cdof
+    (xx, yy, zz, xy, xz, yz), moment, mass = composite[:, :6].T, composite[:, 6:9], composite[:, 9:]
+    turning, moving = motion[:, :3], motion[:, 3:]
+    x, y, z = turning.T
+    spin = jnp.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], axis=-1)
+    momentum = jnp.concatenate(
+        [spin + rotations.cross(moment, moving), mass * moving - rotations.cross(moment, turning)], axis=-1
+    )
+    lower = sum(momentum[:, None, k] * motion[None, :, k] for k in range(6))
+    below = np.tri(model.nv, dtype=bool)
+    return jnp.where(below, lower, lower.T) + jnp.diag(model.dof_armature)
 
 
 def _solve(mass: Float[Array, "root root"], force: Float[Array, " root"]) -> Float[Array, " root"]:

@@ -155,9 +155,19 @@ class Environments:
 
     def restart(self, envs: Envs, key: Array, others: Bool[Array, " envs"] | None = None) -> Envs:
         """See `mjxball.algorithms.base.Environments`."""
-        before, agents = envs.states, self._agents
-        ended = before.done.astype(bool) if others is None else before.done.astype(bool) | others
-        fresh = self.reset(key, envs.difficulty)
+        done = envs.states.done.astype(bool)
+        ended = done if others is None else done | others
+
+        def anew(before: Any) -> Any:
+            return self._mixed(ended, self.reset(key, envs.difficulty), before)
+
+        if jax.default_backend() != "cpu":  # a GPU's host would wait for the condition
+            return envs._replace(states=anew(envs.states))
+        return envs._replace(states=jax.lax.cond(ended.any(), anew, lambda before: before, envs.states))
+
+    def _mixed(self, ended: Bool[Array, " envs"], fresh: Any, before: Any) -> Any:
+        """`fresh` states where `ended`, else those of `before`."""
+        agents = self._agents
 
         def reset_if(these: Array, new: Any, old: Any) -> Any:
             def one(new: Array, old: Array) -> Array:
@@ -166,11 +176,10 @@ class Environments:
             return jax.tree.map(one, new, old)
 
         if not agents:
-            return envs._replace(states=reset_if(ended, fresh, before))
+            return reset_if(ended, fresh, before)
         worlds = reset_if(ended[agents.first], fresh.pipeline_state, before.pipeline_state)
         shown = (one.replace(pipeline_state=()) for one in (fresh, before))
-        states = reset_if(ended[agents.first][agents.world], *shown)
-        return envs._replace(states=states.replace(pipeline_state=worlds))
+        return reset_if(ended[agents.first][agents.world], *shown).replace(pipeline_state=worlds)
 
     def step(self, envs: Envs, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Envs, Transition]:
         """See `mjxball.algorithms.base.Environments`."""
