@@ -21,7 +21,7 @@ from mjxball.evaluate.batch import Batch
 from mjxball.policy import Policy
 from mjxball.sim.scenario import Scenario
 
-SHIPPED = Path(__file__).parents[1] / "policies" / "transport.npz"
+SHIPPED = Path(__file__).parents[1] / "policies" / "balance.npz"
 
 
 def scenarios(count: int, seconds: float) -> list[Scenario]:

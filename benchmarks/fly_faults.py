@@ -35,7 +35,7 @@ from mjxball.fly.twin.server import Truth, Twin
 from mjxball.policy import load_file
 
 ROOT = Path(__file__).parents[1]
-POLICY = ROOT / "policies" / "transport.npz"
+POLICY = ROOT / "policies" / "archive" / "transport.npz"
 LATEST = 4.0  # [s] after the motors first turn: ramp, flight and landing are all hit
 FLOWN = 2.0  # [s] under both laws
 Runner = subprocess.Popen

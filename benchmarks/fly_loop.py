@@ -25,7 +25,7 @@ from mjxball.fly import flight_log
 from mjxball.policy import Policy
 
 ROOT = Path(__file__).parents[1]
-POLICY = ROOT / "policies" / "transport.npz"
+POLICY = ROOT / "policies" / "archive" / "transport.npz"
 
 
 def hog(stop: Any) -> None:

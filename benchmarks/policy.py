@@ -18,7 +18,7 @@ import numpy as np
 from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
 from mjxball.policy import Policy, PolicyFile, load_file
 
-SHIPPED = Path(__file__).parents[1] / "policies" / "transport.npz"
+SHIPPED = Path(__file__).parents[1] / "policies" / "balance.npz"
 CALLS = 200  # in one repetition
 REPETITIONS = 100
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 REPOSITORY = Path(__file__).parents[1]
-TRANSPORT = REPOSITORY / "policies" / "transport.npz"
+TRANSPORT = REPOSITORY / "policies" / "archive" / "transport.npz"
 Main = Callable[[list[str]], int]
 # Programs of tests are small and run once: to optimise them little takes half off the time of tests that compile, most
 # of it by XLA's older emitters of loops. Level 0 compiles no sooner than level 1 and computes four times as slowly.

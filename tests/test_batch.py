@@ -13,7 +13,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.results import fly_scenarios
 from mjxball.policy import Policy
-from mjxball.policy.file import shipped_policies
+from mjxball.policy.file import shipped_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
 
@@ -32,12 +32,11 @@ SCENARIOS = [
     "name",
     [
         "copy",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("transport", "adaptive-mass", "lqg", "oracle")),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("balance", "adaptive-mass", "lqg", "oracle")),
     ],
 )
 def test_batch_equals_recorded_flights(name: str) -> None:
-    transport = next(path for path in shipped_policies() if path.stem == "transport")
-    follower = make_baseline(name, CONFIG) if name in LAWS else Policy.load(transport)
+    follower = make_baseline(name, CONFIG) if name in LAWS else Policy.load(shipped_policy(name))
     batched = Batch(CONFIG, follower).fly(SCENARIOS)
     recorded = [cell.metrics for cell in fly_scenarios(CONFIG, [follower], SCENARIOS, "newton-euler")]
     for mine, other in zip(batched, recorded, strict=True):

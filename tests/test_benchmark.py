@@ -134,7 +134,7 @@ def test_verdict_counts_wins_and_compares_peaks(scores) -> None:
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of two followers on one suite, through the command line."""
     out = tmp_path_factory.mktemp("judged") / "report"
-    flags = ["--followers", "copy", "adaptive", "policies/transport.npz", "--suite", "delay", "start-errors"]
+    flags = ["--followers", "copy", "adaptive", "policies/archive/transport.npz", "--suite", "delay", "start-errors"]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(report_page, "LEAD_SECONDS", 4.0)  # of the moving picture, most of whose time is rendering
         assert evaluate([*flags, "--num-seeds", "1", "--physics", "newton-euler", "--out", str(out)]) == 0

@@ -74,11 +74,11 @@ def limited(remembering: Trained) -> PolicyFile:
 @pytest.fixture(
     params=[
         *("trained", "direct", "remembering", "limited", "estimating"),
-        *("transport", "robust", "flight", "stand", "paper"),
+        *("balance", "transport", "robust", "flight", "stand", "paper"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
-    if request.param in ("transport", "robust", "flight", "stand", "paper"):
+    if request.param in ("balance", "transport", "robust", "flight", "stand", "paper"):
         return load_file(shipped_policy(request.param))
     made = request.getfixturevalue(request.param)
     return made.contents if isinstance(made, Trained) else made

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 
 from mjxball import config as configs
 from mjxball.errors import InputError
-from mjxball.policy import Policy, PolicyFileError, shipped_policies
+from mjxball.policy import Policy, PolicyFileError, shipped_policies, shipped_policy
 from mjxball.train.checkpoint import Checkpoints
 from mjxball.train.run_directory import read_config, write_config
 
@@ -306,4 +306,5 @@ def test_any_bytes_are_refused(content: bytes, head: bytes, tmp_path: Path) -> N
 
 
 def test_shipped_policies_load() -> None:
-    assert {"paper", "robust", "transport"} <= {Policy.load(path).name for path in shipped_policies()}
+    assert {"paper", "balance", "flight"} <= {Policy.load(path).name for path in shipped_policies()}
+    assert {shipped_policy(name).parent.name for name in ("transport", "robust")} == {"archive"}

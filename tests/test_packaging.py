@@ -91,7 +91,7 @@ def test_the_unpacked_wheel_finds_its_own_policies(wheel: Path, tmp_path: Path) 
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path, timeout=60
     )
-    expected = tmp_path / "mjxball" / "policies" / "transport.npz"
+    expected = tmp_path / "mjxball" / "policies" / "archive" / "transport.npz"
     assert done.stdout.split() == [str(expected), str(len(shipped_policies()))]
 
 

@@ -1,6 +1,6 @@
 """Follower policies as plain NumPy. Imports NumPy and `control/` only: no JAX, no MuJoCo.
 
-policy = Policy.load("policies/transport.npz")
+policy = Policy.load("policies/balance.npz")
 roll, pitch, vertical_acceleration = policy(observation)  # SI units
 """
 

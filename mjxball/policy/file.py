@@ -20,6 +20,7 @@ from mjxball.policy.container import PolicyFileError, read_arrays
 
 FORMAT_VERSIONS = (1, 2)  # 2: with the numbers of an offset-free LQG, card field `lqg`
 FOLDER = "policies"  # of those that come with mjxball
+ARCHIVE = "archive"  # in it: those that a later one does better everywhere
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
 MAX_CARD = 2**20  # characters
 # Metrics that a card may bound, all of them the better the smaller.
@@ -269,13 +270,13 @@ def _is_finite(value: Any) -> bool:
 
 
 def shipped_policies() -> list[Path]:
-    """The policy files that come with mjxball, by name; empty if there are none."""
+    """The policy files that come with mjxball, by name, without the archived ones; empty if there are none."""
     return sorted(_folder().glob("*.npz"))
 
 
 def shipped_policy(name: str) -> Path:
-    """The shipped policy file called `name`, such as `transport`; raise InputError if there is none."""
-    known = {path.stem: path for path in shipped_policies()}
+    """The shipped policy file called `name`, such as `balance`, archived ones too; raise InputError if there is none."""
+    known = {path.stem: path for path in (*shipped_policies(), *sorted((_folder() / ARCHIVE).glob("*.npz")))}
     if name not in known:
         raise InputError(f"no shipped policy is called {name!r}; there are {', '.join(known) or 'none'}")
     return known[name]
