@@ -275,7 +275,7 @@ def shipped_policies() -> list[Path]:
 
 
 def shipped_policy(name: str) -> Path:
-    """The shipped policy file called `name`, such as `balance`, archived ones too; raise InputError if there is none."""
+    """The shipped file called `name`, such as `balance`, archived ones too; raise InputError if there is none."""
     known = {path.stem: path for path in (*shipped_policies(), *sorted((_folder() / ARCHIVE).glob("*.npz")))}
     if name not in known:
         raise InputError(f"no shipped policy is called {name!r}; there are {', '.join(known) or 'none'}")
