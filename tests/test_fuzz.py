@@ -60,7 +60,7 @@ def test_damaged_policies(fuzz: ModuleType, tmp_path: Path) -> None:
     counts = fuzz.fuzz_policies(70, 1, tmp_path)
     assert [count for count in counts if count.faults] == []
     assert sum(count.files for count in counts) == 70
-    assert sum(count.loaded for count in counts) > 1, "nothing loads: the mutations are not what they say"
+    assert sum(count.loaded for count in counts) > 0, "nothing loads: the mutations are not what they say"
     assert sum(count.refused for count in counts) > 50
 
 

@@ -145,5 +145,5 @@ def test_a_source_tree_finds_the_policies_beside_it() -> None:
 
 
 def test_an_unknown_policy_is_refused_with_the_names_of_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"'nobody'.*, paper, robust"):
+    with pytest.raises(ValueError, match=r"'nobody'.*balance.*paper.*robust"):
         shipped_policy("nobody")

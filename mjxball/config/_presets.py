@@ -129,7 +129,7 @@ def _balance() -> Config:
             cg_waypoint_probability=0.3,
         ),
         bounds=Bounds(x_peak=0.005, settling_time=2.2, rmse=0.335),
-        reward=replace(large.reward, velocity=12.0, smoothness=0.2, command_change=40.0),
+        reward=replace(large.reward, velocity=10.5, smoothness=0.2, command_change=40.0),
         gradient=Gradient(
             gradient_steps=700,
             num_envs=64,
