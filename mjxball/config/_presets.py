@@ -120,7 +120,10 @@ def _balance() -> Config:
         follower=replace(large.follower, base="lqg", action_scale_tilt=0.3, action_scale_vertical=4.0),
         scenario=replace(
             large.scenario,
+            # Up to what one drone can trim at all: with a margin those that nobody knows are met unprepared.
+            trim_margin=0.0,
             unknown_mass_probability=0.4,
+            unknown_mass=(0.1, 0.4),
             gust=(0.0, 0.2),
             # Half as much again as a user's delay may be: what is stable there is well damped at 60 ms.
             delay=(0.0, 0.1),
