@@ -12,6 +12,8 @@ import statistics
 import sys
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +94,13 @@ def _train(options: argparse.Namespace, command: str) -> int:
         if meeting:
             processes.join(meeting)
         writes = processes.is_writer()
-        code = _run(settings, origin, out, options.resume is not None)
+        with ThreadPoolExecutor(1) as beside:
+
+            def prepare() -> None:
+                if writes and _is_evaluated(origin):
+                    beside.submit(_prepare_evaluation, settings, origin["physics"])
+
+            code = _run(settings, origin, out, options.resume is not None, prepare)
         if meeting:
             processes.leave()
     if writes and code is None and (out / "eval" / RESULTS).exists():
@@ -104,15 +112,20 @@ def _train(options: argparse.Namespace, command: str) -> int:
     if code:
         return code
     draw_training(out, settings, out / "eval" / "training.png")
-    if (origin.get("extensions") or {}).get("env"):
-        return 0  # `copy` and the standard scenarios are for the coupled pair
+    if not _is_evaluated(origin):
+        return 0
     if origin["seeds"] > 1:
         _compare_members(settings, out, origin)
     return _evaluate(settings, origin["physics"], out, out / POLICY)
 
 
-def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: bool) -> int | None:
-    """Train; return 0, 1 if training diverged, 130 if it was interrupted, None if nothing was left to train."""
+def _run(
+    settings: config.Config, origin: dict[str, Any], out: Path, resume: bool, beside: Callable[[], None]
+) -> int | None:
+    """Train; return 0, 1 if training diverged, 130 if it was interrupted, None if nothing was left to train.
+
+    `beside` is called when everything is compiled and the device begins to train.
+    """
     _wake_devices()
     from mjxball.train.run import Run
 
@@ -127,7 +140,7 @@ def _run(settings: config.Config, origin: dict[str, Any], out: Path, resume: boo
         if steps >= total:
             return None
     try:
-        return 0 if Run(settings, out, origin, state).train() else 130
+        return 0 if Run(settings, out, origin, state).train(beside) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
             kept = any(path.name.isdigit() for path in (out / CHECKPOINTS).glob("*"))
@@ -290,6 +303,28 @@ def _refuse_with_resume(options: argparse.Namespace) -> None:
     given += [options.preset] if options.preset else []
     if given:
         raise InputError(f"--resume continues with the run's own configuration; drop {', '.join(given)}")
+
+
+def _is_evaluated(origin: dict[str, Any]) -> bool:
+    """Whether what was trained is compared with `copy`: that and the standard scenarios are for ours alone."""
+    return not (origin.get("extensions") or {}).get("env")
+
+
+def _prepare_evaluation(settings: config.Config, physics: str) -> None:
+    """Import and compile what `_evaluate` needs, while the device trains: on two cores it then begins at once."""
+    import jax
+
+    from mjxball.baselines import make_baseline
+    from mjxball.plotting import pyplot
+    from mjxball.sim.rollout import simulate_batch
+
+    if jax.default_backend() != "cpu":
+        return  # a GPU trains for so short a time that this would only delay its host
+    pyplot()
+    period = settings.timing.control_period
+    scenarios = [dataclasses.replace(one, seconds=period) for one in standard_scenarios(settings)]
+    copies = [make_baseline("copy", settings) for _ in range(2)]  # as many flights as it will be
+    simulate_batch(settings, [(copy, scenarios) for copy in copies], physics)
 
 
 def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) -> int:

@@ -8,7 +8,7 @@ import os
 import resource
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,11 +113,15 @@ class Run:
     def state(self, state: TrainState) -> None:
         self._state = state
 
-    def train(self) -> bool:
-        """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk."""
+    def train(self, beside: Callable[[], None] = lambda: None) -> bool:
+        """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk.
+
+        `beside` is called when everything is compiled.
+        """
         with contextlib.closing(self), contextlib.closing(self.progress):
             with graceful_interrupt(self.progress) as stop:
                 self._start()
+                beside()
                 self._loop(stop)
                 self._save()
                 self.progress.say(self._cost())
