@@ -56,10 +56,10 @@ def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_damaged_policies(fuzz: ModuleType, tmp_path: Path) -> None:
-    """70 files, 5 of each kind of damage. Seed 1: the benchmark's own files are others."""
-    counts = fuzz.fuzz_policies(70, 1, tmp_path)
+    """140 files, 10 of each kind of damage. Seed 1: the benchmark's own files are others."""
+    counts = fuzz.fuzz_policies(140, 1, tmp_path)
     assert [count for count in counts if count.faults] == []
-    assert sum(count.files for count in counts) == 70
+    assert sum(count.files for count in counts) == 140
     assert sum(count.loaded for count in counts) > 0, "nothing loads: the mutations are not what they say"
     assert sum(count.refused for count in counts) > 50
 

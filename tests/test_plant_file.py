@@ -151,7 +151,7 @@ def test_mistakes_are_refused_in_one_sentence(mistake: str, tmp_path: Path, caps
 @rows("name", ["team4", "plate4"])
 def test_what_flies_two_drones_refuses_more(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for main, more, said in (
-        (evaluate.main, ["--followers", "copy", "adaptive"], "4 drones and a load that moves in the plane"),
+        (evaluate.main, ["--followers", "copy", "lqg-offset-free"], "balances a free pair along x"),
         (view.main, ["copy"], "4 drones and a load that moves in the plane"),
         (train.main, [], "make it a multiple of 3"),
     ):

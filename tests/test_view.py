@@ -16,7 +16,7 @@ from conftest import opened
 from mjxball.config import Plant
 from mjxball.errors import InputError
 from mjxball.fly.card import config_of
-from mjxball.policy import load_file
+from mjxball.policy import load_file, shipped_policy
 from mjxball.view.command import main
 from mjxball.view.flight import SHAPES, Flight, flight_from, load_flight, save_flight
 from mjxball.view.page import flight_page, page_contents
@@ -56,9 +56,9 @@ def test_what_is_flown_is_the_reference(flight: Flight):
     ("name", "title"), [("flight", "flight: CG ±{cg:g} cm at 0.31 rad/s"), ("stand", "stand: ball from {ball:g} cm")]
 )
 def test_a_policy_for_crazyflies_flies_its_own_plant(name: str, title: str):
-    ranges = config_of(load_file(TRANSPORT.with_name(f"{name}.npz")).card).scenario
+    ranges = config_of(load_file(shipped_policy(name)).card).scenario
     title = title.format(cg=100 * ranges.cg_amplitude[1], ball=100 * ranges.ball_start)
-    shown = flight_from(str(TRANSPORT.with_name(f"{name}.npz")), {"seconds": 1.0}, "newton-euler")
+    shown = flight_from(str(shipped_policy(name)), {"seconds": 1.0}, "newton-euler")
     assert shown.title == f"{title}, 0.0175 kg"
     assert shown.plant.layout == "x"
     assert len(shown["time"]) == 101
@@ -250,7 +250,7 @@ def test_refusals(arguments: list[str], message: str, tmp_path: Path, monkeypatc
 
 def test_rotors_are_where_the_layout_puts_them(flight: Flight, browser: Any, tmp_path: Path):
     """On the axes of a plus layout, between them on a Crazyflie, which has layout x."""
-    shown = flight_from(str(TRANSPORT.with_name("flight.npz")), {"seconds": 0.5}, "newton-euler")
+    shown = flight_from(str(shipped_policy("flight")), {"seconds": 0.5}, "newton-euler")
     side = shown.plant.arm / np.sqrt(2)
     expected = [[-side, -side], [-side, side], [side, -side], [side, side]]
     np.testing.assert_allclose(sorted(page_contents(shown)["plant"]["rotors"]), expected)

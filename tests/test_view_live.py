@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment
 from fly_policies import untrained
-from fly_virtual import World, log_header
+from fly_virtual import VirtualTwin, log_header
 
 from mjxball.errors import InputError
 from mjxball.fly.display import live_view
@@ -43,7 +43,7 @@ def lines(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
     with Journal(path, **log_header(contents)) as notes:
         settings = FlightSettings(seconds=2.0, goal=(0.1, 0.0, 0.4))
-        world = World(settings, contents=contents, physics=make_pair(contents.card), log=notes)
+        world = VirtualTwin(settings, contents=contents, physics=make_pair(contents.card), log=notes)
         world.fly_until(State.DONE)
         notes.note("end", code=0)
     return path.read_bytes().splitlines(keepends=True)
