@@ -46,7 +46,7 @@ ENGINE = "newton-euler"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fly, print, write."""
     parser = cli.make_parser("python benchmarks/teams.py", __doc__.split("\n\n")[0])
-    parser.add_argument("policies", nargs="+", type=Path, metavar="POLICY.npz")
+    parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz")
     parser.add_argument("--followers", nargs="+", default=["copy"], metavar="NAME", help="baselines (default copy)")
     parser.add_argument("--plate", action="store_true", help="the free ball instead of the paths")
     parser.add_argument("--json", type=Path)

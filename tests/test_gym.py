@@ -43,9 +43,9 @@ def actions(steps: int, *shape: int) -> np.ndarray:
     return np.random.default_rng(5).uniform(-1, 1, (steps, *shape, 3)).astype(np.float32)
 
 
-def test_every_preset_is_registered():
+def test_every_preset_of_a_pair_is_registered():
     ours = {name for name in gymnasium.registry if name.startswith("mjxball/")}
-    assert ours == {mjxball.gym.environment_id(name) for name in PRESETS}
+    assert ours == {mjxball.gym.environment_id(name) for name, config in PRESETS.items() if config.plant.count == 2}
     assert {"mjxball/Transport-v0", "mjxball/Paper-v0", "mjxball/Robust-v0"} <= ours
 
 

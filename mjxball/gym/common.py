@@ -1,4 +1,4 @@
-"""What the single and the vector environment share: spaces, seeds, and what `info` tells."""
+"""What the environments share: spaces, seeds, and what `info` tells."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control.observation import ACTION_SIZE
 from mjxball.env import CoupledPairEnv
+from mjxball.errors import InputError
 
 Array = Any
 
@@ -18,6 +19,17 @@ Array = Any
 def settings(preset: str, config: Config | None) -> Config:
     """`config`, validated, or else the preset called `preset`."""
     return configs.preset(preset) if config is None else configs.validate(config)
+
+
+def pair_settings(preset: str, config: Config | None) -> Config:
+    """`settings`; InputError for a team, whose followers are several agents."""
+    found = settings(preset, config)
+    if found.plant.count > 2:
+        followers = found.plant.count - 1
+        raise InputError(
+            f"this environment has one agent, and the plant {followers} followers; use mjxball.gym.parallel"
+        )
+    return found
 
 
 def spaces(pair: CoupledPairEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:

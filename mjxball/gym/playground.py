@@ -40,7 +40,7 @@ class PlaygroundEnv:
     """
 
     def __init__(self, preset: str = "transport", config: Config | None = None, physics: str = "mjx"):
-        self.config = common.settings(preset, config)
+        self.config = common.pair_settings(preset, config)
         self._pair = CoupledPairEnv(self.config, physics)
         self._model: mujoco.MjModel | None = None
 

@@ -77,7 +77,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or rgb_array, not {render_mode!r}")
-        self.config = common.settings(preset, config)
+        self.config = common.pair_settings(preset, config)
         self.render_mode = render_mode
         self.metadata = {**METADATA, "render_fps": round(1 / self.config.timing.control_period)}
         with on_the_host():

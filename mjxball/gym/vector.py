@@ -85,7 +85,7 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError("the vector environment renders nothing; render one world with gymnasium.make")
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
-        self.config = common.settings(preset, config)
+        self.config = common.pair_settings(preset, config)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._program = compiled_program(self.config, physics)
         self.single_observation_space, self.single_action_space = common.spaces(self._program.pair)
