@@ -57,7 +57,7 @@ def one(cells: list[dict[str, Any]], **wanted: Any) -> dict[str, Any]:
 def test_no_arguments_judge_every_shipped_policy_and_baseline(standard: list[dict[str, Any]]) -> None:
     here, others = group_by_plant(shipped_policies())
     names = {*BASELINES, *(path.stem for path in here)}
-    assert {"transport", "robust", "paper"} <= names
+    assert {"balance", "paper"} <= names
     assert {config.preset for config, _ in others} == {"flight", "stand", "team"}
     scenarios = {(0.31, 0.0), *((omega, 0.05) for omega in SPEEDS)}
     assert {(cell["follower"], cell["omega"], cell["amplitude"]) for cell in standard} == {
@@ -165,7 +165,7 @@ def test_families_refuse_a_policy_for_crazyflies(capsys: pytest.CaptureFixture[s
 @pytest.mark.slow
 def test_every_shipped_policy_meets_its_card_from_anywhere(checked: tuple[Path, str]) -> None:
     shipped = {path.stem for path in shipped_policies()}
-    assert {"paper", "transport", "flight", "stand"} <= shipped
+    assert {"paper", "balance", "flight", "stand"} <= shipped
     for name in shipped:
         assert f"check {name}: ok" in checked[1]
 
