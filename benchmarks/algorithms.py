@@ -25,7 +25,7 @@ from typing import Any
 from training import BAR, launch, say, until_policy, versions
 
 SHORT = {
-    "sac": "--sac.total_steps 6400 --sac.replay_size 6400",
+    "sac": "--sac.total_steps 25600 --sac.replay_size 25600",
     "ppo": "--ppo.total_steps 40960",
     "gradient": "--gradient.gradient_steps 1",
 }
