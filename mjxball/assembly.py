@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ FOLLOWER = "follower"
 BALL = "ball"
 BALL_JOINT = "cg"  # the first of the ball's slides
 BALL_JOINTS = (BALL_JOINT, "cg_across")
+RIM_PARTS = 24  # of a drawn plate's rim
 COLOURS = {LEADER: (0.85, 0.25, 0.2, 1.0), FOLLOWER: (0.2, 0.4, 0.85, 1.0)}
 
 
@@ -59,8 +61,7 @@ def build_spec(plant: Plant, timestep: float = 0.002) -> mujoco.MjSpec:
         inertia=shell_inertia.tolist(),
     )
     _add_root_joints(body, plant.stand)
-    half = np.array(plant.object_size) / 2
-    _add_visual(body, "shell", mujoco.mjtGeom.mjGEOM_BOX, half, (0.75, 0.65, 0.45, 0.35))
+    _add_shell(body, plant)
     body.add_site(name="origin", pos=[0, 0, 0], size=[0.01, 0.01, 0.01])
     if plant.count > 2:
         _add_spokes(body, plant)
@@ -137,6 +138,23 @@ def _add_visual(body: mujoco.MjsBody, name: str, kind: mujoco.mjtGeom, size: Any
     geom.contype = geom.conaffinity = 0
     geom.mass = 0.0
     return geom
+
+
+def _add_shell(body: mujoco.MjsBody, plant: Plant) -> None:
+    """The object; where the load moves in the plane a plate, thin enough to show the drones on it, and its rim."""
+    half, colour = np.array(plant.object_size) / 2, (0.75, 0.65, 0.45, 0.35)
+    if len(plant.directions) == 2:
+        half[2] *= 0.2
+    if plant.is_disc:
+        _add_visual(body, "shell", mujoco.mjtGeom.mjGEOM_CYLINDER, half[[0, 2]], colour)
+    else:
+        _add_visual(body, "shell", mujoco.mjtGeom.mjGEOM_BOX, half, colour)
+    if len(plant.directions) == 2 and plant.ball_stop:
+        angle = 2 * np.pi * np.arange(RIM_PARTS + 1) / RIM_PARTS
+        edge = plant.ball_stop * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])
+        for number, (begin, end) in enumerate(itertools.pairwise(edge)):
+            part = _add_visual(body, f"rim{number}", mujoco.mjtGeom.mjGEOM_CAPSULE, [0.003], (0.55, 0.43, 0.16, 0.9))
+            part.fromto[:] = [*begin, *end]
 
 
 def _add_spokes(body: mujoco.MjsBody, plant: Plant) -> None:

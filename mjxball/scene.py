@@ -24,7 +24,7 @@ class Scene:
     def __init__(self, plant: Plant, goal: Array, size: tuple[int, int], look_at: Array, distance: float = 2.3):
         """`goal` of O (3,) [m], `size` = (height, width) in pixels; camera `distance` [m] from `look_at` (3,)."""
         spec = build_spec(dataclasses.replace(plant, stand="free"))  # a stand's pose is one of free flight
-        _light(spec)
+        _light(spec, plant)
         ball = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [0.03, 0, 0], "rgba": GOAL_COLOUR}
         spec.worldbody.add_geom(name="goal", pos=list(map(float, goal)), contype=0, conaffinity=0, **ball)
         spec.visual.global_.offwidth, spec.visual.global_.offheight = max(640, size[1]), max(480, size[0])
@@ -72,7 +72,7 @@ class Scene:
         scene.ngeom += 1
 
 
-def _light(spec: mujoco.MjSpec) -> None:
+def _light(spec: mujoco.MjSpec, plant: Plant) -> None:
     """A bright sky, a light floor and a soft headlight beside the model's own lamp."""
     sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=384)
     sky.builtin, sky.rgb1, sky.rgb2 = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, [0.80, 0.88, 0.96], [0.97, 0.98, 0.99]
@@ -80,8 +80,8 @@ def _light(spec: mujoco.MjSpec) -> None:
     grid.rgb1, grid.rgb2 = [0.60, 0.64, 0.68], [0.66, 0.70, 0.74]
     spec.geom("floor").size = [0, 0, 0.1]  # without end
     spec.geom("shell").rgba = [0.80, 0.68, 0.42, 0.30]
-    ball, shell = spec.geom("cg"), spec.geom("shell")
-    ball.rgba, ball.size = [0.98, 0.72, 0.05, 1.0], [1.4 * shell.size[2], 0, 0]  # seen from outside the object
+    ball, thick = spec.geom("cg"), plant.object_size[2] / 2
+    ball.rgba, ball.size = [0.98, 0.72, 0.05, 1.0], [1.4 * thick, 0, 0]  # seen from outside the object
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35, 0.35, 0.35], [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.1, 0.1, 0.1]
     spec.visual.quality.shadowsize = 4096

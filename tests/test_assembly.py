@@ -91,6 +91,16 @@ def test_command_line_writes_any_plant(tmp_path) -> None:
     assert {"leader", *(f"follower{number}" for number in range(1, 6))} <= names
 
 
+def test_a_plate_is_drawn_with_its_rim_and_a_ring_as_a_disc() -> None:
+    plate, ring = (build_model(with_plant(preset("paper"), name).plant) for name in ("plate4", "team3"))
+    assert plate.geom("shell").type == mujoco.mjtGeom.mjGEOM_BOX
+    assert ring.geom("shell").type == mujoco.mjtGeom.mjGEOM_CYLINDER
+    assert ring.geom("shell").size[0] == pytest.approx(0.1963)
+    # A chord of 24 is 1 - cos(7.5 degrees) inside the circle.
+    assert np.hypot(*plate.geom("rim0").pos[:2]) == pytest.approx(0.14, rel=0.01)
+    assert not any("rim" in ring.geom(number).name for number in range(ring.ngeom))
+
+
 def test_bare_mujoco_hovers_a_team() -> None:
     plant = with_plant(preset("transport"), "plate4").plant
     model = build_model(plant, timestep=0.002)

@@ -16,7 +16,6 @@ from mjxball.commands import evaluate, train
 from mjxball.config import Attitude, Config, Plant
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
-from mjxball.view import command as view
 
 RING = """
 [plant]
@@ -152,10 +151,9 @@ def test_mistakes_are_refused_in_one_sentence(mistake: str, tmp_path: Path, caps
 def test_what_flies_two_drones_refuses_more(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for main, more, said in (
         (evaluate.main, ["--followers", "copy", "lqg-offset-free"], "balances a free pair along x"),
-        (view.main, ["copy"], "4 drones and a load that moves in the plane"),
         (train.main, [], "make it a multiple of 3"),
     ):
-        out = tmp_path / ("out.html" if main is view.main else "out")
+        out = tmp_path / "out"
         assert main([*more, "--plant", name, "--out", str(out)]) == 2
         error = capsys.readouterr().err
         assert said in error

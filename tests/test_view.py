@@ -18,8 +18,8 @@ from mjxball.errors import InputError
 from mjxball.fly.card import config_of
 from mjxball.policy import load_file, shipped_policy
 from mjxball.view.command import main
-from mjxball.view.flight import SHAPES, Flight, flight_from, load_flight, save_flight
-from mjxball.view.page import flight_page, page_contents
+from mjxball.view.flight import Flight, check_flight, flight_from, load_flight, save_flight, shapes
+from mjxball.view.page import flight_page, page_contents, plant_of
 
 SECONDS = 4.0
 
@@ -69,7 +69,7 @@ def test_a_flight_file_gives_the_flight_back(flight: Flight, tmp_path: Path):
     again = flight_from(str(tmp_path / "flight.npz"), {}, "newton-euler")
     assert (again.title, again.plant) == (flight.title, flight.plant)
     np.testing.assert_array_equal(again["time"], flight["time"])
-    for name in SHAPES:
+    for name in shapes(flight.plant):
         np.testing.assert_allclose(again[name], flight[name], rtol=1e-6, atol=0)  # float32
 
 
@@ -81,6 +81,66 @@ def test_a_run_directory_and_a_baseline_are_flown(flight: Flight, tmp_path: Path
     np.testing.assert_array_equal(run["position"], flight["position"])
     copy = flight_from("copy", {"seconds": 1.0}, "newton-euler")
     np.testing.assert_array_equal(copy["leader_command"], copy["follower_command"])
+
+
+@pytest.mark.parametrize(("name", "place"), [("team3", "on a circle of 5 cm"), ("plate4", "ball from 8 cm")])
+def test_teams_are_flown_and_saved(name: str, place: str, tmp_path: Path):
+    shown = flight_from("adaptive", {"seconds": 1.0}, "newton-euler", Path(name))
+    assert place in shown.title
+    drones = shown.plant.count
+    assert shown["follower_command"].shape == (51, drones - 1, 3)
+    assert shown["cg_offset"].shape == (51, 2)
+    save_flight(tmp_path / "flight.npz", shown)
+    again = load_flight(tmp_path / "flight.npz")
+    assert again.plant == shown.plant
+    np.testing.assert_allclose(again["follower_command"], shown["follower_command"], rtol=1e-6)
+    drawn = page_contents(shown)["plant"]
+    assert [drone["name"] for drone in drawn["drones"]] == ["leader", *(f"follower {k}" for k in range(1, drones))]
+    assert drawn["axes"] == (0, 1)
+    assert drawn["disc"] == (name == "team3")
+    wrong = dataclasses.replace(shown, arrays={**shown.arrays, "contact_force": shown["contact_force"][:, :2]})
+    with pytest.raises(InputError, match="contact_force"):
+        check_flight(wrong, "it")
+
+
+def test_rotors_of_a_turned_drone_are_drawn_turned():
+    """A quarter turn: the rotor at +x comes to +y."""
+    one, other = Plant().drones
+    plant = dataclasses.replace(Plant(), drones=(dataclasses.replace(one, yaw=np.pi / 2, arm=0.1), other))
+    turned, straight = (drone["rotors"] for drone in plant_of(plant)["drones"])
+    np.testing.assert_allclose(turned[0], [0.0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(straight[0], [0.12, 0.0], atol=1e-12)
+
+
+def test_the_page_of_a_team(browser: Any, tmp_path: Path):
+    """Every drone has a line in each plot of commands, in its own colour, and two arrows; the CG has two numbers."""
+    shown = flight_from("adaptive", {"seconds": 1.0}, "newton-euler", Path("team4"))
+    path = tmp_path / "team.html"
+    path.write_text(flight_page(shown), encoding="utf-8")
+    tab = opened(browser, path, 1000)
+    tab.evaluate("player.seek(0.5)")
+    x, y = 100 * shown["cg_offset"][25]
+    assert tab.inner_text("#now-cg").replace("−", "-") == f"{x:.1f}, {y:.1f} cm"
+    pitch = tab.locator(".plot", has_text="Commanded pitch").locator(".legend > span").all_inner_texts()
+    names = [re.sub(r" [−\d.]+$", "", text) for text in pitch]
+    assert names == ["leader", "follower 1", "follower 2", "follower 3"]
+    values = [float(text.split()[-1].replace("−", "-")) for text in pitch]
+    commands = [shown["leader_command"][25, 1], *shown["follower_command"][25, :, 1]]
+    np.testing.assert_allclose(values, np.degrees(commands), rtol=6e-3)
+    colours = tab.evaluate("[0, 1, 2, 3].map((drone) => player.flight.colour(drone))")
+    assert len(set(colours)) == 4
+    arrows = tab.evaluate(
+        """() => {
+            let count = 0;
+            const { scene } = player, arrow = scene.arrow;
+            scene.arrow = () => { count += 1; };
+            player.seek(0.7);
+            scene.arrow = arrow;
+            return count;
+        }"""
+    )
+    assert arrows == 9
+    tab.close()
 
 
 @pytest.mark.parametrize(
@@ -253,17 +313,17 @@ def test_rotors_are_where_the_layout_puts_them(flight: Flight, browser: Any, tmp
     shown = flight_from(str(shipped_policy("flight")), {"seconds": 0.5}, "newton-euler")
     side = shown.plant.arm / np.sqrt(2)
     expected = [[-side, -side], [-side, side], [side, -side], [side, side]]
-    np.testing.assert_allclose(sorted(page_contents(shown)["plant"]["rotors"]), expected)
+    np.testing.assert_allclose(sorted(page_contents(shown)["plant"]["drones"][1]["rotors"]), expected)
     arm = flight.plant.arm
-    assert sorted(page_contents(flight)["plant"]["rotors"]) == [[-arm, 0], [0, -arm], [0, arm], [arm, 0]]
+    assert sorted(page_contents(flight)["plant"]["drones"][0]["rotors"]) == [[-arm, 0], [0, -arm], [0, arm], [arm, 0]]
     path = tmp_path / "flight.html"
     path.write_text(flight_page(shown), encoding="utf-8")
     tab = opened(browser, path, 1000)
     discs = tab.evaluate(
         """() => {
             const { scene } = player, found = [], face = scene.face;
-            scene.face = (points, ...rest) => { if (points.length === 20) found.push(points); };
-            scene.pair(0);
+            scene.face = (points, ...rest) => { if (points.length === 25) found.push(points.slice(1)); };
+            scene.team(0);
             scene.face = face;
             return found;
         }"""

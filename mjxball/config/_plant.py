@@ -87,6 +87,13 @@ class Plant:
         return tuple("xy".index(axis) for axis in self.cg_axis)
 
     @property
+    def is_disc(self) -> bool:
+        """Whether pictures show the carrier as a disc: the load moves in the plane, and all drones sit on that disc."""
+        radius = min(self.object_size[:2]) / 2
+        ring = all(drone.mount[0] ** 2 + drone.mount[1] ** 2 <= (1.01 * radius) ** 2 for drone in self.drones)
+        return len(self.directions) == 2 and ring
+
+    @property
     def load_shares(self) -> tuple[float, ...]:
         """Share of the load's weight that each drone carries with the CG at O: the most even ones that hold it level.
 

@@ -16,6 +16,7 @@ import numpy as np
 from mjxball.evaluate.benchmark import Score
 from mjxball.evaluate.results import RESULTS, Result, scenario_stem, scenario_title, to_json
 from mjxball.plotting import pyplot
+from mjxball.sim.rollout import Trajectory
 
 POINTS = 240  # of a curve over time
 PAPER_WIDTH, PAPER_POINTS = 4.5, 700  # [in] readable on a phone; points of a curve: of the paper's figures
@@ -43,6 +44,7 @@ PANELS = (
     ("command", 1, "pitch command [deg]"),
     ("command", 2, "vertical command [m/s²]"),
 )
+CG_STYLES = ("-", ":")  # along the line, or along x and y
 NOT_DRAWN = ("stay", "random")  # they would flatten every scale
 
 
@@ -51,6 +53,11 @@ def colours(names: Sequence[str]) -> dict[str, str]:
     policies = [name for name in dict.fromkeys(names) if name not in COLOURS]
     chosen = {name: POLICY_COLOURS[k % len(POLICY_COLOURS)] for k, name in enumerate(policies)}
     return {**COLOURS, **chosen}
+
+
+def of_followers(flight: Trajectory, index: int) -> np.ndarray:
+    """(F, T) number `index` of every follower's command."""
+    return flight.follower_command.reshape(len(flight.time), -1, 3)[..., index].T
 
 
 def variant_curves(scores: Sequence[Score], axis: str) -> str:
@@ -93,7 +100,8 @@ def flight_curves(scores: Sequence[Score]) -> str:
         flight, style = score.shown.flight, {"color": shade[score.follower], "linewidth": 1.1}
         for axis, k in zip(axes[:2], (0, 2), strict=True):
             axis.plot(flight.time[rows], flight.position[rows, k], label=score.follower, **style)
-        axes[2].plot(flight.time[rows], np.degrees(flight.follower_command[rows, 1]), **style)
+        for pitch in of_followers(flight, 1):
+            axes[2].plot(flight.time[rows], np.degrees(pitch[rows]), **style)
     axes[2].set_ylabel("pitch command [deg]")
     axes[2].set_xlabel("time [s]")
     for axis in axes:
@@ -157,7 +165,7 @@ def as_svg(figure: Any) -> str:
 
 
 def draw_flights(results: Sequence[Result], title: str, path: Path) -> None:
-    """Draw all followers of one scenario over time: position with goal, CG offset, both drones' commands."""
+    """Draw all followers of one scenario over time: position with goal, CG offset (y dotted), all drones' commands."""
     plt = pyplot()
     # Fixed margins: to fit them takes Matplotlib as long as to draw.
     margins = {"left": 0.1, "right": 0.985, "top": 0.96, "bottom": 0.035, "hspace": 0.1}
@@ -181,13 +189,14 @@ def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | No
         if kind == "position":
             axis.plot(time, result.flight.position[:, index], color=colour, linewidth=1.3, label=result.follower)
         elif kind == "cg_offset":
-            axis.plot(time, result.flight.cg_offset, color=colour, linewidth=1.2)
+            for along, style in zip(result.flight.cg_offset.reshape(len(time), -1).T, CG_STYLES, strict=False):
+                axis.plot(time, along, color=colour, linewidth=1.2, linestyle=style)
         else:
             factor = 1.0 if index == 2 else 57.29577951308232
             flight, name = result.flight, None if number else "dashed: leader"
-            axis.plot(
-                time, factor * flight.follower_command[:, index], color=colour, linewidth=1.1, label=result.follower
-            )
+            for which, followed in enumerate(of_followers(flight, index or 0)):
+                own = None if which else result.follower
+                axis.plot(time, factor * followed, color=colour, linewidth=1.1, label=own)
             dashed: dict[str, Any] = {"linewidth": 0.8, "linestyle": "--", "alpha": 0.7, "label": name}
             axis.plot(time, factor * flight.leader_command[:, index], color=colour, **dashed)
     low, high = axis.get_ylim()

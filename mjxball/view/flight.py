@@ -31,21 +31,25 @@ if TYPE_CHECKING:
 
 FORMAT = "mjxball flight 1"
 MAX_BYTES = 256 * 2**20
-# What is shown of a `rollout.Trajectory`, and the shape of a row.
-SHAPES: dict[str, tuple[int, ...]] = {
-    "time": (),
-    "position": (3,),
-    "velocity": (3,),
-    "euler": (3,),
-    "quaternion": (4,),
-    "rotor_force": (2, 4),
-    "leader_command": (3,),
-    "follower_command": (3,),
-    "cg_offset": (),
-    "object_mass": (),
-    "contact_force": (2, 3),
-    "target": (3,),
-}
+
+
+def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
+    """What is shown of a `rollout.Trajectory`, and the shape of a row."""
+    drones, followers = plant.count, plant.count - 1
+    return {
+        "time": (),
+        "position": (3,),
+        "velocity": (3,),
+        "euler": (3,),
+        "quaternion": (4,),
+        "rotor_force": (drones, 4),
+        "leader_command": (3,),
+        "follower_command": (3,) if followers == 1 else (followers, 3),
+        "cg_offset": () if len(plant.directions) == 1 else (2,),
+        "object_mass": (),
+        "contact_force": (drones, 3),
+        "target": (3,),
+    }
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Flight:
 
 def flight_of(trajectory: Trajectory, plant: Plant, title: str) -> Flight:
     """A single recorded `trajectory` as a flight."""
-    return Flight(title, plant, {name: np.asarray(getattr(trajectory, name), float) for name in SHAPES})
+    return Flight(title, plant, {name: np.asarray(getattr(trajectory, name), float) for name in shapes(plant)})
 
 
 def save_flight(path: str | os.PathLike[str], flight: Flight) -> None:
@@ -93,7 +97,8 @@ def check_flight(flight: Flight, name: str) -> Flight:
     rows = np.shape(flight.arrays.get("time", 0.0))
     if len(rows) != 1 or rows[0] < 2:
         raise InputError(f"{name}: a flight needs a time of at least two rows")
-    for field, shape in SHAPES.items():
+    wanted = shapes(flight.plant)
+    for field, shape in wanted.items():
         array = flight.arrays.get(field)
         if array is None or array.dtype.kind != "f" or array.shape != rows + shape:
             raise InputError(f"{name}: {field} is missing or not of shape {rows + shape}")
@@ -101,7 +106,7 @@ def check_flight(flight: Flight, name: str) -> Flight:
             raise InputError(f"{name}: {field} holds a value that is not finite")
     if (np.diff(flight["time"]) <= 0).any():
         raise InputError(f"{name}: time must increase from row to row")
-    return Flight(flight.title, flight.plant, {field: flight[field] for field in SHAPES})
+    return Flight(flight.title, flight.plant, {field: flight[field] for field in wanted})
 
 
 def is_flight(path: Path) -> bool:
@@ -170,7 +175,6 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
 
     setup, reference, path = plant_setup(plant), REFERENCE, Path(source)
     if plant is not None:
-        _ = setup.plant.pair  # InputError for teams
         reference = standard_scenarios(setup)[-1]
     if source in LAWS:
         follower: Any = make_baseline(source, setup)
@@ -184,7 +188,8 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
     tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
     scenario = dataclasses.replace(reference, **tuples)
     flown = simulate(setup, follower, scenario, physics)
-    motion = f"CG ±{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s"
+    reach = "±" if len(setup.plant.directions) == 1 else "on a circle of "
+    motion = f"CG {reach}{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s"
     if setup.motion.kind == "rolling":
         motion = f"ball from {100 * scenario.ball_start:g} cm"
     return flight_of(flown, setup.plant, f"{follower.name}: {motion}, {scenario.mass:g} kg")

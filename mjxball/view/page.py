@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -57,17 +58,34 @@ def page_contents(flight: Flight) -> dict[str, Any]:
 
 def plant_of(plant: Plant) -> dict[str, Any]:
     """The numbers of `plant` that the scene draws."""
-    lever = rotors.lever(plant.arm, plant.layout)
+    followers = iter(range(1, plant.count))
+    names = ["leader" if number == plant.leader else f"follower {next(followers)}" for number in range(plant.count)]
     return {
         "size": plant.object_size,
-        "arm": plant.arm,
-        "rotors": [[lever * x, lever * y] for x, y in rotors.PLACES[plant.layout]],  # from a drone's centre [m]
-        "mounts": [drone.mount for drone in plant.drones],
-        "axis": "xy".index(plant.cg_axis),
+        "disc": plant.is_disc,
+        "drones": [
+            {"name": name if plant.count > 2 else name.split()[0], "mount": drone.mount, "arm": arm, "rotors": places}
+            for name, drone, arm, places in zip(
+                names, plant.drones, plant.of_drones("arm"), _rotor_places(plant), strict=True
+            )
+        ],
+        "leader": plant.leader,
+        "axes": plant.directions,
         "share": plant.moving_fraction,
         "ball": plant.ball_radius,
+        "rim": plant.ball_stop,
         "gravity": plant.gravity,
     }
+
+
+def _rotor_places(plant: Plant) -> list[list[list[float]]]:
+    """Of every drone, (x, y) of its rotors from its centre, body axes [m]."""
+    found = []
+    for drone, arm in zip(plant.drones, plant.of_drones("arm"), strict=True):
+        c, s = math.cos(drone.yaw), math.sin(drone.yaw)
+        own = rotors.lever(arm, plant.layout) * np.array(rotors.PLACES[plant.layout], dtype=float)
+        found.append((own @ [[c, s], [-s, c]]).tolist())
+    return found
 
 
 def packed(array: np.ndarray) -> str:

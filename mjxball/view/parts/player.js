@@ -43,10 +43,16 @@ class Flight {
   largestContact() {
     let most = 1e-6;
     for (let row = 0; row < this.rows; row++) {
-      const f = this.at('contact_force', row);
-      most = Math.max(most, length(f.slice(0, 3)), length(f.slice(3)));
+      const force = this.at('contact_force', row);
+      for (let k = 0; k < force.length; k += 3) most = Math.max(most, length(force.slice(k, k + 3)));
     }
     return most;
+  }
+
+  // Of drone number `drone`, in the scene and in the plots.
+  colour(drone) {
+    const { leader } = this.plant;
+    return drone === leader ? COLOURS.leader : FOLLOWERS[(drone < leader ? drone : drone - 1) % FOLLOWERS.length];
   }
 
   bounds() {
@@ -104,16 +110,20 @@ class Player {
     const { flight } = this, degrees = 180 / Math.PI;
     const line = (name, colour, values, dash) => ({ name, colour, values, dash });
     const axes = ['#c92a2a', '#2b8a3e', '#1864ab'];
-    const drones = [['leader', COLOURS.leader], ['follower', COLOURS.follower]];
-    const command = (index, factor) => drones.map(([name, colour], k) =>
-      line(name, colour, flight.column(`${name}_command`, index, factor), k ? [] : [5, 3]));
+    const { leader, axes: along } = flight.plant;
+    const drones = flight.plant.drones.map(({ name }, drone) => [name, flight.colour(drone)]);
+    const command = (index, factor) => drones.map(([name, colour], drone) => (drone === leader
+      ? line(name, colour, flight.column('leader_command', index, factor), [5, 3])
+      : line(name, colour, flight.column('follower_command', 3 * (drone < leader ? drone : drone - 1) + index, factor))));
     const push = (drone) => Float32Array.from({ length: flight.rows }, (_, row) =>
       length(flight.at('contact_force', row).slice(3 * drone, 3 * drone + 3)));
     const of = (name) => drones.map(([drone, colour], k) => line(drone, colour, flight.column(name, k)));
     const found = [];
     const plot = (needed, title, unit, series) => { if (flight.has(needed)) found.push({ title, unit, series: series() }); };
     plot('error', 'Error to the goal', 'm', () => ['x', 'y', 'z'].map((name, k) => line(name, axes[k], flight.column('error', k))));
-    plot('cg_offset', 'CG from the centre', 'cm', () => [line('offset', COLOURS.cg, flight.column('cg_offset', 0, 100))]);
+    plot('cg_offset', 'CG from the centre', 'cm', () => (along.length === 1
+      ? [line('offset', COLOURS.cg, flight.column('cg_offset', 0, 100))]
+      : along.map((axis, k) => line('xy'[axis], axes[axis], flight.column('cg_offset', k, 100)))));
     plot('euler', 'Attitude', '°', () => ['roll', 'pitch', 'yaw'].map((name, k) => line(name, axes[k], flight.column('euler', k, degrees))));
     plot('leader_command', 'Commanded pitch', '°', () => command(1, degrees));
     plot('leader_command', 'Commanded roll', '°', () => command(0, degrees));
@@ -207,7 +217,7 @@ class Player {
     tell('time', `${flight.time[row].toFixed(2)} s`);
     tell('error', `${length(flight.at('error', row)).toFixed(3)} m`);
     tell('tilt', `${tilt.toFixed(1)}°`);
-    if (flight.has('cg_offset')) tell('cg', `${(100 * flight.at('cg_offset', row)[0]).toFixed(1).replace('-', '−')} cm`);
+    if (flight.has('cg_offset')) tell('cg', `${flight.at('cg_offset', row).map((c) => (100 * c).toFixed(1).replace('-', '−')).join(', ')} cm`);
     this.span();
     this.scene.draw(row);
     this.plots.forEach((plot) => plot.draw(row));

@@ -1,8 +1,10 @@
 // The scene: faces, lines and arrows, sorted by depth and drawn on a plain 2D canvas.
 const COLOURS = {
-  leader: '#2563a8', follower: '#d9730d', goal: '#2f9e44', cg: '#e0a800', thrust: '#0c8599', contact: '#c2255c',
+  leader: '#2563a8', goal: '#2f9e44', cg: '#e0a800', thrust: '#0c8599', contact: '#c2255c',
   weight: '#868e96', path: '#8fa1b3',
 };
+// Of several followers, one after the other.
+const FOLLOWERS = ['#d9730d', '#9c36b5', '#0ca678', '#e03131', '#7a5c3e', '#66a80f', '#495057', '#f06595'];
 const LIGHT = [0.36, -0.48, 0.8];
 
 function shaded(colour, light, alpha) {
@@ -53,7 +55,7 @@ class Scene {
     this.paint();
     this.goal(row);
     if (this.shown.path) this.path(row);
-    this.pair(row);
+    this.team(row);
     this.paint();
     this.arrows(row);
     if (this.flight.has('cg_offset')) this.centreOfGravity(row);
@@ -144,31 +146,41 @@ class Scene {
     this.line([here, [here[0], here[1], this.floor]], '#c3ccd5', 1, [2, 5]);
   }
 
-  pair(row) {
-    const { flight } = this, { size, mounts, arm, rotors } = flight.plant;
+  team(row) {
+    const { flight } = this, { size, drones, disc, axes, rim } = flight.plant, plane = axes.length === 2;
     const place = flight.at('position', row), turn = flight.at('quaternion', row);
     const world = (point) => add(place, rotate(turn, point));
-    this.box(world, [0, 0, 0], size.map((edge) => edge / 2), '#c8b07a', 0.4);
-    mounts.forEach((mount, drone) => {
-      const colour = drone ? COLOURS.follower : COLOURS.leader, hub = 0.18 * arm, high = 0.028;
+    const half = size.map((edge, k) => (plane && k === 2 ? 0.2 : 1) * edge / 2);
+    if (disc) this.disc(world, [0, 0, 0], half[0], '#c8b07a', 0.4);
+    else this.box(world, [0, 0, 0], half, '#c8b07a', 0.4);
+    if (plane && rim) this.line(this.circle(world, [0, 0, half[2]], rim), '#8d6e28', 1.5);
+    drones.forEach(({ mount, rotors, arm }, drone) => {
+      const colour = flight.colour(drone), hub = 0.18 * arm, high = 0.028;
+      if (drones.length > 2) this.line([world([0, 0, 0]), world(mount)], '#a08a55', 3);
       this.box(world, mount, [hub * 1.3, hub * 1.3, 0.022], colour, 1);
       rotors.forEach(([x, y]) => {
         const tip = add(mount, [x, y, high]);
         this.line([world(add(mount, [hub * x, hub * y, 0])), world(tip)], shaded(colour, 0, 1), 3);
-        const disc = [];
-        for (let k = 0; k < 20; k++) {
-          const angle = k * Math.PI / 10;
-          disc.push(world(add(tip, [0.6 * arm * Math.cos(angle), 0.6 * arm * Math.sin(angle), 0])));
-        }
-        this.face(disc, colour, 0.42);
+        this.disc(world, tip, 0.6 * arm, colour, 0.42);
       });
     });
   }
 
-  // Where along its axis the object's CG is, in body axes.
+  circle(world, centre, radius) {
+    const found = [];
+    for (let k = 0; k <= 24; k++) {
+      const angle = k * Math.PI / 12;
+      found.push(world(add(centre, [radius * Math.cos(angle), radius * Math.sin(angle), 0])));
+    }
+    return found;
+  }
+
+  disc(world, centre, radius, colour, alpha) { this.face(this.circle(world, centre, radius), colour, alpha); }
+
+  // Where the object's CG is, in body axes.
   offset(row) {
-    const offset = [0, 0, 0];
-    offset[this.flight.plant.axis] = this.flight.at('cg_offset', row)[0];
+    const offset = [0, 0, 0], found = this.flight.at('cg_offset', row);
+    this.flight.plant.axes.forEach((axis, k) => { offset[axis] = found[k]; });
     return offset;
   }
 
@@ -196,7 +208,7 @@ class Scene {
   arrows(row) {
     const { flight } = this, place = flight.at('position', row), turn = flight.at('quaternion', row);
     const thrust = flight.at('thrust', row), force = this.shown.contact ? flight.at('contact_force', row) : [];
-    flight.plant.mounts.forEach((mount, drone) => {
+    flight.plant.drones.forEach(({ mount }, drone) => {
       const from = add(place, rotate(turn, mount));
       if (this.shown.thrust) this.arrow(from, rotate(turn, [0, 0, this.reach.thrust * thrust[drone]]), COLOURS.thrust);
       if (!this.shown.contact) return;
