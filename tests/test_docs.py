@@ -209,10 +209,16 @@ def test_a_flag_that_does_not_exist_is_seen(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("page", RUN)
 def test_python_on_the_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All blocks of a page, in order, in one namespace, as a reader would type them; their asserts count."""
+    """All blocks of a page, in order, in one namespace, as a reader would type them; their asserts count.
+
+    A block of TOML that begins with a file's name is that file.
+    """
     (tmp_path / "policies").symlink_to(REPOSITORY / "policies")
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"^```python\n(.*?)^```", (REPOSITORY / page).read_text(), flags=re.DOTALL | re.MULTILINE)
+    text = (REPOSITORY / page).read_text()
+    for block, name in re.findall(r"^```toml\n(# (\S+\.toml)\n.*?)^```", text, flags=re.DOTALL | re.MULTILINE):
+        (tmp_path / name).write_text(block)
+    blocks = re.findall(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
     assert blocks
     names: dict[str, Any] = {"__name__": "page"}
     for number, block in enumerate(blocks):
