@@ -155,7 +155,10 @@ class ScenarioRanges:
     cg_amplitude: Range = drawn((0.05, 0.05), "amplitude of the CG's sine [m]", low=0)
     object_mass: Range = drawn((0.2, 0.2), "true mass of the object [kg]", above=0)
     trim_margin: float = setting(
-        0.15, "the CG's amplitude is cut to where one drone holds it with this share of its torque left", low=0, high=1
+        0.15,
+        "the CG's amplitude is cut to where one drone holds it with this share of its torque left; negative: beyond",
+        low=-0.5,
+        high=1,
     )
     mass_change: Range = drawn((0.0, 0.0), "mass added to (dropped from, if negative) the object in flight [kg]")
     ball_start: float = setting(0.0, "rolling: the ball starts within +- this from O [m]", low=0)
