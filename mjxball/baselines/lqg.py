@@ -215,10 +215,10 @@ class SlowLqg(Lqg):
     tuning = SLOW
 
 
-class ToldLqg(Lqg):
-    """`lqg` that is told, besides the plant, what every drone gives of its thrust: which are lost, and when."""
+class KnownFailuresLqg(Lqg):
+    """`lqg` that also knows what every drone gives of its thrust: which have failed, and when."""
 
-    name = "lqg-told"
+    name = "lqg-known-failures"
     needs_privileged = True
 
     def _thrust(self, privileged: PrivilegedInfo) -> Array | None:

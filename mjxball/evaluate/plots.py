@@ -27,7 +27,7 @@ COLOURS = {
     "oracle": "#222222",
     "lqg": "#2e933c",
     "lqg-slow": "#9bc53d",
-    "lqg-told": "#1f6b4f",
+    "lqg-known-failures": "#1f6b4f",
     "memoryless": "#8d6a4f",
     "stay": "#b9a7c7",
     "random": "#d9c9b0",
