@@ -29,7 +29,7 @@ from mjxball.config import ball_limit, preset
 from mjxball.control import rotations
 from mjxball.control.followers import Follower
 from mjxball.control.observation import OBSERVATION_SIZE
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.policy import NetworkLaw, Policy
@@ -76,7 +76,7 @@ def stand(path: Path, starts: int) -> list[dict[str, Any]]:
     return rows
 
 
-def fly_rigs(env: CoupledPairEnv, starts: Any, follower: Follower) -> tuple[np.ndarray, ...]:
+def fly_rigs(env: TransportEnv, starts: Any, follower: Follower) -> tuple[np.ndarray, ...]:
     """e_o (T, n, 3) [m], tilt [rad] and divergence (T, n) of `follower` in the worlds that begin as `starts`."""
     privileged = jax.vmap(make_privileged_info(env.config))
     policy = isinstance(follower, Policy)
@@ -105,7 +105,7 @@ def fly_rigs(env: CoupledPairEnv, starts: Any, follower: Follower) -> tuple[np.n
 def flight(path: Path, rigs: int) -> list[dict[str, Any]]:
     """Crashes, RMSE and tilt over random rigs, of every follower in the same worlds."""
     config = preset("flight")
-    env = CoupledPairEnv(config, "newton-euler")
+    env = TransportEnv(config, "newton-euler")
     starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(7), rigs))
     rows = []
     for follower in (*(make_baseline(name, config) for name in CLASSICAL), load_policy(path, config)):

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from mjxball import config as configs
 from mjxball.algorithms.base import PolicyNetwork
 from mjxball.cache import enable_compilation_cache
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.policy import save_file
 from mjxball.policy.export import policy_file
 from mjxball.quiet import import_brax_env
@@ -37,19 +37,19 @@ def replicated(tree: Any, devices: list[Any]) -> Any:
 class Masked:
     """An environment whose observation has zeros where the preset's networks look away."""
 
-    def __init__(self, env: CoupledPairEnv):
+    def __init__(self, env: TransportEnv):
         self._env, self._mask = env, jnp.asarray(env.input_mask, jnp.float32)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._env, name)
 
     def reset(self, key: Any) -> Any:
-        """See `CoupledPairEnv.reset`."""
+        """See `TransportEnv.reset`."""
         state = self._env.reset(key)
         return state.replace(obs=state.obs * self._mask)
 
     def step(self, state: Any, action: Any) -> Any:
-        """See `CoupledPairEnv.step`."""
+        """See `TransportEnv.step`."""
         state = self._env.step(state, action)
         return state.replace(obs=state.obs * self._mask)
 
@@ -72,7 +72,7 @@ def train(config: configs.Config, options: argparse.Namespace, export: Callable[
     layers = tuple(int(size) for size in options.layers.split(","))
     with jax.default_matmul_precision("highest"):
         train.train(
-            environment=Masked(CoupledPairEnv(config, options.physics)),
+            environment=Masked(TransportEnv(config, options.physics)),
             wrap_env_fn=wrappers.wrap,
             num_timesteps=options.steps,
             episode_length=config.timing.episode_steps,
@@ -120,7 +120,7 @@ def main() -> None:
     card = {"trainer": "brax.training.agents.sac.train", "seed": options.seed, "physics": options.physics}
 
     def export(steps: int, parameters: Any) -> None:
-        seen, mask = parameters[0], CoupledPairEnv(config, options.physics).input_mask
+        seen, mask = parameters[0], TransportEnv(config, options.physics).input_mask
         learnt = PolicyNetwork(parameters[1]["params"], seen.mean, seen.std, mask)
         exported = policy_file(config, follower_law(config), learnt, steps, card)
         save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)

@@ -66,7 +66,7 @@ class PipelineState(NamedTuple):
         return self.loop.plant
 
 
-class CoupledPairEnv:
+class TransportEnv:
     """A team with one object whose CG moves: the followers act, the leader flies its PID. Brax's `Env` interface.
 
     Of a pair observations are (n,), actions (3,) and the reward (). Of F > 1 followers they are (F, n), (F, 3) and
@@ -133,7 +133,7 @@ class CoupledPairEnv:
         return self._backend
 
     @property
-    def unwrapped(self) -> CoupledPairEnv:
+    def unwrapped(self) -> TransportEnv:
         """Itself."""
         return self
 
@@ -349,6 +349,9 @@ class CoupledPairEnv:
             found["peak"] = peaks["steady_error"].mean(axis=-1) + nothing
             found |= {name: np.sqrt(totals[name] / count) for name in ("tilt_error", "vertical_error")}
         return found
+
+
+CoupledPairEnv = TransportEnv  # its former name
 
 
 def make_physics(config: Config, physics: str, rig: PlantParameters | None = None) -> ControlStep:

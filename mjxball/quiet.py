@@ -6,47 +6,36 @@ import contextlib
 import importlib
 import io
 import sys
-from collections.abc import Iterator
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+
+def quietly(name: str) -> Any:
+    """The module `name`, imported without what it prints: MJX, also behind Brax, says that NVIDIA Warp is absent."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        return importlib.import_module(name)
 
 
 def import_mjx() -> ModuleType:
-    """Return `mujoco.mjx`, without the note that it prints when NVIDIA Warp is absent."""
-    with _silence():
-        return importlib.import_module("mujoco.mjx")
+    """`mujoco.mjx`."""
+    return quietly("mujoco.mjx")
 
 
 def import_brax_env() -> tuple[type, type]:
-    """Return Brax's `Env` and `State`; Brax imports MJX, hence silently."""
-    with _silence():
-        base = importlib.import_module("brax.envs.base")
+    """Brax's `Env` and `State`."""
+    base = quietly("brax.envs.base")
     return base.Env, base.State
 
 
 def import_tensorboard_writer() -> type:
-    """Return tensorboardX's `SummaryWriter`, without PyTorch, which it would load (5 s) where that is installed."""
-    with _without("torch"):
+    """tensorboardX's `SummaryWriter`, without PyTorch, which it would load (5 s) where that is installed."""
+    if "torch" in sys.modules:
         return importlib.import_module("tensorboardX").SummaryWriter
-
-
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        yield
-
-
-@contextlib.contextmanager
-def _without(name: str) -> Iterator[None]:
-    """Let imports take the optional package `name` for not installed, unless it is loaded already."""
-    if name in sys.modules:
-        yield
-        return
-    sys.modules[name] = None  # type: ignore[assignment]  # what Python raises ImportError for
+    sys.modules["torch"] = None  # type: ignore[assignment]  # what Python raises ImportError for
     try:
-        yield
+        return importlib.import_module("tensorboardX").SummaryWriter
     finally:
-        del sys.modules[name]
+        del sys.modules["torch"]
 
 
 class BraxTraining(NamedTuple):
@@ -61,17 +50,9 @@ class BraxTraining(NamedTuple):
 
 
 def import_brax_training() -> BraxTraining:
-    """Return Brax's networks, SAC losses, running statistics and types, imported silently."""
-    names = (
-        "brax.training.networks",
-        "brax.training.agents.sac.losses",
-        "brax.training.acme.running_statistics",
-        "brax.training.acme.specs",
-        "brax.training.distribution",
-        "brax.training.types",
-    )
-    with _silence():
-        return BraxTraining(*map(importlib.import_module, names))
+    """Brax's networks, SAC losses, running statistics and types."""
+    names = ("networks", "agents.sac.losses", "acme.running_statistics", "acme.specs", "distribution", "types")
+    return BraxTraining(*(quietly(f"brax.training.{name}") for name in names))
 
 
 class BraxPpo(NamedTuple):
@@ -82,6 +63,5 @@ class BraxPpo(NamedTuple):
 
 
 def import_brax_ppo() -> BraxPpo:
-    """Return Brax's PPO losses and networks, imported silently."""
-    with _silence():
-        return BraxPpo(*(importlib.import_module(f"brax.training.agents.ppo.{name}") for name in BraxPpo._fields))
+    """Brax's PPO losses and networks."""
+    return BraxPpo(*(quietly(f"brax.training.agents.ppo.{name}") for name in BraxPpo._fields))

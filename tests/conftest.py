@@ -28,7 +28,7 @@ from mjxball import config as configs
 from mjxball.algorithms import sac
 from mjxball.algorithms.base import PolicyNetwork
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
 from mjxball.sim.follower import follower_law
@@ -145,7 +145,7 @@ def with_settings(config: Config, **sections: dict[str, Any]) -> Config:
 class CompiledEnv(NamedTuple):
     """One environment with its jitted functions."""
 
-    env: CoupledPairEnv
+    env: TransportEnv
     reset: Any  # key -> State
     step: Any  # (State, action (3,)) -> State
 
@@ -160,7 +160,7 @@ class CompiledEnv(NamedTuple):
 
 def compile_env(config: Config, physics: str) -> CompiledEnv:
     """Environment of `config` with its functions jitted."""
-    env = CoupledPairEnv(config, physics)
+    env = TransportEnv(config, physics)
     return CompiledEnv(env, jax.jit(env.reset), jax.jit(env.step))
 
 
@@ -192,7 +192,7 @@ def fast_pair(transport: Config) -> CompiledEnv:
     return compile_env(transport, "newton-euler")
 
 
-def policy_of(env: CoupledPairEnv, learner: sac.Learner) -> PolicyNetwork:
+def policy_of(env: TransportEnv, learner: sac.Learner) -> PolicyNetwork:
     """What SAC exports."""
     return PolicyNetwork(
         learner.average["params"], learner.normaliser.mean, learner.normaliser.std, np.array(env.input_mask)
@@ -210,7 +210,7 @@ class Trained(NamedTuple):
 
 def make_trained(config: Config) -> Trained:
     """A learner whose observation statistics have seen data of very different scales, as in a real run."""
-    env = CoupledPairEnv(config, "newton-euler")
+    env = TransportEnv(config, "newton-euler")
     networks = sac.make_networks(config.sac, env.input_mask, env.action_size, env.critic_mask)
     learner = sac.create(networks, config.sac, env.observation_size, jax.random.key(3))
     random = np.random.default_rng(4)

@@ -11,7 +11,7 @@ from conftest import policy_of
 
 from mjxball import config as configs
 from mjxball.algorithms import sac
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.policy import PolicyFile
 from mjxball.policy.export import policy_file
 from mjxball.sim.follower import follower_law
@@ -21,7 +21,7 @@ from mjxball.sim.follower import follower_law
 def untrained(preset: str) -> PolicyFile:
     """A policy file of `preset` from the exporter, its last layer zero: a residual policy then copies its leader."""
     config = configs.preset(preset)
-    env = CoupledPairEnv(config, "newton-euler")
+    env = TransportEnv(config, "newton-euler")
     networks = sac.make_networks(config.sac, env.input_mask, env.action_size, env.critic_mask)
     learner = sac.create(networks, config.sac, env.observation_size, jax.random.key(0))
     contents = policy_file(config, follower_law(config), policy_of(env, learner), steps=0)

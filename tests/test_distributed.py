@@ -130,8 +130,8 @@ TRACE = """
 import sys, jax
 from mjxball.config import preset
 jax.distributed.initialize(sys.argv[1], 2, int(sys.argv[2]))
-from mjxball.env import CoupledPairEnv
-env = CoupledPairEnv(preset("transport"), "mjx")
+from mjxball.env import TransportEnv
+env = TransportEnv(preset("transport"), "mjx")
 state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
 jax.jit(env.step).lower(state, jax.ShapeDtypeStruct((3,), "float32"))
 print("traced by", jax.process_index())

@@ -47,7 +47,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d", place / "trees", DOCS, place / "html"]
     # A graphics library that MuJoCo would load reports what it lacks on stderr.
     child = {**environment(), "PYTHONPATH": str(REPOSITORY), "MUJOCO_GL": "disabled"}
-    done = subprocess.run(command, env=child, capture_output=True, text=True, timeout=180, check=False)
+    done = subprocess.run(command, env=child, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return place / "html"

@@ -9,7 +9,7 @@ import pytest
 from conftest import CompiledEnv, with_settings
 
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.quiet import import_brax_env
 
 import_brax_env()  # silently, before Brax's wrappers import it with its notes
@@ -49,7 +49,7 @@ def test_sizes_and_names(pair: CompiledEnv, engine: str, transport):
 
 def hovering(config: Config, seed: int) -> Any:
     """A state at rest at its goal, the CG at O and standing still. Only the reset depends on it."""
-    return CoupledPairEnv(with_settings(config, scenario=HOVER), "newton-euler").reset(jax.random.key(seed))
+    return TransportEnv(with_settings(config, scenario=HOVER), "newton-euler").reset(jax.random.key(seed))
 
 
 def test_hover_is_an_equilibrium(pair: CompiledEnv, transport):
@@ -101,7 +101,7 @@ def test_same_key_same_world(fast_pair: CompiledEnv):
 
 
 def test_unknown_mass_is_not_believed(transport):
-    env = CoupledPairEnv(with_settings(transport, scenario={"mass_known": False}), "newton-euler")
+    env = TransportEnv(with_settings(transport, scenario={"mass_known": False}), "newton-euler")
     load = env.reset(jax.random.key(5)).pipeline_state.load
     assert float(load.believed_mass) == pytest.approx(transport.plant.object_mass, rel=1e-7)  # float32
     assert float(load.object_mass) != float(load.believed_mass)
@@ -191,7 +191,7 @@ def test_engine_flies_the_closed_form_path(transport, fast_pair: CompiledEnv):
     actions = jax.random.uniform(jax.random.key(11), (50, 3), minval=-1, maxval=1)
     start = fast_pair.reset(jax.random.key(12))
     closed_form = fast_pair.roll(start, actions)
-    mjx = fast_pair._replace(step=jax.jit(CoupledPairEnv(transport, "mjx").step)).roll(start, actions)
+    mjx = fast_pair._replace(step=jax.jit(TransportEnv(transport, "mjx").step)).roll(start, actions)
     assert np.abs(mjx.pipeline_state.plant.position).max() > 0.05  # 500 times the tolerance below
     # Float32 rounding over 200 physics steps: 200 ulp of 10 m/s2 and of some rad/s, integrated over 1 s.
     np.testing.assert_allclose(mjx.obs, closed_form.obs, rtol=0, atol=1e-4)
@@ -219,9 +219,9 @@ class TestBraxWrappers:
 
     @pytest.fixture(scope="class")
     def steps(self, transport) -> Any:
-        return self.rolled(CoupledPairEnv(transport, "newton-euler"))
+        return self.rolled(TransportEnv(transport, "newton-euler"))
 
-    def rolled(self, env: CoupledPairEnv) -> Any:
+    def rolled(self, env: TransportEnv) -> Any:
         wrapped = wrappers.wrap(env, episode_length=self.EPISODE)
 
         def roll(key: Any) -> Any:
@@ -245,7 +245,7 @@ class TestBraxWrappers:
     def test_time_limits_of_both_together_are_truncations(self, transport):
         """`episode_length` equal to `timing.episode_steps`, as everybody would choose it."""
         limited = with_settings(transport, timing={"episode_steps": self.EPISODE})
-        steps = self.rolled(CoupledPairEnv(limited, "newton-euler"))
+        steps = self.rolled(TransportEnv(limited, "newton-euler"))
         np.testing.assert_array_equal(steps.info["truncation"][self.EPISODE - 1], 1.0)
 
 
@@ -265,7 +265,7 @@ class TestStockBrax:
 
         seen = []
         _, parameters, _ = ppo.train(
-            CoupledPairEnv(transport, "newton-euler"),
+            TransportEnv(transport, "newton-euler"),
             num_timesteps=1024,
             episode_length=40,
             num_envs=16,
@@ -287,7 +287,7 @@ class TestStockBrax:
         from brax.training.agents.sac import train as sac
 
         _, parameters, _ = sac.train(
-            CoupledPairEnv(transport, "newton-euler"),
+            TransportEnv(transport, "newton-euler"),
             num_timesteps=512,
             episode_length=40,
             num_envs=8,

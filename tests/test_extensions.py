@@ -14,7 +14,7 @@ from conftest import with_settings
 from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.commands.train import main
 from mjxball.config import Config, preset
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.train import program as programs
 from mjxball.train import train
 from mjxball.train.extensions import Extensions, find, make_env
@@ -147,6 +147,6 @@ def test_mistakes_are_one_sentence(
 
 def test_our_environment_and_algorithm_need_no_exception() -> None:
     """The defaults go the same way as a user's own."""
-    env = make_env(Extensions(env=CoupledPairEnv), preset("transport"), "newton-euler")
-    assert isinstance(env, CoupledPairEnv)
+    env = make_env(Extensions(env=TransportEnv), preset("transport"), "newton-euler")
+    assert isinstance(env, TransportEnv)
     assert {"init", "collect", "update", "policy"} <= set(vars(SoftActorCritic))

@@ -13,7 +13,7 @@ from mjxball.config import Config, apply_overrides, preset, read_plant, validate
 from mjxball.control import crazyflie, motors
 from mjxball.control.constants import drone_loop, hover
 from mjxball.control.motors import OLDER, compensates, firmware, with_curve
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.physics.autopilot import make_battery_autopilot
 from mjxball.physics.engine import Load
 from mjxball.physics.step import start_state
@@ -130,7 +130,7 @@ class TestDrawnWorlds:
     @pytest.mark.slow
     def test_every_world_can_be_flown(self) -> None:
         config = preset("flight")
-        env = CoupledPairEnv(config, "newton-euler")
+        env = TransportEnv(config, "newton-euler")
         state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(3), 512))
         load = state.pipeline_state.load
         assert 0.4 < float(load.uncompensated.mean()) < 0.65  # half, and some of the others' candidates are refused
@@ -155,7 +155,7 @@ class TestDrawnWorlds:
 
     @pytest.mark.slow
     def test_other_presets_draw_no_battery(self) -> None:
-        env = CoupledPairEnv(preset("robust"), "newton-euler")
+        env = TransportEnv(preset("robust"), "newton-euler")
         load = env.reset(jax.random.PRNGKey(0)).pipeline_state.load
         assert load.battery is None
         assert load.uncompensated is None

@@ -13,7 +13,7 @@ from gymnasium.utils.seeding import np_random
 from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from mjxball.config import Config, preset, with_plant
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.gym import common
 from mjxball.gym.parallel import FollowersParallelEnv, compiled_program
@@ -56,7 +56,7 @@ def test_spaces_and_what_is_in_them(team: Config):
 def test_it_flies_as_the_brax_environment(team: Config):
     """The same world and the same actions in the order of the agents' names."""
     env, program = FollowersParallelEnv(config=team), compiled_program(team, "newton-euler")
-    assert isinstance(program.env, CoupledPairEnv)
+    assert isinstance(program.env, TransportEnv)
     first, _ = env.reset(seed=7)
     _, state = program.start(jax.random.key(common.seed_number(np_random(7)[0])))
     np.testing.assert_array_equal(np.stack(list(first.values())), state.obs)

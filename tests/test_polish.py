@@ -12,7 +12,7 @@ import pytest
 from mjxball.control import crazyflie
 from mjxball.fly.card import config_of
 from mjxball.policy import Policy, load_file, shipped_policy
-from mjxball.train.polish import FlightState, KnownLoad, Polisher, nominal_load, resting
+from mjxball.train.polish import FlightState, KnownLoad, LoadedEnv, Polisher, nominal_load, resting
 
 
 def test_rounding_passes_a_gradient_and_rounds_all_the_same() -> None:
@@ -37,20 +37,43 @@ def test_rounding_passes_a_gradient_and_rounds_all_the_same() -> None:
 
 
 @pytest.fixture(scope="module")
-def polisher() -> Polisher:
-    """Of the shipped policy; compiled once for this file."""
+def uncompiled() -> Polisher:
+    """Of the shipped policy."""
     contents = load_file(shipped_policy("flight"))
-    made = Polisher(config_of(contents.card), contents, {"num_envs": 8, "horizon": 50})
+    return Polisher(config_of(contents.card), contents, {"num_envs": 8, "horizon": 50})
+
+
+@pytest.fixture(scope="module")
+def polisher(uncompiled: Polisher) -> Polisher:
+    """The same, compiled once for this file."""
     said: list[str] = []
-    made.compile(said.append)
+    uncompiled.compile(said.append)
     assert said == [f"{k} of 3 programs compiled" for k in (1, 2, 3)]
-    return made
+    return uncompiled
 
 
-@pytest.mark.slow
-def test_it_starts_from_the_flown_policy(polisher: Polisher) -> None:
+def test_worlds_begin_at_the_flight_with_the_known_load(uncompiled: Polisher) -> None:
+    config, tilted = uncompiled.config, np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0], np.float32)
+    load = KnownLoad(0.0215, -0.0112, 0.009, 0.7, 0.3, 3.84, 1.0)
+    flight = resting(config)._replace(position=np.array([1.0, -2.0, 0.5], np.float32), quaternion=tilted)
+    flight = flight._replace(goal=np.array([1.0, -2.0, 0.6], np.float32), history=resting(config).history + 0.25)
+    reset = jax.jit(lambda load, flight, key: LoadedEnv(config, load, flight).reset(key).pipeline_state)
+    world = reset(load, flight, jax.random.PRNGKey(3))
+    # Five deviations of what training varies: 5 mm of the place, 1 % of the mass, 1 mm and 10 % of the CG's places.
+    np.testing.assert_allclose(world.plant.position, flight.position, atol=0.025)
+    np.testing.assert_array_equal(world.plant.quaternion, tilted)
+    np.testing.assert_array_equal(world.goal, flight.goal)
+    np.testing.assert_array_equal(world.history, flight.history)
+    assert world.load.object_mass == pytest.approx(load.mass, rel=0.05)
+    ends = np.asarray(world.load.cg_path)
+    np.testing.assert_allclose(np.unique(ends), [-0.0202, -0.0022], atol=0.0095)
+    assert (np.sign(np.diff(ends)) == [-1, 1] * 7 + [-1]).all()  # to and fro
+    assert (world.load.battery, world.load.uncompensated) == (pytest.approx(3.84), 1)
+
+
+def test_it_starts_from_the_flown_policy(uncompiled: Polisher) -> None:
     flown = load_file(shipped_policy("flight"))
-    again = polisher._contents(polisher._start)
+    again = uncompiled._contents(uncompiled._start)
     draw = np.random.default_rng(1).normal(size=(50, 18)) * 0.05
     old, new = (Policy(one, "one", np.float64) for one in (flown, again))
     np.testing.assert_allclose([new(row) for row in draw], [old(row) for row in draw], atol=1e-5)

@@ -12,7 +12,7 @@ import pytest
 from conftest import CompiledEnv, compile_env, with_settings
 
 from mjxball.config import Config, preset, replace
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.physics import motion, newton_euler
 from mjxball.physics.step import jax_repeat, make_control_step
 from mjxball.sim.disturbances import GUST_TIME, NOISE, RandomDisturbances
@@ -169,7 +169,7 @@ def test_a_gust_pushes(disturbed: CompiledEnv) -> None:
 @pytest.mark.slow
 def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> None:
     config = with_settings(transport, scenario={"cg_waypoint_probability": 0.5, "cg_amplitude": (0.05, 0.1)})
-    env = CoupledPairEnv(config, "newton-euler")
+    env = TransportEnv(config, "newton-euler")
     load = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 400)).pipeline_state.load
     assert 160 < int(load.follows_path.sum()) < 240
     assert load.cg_path.shape == (400, 16)
@@ -181,7 +181,7 @@ def test_some_flights_visit_places_within_their_amplitude(transport: Config) -> 
 
 def test_no_world_is_drawn_whose_thrust_nobody_could_trim() -> None:
     config = preset("robust")
-    env = CoupledPairEnv(config, "newton-euler")
+    env = TransportEnv(config, "newton-euler")
     load = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 2000)).pipeline_state.load
     assert float(jax.vmap(env._resets.trimmed)(load).min()) > -1e-3
     # The follower's own rotors keep most of their range; a leader that lifts too much or too little does not.

@@ -11,7 +11,7 @@ import pytest
 
 from mjxball import config as configs
 from mjxball.algorithms.scalar_form import LARGEST, scalar_form
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 
 
 def rotation(x: Any) -> Any:
@@ -74,7 +74,7 @@ def test_products_with_known_zeros_vanish() -> None:
 @pytest.mark.parametrize("name", ["robust", "flight"])
 def test_a_step_of_an_environment_is_the_same(name: str) -> None:
     """`robust`: disturbances, delays and a memory; `flight`: the firmware's cascade and a rolling ball."""
-    env = CoupledPairEnv(configs.preset(name), "newton-euler")
+    env = TransportEnv(configs.preset(name), "newton-euler")
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
     actions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (3, 3)), jnp.float32)
     whole, form = (jax.jit(jax.vmap(step)) for step in (env.step, scalar_form(env.step)))

@@ -16,7 +16,7 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config, preset, with_plant
 from mjxball.control import rotations
 from mjxball.control.observation import ERROR, mount_angles
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, total_wrench
@@ -59,10 +59,10 @@ class TestRings:
     def test_a_padded_rig_moves_as_the_rig_itself(self) -> None:
         """The same commands to three drones, alone and with three that pad: the same accelerations."""
         config = settings(scenario__team_sizes=SIZES, scenario__cg_amplitude=(0.1, 0.1), scenario__start_tilt=0.3)
-        env = CoupledPairEnv(config, "newton-euler")
+        env = TransportEnv(config, "newton-euler")
         world = jax.jit(env.reset)(jax.random.key(1), 1.0, 1).pipeline_state
         own = ring_config(config, 3)
-        alone = CoupledPairEnv(own, "newton-euler")
+        alone = TransportEnv(own, "newton-euler")
         plant = world.plant._replace(rotor_force=world.plant.rotor_force[:3])
         still = jnp.zeros((2, 3))
         other = world._replace(loop=world.loop._replace(plant=plant), action=still, command=still, rig=())
@@ -169,7 +169,7 @@ class TestWorlds:
         assert stops[:, 5].any()
 
     def test_every_follower_sees_its_own_errors_and_the_reward_is_its_own(self) -> None:
-        env = CoupledPairEnv(settings(scenario__noise=(1.0, 1.0)), "newton-euler")
+        env = TransportEnv(settings(scenario__noise=(1.0, 1.0)), "newton-euler")
         state = jax.jit(env.reset)(jax.random.key(0), 1.0, 3)
         angles = mount_angles(env.config.plant)
         seen = rotations.turned_about_z(np.asarray(state.obs[:, ERROR], float), angles)
@@ -204,7 +204,7 @@ class TestAgents:
 
     def test_actions_reach_their_followers_and_worlds_end_as_a_whole(self) -> None:
         config = settings(timing__episode_steps=3)
-        env = CoupledPairEnv(config, "newton-euler")
+        env = TransportEnv(config, "newton-euler")
         environments = Environments(env, 11)
         states = jax.jit(environments.reset)(jax.random.PRNGKey(0))
         assert states.obs.shape == (11, env.observation_size)
