@@ -27,11 +27,14 @@ class PpoState(NamedTuple):
     parameters: Any  # Brax's of policy and value
     adam: Any
     normaliser: Any  # running mean and deviation of the observations
-    rollout: Any  # Brax's `Transition`, the newest steps of all environments: (envs, unroll_length, ...)
+    rollout: Any  # Brax's `Transition`, the newest steps of all environments: (envs x unrolls, unroll_length, ...)
 
 
 class ProximalPolicyOptimization:
-    """`collect` flies `ppo.unroll_length` steps, `update` learns from them alone; see `mjxball.algorithms.base`."""
+    """`collect` flies `ppo.unrolls` times `ppo.unroll_length` steps, `update` learns from them alone.
+
+    See `mjxball.algorithms.base`.
+    """
 
     metrics = ("loss", "policy_loss", "value_loss", "deviation")
     engines = ("mjx", "newton-euler")
@@ -41,7 +44,8 @@ class ProximalPolicyOptimization:
     def __init__(self, config: Config, environments: Environments):
         ppo = config.ppo
         self._config, self._environments, self._shards = ppo, environments, environments.shards
-        self.steps_per_collect = ppo.unroll_length
+        self.steps_per_collect = ppo.unrolls * ppo.unroll_length
+        self._count = environments.count * ppo.unrolls
         self.schedule = Schedule(ppo.total_steps, ppo.num_envs, 0, ppo.num_evaluations, 0.0)
         self._mask = environments.policy_mask
         self._sizes = (environments.observation_size, environments.action_size)
@@ -55,15 +59,15 @@ class ProximalPolicyOptimization:
         )
         size, actions = self._sizes
         specification = brax.specs.Array((size,), jnp.dtype("float32"))
-        shape = (self._environments.count, self._config.unroll_length)
+        shape = (self._count, self._config.unroll_length)
         seen, acted, none = jnp.zeros((*shape, size)), jnp.zeros((*shape, actions)), jnp.zeros(shape)
         parameters_none = jnp.zeros((*shape, 2 * actions))
         rollout = _rollout(Transition(seen, acted, none, none, seen, none), parameters_none, acted, none)
         return PpoState(parameters, ADAM.init(parameters), brax.running_statistics.init_state(specification), rollout)
 
     def collect(self, state: PpoState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[PpoState, Any]:
-        """`unroll_length` steps of all environments; what was seen goes into the normaliser."""
-        act_keys, reset_keys = (jax.random.split(key, self._config.unroll_length) for key in keys)
+        """`steps_per_collect` steps of all environments; what was seen goes into the normaliser."""
+        act_keys, reset_keys = (jax.random.split(key, self.steps_per_collect) for key in keys)
         distribution = self.networks.parametric_action_distribution
 
         def step(envs: Any, drawn: tuple[Array, Array]) -> tuple[Any, Any]:
@@ -74,7 +78,11 @@ class ProximalPolicyOptimization:
             return envs, _rollout(seen, parameters, raw, distribution.log_prob(parameters, raw))
 
         envs, flown = jax.lax.scan(step, envs, (act_keys, reset_keys))
-        flown = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), flown)
+
+        def in_unrolls(leaf: Array) -> Array:
+            return jnp.swapaxes(leaf, 0, 1).reshape((self._count, self._config.unroll_length, *leaf.shape[2:]))
+
+        flown = jax.tree.map(in_unrolls, flown)
         normaliser = brax.running_statistics.update(
             state.normaliser, flown.observation, pmap_axis_name=self._shards.axis
         )
@@ -85,8 +93,8 @@ class ProximalPolicyOptimization:
     def update(
         self, state: PpoState, keys: Sequence[Array], progress: Array, phase: Phase
     ) -> tuple[PpoState, dict[str, Array]]:
-        """`epochs` passes over the rollout in `minibatches` parts, each environment's steps together."""
-        ppo, count = self._config, self._environments.count
+        """`epochs` passes over the rollout in `minibatches` parts, the steps of an unroll together."""
+        ppo, count = self._config, self._count
         rate = ppo.learning_rate * (1.0 + (ppo.learning_rate_final_ratio - 1.0) * progress)
         order_key, loss_key = jax.random.split(self._shards.own(keys[0]))
         orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(order_key, ppo.epochs))
@@ -133,10 +141,13 @@ class ProximalPolicyOptimization:
 
     def check_parts(self, parts: int) -> None:
         """Raise InputError unless environments and minibatches can be cut into `parts`."""
-        if self._config.num_envs % (parts * self._config.minibatches):
+        if (
+            self._config.num_envs % parts
+            or self._config.num_envs // parts * self._config.unrolls % self._config.minibatches
+        ):
             raise InputError(
-                f"ppo.num_envs = {self._config.num_envs} cannot be cut into {self._config.minibatches} minibatches on "
-                f"{parts} devices evenly; make it a multiple"
+                f"ppo.num_envs = {self._config.num_envs} times ppo.unrolls = {self._config.unrolls} cannot be cut into "
+                f"{self._config.minibatches} minibatches on {parts} devices evenly; make it a multiple"
             )
 
 

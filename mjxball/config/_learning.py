@@ -52,9 +52,10 @@ class Ppo:
 
     total_steps: int = setting(4_000_000, "environment steps in all", low=1)
     num_envs: int = setting(512, "environments that are stepped at once", low=1)
-    unroll_length: int = setting(20, "steps of every environment between two updates", low=1)
+    unroll_length: int = setting(20, "steps in a row whose advantages are estimated together", low=1)
+    unrolls: int = setting(1, "such rows of every environment between two updates", low=1)
     epochs: int = setting(4, "passes over these steps in an update", low=1)
-    minibatches: int = setting(8, "parts of the environments that each pass is cut into", low=1)
+    minibatches: int = setting(8, "parts of the unrolls that each pass is cut into", low=1)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     value_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the state value", low=1)
     learning_rate: float = setting(1e-3, "Adam's rate at the start", above=0)

@@ -26,6 +26,7 @@ def train(
     reward: Any = None,
     algorithm: Any = None,
     overrides: Mapping[str, Any] | None = None,
+    evaluate: bool = True,
 ) -> tuple[PolicyNetwork, dict[str, Array]]:
     """Train a follower from `key` (`jax.random.PRNGKey(seed)` gives the run of `train.py --seed`) without any file.
 
@@ -34,8 +35,8 @@ def train(
     the setting's name, which may be traced: `jax.vmap(lambda rate: train(config, key, overrides={"sac.learning_rate":
     rate}))(rates)`. Returns the policy, which can be called with an observation, and of each evaluation
     (`num_evaluations`,): `steps`, `episode_return` (exploring), the algorithm's metrics, `eval_return`, and the
-    means of the environment's metrics as `eval_<name>`. Raises InputError if one
-    of them does not fit.
+    means of the environment's metrics as `eval_<name>`. Without `evaluate` it
+    trains in one stretch, and what is named `eval_` holds nothing. Raises InputError if one of them does not fit.
     """
     program = Program(config, physics, overrides, extensions=Extensions(env, reward, algorithm))
     program.algorithm.check_parts(1)
@@ -55,23 +56,25 @@ def train(
         own = {f"eval_{name}": total / jnp.maximum(count, 1) for name, total in statistics.totals.items()}
         return kept, {"steps": kept.steps, "return": returned, **metrics, **own}
 
-    modes = _phases(program)
+    modes = _phases(program, evaluate)
     state, seen = jax.lax.scan(phase, state, modes)
-    trained, evaluated = slice(1, None, 2), slice(2, None, 2)  # behind the warm-up
+    # Behind the warm-up.
+    trained, evaluated = slice(1, None, 2), slice(2, None, 2)
     metrics = {name: seen[name][trained] for name in ("steps", *program.algorithm.metrics)}
     metrics |= {"episode_return": seen["return"][trained], "eval_return": seen["return"][evaluated]}
     metrics |= {name: value[evaluated] for name, value in seen.items() if name.startswith("eval_")}
     return program.policy(state), metrics
 
 
-def _phases(program: Program) -> Mode:
-    """The warm-up, then training and evaluation in turns, stacked."""
+def _phases(program: Program, evaluate: bool) -> Mode:
+    """The warm-up, then training and evaluation in turns, or training alone; stacked."""
     first, total = program.warmup_rounds, max(program.total_rounds, program.warmup_rounds)
     window = program.algorithm.steps_per_collect
-    ends = np.round(np.linspace(first, total, program.schedule.num_evaluations + 1) / window).astype(int) * window
+    stretches = program.schedule.num_evaluations if evaluate else 1
+    ends = np.round(np.linspace(first, total, stretches + 1) / window).astype(int) * window
     found = [programs.warmup(first)]
     for steps in np.diff(ends):
-        found += [programs.train(int(steps)), programs.evaluate(program.evaluation_steps)]
+        found += [programs.train(int(steps)), programs.evaluate(program.evaluation_steps)][: 1 + evaluate]
     return Mode(
         np.stack([mode.steps for mode in found]),
         Phase(*(np.stack(list(flags)) for flags in zip(*(mode.phase for mode in found), strict=True))),
