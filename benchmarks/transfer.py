@@ -6,8 +6,8 @@
 Ours is `mjxball.train.train(config, key, env=..., algorithm=...)`, the function behind `train.py --env`; stock is
 `brax.training.agents.{sac,ppo}.train`. Both get Brax's published hyper-parameters (notebooks/training.ipynb) and
 backend (`positional`, as there), the same network sizes and steps. Both SACs evaluate once, at the end, in 128 000
-steps; Brax's cannot leave that out. PPO is not evaluated while the clock runs. Brax publishes PPO for both environments;
-its SAC has the settings of walker2d, the nearest that it publishes.
+steps. PPO is not evaluated while the clock runs. Brax publishes PPO for both environments; its SAC has those of
+walker2d, the nearest that it publishes.
 
 One process, one after the other, each with an empty compilation cache of its own for the first seed (cold), which
 the other seeds find filled (warm). Seconds are those of the whole call: tracing, compiling, training. Every policy

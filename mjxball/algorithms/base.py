@@ -109,8 +109,17 @@ class Environments(Protocol):
         """The same environments with `transform` applied to the step of a single one."""
         ...
 
-    def step(self, envs: Any, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Any, Transition]:
-        """Step `envs` with `action`, then `restart` them; with a `key` of None those that ended go on."""
+    def drawn(self, envs: Any, key: Array) -> Any:
+        """States to start anew from, one for each of `envs`, for `step`."""
+        ...
+
+    def step(
+        self, envs: Any, action: Float[Array, "envs actions"], key: Array | None, fresh: Any = None
+    ) -> tuple[Any, Transition]:
+        """Step `envs` with `action`, then `restart` them; with a `key` of None those that ended go on.
+
+        Those that ended begin at `fresh` if it is given, which spares a draw at every step.
+        """
         ...
 
 

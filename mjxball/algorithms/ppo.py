@@ -67,17 +67,17 @@ class ProximalPolicyOptimization:
 
     def collect(self, state: PpoState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[PpoState, Any]:
         """`steps_per_collect` steps of all environments; what was seen goes into the normaliser."""
-        act_keys, reset_keys = (jax.random.split(key, self.steps_per_collect) for key in keys)
+        act_keys, fresh = jax.random.split(keys[0], self.steps_per_collect), self._environments.drawn(envs, keys[1])
         distribution = self.networks.parametric_action_distribution
 
-        def step(envs: Any, drawn: tuple[Array, Array]) -> tuple[Any, Any]:
+        def step(envs: Any, key: Array) -> tuple[Any, Any]:
             parameters = self.networks.policy_network.apply(state.normaliser, state.parameters.policy, envs.states.obs)
-            raw = distribution.sample_no_postprocessing(parameters, self._shards.own(drawn[0]))
+            raw = distribution.sample_no_postprocessing(parameters, self._shards.own(key))
             action = jnp.where(phase.evaluate, distribution.mode(parameters), distribution.postprocess(raw))
-            envs, seen = self._environments.step(envs, action, drawn[1])
+            envs, seen = self._environments.step(envs, action, None, fresh)
             return envs, _rollout(seen, parameters, raw, distribution.log_prob(parameters, raw))
 
-        envs, flown = jax.lax.scan(step, envs, (act_keys, reset_keys))
+        envs, flown = jax.lax.scan(step, envs, act_keys)
 
         def in_unrolls(leaf: Array) -> Array:
             return jnp.swapaxes(leaf, 0, 1).reshape((self._count, self._config.unroll_length, *leaf.shape[2:]))

@@ -153,13 +153,17 @@ class Environments:
         other._step = jax.vmap(transform(self.env.step))
         return other
 
+    def drawn(self, envs: Envs, key: Array) -> Any:
+        """See `mjxball.algorithms.base.Environments`."""
+        return self.reset(key, envs.difficulty)
+
     def restart(self, envs: Envs, key: Array, others: Bool[Array, " envs"] | None = None) -> Envs:
         """See `mjxball.algorithms.base.Environments`."""
         done = envs.states.done.astype(bool)
         ended = done if others is None else done | others
 
         def anew(before: Any) -> Any:
-            return self._mixed(ended, self.reset(key, envs.difficulty), before)
+            return self._mixed(ended, self.drawn(envs, key), before)
 
         if jax.default_backend() != "cpu":  # a GPU's host would wait for the condition
             return envs._replace(states=anew(envs.states))
@@ -181,7 +185,9 @@ class Environments:
         shown = (one.replace(pipeline_state=()) for one in (fresh, before))
         return reset_if(ended[agents.first][agents.world], *shown).replace(pipeline_state=worlds)
 
-    def step(self, envs: Envs, action: Float[Array, "envs actions"], key: Array | None) -> tuple[Envs, Transition]:
+    def step(
+        self, envs: Envs, action: Float[Array, "envs actions"], key: Array | None, fresh: Any = None
+    ) -> tuple[Envs, Transition]:
         """See `mjxball.algorithms.base.Environments`."""
         before, agents = envs.states, self._agents
         if agents:
@@ -198,6 +204,8 @@ class Environments:
         )
         transition = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
         stepped = Envs(after, statistics, envs.difficulty)
+        if fresh is not None:
+            return stepped._replace(states=self._mixed(after.done.astype(bool), fresh, after)), transition
         return stepped if key is None else self.restart(stepped, key), transition
 
     def over_shards(self, statistics: Statistics) -> Statistics:
