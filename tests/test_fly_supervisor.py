@@ -17,7 +17,6 @@ from mjxball.fly.supervisor import (
     Fault,
     State,
     Supervisor,
-    markdown,
 )
 
 PAIRS = list(itertools.product(State, Event))
@@ -117,10 +116,3 @@ def test_nothing_happens_without_an_event() -> None:
     for state in State:
         supervisor = Supervisor(state, 5.0)
         assert supervisor.after([], 9.0) is supervisor
-
-
-def test_the_printed_table_holds_every_transition() -> None:
-    head, _, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in markdown().splitlines()]
-    cells = {(state, row[0]): cell for row in rows for state, cell in zip(head[1:], row[1:], strict=True) if cell}
-    assert len(cells) == len(TRANSITIONS)
-    assert cells["fly", Event.STALE.value] == "hold"

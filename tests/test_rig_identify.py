@@ -102,7 +102,7 @@ def found(logs) -> dict[str, Estimate]:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RIGS)
 def test_truth_is_found(found, name: str) -> None:
-    """The errors that docs/crazyflie.md states: 20 s of noisy flight."""
+    """The errors that docs/archive/crazyflie.md states: 20 s of noisy flight."""
     truth, one = RIGS[name], found[name]
     assert one.thrust == pytest.approx(truth.thrust, rel=0.005)
     assert one.inertia == pytest.approx(COMPUTED + truth.added, rel=0.04)

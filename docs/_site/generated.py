@@ -1,4 +1,4 @@
-"""The directive `generated`: Markdown that a function of the package returns, such as the supervisor's table."""
+"""The directive `generated`: Markdown that a function returns, such as the supervisor's table."""
 
 from __future__ import annotations
 

@@ -237,14 +237,3 @@ def _field(raw: Mapping[str, Any], name: str, field: Field) -> Any:
     except (ValueError, TypeError, AttributeError, KeyError, IndexError, OverflowError, RecursionError) as error:
         why = f": {error}" if field.type is CONFIG and str(error) else ""
         raise ValueError(f"the {name} of its {raw['kind']} is not {field.type.name}{why}") from None
-
-
-def markdown() -> str:
-    """The table of docs/flight-log.md, as Markdown."""
-    lines = ["| kind | when | field | type | what |", "|---|---|---|---|---|"]
-    for name, kind in KINDS.items():
-        head = f"`{name}` | {kind.text}"
-        for field, (type_, text, required) in kind.fields.items():
-            lines.append(f"| {head} | `{field}`{'' if required else ' (optional)'} | {type_.name} | {text} |")
-            head = " | "
-    return "\n".join(lines)

@@ -58,31 +58,52 @@ def make_parser() -> cli.Parser:
     for name, _, high in LINK[1:]:
         add(f"--{name}", type=float, metavar="X", help=f"--rehearse: {WORSE[name]}, up to {high:g}")
     kinds = ", ".join(FAULT_KINDS)
-    add("--fault", action="append", default=[], metavar="KIND:DRONE@S", help=f"--rehearse: {kinds}")
+    add(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="KIND:DRONE@S",
+        help=f"--rehearse: after S seconds with motors on; may be repeated: {kinds}",
+    )
     add_twin_options(parser)
     add("--retrain", action="store_true", help="--rehearse: put a load on in flight, and retrain the policy for it")
     add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
-    add("--dry-run", action="store_true", help="connect, log, and send zeros only")
-    about = "time under both laws (20; with --retrain 50)"
+    add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
+    about = "time under both laws before landing (20; with --retrain 50)"
     add("--seconds", type=float, metavar="S", help=about)
     about = "write everything to this new file (flight-DATE.jsonl; none for --rehearse)"
     add("--log", type=Path, metavar="FILE", help=about)
     about = "a live page of the log, for a browser on this machine (a free port)"
     add("--view", type=int, nargs="?", const=0, metavar="PORT", help=about)
-    about = "m from the start (0 0 0.4; a stand: 0 0 0.08)"
+    about = "of O from its start, m (0 0 0.4; a stand: 0 0 0.08)"
     add("--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help=about)
     about = "JSON of firmware parameters to upload, for both drones or each, over the card's"
     add("--gains", type=Path, metavar="FILE", help=about)
-    add("--thrust", choices=("calibrated", "paper"), help="law from az to thrust (the card's)")
+    add(
+        "--thrust",
+        choices=("calibrated", "paper"),
+        help="m (g + az) through the force curve, or the paper's HOVER + 1000 az (the card's)",
+    )
     add("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
     add("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
     add("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
     add("--mocap", choices=KINDS, metavar="KIND", help=f"forward poses from: {', '.join(KINDS)}")
     add("--mocap-host", metavar="HOST", help="--mocap: its server; optitrack: as numbers")
     add("--bodies", nargs=2, metavar=("LEADER", "FOLLOWER"), help="--mocap: names of the rigid bodies")
-    add("--mocap-rate", type=float, metavar="HZ", help="--mocap: poses to each drone, 50 to 100")
-    add("--mocap-std", type=float, nargs=2, metavar=("M", "RAD"), help="--mocap: deviations told the estimators")
-    about = "--mocap: more, such as port=22222"
+    add(
+        "--mocap-rate",
+        type=float,
+        metavar="HZ",
+        help="--mocap: poses a second to each drone, 50 to 100 (100; on a shared dongle 50)",
+    )
+    add(
+        "--mocap-std",
+        type=float,
+        nargs=2,
+        metavar=("M", "RAD"),
+        help="--mocap: deviations of a pose for the estimators (0.01 0.05)",
+    )
+    about = "--mocap: more for this kind, such as port=22222; may be repeated"
     add("--mocap-option", action="append", default=[], metavar="KEY=VALUE", help=about)
     return parser
 

@@ -174,13 +174,3 @@ class Supervisor:
         state, since = self.held or (State.DESCEND, now)
         cause = None if self.cause is not None and self.cause.event is Event.STALE else self.cause
         return Supervisor(state, since, cause) if state in GUIDED else Supervisor(State.DESCEND, now, self.cause)
-
-
-def markdown() -> str:
-    """The table as Markdown, an event a line and a state a column; an empty cell keeps the state."""
-    states = [state for state in State if state is not State.DONE]
-    lines = ["| event | " + " | ".join(state.value for state in states) + " |", "|---" * (len(states) + 1) + "|"]
-    cells = {key: state.value for key, state in TRANSITIONS.items()} | {(S.HOLD, E.RESUMED): "as before"}
-    for event in Event:
-        lines.append(f"| {event.value} | " + " | ".join(cells.get((state, event), "") for state in states) + " |")
-    return "\n".join(lines)

@@ -1,0 +1,75 @@
+"""Tables of the pages on flying, made from the code: the directive `generated` prints them as Markdown."""
+
+from __future__ import annotations
+
+import math
+
+from mjxball.fly import command
+from mjxball.fly.command import CommandMap
+from mjxball.fly.limits import STAND_SPARE, Limits, Times
+from mjxball.fly.log_schema import KINDS
+from mjxball.fly.main import make_parser
+from mjxball.fly.mocap_supervision import MocapLimits
+from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR
+from mjxball.fly.supervisor import TRANSITIONS, Event, State
+
+
+def log_kinds() -> str:
+    """The kinds of records in a flight log, and their fields."""
+    lines = ["| kind | when | field | type | what |", "|---|---|---|---|---|"]
+    for name, kind in KINDS.items():
+        head = f"`{name}` | {kind.text}"
+        for field, (type_, text, required) in kind.fields.items():
+            lines.append(f"| {head} | `{field}`{'' if required else ' (optional)'} | {type_.name} | {text} |")
+            head = " | "
+    return "\n".join(lines)
+
+
+def transitions() -> str:
+    """The supervisor's transitions, an event a line and a state a column; an empty cell keeps the state."""
+    states = [state for state in State if state is not State.DONE]
+    lines = ["| event | " + " | ".join(state.value for state in states) + " |", "|---" * (len(states) + 1) + "|"]
+    cells = {key: state.value for key, state in TRANSITIONS.items()} | {(State.HOLD, Event.RESUMED): "as before"}
+    for event in Event:
+        lines.append(f"| {event.value} | " + " | ".join(cells.get((state, event), "") for state in states) + " |")
+    return "\n".join(lines)
+
+
+def flags() -> str:
+    """The flags of `python -m mjxball.fly`."""
+    lines = ["| flag | meaning |", "|---|---|"]
+    for action in make_parser()._actions:
+        if action.option_strings and action.dest not in ("help", "version"):
+            shown = action.metavar or ("|".join(action.choices) if action.choices else "")
+            shown = " ".join(shown) if isinstance(shown, tuple) else shown
+            flag = f"`{action.option_strings[-1]} {shown}`".replace(" `", "`").replace("|", "\\|")
+            lines.append(f"| {flag} | {action.help} |")
+    return "\n".join(lines)
+
+
+def bounds() -> str:
+    """What ends a flight, and how long its parts last."""
+    limits, times, law = Limits(), Times(), CommandMap()
+    rows = {
+        "age of a state": f"{1000 * limits.state_age:.0f} ms",
+        "fence around the start": f"±{limits.fence_high[0]:g} m, "
+        f"height {limits.fence_low[2]:g} .. {limits.fence_high[2]:g} m",
+        "tilt of a drone": f"{math.degrees(limits.tilt):.0f} degrees",
+        "tilt of the drone that is heard, in *hold*": f"{math.degrees(limits.hold_tilt):.0f} degrees",
+        "tilt of the stick by both positions": f"{math.degrees(limits.stick_tilt):.0f} degrees",
+        "length of the stick by both positions": f"±{100 * limits.stick_error:.0f} cm",
+        "battery": f"{limits.battery:g} V for {limits.battery_time:g} s",
+        "thrust at its bound": f"{limits.saturation_time:g} s",
+        "missed deadlines in a second": f"{limits.missed_deadlines}",
+        "gap between two ticks": f"{1000 * limits.longest_gap:.0f} ms",
+        "height above the goal, on a stand": f"{100 * STAND_SPARE:.0f} cm",
+        "sent roll and pitch": f"±{math.degrees(law.tilt_limit):.0f} degrees",
+        "sent thrust": f"{THRUST_FLOOR} .. {THRUST_CEILING} units",
+        "ramp to hover": f"{times.ramp:g} s",
+        "landing speed of the goal": f"{times.land_speed:g} m/s",
+        "descent": f"{times.descend_speed:g} m/s for at most {times.descend_limit:g} s",
+        "*hold* ends after the last word of a drone by": f"{times.drone_watchdog:g} s",
+        "thrust in *hold* below hover": f"up to {100 * command.GENTLE / command.GRAVITY:.0f} %",
+        "no good pose of a drone (motion capture)": f"{MocapLimits().lost:g} s",
+    }
+    return "\n".join(["| bound | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
