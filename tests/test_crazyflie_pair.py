@@ -10,6 +10,8 @@ import jax
 import numpy as np
 import pytest
 
+from attitude_gains import Body, Trial
+from attitude_gains import simulate as simulate_attitude
 from mjxball.config import Autopilot, Config, preset
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
@@ -19,8 +21,6 @@ from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import hover_rotor_force, make_control_step, make_stepper, start_state
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
-from mjxball.rig.attitude import Body, Trial
-from mjxball.rig.attitude import simulate as simulate_attitude
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 

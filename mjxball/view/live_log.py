@@ -35,8 +35,6 @@ COLUMNS = {
     "late": 1,
 }
 STEP = 0.04  # [s] between two rows at least: nobody sees more while it happens
-CHUNK = 2**20  # bytes read at once
-LONGEST_LINE = 2**20  # bytes
 NO_LAW = (0.0, 0.0, 0.0)
 SEVERITY = {state.value: state.severity for state in State}
 FAULT_NAMES = {event.name for event in FAULTS}
