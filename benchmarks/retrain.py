@@ -37,8 +37,7 @@ from mjxball.fly.twin.conditions import AddedLoad, Surroundings
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.rig.load import LoadWatch
-from mjxball.rig.replay import FlightReplay
-from mjxball.rig.retrain import situation
+from mjxball.rig.retrain import FlightReplay, situation
 from mjxball.train.polish import MOST_STEPS, Polished, Polisher
 
 ROOT = Path(__file__).parents[1]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from euler_angles import matrix_from_euler
 from plants import LIGHT_BALL, REFERENCE, VARIED, copying, paper_with, team
 
 from mjxball.config import Attitude, Plant
@@ -49,7 +50,7 @@ def momenta(plant: Plant, mass: np.ndarray, cg: CgState, state: PlantState) -> t
     matrix = rotations.matrix_from_quaternion(state.quaternion)
     constants, share = plant_parameters(plant, Attitude()), plant.moving_fraction
     ones, still = np.ones(WORLDS), np.zeros((WORLDS, 3))
-    turned = [np.array(rotations.matrix_from_euler(np.array([0.0, 0.0, drone.yaw]))) for drone in plant.drones]
+    turned = [np.array(matrix_from_euler(np.array([0.0, 0.0, drone.yaw]))) for drone in plant.drones]
     inertias = [
         *(turn @ np.diag(drone.inertia) @ turn.T for turn, drone in zip(turned, plant.drones, strict=True)),
         np.diag(plant.carrier_inertia),

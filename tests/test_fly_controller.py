@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from command_line import TRANSPORT
+from euler_angles import matrix_from_euler
 from hypothesis import given
 from hypothesis import strategies as st
 from wire import pack_state
@@ -69,7 +70,7 @@ def test_a_flight_of_the_pilot_is_a_flight_of_the_simulation() -> None:
         position, euler, velocity, rates = (0.3 * random.normal(size=3) for _ in range(4))
         state = object_state(drones(pilot_rig(contents), position, euler, velocity, rates), pilot_rig(contents))
         flown = controller.step(state, goal)
-        matrix = rotations.matrix_from_euler(euler)
+        matrix = matrix_from_euler(euler)
         seen = observation.observe(position, matrix, velocity, rates, goal, mount)
         np.testing.assert_allclose(flown.observation, seen, atol=1e-12)
         zero = np.zeros(())

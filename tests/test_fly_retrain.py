@@ -203,7 +203,7 @@ def test_without_jax_one_sentence(tmp_path: Path) -> None:
 
 
 def test_the_runner_loads_no_jax() -> None:
-    script = "import sys, mjxball.fly.main, mjxball.fly.retrain, mjxball.rig.load, mjxball.rig.replay\n"
+    script = "import sys, mjxball.fly.main, mjxball.fly.retrain, mjxball.rig.load, mjxball.rig.retrain\n"
     done = run(["-c", script + "print('jax' in sys.modules, 'scipy' in sys.modules)"], REPOSITORY)
     assert done.stdout.split() == ["False", "False"], done
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from euler_angles import matrix_from_euler
 from tables import rows
 
 from mjxball.baselines import LAWS as FOLLOWERS
@@ -28,7 +29,7 @@ def normal(*shape: int) -> np.ndarray:
 
 # Roll within +-1 rad: at +-pi/2 the Euler angles are singular and no two roundings agree.
 EULER = random.uniform(-1, 1, (WORLDS, 3))
-MATRIX = rotations.matrix_from_euler(EULER)
+MATRIX = matrix_from_euler(EULER)
 QUATERNION = rotations.quaternion_from_euler(EULER)
 HALF = normal(3, 3)
 SYMMETRIC = HALF @ np.swapaxes(HALF, -1, -2) + 3 * np.eye(3)  # well conditioned, as inertias are
@@ -74,7 +75,7 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "rotations.rotate_back": (rotations.rotate_back, (MATRIX, normal(3))),
     "rotations.cross": (rotations.cross, (normal(3), normal(3))),
     "rotations.turned_about_z": (rotations.turned_about_z, (normal(18), EULER[:, 2])),
-    "rotations.matrix_from_euler": (rotations.matrix_from_euler, (EULER,)),
+    "matrix_from_euler": (matrix_from_euler, (EULER,)),
     "rotations.euler_from_matrix": (rotations.euler_from_matrix, (MATRIX,)),
     "rotations.matrix_from_quaternion": (rotations.matrix_from_quaternion, (QUATERNION,)),
     "rotations.multiply_quaternions": (rotations.multiply_quaternions, (QUATERNION, QUATERNION[::-1])),

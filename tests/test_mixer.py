@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from euler_angles import matrix_from_euler
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -70,6 +71,6 @@ def test_motors_of_the_model_give_the_same_wrench(plant):
         data.ctrl[:] = rotor_force.ravel()
         mujoco.mj_forward(model, data)
         wrench = total_wrench(plant, parameters, rotor_force)
-        force = rotations.matrix_from_euler(euler) @ wrench.force
+        force = matrix_from_euler(euler) @ wrench.force
         # MuJoCo works in float64; positions of some metres cost an ulp of 4e-16 m times 44 N.
         np.testing.assert_allclose(data.qfrc_actuator, [*force, *wrench.torque, 0.0], rtol=0, atol=1e-13)

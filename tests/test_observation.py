@@ -1,6 +1,7 @@
 """What the follower sees: order, values, memory, mask; and how its action becomes a command."""
 
 import numpy as np
+from euler_angles import matrix_from_euler
 
 from mjxball.control import observation as layout
 from mjxball.control import rotations
@@ -31,7 +32,7 @@ def test_slots_by_hand_at_a_quarter_turn_of_yaw():
     euler = np.array([0.0, 0.0, np.pi / 2])
     seen = layout.observe(
         position=np.array([1.0, 2.0, 3.0]),
-        matrix=rotations.matrix_from_euler(euler),
+        matrix=matrix_from_euler(euler),
         velocity=np.array([0.1, 0.2, 0.3]),
         rates=np.array([0.0, 0.0, 2.0]),
         goal=np.array([1.5, 1.0, 3.25]),

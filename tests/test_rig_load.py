@@ -19,7 +19,7 @@ from mjxball.fly.twin.coupled import CoupledPair, grounded_model, put_on
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, shipped_policy
 from mjxball.rig.load import LONGEST, IdentifiedLoad, LoadWatch
-from mjxball.rig.replay import FlightReplay
+from mjxball.rig.retrain import FlightReplay
 
 LATE = 12.0  # [s] after the motors first turn
 # Mass [kg], place from O [m], and what else differs; then how far off mass [kg] and moment [kg m] may be. One standard

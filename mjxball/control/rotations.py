@@ -52,22 +52,6 @@ def cross(a: Array, b: Array) -> Array:
     )
 
 
-def matrix_from_euler(euler: Array) -> Array:
-    """R = Rz(psi) Rx(phi) Ry(theta) from `euler` = (phi, theta, psi) (..., 3) [rad] -> (..., 3, 3).
-
-    The paper's Z-X-Y convention.
-    """
-    xp = euler.__array_namespace__()
-    cf, ct, cp = (xp.cos(euler[..., i]) for i in range(3))
-    sf, st, sp = (xp.sin(euler[..., i]) for i in range(3))
-    rows = [
-        xp.stack([cp * ct - sp * sf * st, -sp * cf, cp * st + sp * sf * ct], axis=-1),
-        xp.stack([sp * ct + cp * sf * st, cp * cf, sp * st - cp * sf * ct], axis=-1),
-        xp.stack([-cf * st, sf, cf * ct], axis=-1),
-    ]
-    return xp.stack(rows, axis=-2)
-
-
 def euler_from_matrix(matrix: Array) -> Array:
     """(phi, theta, psi) [rad] of `matrix` (..., 3, 3) -> (..., 3); |phi| <= pi/2, singular at its ends."""
     xp = matrix.__array_namespace__()

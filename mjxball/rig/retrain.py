@@ -10,27 +10,33 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from mjxball.cli import make_parser
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.fly.card import config_of
+from mjxball.fly.card import Controller, config_of
 from mjxball.fly.flight_log import Tail
+from mjxball.fly.supervisor import GUIDED
 from mjxball.policy import Policy, PolicyFile, load_file, save_file
 from mjxball.rig.load import IdentifiedLoad, LoadWatch
-from mjxball.rig.replay import FlightReplay
+from mjxball.sim.laws import BodyState, Laws
 
 NICE = 15
 POLL = 0.02  # [s] between two looks at the log
 LOOK = 0.5  # [s] of flight between two looks for a load
 SECONDS = 4.0  # [s] in which a policy is to be polished
+GUIDED_NAMES = tuple(state.value for state in GUIDED)
+LOOP_RATE = 100.0  # [Hz] of the runner's ticks at least
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -129,6 +135,41 @@ def with_origin(contents: PolicyFile, load: IdentifiedLoad, numbers: dict[str, A
     """`contents` whose card says what it was retrained for."""
     origin = {"mass": load.mass, "offset": load.offset, **numbers}
     return dataclasses.replace(contents, card={**contents.card, "retrained": origin})
+
+
+class Place(NamedTuple):
+    """Where a flight is."""
+
+    body: BodyState  # as the follower measures it
+    goal: np.ndarray  # (3,) of O [m]
+    integral: np.ndarray  # of both laws, see `sim.laws.Laws`
+    history: np.ndarray  # (m,) of the policy
+
+
+class FlightReplay:
+    """Both laws once more, on the observations in the log: they remember what the runner's remember."""
+
+    def __init__(self, policy: Policy):
+        self._controller = Controller(policy)
+        self._laws = Laws(self._controller.config)
+        self._every = math.ceil(policy.control_period * LOOP_RATE - 1e-9)
+        self._count = 0
+        self.place: Place | None = None
+
+    def take(self, record: Mapping[str, Any]) -> None:
+        """One record of the log (`fly.log_schema`), in order."""
+        if record["kind"] == "transition" and record["before"] == "ramp":
+            self._controller.reset()
+            self._count = 0
+        if record["kind"] != "tick" or record["state"] not in GUIDED_NAMES or "observation" not in record:
+            return
+        self._count += 1
+        if (self._count - 1) % self._every:
+            return
+        goal = np.asarray(record["goal"], float)
+        body = self._laws.body_from_observation(np.asarray(record["observation"], float), goal)
+        self._controller.step(body, goal)
+        self.place = Place(body, goal, self._controller.integral, self._controller.policy.memory)
 
 
 def _end_with_input() -> None:
