@@ -5,7 +5,8 @@
 
 Both are timed in turn with the same interpreter, each training in a process of its own with README's command; cold:
 an empty cache of compiled programs, warm: the cache that the cold run left. Medians of seconds by the clock, and of CPU
-seconds, which other programs on the machine change less; the load averages are written to the JSON file.
+seconds, which other programs on the machine change less; the load averages are written to the JSON file. With
+`--repeats 0` sizes alone are counted, and the timings in the JSON file stay, with the commits that they are of.
 """
 
 from __future__ import annotations
@@ -84,17 +85,19 @@ def main() -> None:
                     times[name].setdefault(f"{what} [CPU s]", []).append(busy)
             loads.append(os.getloadavg()[0])
             print(name, {what: round(values[-1], 1) for what, values in times[name].items()}, flush=True)
+    commits = {name: run_git(tree) for name, tree in trees.items()}
+    timed = {"commits": commits, "load": loads, "all": times}
+    if not options.repeats and options.json and options.json.exists():
+        timed = json.loads(options.json.read_text())["timed"]
     rows = {
-        name: {**found[name], **{w: round(statistics.median(v), 2) for w, v in times[name].items()}} for name in trees
+        name: {**found[name], **{w: round(statistics.median(v), 2) for w, v in timed["all"][name].items()}}
+        for name in trees
     }
     print(f"{'':28} {'before':>10} {'after':>10}")
     for what in rows["before"]:
         print(f"{what:28} {rows['before'][what]:>10} {rows['after'][what]:>10}")
     if options.json:
-        commits = {name: run_git(tree) for name, tree in trees.items()}
-        options.json.write_text(
-            json.dumps({"commits": commits, "load": loads, "medians": rows, "all": times}, indent=1) + "\n"
-        )
+        options.json.write_text(json.dumps({"commits": commits, "medians": rows, "timed": timed}, indent=1) + "\n")
 
 
 def run_git(tree: Path) -> str:

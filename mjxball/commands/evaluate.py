@@ -64,7 +64,7 @@ def parser() -> cli.Parser:
     )
     result.add_argument("--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or a file of a rig")
     result.add_argument("--physics", choices=ENGINES, default="mjx", help="physics engine (default mjx)")
-    result.add_argument("--json", type=Path, metavar="FILE", help="write the cells as JSON")
+    result.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON")
     result.add_argument("--out", type=Path, metavar="DIR", help="write report.html, JSON and figures")
     result.add_argument("--check", action="store_true", help="exit 1 if a policy misses the bounds in its card")
     result.add_argument("--suite", "--families", nargs="+", metavar="NAME", help="benchmark suites, or all; see --list")

@@ -276,13 +276,13 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
     from mjxball.train.curves import POLICIES, draw_members
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
-    cells = fly_scenarios(settings, policies, standard_scenarios(settings)[-1:], origin["physics"])
-    print(table(cells))
+    results = fly_scenarios(settings, policies, standard_scenarios(settings)[-1:], origin["physics"])
+    print(table(results))
     compared = ("rmse", "settling_time", "x_peak", "overshoot")
     chosen = load_file(out / POLICY)
-    seeds = [int(cell.follower.removeprefix("seed")) for cell in cells]
-    spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in cells] for name in compared}
-    spread["failed"] = [cell.metrics.failed for cell in cells]
+    seeds = [int(result.follower.removeprefix("seed")) for result in results]
+    spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in results] for name in compared}
+    spread["failed"] = [result.metrics.failed for result in results]
     save_file(out / POLICY, dataclasses.replace(chosen, card={**chosen.card, "population": {"seed": seeds, **spread}}))
     for name in compared:
         values = sorted(math.inf if value is None else value for value in spread[name])
@@ -336,10 +336,12 @@ def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) ->
 
     scenarios = standard_scenarios(settings)
     trained = load_policy(policy, settings)
-    cells = fly_scenarios(settings, [make_baseline("copy", settings), trained], scenarios, physics)
-    print(table(cells))
-    write_results(cells, out / "eval")
-    reference = next(cell for cell in cells if cell.follower == trained.name and cell.scenario == scenarios[-1])
+    results = fly_scenarios(settings, [make_baseline("copy", settings), trained], scenarios, physics)
+    print(table(results))
+    write_results(results, out / "eval")
+    reference = next(
+        result for result in results if result.follower == trained.name and result.scenario == scenarios[-1]
+    )
     misses = check_bounds(trained, reference.metrics)
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
     print(f"{policy} {verdict}; figures in {out / 'eval'}")
