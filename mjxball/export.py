@@ -1,6 +1,7 @@
 """Export a follower: `python -m mjxball.export RUN_DIR OUT`, of a run's newest checkpoint or of a policy file.
 
-OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header); see docs/policy-file.md.
+OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header); see docs/policy-file.md. With --crazyflie it is a
+new directory of apps for both drones; see docs/onboard.md.
 """
 
 from __future__ import annotations
@@ -40,21 +41,35 @@ def _write_onnx(out: Path, policy: PolicyFile) -> None:
     write_whole(out, onnx_model(policy, out.stem).SerializeToString())
 
 
-def _write_header(out: Path, policy: PolicyFile) -> None:
+def _write_header(out: Path, policy: PolicyFile, int8: bool = False) -> None:
     from mjxball.policy.formats.c_header import c_header
 
-    write_whole(out, c_header(policy, out.stem).encode("ascii"))
+    write_whole(out, c_header(policy, out.stem, int8).encode("ascii"))
 
 
 WRITERS = {".npz": save_file, ".onnx": _write_onnx, ".h": _write_header}
 
 
-def export(source: Path, out: Path) -> None:
-    """Export `source` to the new file `out`, in the format that its ending names; raise InputError if that fails."""
+def export(source: Path, out: Path, crazyflie: bool = False, int8: bool = False) -> None:
+    """Export `source` to the new file `out`, in the format that its ending names; raise InputError if that fails.
+
+    `crazyflie`: to the new directory `out`, as apps for both drones. `int8`: weights of 8 bits, in an app or a header.
+    """
+    if crazyflie:
+        from mjxball.fly.app.generate import check_place, write_app
+
+        check_place(out)
+        write_app(contents_of(source), source.stem, out, int8)
+        return
+    if int8 and out.suffix != ".h":
+        raise InputError("--int8 is for C: with --crazyflie, or an output file that ends in .h")
     if out.suffix not in WRITERS:
         raise InputError(f"output file {out} must end in {', '.join(WRITERS)}, which chooses the format")
     output_file(out, out.suffix)
-    WRITERS[out.suffix](out, contents_of(source))
+    if int8:
+        _write_header(out, contents_of(source), int8)
+    else:
+        WRITERS[out.suffix](out, contents_of(source))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -63,10 +78,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = make_parser("python -m mjxball.export", about, epilog=formats)
     parser.add_argument("source", metavar="RUN_DIR", type=Path, help="run directory of train.py, or a policy file .npz")
     parser.add_argument("out", metavar="OUT", type=Path, help="file to write, .npz, .onnx or .h; must not exist")
+    parser.add_argument("--crazyflie", action="store_true", help="OUT is a directory: apps for a pair of Crazyflies")
+    parser.add_argument("--int8", action="store_true", help="weights of 8 bits, in an app or a header")
     options = parser.parse_args(arguments)
 
     def command() -> int:
-        export(options.source, options.out)
+        export(options.source, options.out, options.crazyflie, options.int8)
         print(options.out)  # noqa: T201
         return 0
 

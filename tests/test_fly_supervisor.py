@@ -35,7 +35,7 @@ def test_every_pair(state: State, event: Event) -> None:
     assert reached.severity >= state.severity
     if state in ENDED:
         assert reached not in AIRBORNE  # no way from stopped motors to thrust
-    on_ground = {Event.REFUSED, Event.CURVE_UNKNOWN}
+    on_ground = {Event.REFUSED, Event.CURVE_UNKNOWN, Event.APP_REFUSES}
     if event in FAULTS - on_ground and state in (State.RAMP, State.FLY):
         assert reached not in (State.RAMP, State.FLY)  # a fault always ends the flight
     if event is Event.KEY_KILL and state is not State.DONE:

@@ -14,7 +14,7 @@ from mjxball.fly.display import View
 from mjxball.fly.handover import HandoverMonitor, Successor
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.mocap import Mocap
-from mjxball.fly.monitor import Monitor, Sustained, link_faults, tilt_angle
+from mjxball.fly.monitor import Monitor, Sustained, UplinkWatch, link_faults, tilt_angle
 from mjxball.fly.packets import ZERO, PacketError, Setpoint
 from mjxball.fly.preflight import SpinCheck
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, Event, Fault, State, Supervisor
@@ -291,8 +291,11 @@ class Flight:
                 link.command(packets.DISARM)  # its motors idle until then; one that arms itself would arm again
             elif state is State.ARM and sometimes:
                 link.command(packets.ARM)
-            link.send(packets.setpoint_packet(ZERO if dry else value))
-            watch.sent(value.thrust, self._now)
+            self._send(link, watch, ZERO if dry else value)
+
+    def _send(self, link: DroneLink, watch: UplinkWatch, value: Setpoint) -> None:
+        watch.sent(value.thrust, self._now)
+        link.send(packets.setpoint_packet(value))
 
     def _record(self, sent: list[Setpoint], late: float, missed: int) -> None:
         goal, state = self.goal(self._now), self.supervisor.state

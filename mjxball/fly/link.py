@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from mjxball.fly import packets
+from mjxball.fly.app.protocol import APP_VARIABLES, Reply, reply_of, sample_of
 from mjxball.fly.connection import PORT, Deadlines, Element, Identity, LinkError, Parameters, connect
 from mjxball.fly.packets import Packet, PacketError
 from mjxball.fly.process import bounded
@@ -23,6 +24,7 @@ from mjxball.fly.telemetry import HealthSample, Note, Telemetry
 PROTOCOL = 12  # CRTP version with a supervisor port
 LOG_PORT, LOG_DATA = 5, 2
 DEADLINES = Deadlines()
+ATTEMPTS, REPEAT = 8, 0.25  # of a packet of an upload, and how long each answer may take [s]
 QUIET = 0.1  # [s] without anything to send, after which a ping goes out
 REVISION = ("firmware.revision0", "firmware.revision1", "firmware.modified")
 
@@ -108,8 +110,12 @@ class Link:
         self._crazyflie.add_header_callback(self._receive, LOG_PORT, LOG_DATA)
         health = self._log_block("health", self._health_variables(), 50)
         health.data_received_cb.add_callback(lambda stamp, values, config: self._take_health(values))
-        self._ask(block.start)
-        self._ask(health.start)
+        blocks = [block, health]
+        if self._crazyflie.log.toc.get_element_by_complete_name(APP_VARIABLES[0][0]) is not None:
+            blocks.append(self._log_block("app", APP_VARIABLES, 20))
+            blocks[-1].data_received_cb.add_callback(lambda stamp, values, config: self._take_app(values))
+        for one in blocks:
+            self._ask(one.start)
         deadline = time.monotonic() + self._deadlines.first_state
         while self.telemetry.newest is None or self.telemetry.health is None:
             if time.monotonic() > deadline:
@@ -168,6 +174,27 @@ class Link:
         if not bounded(ask, self._deadlines.request):
             raise LinkError(f"the link to the {self.name} takes no packet within {self._deadlines.request:g} s")
         return refused[0] if refused else None
+
+    def ask_app(self, packet: Packet) -> Reply:
+        """The answer of the app on board to `packet`, which is repeated until it comes. Raises LinkError."""
+        answers: list[Reply] = []
+        heard = threading.Event()
+
+        def answered(wire: Any) -> None:
+            reply = reply_of(bytes(wire.data)) if wire.channel == packet.channel else None
+            if reply is not None and reply.kind == packet.data[0]:
+                answers.append(reply)
+                heard.set()
+
+        self._crazyflie.add_port_callback(packet.port, answered)
+        try:
+            for _ in range(ATTEMPTS):
+                self._request(packet)
+                if heard.wait(REPEAT):
+                    return answers[0]
+        finally:
+            self._crazyflie.remove_port_callback(packet.port, answered)
+        raise LinkError(f"the app of the {self.name} does not answer")
 
     # In flight; these never block.
 
@@ -267,6 +294,9 @@ class Link:
         arrival, health = time.monotonic(), packets.health_of(values)
         self.telemetry.health = HealthSample(health, arrival)
         self._note("health", t=arrival, drone=self.name, **health._asdict())
+
+    def _take_app(self, values: Mapping[str, float]) -> None:
+        self.telemetry.app = sample_of(values, time.monotonic())
 
     def _end(self, why: str) -> None:
         self.lost = self.lost or (why.strip().splitlines() or ["link error"])[0]

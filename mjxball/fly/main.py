@@ -19,7 +19,8 @@ from mjxball import cli
 from mjxball.cli import run_command
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.fly import limits
+from mjxball.fly import limits, onboard
+from mjxball.fly.app import generate
 from mjxball.fly.card import Controller, ThrustChoice, drone_of, goal_of, is_crazyflie, motor_of, times_of, variants
 from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.display import live_view
@@ -31,7 +32,8 @@ from mjxball.fly.retrain import Retrainer
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
-from mjxball.policy import Policy
+from mjxball.policy import Policy, load_file
+from mjxball.policy.formats.c_header import weight_bytes
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
 RETRAINED = (0.004, -0.06, 14.0)  # load that --retrain puts on, unless --twin-load says more: kg, m, s
@@ -67,6 +69,9 @@ def make_parser() -> cli.Parser:
     )
     add_twin_options(parser)
     add("--retrain", action="store_true", help="--rehearse: put a load on in flight, and retrain the policy for it")
+    about = "the laws run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
+    add("--onboard", nargs="?", const="float32", choices=("float32", "int8"), help=about)
+    add("--upload", action="store_true", help="--onboard int8: put the policy's weights into the follower's app first")
     add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
     add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
     about = "time under both laws before landing (20; with --retrain 50)"
@@ -183,6 +188,10 @@ def check_twin_options(options: argparse.Namespace) -> None:
         raise InputError("--retrain is for --rehearse only")
     if options.retrain and options.dry_run:
         raise InputError("--retrain takes a flight: leave --dry-run out")
+    if options.upload and options.onboard != "int8":
+        raise InputError("--upload takes weights of 8 bits: --onboard int8 --upload")
+    if options.onboard and options.retrain:
+        raise InputError("--retrain changes laws on the laptop: leave --onboard out")
     check_twin(options)
     for fault in options.fault:
         read_fault(fault)
@@ -196,10 +205,33 @@ def check_loaded(config: Config, retrains: bool) -> None:
         raise InputError("--retrain is for pairs in free flight along y whose CG follows a sine, such as flight")
 
 
+def rehearsed_options(options: argparse.Namespace) -> list[str]:
+    """Which pair the twin is: ports, policy, apps."""
+    ports = [uri.rsplit(":", 1)[1] if uri else "0" for uri in (options.leader, options.follower)]
+    pair = ["--ports", *ports, "--policy", str(options.policy)]
+    pair += ["--onboard", options.onboard] if options.onboard else []
+    return pair
+
+
 def twin_options(options: argparse.Namespace) -> list[str]:
     """The twin's options: link, faults, drones, surroundings."""
     worse = [f"--{name}={getattr(options, name)}" for name in WORSE if getattr(options, name) is not None]
     return [*worse, *(f"--fault={fault}" for fault in options.fault), *given_twin_options(options)]
+
+
+def on_board(
+    options: argparse.Namespace, setup: FlightSetup, settings: FlightSettings
+) -> tuple[FlightSetup, FlightSettings]:
+    """The flight for --onboard. Raises InputError for a policy that cannot fly there."""
+    if options.thrust or options.hover or options.mass:
+        raise InputError("--onboard flies the thrust law in the app: leave --thrust, --hover and --mass out")
+    policy, name = load_file(options.policy), options.policy.stem
+    generate.check_policy(policy, name)
+    idents = [generate.ident_of(policy, int8) for int8 in (False, True)]
+    weights = (weight_bytes(policy), generate.key_of(policy)) if options.upload else None
+    apps = onboard.Apps(name, idents, round(1000 * policy.card["control_period"]), weights)
+    variants = onboard.variants_of(setup.variants, setup.rig, settings.goal)
+    return replace(setup, variants=variants, apps=apps), onboard.settings_of(settings)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -236,6 +268,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         setup = FlightSetup(
             controller, variants(config, choice, more), choice.curve or "linear", rig, Preflight(drone=drone_of(config))
         )
+        if options.onboard:
+            setup, settings = on_board(options, setup, settings)
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
             if options.retrain:
@@ -246,8 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 retrainer.wait(lambda text: print(text, flush=True))  # noqa: T201
                 setup = replace(setup, retrainer=retrainer)
             if options.rehearse:
-                ports = [int(uri.rsplit(":", 1)[1]) if uri else 0 for uri in uris]
-                flags = ["--ports", *map(str, ports), "--policy", str(options.policy), *twin_options(options)]
+                flags = [*rehearsed_options(options), *twin_options(options)]
                 failure = "the twin did not start; are the ports of --leader and --follower free?"
                 twin = stack.enter_context(Child(["mjxball.fly.twin", *flags], failure))
                 uris = tuple(json.loads(twin.line)["uris"])

@@ -24,6 +24,7 @@ from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
+from mjxball.fly.onboard import Apps, OnboardFlight
 from mjxball.fly.preflight import Preflight, check, prepare
 from mjxball.fly.process import Metronome, Timing, urgent
 from mjxball.fly.retrain import Retrainer
@@ -46,6 +47,7 @@ class FlightSetup:
     preflight: Preflight
     mocap: Mocap | None = None  # ready; the caller ends it
     retrainer: Retrainer | None = None  # likewise
+    apps: Apps | None = None  # on board, if the laws are to run there
 
 
 def fly(
@@ -70,17 +72,22 @@ def fly(
         links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]
         try:
             sys.setswitchinterval(SWITCH_INTERVAL)
-            with urgent() as priority, Watchdog(uris) as watchdog:
+            # Apps land by themselves: nobody else must take their place.
+            guard = contextlib.nullcontext() if setup.apps is not None else Watchdog(uris)
+            with urgent() as priority, guard as watchdog:
                 journal.note("priority", granted=priority)
                 if setup.mocap is not None:
                     setup.mocap.note = journal.note
                 curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
+                if setup.apps is not None:
+                    setup.apps.check(links, _say)
                 pair = (links, setup.controller, setup.variants, curves, setup.rig)
                 retrainer = setup.retrainer
                 if retrainer is not None:
                     retrainer.note = journal.note
                 successor = None if retrainer is None else retrainer.take
-                flight = Flight(*pair, settings, journal.note, watchdog, setup.mocap, successor)
+                kind = Flight if setup.apps is None else OnboardFlight
+                flight = kind(*pair, settings, journal.note, watchdog, setup.mocap, successor)
                 flight.ready = _checked(links, setup, settings, journal)
                 flight.refusal = "" if flight.ready else "see the checks"
                 timing = run(flight)

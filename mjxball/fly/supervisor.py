@@ -58,6 +58,10 @@ class Event(Enum):
     DEADLINES = "the loop missed too many deadlines"
     WATCHDOG = "the watchdog process ended"
     DRONE_DOWN = "a drone's firmware is locked, crashed, tumbled or cannot fly"
+    APP_REFUSES = "an app on board does not start"
+    APP_LANDS = "an app on board lands, or is not heard"
+    APP_DESCENDS = "an app on board descends"
+    APP_STOPS = "an app on board turns its motors off"
     POSE = "the motion capture has had no good pose of a drone for too long"
     TOUCHED_DOWN = "the pair stands on the ground"
     GROUNDED = "the firmware counts neither drone as flying"
@@ -81,7 +85,7 @@ ENDED = (S.STOP, S.KILL, S.DONE)
 
 # What goes as planned; and after what the pair sinks under control.
 PLANNED = frozenset({E.READY, E.ARMED, E.CURVE_KNOWN, E.HOVERING, E.TIME_UP, E.RESUMED, E.TOUCHED_DOWN, E.GROUNDED})
-_CONTROLLED = (E.BAD_STATE, E.FENCE, E.SATURATED, E.DEADLINES, E.STICK, E.ESTIMATOR, E.POSE)
+_CONTROLLED = (E.BAD_STATE, E.FENCE, E.SATURATED, E.DEADLINES, E.STICK, E.ESTIMATOR, E.APP_DESCENDS, E.POSE)
 
 
 def _planned() -> dict[tuple[State, Event], State]:
@@ -116,10 +120,11 @@ def _in_the_air() -> dict[tuple[State, Event], State]:
     table = {(S.FLY, event): S.LAND for event in (E.BATTERY, E.WATCHDOG, E.GAPS)}
     table |= {(S.RAMP, event): S.DESCEND for event in (E.BATTERY, E.WATCHDOG, E.GAPS, E.TIMEOUT)}
     table[S.LAND, E.TIMEOUT] = S.DESCEND
+    table |= {(S.FLY, E.APP_LANDS): S.LAND, (S.RAMP, E.APP_LANDS): S.DESCEND}
     for state in (S.RAMP, *GUIDED):
         table |= {(state, event): S.DESCEND for event in _CONTROLLED}
     for state in AIRBORNE:
-        table |= {(state, event): S.STOP for event in (E.DRONE_DOWN, E.TILT)}
+        table |= {(state, event): S.STOP for event in (E.DRONE_DOWN, E.TILT, E.APP_STOPS)}
         table |= {(state, event): S.HOLD for event in (E.STALE, E.LINK_LOST, E.UNHEARD)}
     table |= {(state, E.TIMEOUT): S.STOP for state in (S.DESCEND, S.HOLD)}
     table[S.DESCEND, E.BAD_STATE] = S.STOP

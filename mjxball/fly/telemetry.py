@@ -11,6 +11,7 @@ import numpy as np
 
 from mjxball import config as configs
 from mjxball.control import rotations
+from mjxball.fly.app.protocol import AppSample
 from mjxball.fly.packets import DroneState, Health, Packet
 
 Note = Callable[..., None]  # note(kind, t=None, **fields): into the flight log, without blocking
@@ -74,6 +75,7 @@ class Telemetry:
         self.clock = FirmwareClock()
         self.newest: Sample | None = None
         self.health: HealthSample | None = None
+        self.app: AppSample | None = None
         self.received = self.damaged = self.late = 0
 
     def take(self, state: DroneState, stamp: int, arrival: float) -> bool:

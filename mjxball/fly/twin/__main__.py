@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 from mjxball.cli import make_parser, run_command
+from mjxball.fly.app.host import compile_pair
 from mjxball.fly.process import urgent
 from mjxball.fly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
 from mjxball.fly.twin.physics import make_pair
@@ -27,6 +28,7 @@ def main() -> int:
     parser.add_argument("--policy", type=Path, default=None, metavar="POLICY.npz", help="its card names the rig")
     for name in ("loss", "delay", "jitter"):
         parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links, once motors turn")
+    parser.add_argument("--onboard", choices=("float32", "int8"), help="apps on the drones, with these weights")
     add_twin_options(parser)
     parser.add_argument("--fault", type=read_fault, action="append", default=[], metavar="KIND:DRONE@S")
     options = parser.parse_args()
@@ -35,9 +37,11 @@ def main() -> int:
 
 def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` ask for until standard input ends."""
-    card = load_file(options.policy).card if options.policy else None
+    policy = load_file(options.policy) if options.policy else None
+    card = policy.card if policy else None
+    cores = compile_pair(policy, options.policy.stem, options.onboard == "int8") if policy and options.onboard else None
     kind = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear")
-    with urgent(), Twin(make_pair(card, kind, surroundings(options)), tuple(options.ports)) as twin:
+    with urgent(), Twin(make_pair(card, kind, surroundings(options)), tuple(options.ports), cores) as twin:
         worse = LinkFaults(options.loss, options.delay, options.jitter)
         links = [Injection(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
         for one in (*links, *options.fault):

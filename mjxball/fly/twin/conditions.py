@@ -188,6 +188,7 @@ class DroneFaults:
     garbage: float = 0.0  # datagrams of random bytes sent for each step
     stabilizer_dead: bool = False  # its task hangs: the log goes on with fresh stamps and frozen values, PWM stays
     stopped: bool = False  # the program hangs: nothing is answered, PWM stays
+    peer_silent: bool = False  # apps: no heartbeat of it arrives at the other drone
     restarts: bool = True  # the microcontroller's watchdog restarts what hangs; else its motors stay off
 
 
@@ -217,6 +218,7 @@ FAULT_KINDS: dict[str, What] = {
     "stabilizer": DroneFaults(stabilizer_dead=True),
     "imu": DroneFaults(stabilizer_dead=True),  # the stabilizer waits for it
     "stopped": DroneFaults(stopped=True),
+    "peer": DroneFaults(peer_silent=True),
     "killed": DroneFaults(stopped=True, restarts=False),
     "pose-frozen": BodyFault("frozen", 1.0),
     "pose-lost": BodyFault("lost", 1.0),

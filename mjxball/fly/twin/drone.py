@@ -8,6 +8,9 @@ import math
 
 import numpy as np
 
+from mjxball.fly.app.host import App, Library, State
+from mjxball.fly.app.protocol import GROUP
+from mjxball.fly.packets import Setpoint
 from mjxball.fly.twin import protocol
 from mjxball.fly.twin.conditions import BodyFault, DroneFaults, LinkFaults, What
 from mjxball.fly.twin.firmware import Firmware, Motors, Order
@@ -16,6 +19,7 @@ from mjxball.fly.twin.physics import Modes, Pair, PairState
 from mjxball.fly.twin.protocol import Peer
 
 GRAVITY = 9.81  # [m/s2]
+BEAT = 2  # periods of an app between two heartbeats
 # Parameters of the supervisor, each with its field there and the factor to its unit.
 SUPERVISOR = {
     "supervisor.prefltTimeout": ("preflight_time", 1e-3),
@@ -28,26 +32,36 @@ SUPERVISOR = {
 class TwinDrone:
     """What answers at one address. `receive`, `step` and `send` are called by one thread."""
 
-    def __init__(self, pair: Pair, number: int):
-        """Drone `number` (0 leader, 1 follower) of `pair`."""
+    def __init__(self, pair: Pair, number: int, core: Library | None = None):
+        """Drone `number` (0 leader, 1 follower) of `pair`; `core`: the app on board, none without one."""
         self._pair, self.number = pair, number
         self._random = np.random.default_rng([pair.surroundings.seed, number])
         self.firmware = Firmware(pair.kind, phase=float(self._random.random()))
         self._estimator = 2 if pair.surroundings.deck else 1
+        self._core = core
+        self.app = self._new_app()
         self.peer = self._new_peer()
         self.link, self.faults = LinkFaults(), DroneFaults()
         self.up, self.down = Channel(self._random), Channel(self._random)
         self._now = self._stamp = self._booted = 0.0  # [s]
         self._readings: Readings | None = None
         self._pose = (0.0,) * 7
+        self._estimated = 0  # [ms] of the estimate that an app sees
 
     def _new_peer(self) -> Peer:
-        return Peer(self.firmware, self._written, self._posed, self._estimator)
+        return Peer(self.firmware, self._written, self._posed, self._estimator, self.app)
+
+    def _new_app(self) -> App | None:
+        self.beat = b""  # heartbeat that is on its way to the other drone
+        self._ticks, self._next_tick, self._app_ran = 0, 0.0, False
+        return None if self._core is None else App(self._core, self.number)
 
     def _written(self, name: str, value: float) -> None:
         if name in SUPERVISOR:
             field, factor = SUPERVISOR[name]
             setattr(self.firmware.supervisor, field, value * factor)
+        if self.app is not None and name.startswith(f"{GROUP}."):
+            self.app.set(name.removeprefix(f"{GROUP}."), value)
         self._pair.set_parameter(self.number, name, value)
 
     def _posed(self, position: np.ndarray, quaternion: np.ndarray | None) -> None:
@@ -97,6 +111,8 @@ class TwinDrone:
         self.answer(now)
         report, mine, wrong = state.report, self.number, self.faults
         hung = wrong.stopped or wrong.stabilizer_dead
+        if not (wrong.stopped or self.firmware.dead or self.firmware.booting):
+            self._run_app(state, now)
         before = self.firmware.supervisor
         acceleration = (report.acceleration[mine] / GRAVITY).tolist()
         order = self.firmware.step(now, acceleration, report.pwm[mine].tolist(), hung, wrong.restarts)
@@ -111,11 +127,41 @@ class TwinDrone:
             self._readings = Readings(self._readings.snapshot._replace(info=self.firmware.info))
         return order
 
+    def _run_app(self, state: PairState, now: float) -> None:
+        """A period of the app, if one is due: its task takes the newest estimate and sends a setpoint."""
+        if self.app is None or now < self._next_tick - 1e-9:
+            return
+        self._next_tick = max(self._next_tick, now - 1e-9) + self.app.period / 1000
+        seen = self._readings.snapshot if self.faults.frozen and self._readings else self._snapshot(state)
+        report, mine, estimate = seen.report, self.number, State()
+        estimate.position[:], estimate.velocity[:] = seen.position.tolist(), report.velocity[mine].tolist()
+        estimate.quaternion[:], estimate.rates[:] = report.quaternion[mine].tolist(), report.rates[mine].tolist()
+        estimate.variance[:] = report.variance[mine][:3].tolist()
+        clock = round(1000 * now)
+        self._estimated = self._estimated if self.faults.stabilizer_dead else clock
+        estimate.time, estimate.can_fly = self._estimated, self.firmware.supervisor.can_fly
+        wanted = self.app.tick(estimate, clock)
+        if wanted.active:
+            self.firmware.commander.from_app(Setpoint(wanted.roll, wanted.pitch, 0.0, int(wanted.thrust)), now)
+        elif self._app_ran:
+            self.firmware.commander.relax()
+        self._app_ran = wanted.active
+        if self._ticks % BEAT == 0:
+            self.beat = self.app.send()
+        self._ticks += 1
+
+    def hear(self, beat: bytes, now: float) -> None:
+        """A heartbeat of the other drone's app arrives, unless it is lost."""
+        lost = self.link.loss and self._random.random() < self.link.loss
+        if self.app is not None and not self._silent and not lost:
+            self.app.hear(beat, round(1000 * now))
+
     def _snapshot(self, state: PairState) -> Snapshot:
         position = state.report.position[self.number] + np.array(self.faults.offset)
         voltage = float(state.battery[self.number]) + self.faults.battery
         setpoint = self.firmware.order.setpoint
-        return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, self._pose)
+        logged = {} if self.app is None else self.app.logged()
+        return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, self._pose, logged)
 
     def send(self, now: float) -> list[bytes]:
         """Datagrams that leave for the laptop at `now`."""
@@ -140,6 +186,7 @@ class TwinDrone:
         self._forget(self._now)
 
     def _forget(self, now: float) -> None:
+        self.app = self._new_app()
         self.peer = self._new_peer()
         self._booted = now
         self.faults = DroneFaults()
@@ -192,6 +239,10 @@ def garbage(random: np.random.Generator) -> bytes:
 def advance(pair: Pair, drones: tuple[TwinDrone, TwinDrone], state: PairState, now: float, dt: float) -> PairState:
     """Step both drones at `now` [s] and the physics `dt` [s] on."""
     one, other = drones[0].step(state, now), drones[1].step(state, now)
+    for drone, peer in (drones, drones[::-1]):
+        if drone.beat and not drone.faults.peer_silent:
+            peer.hear(drone.beat, now)
+        drone.beat = b""
     modes = Modes(
         run=(one.motors is not Motors.OFF, other.motors is not Motors.OFF),
         held=(one.motors is Motors.HELD, other.motors is Motors.HELD),

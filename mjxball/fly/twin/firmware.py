@@ -13,7 +13,7 @@ from mjxball.fly.twin.supervisor import AIRBORNE, PERIOD, Phase, Supervisor
 
 THRUST_FLOOR, THRUST_CEILING = 1000, 60000  # [thrust units] below: motors stand still; above: cut
 PLANNER_PERIOD = 0.01  # [s] of the high-level commander, whose planner never flies here: it asks for motors off
-UNSET, PLANNER, LAPTOP = 0, 1, 2  # priorities of who sent the setpoint
+UNSET, PLANNER, LAPTOP, APP = 0, 1, 2, 3  # priorities of who sent the setpoint
 WORST_ANGLE = 30.0  # [deg] in place of a number that is not finite: the real controller takes such a one as a kick
 
 
@@ -38,6 +38,10 @@ class Commander:
         angles = (part if math.isfinite(part) else WORST_ANGLE for part in value[:3])
         roll, pitch, yaw_rate = (min(max(part, -180.0), 180.0) for part in angles)
         self._take(Setpoint(roll, pitch, yaw_rate, thrust), now, LAPTOP)
+
+    def from_app(self, value: Setpoint, now: float) -> None:
+        """A setpoint of an app on board: no thrust lock, and before the laptop's."""
+        self._take(value, now, APP)
 
     def stop(self, now: float) -> None:
         """Port 7, stop: a setpoint that turns the motors off; the thrust lock stays open."""

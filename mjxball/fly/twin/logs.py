@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.fly import packets
+from mjxball.fly.app.protocol import GROUP, LOGGED
 from mjxball.fly.packets import Setpoint
 from mjxball.fly.twin.estimators import euler_of, matrix_of
 from mjxball.fly.twin.physics import Report
@@ -38,6 +39,9 @@ def item(type_byte: int, name: str) -> bytes:
 
 LOG_VARIABLES: tuple[tuple[str, str], ...] = tuple((row["name"], row["type"]) for row in listed("log"))
 LOG_ITEMS = [item(LOG_TYPES[kind][0], name) for name, kind in LOG_VARIABLES]
+OF_APP = tuple((f"{GROUP}.{name}", kind) for name, kind in LOGGED)
+APP_ITEMS = [item(LOG_TYPES[kind][0], name) for name, kind in OF_APP]
+KNOWN = LOG_VARIABLES + OF_APP  # those of the app are listed by a drone that has one
 
 
 class Snapshot(NamedTuple):
@@ -50,6 +54,7 @@ class Snapshot(NamedTuple):
     voltage: float  # [V]
     position: np.ndarray  # (3,) that is reported [m]
     pose: tuple[float, ...]  # last pose from the laptop: x, y, z, qx, qy, qz, qw
+    app: Mapping[str, float] = {}  # what the app on board logs
 
     @property
     def quaternion(self) -> np.ndarray:
@@ -133,6 +138,7 @@ GROUPS: dict[str, Callable[[Snapshot], dict[str, float]]] = {
     "gyro": lambda one: _named("x y z", np.degrees(one.report.rates[one.drone])),
     "ext_pos": lambda one: _named("X Y Z", one.pose[:3]),
     "locSrv": lambda one: _named("x y z qx qy qz qw", one.pose),
+    GROUP: lambda one: dict(one.app),
     "radio": lambda one: {"isConnected": 1.0, "rssi": 40.0},
 }
 
@@ -236,9 +242,9 @@ class Blocks:
                 return TOO_BIG
             if sum(len(one.variables) for one in self.by_number.values()) >= MAX_VARIABLES:
                 return NO_MEMORY
-            if index >= len(LOG_VARIABLES):
+            if index >= len(KNOWN):
                 return UNKNOWN
-            block.variables.append((LOG_VARIABLES[index][0], code))
+            block.variables.append((KNOWN[index][0], code))
         return 0
 
 

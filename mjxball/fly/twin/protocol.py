@@ -14,10 +14,23 @@ import numpy as np
 
 from mjxball.control.crazyflie import STOCK, gains_of
 from mjxball.fly import packets
+from mjxball.fly.app.host import App
+from mjxball.fly.app.protocol import GROUP
+from mjxball.fly.app.protocol import PARAMETERS as APP_PARAMETERS
 from mjxball.fly.packets import PacketError
 from mjxball.fly.twin.conditions import DroneKind
 from mjxball.fly.twin.firmware import Firmware
-from mjxball.fly.twin.logs import LOG_ITEMS, MAX_BLOCKS, MAX_VARIABLES, UNKNOWN, Blocks, Readings, item, listed
+from mjxball.fly.twin.logs import (
+    APP_ITEMS,
+    LOG_ITEMS,
+    MAX_BLOCKS,
+    MAX_VARIABLES,
+    UNKNOWN,
+    Blocks,
+    Readings,
+    item,
+    listed,
+)
 
 VERSION = 12
 MAX_DATA = 30
@@ -91,6 +104,7 @@ PARAMETERS = tuple(
     for row in listed("param")
 )
 PARAM_ITEMS = [item(parameter.type_byte, parameter.name) for parameter in PARAMETERS]
+OF_APP = tuple(Parameter(f"{GROUP}.{name}", kind, 0.0, read_only) for name, kind, read_only in APP_PARAMETERS)
 
 
 def defaults_of(kind: DroneKind, estimator: int) -> dict[str, float]:
@@ -120,10 +134,15 @@ class Peer:
         on_parameter: Callable[[str, float], None] = lambda name, value: None,
         on_pose: Pose = lambda position, quaternion: None,
         estimator: int = 2,
+        app: App | None = None,
     ):
-        """`estimator` is what the drone's decks ask for: 1 complementary, 2 Kalman."""
-        self.firmware = firmware
+        """`estimator` is what the drone's decks ask for: 1 complementary, 2 Kalman; `app`: what runs beside it."""
+        self.firmware, self._app = firmware, app
         self.values = defaults_of(firmware.kind, estimator)
+        self.parameters = PARAMETERS if app is None else PARAMETERS + OF_APP
+        self.values |= {one.name: one.default for one in self.parameters[len(PARAMETERS) :]}
+        parameters = [item(one.type_byte, one.name) for one in self.parameters]
+        variables = LOG_ITEMS if app is None else LOG_ITEMS + APP_ITEMS
         self.logs = Blocks()
         self._estimator = estimator
         self._on_parameter, self._on_pose = on_parameter, on_pose
@@ -132,11 +151,12 @@ class Peer:
             (LINK, 1): lambda data, now: [GREETING] if data[:1] == b"\0" else [],
             (PLATFORM, 0): self._platform,
             (PLATFORM, 1): self._version,
-            (PARAM, 0): lambda data, now: self._contents(data, PARAM_ITEMS, b""),
+            (PLATFORM, 2): self._of_app,
+            (PARAM, 0): lambda data, now: self._contents(data, parameters, b""),
             (PARAM, 1): self._read_parameter,
             (PARAM, 2): self._write_parameter,
             (PARAM, 3): self._parameter_extra,
-            (LOG, 0): lambda data, now: self._contents(data, LOG_ITEMS, bytes([MAX_BLOCKS, MAX_VARIABLES])),
+            (LOG, 0): lambda data, now: self._contents(data, variables, bytes([MAX_BLOCKS, MAX_VARIABLES])),
             (LOG, 1): self.logs.control,
             (MEMORY, 0): lambda data, now: [b"\x01\x00"] if data[:1] == b"\x01" else [],
             (COMMANDER, 0): self._setpoint,
@@ -180,6 +200,10 @@ class Peer:
             return [bytes([1, done, supervisor.armed])]
         return [bytes([2, supervisor.recover(), not supervisor.crashed])] if data[:1] == b"\x02" else [data]
 
+    def _of_app(self, data: bytes, now: float) -> list[bytes]:
+        answer = b"" if self._app is None else self._app.laptop(data, int(1000 * now))
+        return [answer] if answer else []
+
     def _contents(self, data: bytes, items: list[bytes], tail: bytes) -> list[bytes]:
         if data[:1] == b"\x03":
             return [b"\x03" + struct.pack("<HI", len(items), zlib.crc32(b"".join(items))) + tail]
@@ -189,13 +213,15 @@ class Peer:
         return []
 
     def _parameter(self, data: bytes) -> Parameter | None:
-        index = int.from_bytes(data[:2], "little") if len(data) >= 2 else len(PARAMETERS)
-        return PARAMETERS[index] if index < len(PARAMETERS) else None
+        index = int.from_bytes(data[:2], "little") if len(data) >= 2 else len(self.parameters)
+        return self.parameters[index] if index < len(self.parameters) else None
 
     def _read_parameter(self, data: bytes, now: float) -> list[bytes]:
         known = self._parameter(data)
         if known is None:
             return [data[:2] + bytes([UNKNOWN])] if len(data) >= 2 else []
+        if self._app is not None:
+            self.values |= {f"{GROUP}.{name}": value for name, value in self._app.parameters().items()}
         return [data[:2] + b"\0" + known.pack(self.values[known.name])]
 
     def _write_parameter(self, data: bytes, now: float) -> list[bytes]:
@@ -220,7 +246,7 @@ class Peer:
             return [data[:3] + bytes([UNKNOWN])] if len(data) >= 3 else []
         if data[0] == 0x07:
             return [data[:3] + bytes([0, int(known.persistent)])]
-        default = defaults_of(self.firmware.kind, self._estimator)[known.name]
+        default = defaults_of(self.firmware.kind, self._estimator).get(known.name, known.default)
         return [data[:3] + b"\0" + known.pack(default)] if data[0] == 0x08 else []
 
     def _setpoint(self, data: bytes, now: float) -> None:

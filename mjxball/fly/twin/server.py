@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mjxball.fly.app.host import Library
 from mjxball.fly.twin.conditions import Injection
 from mjxball.fly.twin.drone import TwinDrone, advance
 from mjxball.fly.twin.physics import Pair, PairState
@@ -34,10 +35,11 @@ class Truth:
 class Twin:
     """Two drones that answer at `uris`. A context manager; `inject` works while it runs."""
 
-    def __init__(self, pair: Pair, ports: tuple[int, int] = (0, 0)):
-        """`ports` of leader and follower, 0: any free one."""
+    def __init__(self, pair: Pair, ports: tuple[int, int] = (0, 0), cores: tuple[Library, Library] | None = None):
+        """`ports` of leader and follower, 0: any free one; `cores`: the apps on board, see `app.host`."""
         self._pair, self._state = pair, pair.start()
-        self.drones = TwinDrone(pair, 0), TwinDrone(pair, 1)
+        one, other = cores or (None, None)
+        self.drones = TwinDrone(pair, 0, one), TwinDrone(pair, 1, other)
         self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in ports]
         for sock, port in zip(self._sockets, ports, strict=True):
             sock.bind((HOST, port))

@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.fly import packets
+from mjxball.fly import onboard, packets
+from mjxball.fly.app.host import Library
+from mjxball.fly.app.protocol import APP_VARIABLES, sample_of
 from mjxball.fly.card import Controller, motor_of, times_of, variants
 from mjxball.fly.command import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
 from mjxball.fly.flight import Flight
@@ -24,7 +26,7 @@ from mjxball.fly.monitor import down_reason, tilt_angle
 from mjxball.fly.packets import Packet
 from mjxball.fly.supervisor import State, Supervisor
 from mjxball.fly.telemetry import HealthSample, Note, Rig, Telemetry
-from mjxball.fly.twin import logs, protocol
+from mjxball.fly.twin import logs
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.drone import TwinDrone, advance
 from mjxball.fly.twin.physics import Pair, PairState, pair_of
@@ -34,7 +36,7 @@ from mjxball.policy import Policy
 
 STEP = 0.005  # [s] between two steps of the drones; delays are a whole number of them
 GROUNDED = 3e-3  # [m] above its rest below which the pair has touched down
-BLOCK, HEALTH_BLOCK = 1, 2  # log blocks of the state and of health
+BLOCK, HEALTH_BLOCK, APP_BLOCK = 1, 2, 3  # log blocks of the state, of health, of the app
 HEALTH = (*packets.VARIANCES, *packets.MOTORS[0], packets.ACTING_THRUST)
 _HEALTH = struct.Struct("<3f4Hf")
 
@@ -69,17 +71,20 @@ class VirtualLink:
 
     def write_parameters(self, values: Mapping[str, float]) -> None:
         """Write parameters by name."""
-        names = [parameter.name for parameter in protocol.PARAMETERS]
+        parameters = self.drone.peer.parameters
+        names = [parameter.name for parameter in parameters]
         for name, value in values.items():
             number = names.index(name)
-            self.ask(2, 2, number.to_bytes(2, "little") + protocol.PARAMETERS[number].pack(value))
+            self.ask(2, 2, number.to_bytes(2, "little") + parameters[number].pack(value))
 
     write_later = write_parameters
 
     def start_states(self) -> None:
         """Have the state logged at 100 Hz and health at 20 Hz."""
-        names = [name for name, _ in logs.LOG_VARIABLES]
-        for block, variables, period in ((BLOCK, packets.STATE_VARIABLES, 1), (HEALTH_BLOCK, HEALTH, 5)):
+        names = [name for name, _ in logs.KNOWN]
+        blocks = [(BLOCK, packets.STATE_VARIABLES, 1), (HEALTH_BLOCK, HEALTH, 5)]
+        blocks += [(APP_BLOCK, APP_VARIABLES, 2)] if self.drone.app is not None else []
+        for block, variables, period in blocks:
             entries = [
                 bytes([logs.LOG_TYPES[kind][0]]) + names.index(name).to_bytes(2, "little") for name, kind in variables
             ]
@@ -96,6 +101,10 @@ class VirtualLink:
             health = packets.health_of(dict(values))
             self._note("health", t=now, drone=self.name, **health._asdict())
             self.telemetry.health = HealthSample(health, now)
+        elif logged and len(datagram) == 5 + len(APP_VARIABLES) and datagram[1] == APP_BLOCK:
+            self.telemetry.app = sample_of(
+                dict(zip((name for name, _ in APP_VARIABLES), datagram[5:], strict=True)), now
+            )
         elif logged and len(datagram) == 5 + packets.STATE_SIZE:
             try:
                 state = packets.unpack_state(datagram[5:])
@@ -153,12 +162,13 @@ class VirtualTwin:
         log: Any = None,
         settle: float = 0.05,
         checks: bool = False,
+        cores: tuple[Library, Library] | None = None,
     ):
         """Put the pair on the ground and begin a flight, `settle` [s] after the states have started.
 
         Without `physics` it is that of the policy's card, without `maps` the card's by force curve. `log` is what
         `MemoryLog` is, or a `flight_log.Journal`. With `checks` a drone that cannot fly refuses the flight, as the
-        check before a real one does.
+        check before a real one does. `cores`: apps of both drones, which then fly; see `app.host`.
         """
         self.policy, self.rig, self._checks = policy, Rig.of_card(policy.card), checks
         self.config = Controller(policy).config
@@ -166,16 +176,21 @@ class VirtualTwin:
         self.state: PairState = self.pair.start()
         self.rest = float(self.state.position[:, 2].mean())
         self.now, self._count = 0.0, 0
-        self.drones = TwinDrone(self.pair, 0), TwinDrone(self.pair, 1)
+        one, other = cores or (None, None)
+        self.drones = TwinDrone(self.pair, 0, one), TwinDrone(self.pair, 1, other)
         self.log: Any = log or MemoryLog()
         named = zip(NAMES, self.drones, strict=True)
         self.links = [VirtualLink(drone, lambda: self.now, name, self.log.note) for name, drone in named]
         self.variants: Sequence[Variants] = variants(self.config)
         if maps is not None:
             self.variants = [{name: Variant(one, {}) for name in CURVE_NAMES} for one in maps]
+        self._onboard = cores is not None
         stand, times = self.config.plant.stand != "free", times_of(self.config)
         settings = settings or FlightSettings(seconds=2.0, stand=stand, times=times)
         self.settings = dataclasses.replace(settings, motor=motor_of(self.config))
+        if self._onboard:
+            self.settings = onboard.settings_of(self.settings)
+            self.variants = onboard.variants_of(self.variants, self.rig, self.settings.goal)
         self.track: list[Moment] = []
         self._start_flight(settle)
 
@@ -183,7 +198,8 @@ class VirtualTwin:
         """Prepare the drones, wait `settle` [s], and begin a flight as one whose checks have passed, if they would."""
         curve: CurveName = "linear" if "linear" in self.variants[0] else "older"
         controller, curves = Controller(self.policy), [curve, curve]
-        self.flight = Flight(self.links, controller, self.variants, curves, self.rig, self.settings, self.log.note)
+        kind = onboard.OnboardFlight if self._onboard else Flight
+        self.flight = kind(self.links, controller, self.variants, curves, self.rig, self.settings, self.log.note)
         for link, own in zip(self.links, self.variants, strict=True):
             link.telemetry = Telemetry()
             link.write_parameters(own[curve].gains)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -19,6 +20,8 @@ from mjxball.control.observation import (
     OBSERVATION_SIZE,
 )
 from mjxball.policy.file import PolicyFile, law_of
+from mjxball.policy.formats import c_texts
+from mjxball.policy.quantize import Rows, rows_of
 
 FLOAT = 4  # bytes
 
@@ -28,30 +31,35 @@ class Footprint:
     """What a header costs on board [bytes]; code comes on top, about 1 KiB with -Os."""
 
     flash: int  # constants
-    state: int  # `mjxball_follower`
+    state: int  # `mjxball_follower`, where a pointer has 4 bytes
     stack: int  # arrays of one call
 
 
-def footprint(policy: PolicyFile) -> Footprint:
-    """Bytes that the header of `policy` needs."""
-    weights, biases = _mean_layers(policy)
+def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
+    """Bytes that the header of `policy` needs, see `c_header`."""
+    weights, biases = mean_layers(policy)
     size = len(policy.observation_mean)
     widest = max(len(bias) for bias in biases)
     lqg = law_of(policy.card).lqg
-    constants = sum(array.size for array in (*weights, *biases)) + 2 * size + 2 * ACTION_SIZE
-    constants += 0 if lqg is None else sum(np.size(value) for value in lqg)
-    return Footprint(FLOAT * constants, FLOAT * (size - OBSERVATION_SIZE) + 4, FLOAT * (size + 2 * widest))
+    constants = 2 * ACTION_SIZE + (0 if lqg is None else sum(np.size(value) for value in lqg))
+    state, stack = FLOAT * (size - OBSERVATION_SIZE) + 4, FLOAT * (size + 2 * widest)
+    if int8:
+        flash = len(weight_bytes(policy)) + FLOAT * constants
+        return Footprint(flash, state + FLOAT, stack + 2 * (max(size, widest) + 7))
+    constants += sum(array.size for array in (*weights, *biases)) + 2 * size
+    return Footprint(FLOAT * constants, state, stack)
 
 
-def c_header(policy: PolicyFile, name: str) -> str:
-    """The header's text. `mjxball_follow` computes what `mjxball.Policy` computes, in float."""
-    law, card, cost = law_of(policy.card), policy.card, footprint(policy)
+def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
+    """The header's text. `mjxball_follow` computes what `mjxball.Policy` computes, in float.
+
+    With `int8` the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the
+    same layout may be put in place at run time, `mjxball_follower.weights`.
+    """
+    law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)
     history = law.history
-    weights, biases = _mean_layers(policy)
-    sizes = [len(policy.observation_mean), *map(len, biases)]
-    arrays = [_array("mean", policy.observation_mean), _array("scale", policy.observation_scale)]
-    for number, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-        arrays += [_array(f"weight_{number}", weight.T), _array(f"bias_{number}", bias)]
+    sizes = [len(policy.observation_mean), *map(len, mean_layers(policy)[1])]
+    arrays = _float_arrays(policy) if not int8 else []
     tilt, vertical = card["command_limits"]
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
     if law.lqg is not None:
@@ -59,7 +67,10 @@ def c_header(policy: PolicyFile, name: str) -> str:
             _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
             for name, value in law.lqg._asdict().items()
         ]
-    return HEADER.format(
+    helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
+    helpers += (c_texts.APPROACH if history.filters else "") + (c_texts.COSINE if law.lqg is not None else "")
+    layers = _network_int8(sizes) if int8 else _network(sizes)
+    return c_texts.HEADER.format(
         name=_plain(name),
         origin=_plain(f"preset {card['preset']}, configuration {card['config_hash']}, {card['training_steps']} steps"),
         version=_plain(card["package_version"]),
@@ -72,22 +83,38 @@ def c_header(policy: PolicyFile, name: str) -> str:
         stack=cost.stack,
         size=sizes[0],
         widest=max(sizes[1:]),
+        broadest=max(sizes),
+        int8="#define MJXBALL_INT8 1\n" if int8 else "",
+        weights=", weights of 8 bits" if int8 else "",
+        includes="#include <stdint.h>\n\n" if int8 else "",
+        weights_field="    const mjxball_weights *weights;  /* 0: those compiled in */\n" if int8 else "",
+        weights_type=_weights_type(sizes) if int8 else "",
+        compiled=_compiled(policy) if int8 else "",
+        leader="\n".join(["    int i;", *_leader(card, "to")]),
         memory_size=law.size,
         memory_field=f"    mjxball_real memory[{law.size}];\n" if law.size else "",
-        helpers=(APPROACH if history.filters else "") + (LQG if law.lqg is not None else ""),
+        helpers=helpers,
+        lqg=c_texts.LQG if law.lqg is not None else "",
         memory_pointer="    mjxball_real *memory = follower->memory;\n" if law.size else "",
         arrays="\n".join(arrays),
         history=_history(law, card),
         history_update=_history_update(law),
-        network=_network(sizes),
+        network=layers,
         command=_command(law, card),
     )
 
 
-def _mean_layers(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def mean_layers(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Weights and biases without the last layer's second half, which exploration alone uses."""
     weights = [*policy.weights[:-1], policy.weights[-1][:, :ACTION_SIZE]]
     return weights, [*policy.biases[:-1], policy.biases[-1][:ACTION_SIZE]]
+
+
+def _float_arrays(policy: PolicyFile) -> list[str]:
+    arrays = [_array("mean", policy.observation_mean), _array("scale", policy.observation_scale)]
+    for number, (weight, bias) in enumerate(zip(*mean_layers(policy), strict=True)):
+        arrays += [_array(f"weight_{number}", weight.T), _array(f"bias_{number}", bias)]
+    return arrays
 
 
 def _number(value: float | np.floating) -> str:
@@ -131,7 +158,7 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
         place = OBSERVATION_SIZE + older + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
     if law.lqg is not None:
-        lines = ["    mjxball_real led[3];", *_leader(card, "led"), *lines]
+        lines = ["    mjxball_real led[3];", "    mjxball_copy_law(observation, led);", *lines]
         lines += [f"    mjxball_lqg_estimate(memory + {history.size}, observation);"]
         features = f"input + {OBSERVATION_SIZE + history.size}"
         lines += [f"    mjxball_lqg_features(memory + {history.size}, observation, {features});"]
@@ -159,17 +186,96 @@ def _history_update(law: FollowerLaw) -> str:
 
 
 def _network(sizes: Sequence[int]) -> str:
-    """Calls of the layers, from `input` through two buffers in turn to `action`."""
+    """Lines that scale `input` and call the layers."""
+    scale = f"    for (i = 0; i < {sizes[0]}; i++) input[i] = (input[i] - mjxball_mean[i]) * mjxball_scale[i];"
+    calls = [
+        f"mjxball_layer(mjxball_weight_{n}, mjxball_bias_{n}, {inputs}, {outputs}"
+        for n, (inputs, outputs) in enumerate(itertools.pairwise(sizes))
+    ]
+    return "\n".join([scale, *_layers(sizes, calls)])
+
+
+def _network_int8(sizes: Sequence[int]) -> str:
+    """The same for weights of 8 bits."""
+    weights = "    const mjxball_weights *w = follower->weights ? follower->weights : &mjxball_compiled;"
+    scale = f"    for (i = 0; i < {sizes[0]}; i++) input[i] = (input[i] - w->mean[i]) * w->scale[i];"
+    calls = [
+        f"mjxball_layer(w->weight_{n}, w->step_{n}, w->bias_{n}, {inputs}, {outputs}, {stride(inputs)}"
+        for n, (inputs, outputs) in enumerate(itertools.pairwise(sizes))
+    ]
+    return "\n".join([weights, scale, *_layers(sizes, calls)])
+
+
+def _layers(sizes: Sequence[int], calls: Sequence[str]) -> list[str]:
+    """`calls` of the layers, from `input` through two buffers in turn to `action`."""
     lines, source = [], "input"
     last = len(sizes) - 2
-    for number in range(last + 1):
+    for number, call in enumerate(calls):
         target = "action" if number == last else f"hidden[{number % 2}]"
-        arrays = f"mjxball_weight_{number}, mjxball_bias_{number}"
-        lines.append(f"    mjxball_layer({arrays}, {sizes[number]}, {sizes[number + 1]}, {source}, {target});")
+        lines.append(f"    {call}, {source}, {target});")
         if number < last:
             lines.append(f"    for (i = 0; i < {sizes[number + 1]}; i++) if ({target}[i] < 0) {target}[i] = 0;")
         source = target
-    return "\n".join(lines)
+    return lines
+
+
+def stride(inputs: int) -> int:
+    """Weights of 8 bits in a row, a multiple of 8."""
+    return -(-inputs // 8) * 8
+
+
+def _weights_type(sizes: Sequence[int]) -> str:
+    """The struct whose bytes are `weight_bytes`."""
+    floats = [f"mean[{sizes[0]}]", f"scale[{sizes[0]}]"]
+    floats += [f"{kind}_{n}[{outputs}]" for n, outputs in enumerate(sizes[1:]) for kind in ("step", "bias")]
+    whole = [f"weight_{n}[{outputs * stride(inputs)}]" for n, (inputs, outputs) in enumerate(itertools.pairwise(sizes))]
+    fields = [*(f"float {one}" for one in floats), *(f"int8_t {one}" for one in whole)]
+    return "typedef struct {\n" + "".join(f"    {one};\n" for one in fields) + "} mjxball_weights;\n\n"
+
+
+def _layers_int8(policy: PolicyFile) -> tuple[list[Rows], list[np.ndarray]]:
+    weights, biases = mean_layers(policy)
+    return [rows_of(weight) for weight in weights], biases
+
+
+def weight_bytes(policy: PolicyFile) -> bytes:
+    """The struct `mjxball_weights` of `policy` as a little-endian machine holds it."""
+    rows, biases = _layers_int8(policy)
+    parts = [policy.observation_mean, policy.observation_scale]
+    for own, bias in zip(rows, biases, strict=True):
+        parts += [own.step, bias]
+    floats = b"".join(np.asarray(part, "<f4").tobytes() for part in parts)
+    return floats + b"".join(_padded(own.weight).tobytes() for own in rows)
+
+
+def float_bytes(policy: PolicyFile) -> bytes:
+    """What the network computes with, as a little-endian machine holds it."""
+    weights, biases = mean_layers(policy)
+    parts = [*_scaling(policy), *(part for one in zip(weights, biases, strict=True) for part in one)]
+    return b"".join(np.asarray(part, "<f4").tobytes() for part in parts)
+
+
+def _padded(weight: np.ndarray) -> np.ndarray:
+    """Rows of `weight` (outputs, inputs), filled up with zeros."""
+    return np.pad(weight, ((0, 0), (0, stride(weight.shape[1]) - weight.shape[1])))
+
+
+def _compiled(policy: PolicyFile) -> str:
+    """The constant `mjxball_compiled`."""
+    rows, biases = _layers_int8(policy)
+    parts: list[list[str]] = [[_number(value) for value in part] for part in _scaling(policy)]
+    for own, bias in zip(rows, biases, strict=True):
+        parts += [[_number(value) for value in part] for part in (own.step, bias)]
+    parts += [[str(value) for value in _padded(own.weight).ravel()] for own in rows]
+    return "static const mjxball_weights mjxball_compiled = {\n" + ",\n".join(map(_braced, parts)) + "};\n"
+
+
+def _scaling(policy: PolicyFile) -> tuple[np.ndarray, np.ndarray]:
+    return policy.observation_mean, policy.observation_scale
+
+
+def _braced(numbers: Sequence[str]) -> str:
+    return "    {" + ",\n     ".join(", ".join(numbers[k : k + 16]) for k in range(0, len(numbers), 16)) + "}"
 
 
 def _leader(card: dict[str, Any], to: str) -> list[str]:
@@ -196,157 +302,13 @@ def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
         return "\n".join(
             [*lines, "    for (i = 0; i < 3; i++) command[i] = mjxball_clip(command[i], mjxball_limit[i]);"]
         )
-    lines = _leader(card, "command") if law.residual else ["    for (i = 0; i < 3; i++) command[i] = 0;"]
+    lines = (
+        ["    mjxball_copy_law(observation, command);"]
+        if law.residual
+        else ["    for (i = 0; i < 3; i++) command[i] = 0;"]
+    )
     lines += [
         "    for (i = 0; i < 3; i++)",
         f"        command[i] = mjxball_clip(command[i] + {added}, mjxball_limit[i]);",
     ]
     return "\n".join(lines)
-
-
-HEADER = """\
-/* Follower {name}, exported by mjxball {version}: {origin}.
- *
- *   mjxball_follower follower;
- *   mjxball_reset(&follower);                                   before every flight
- *   mjxball_follow(&follower, observation, action, command);    every {period} s
- *
- * observation (18), SI units and radians, world axes, body rates in body axes:
-{observation}
- * action (3): the network's mean in [-1, 1]. command (3): roll [rad], pitch [rad], vertical acceleration [m/s2].
- *
- * Network {layers}, ReLU, tanh. C99, needs math.h; no allocation, no globals but constants.
- * Flash: {flash} bytes of constants, and the code. RAM: {state} bytes for mjxball_follower,
- * {stack} bytes of arrays on the stack during mjxball_follow.
- * Define MJXBALL_REAL as double before including this for arithmetic without rounding to float, at twice the RAM.
- */
-#ifndef MJXBALL_FOLLOWER_H
-#define MJXBALL_FOLLOWER_H
-
-#include <math.h>
-
-#ifndef MJXBALL_REAL
-#define MJXBALL_REAL float
-#endif
-typedef MJXBALL_REAL mjxball_real;
-
-#define MJXBALL_OBSERVATION_SIZE 18
-#define MJXBALL_ACTION_SIZE 3
-#define MJXBALL_MEMORY_SIZE {memory_size}
-#define MJXBALL_CONTROL_PERIOD {period}
-#define MJXBALL_GRAVITY {gravity}
-
-typedef struct {{
-{memory_field}    int running;
-}} mjxball_follower;
-
-{arrays}
-
-static inline void mjxball_copy(mjxball_real *to, const mjxball_real *from, int count) {{
-    for (int i = 0; i < count; i++) to[i] = from[i];
-}}
-static inline mjxball_real mjxball_clip(mjxball_real value, mjxball_real limit) {{
-    return value < -limit ? -limit : value > limit ? limit : value;
-}}
-{helpers}
-/* to = weight from + bias. Four sums side by side keep a pipelined FPU busy and round less than one long sum. */
-static inline void mjxball_layer(
-    const float *weight, const float *bias, int inputs, int outputs, const mjxball_real *from, mjxball_real *to) {{
-    for (int row = 0; row < outputs; row++, weight += inputs) {{
-        mjxball_real sum[4] = {{0, 0, 0, 0}};
-        int k = 0;
-        for (; k + 4 <= inputs; k += 4)
-            for (int lane = 0; lane < 4; lane++) sum[lane] += weight[k + lane] * from[k + lane];
-        for (; k < inputs; k++) sum[0] += weight[k] * from[k];
-        to[row] = (sum[0] + sum[1]) + (sum[2] + sum[3]) + bias[row];
-    }}
-}}
-
-/* Forget the past: the next call starts a flight. */
-static inline void mjxball_reset(mjxball_follower *follower) {{
-    follower->running = 0;
-}}
-
-static inline void mjxball_follow(
-    mjxball_follower *follower, const mjxball_real observation[18], mjxball_real action[3], mjxball_real command[3]) {{
-    mjxball_real input[{size}], hidden[2][{widest}];
-{memory_pointer}    int i;
-    mjxball_copy(input, observation, 18);
-{history}
-    for (i = 0; i < {size}; i++) input[i] = (input[i] - mjxball_mean[i]) * mjxball_scale[i];
-{network}
-    for (i = 0; i < 3; i++) action[i] = (mjxball_real)tanh((double)action[i]);
-{command}
-{history_update}
-}}
-
-#endif
-"""
-APPROACH = """
-static inline void mjxball_approach(mjxball_real *average, const mjxball_real *value, int count, float share) {
-    for (int i = 0; i < count; i++) average[i] += share * (value[i] - average[i]);
-}
-"""
-LQG = """
-/* LQG with estimates of the load; its memory: the filter's state (8) and what drives it (2). */
-static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *observation) {
-    memory[0] = observation[4];
-    memory[1] = observation[10];
-    memory[5] = -observation[17];
-}
-
-static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
-    mjxball_real predicted[8], off[3];
-    for (int row = 0; row < 8; row++) {
-        predicted[row] = 0;
-        for (int k = 0; k < 10; k++) predicted[row] += mjxball_lqg_transition[10 * row + k] * memory[k];
-    }
-    off[0] = observation[4] - predicted[0];
-    off[1] = observation[10] - predicted[1];
-    off[2] = -observation[17] - predicted[5];
-    for (int row = 0; row < 8; row++) {
-        memory[row] = predicted[row];
-        for (int k = 0; k < 3; k++) memory[row] += mjxball_lqg_gain[3 * row + k] * off[k];
-    }
-}
-
-static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
-    to[0] = observation[4] - memory[0];
-    to[1] = observation[10] - memory[1];
-    to[2] = -observation[17] - memory[5];
-    mjxball_copy(to + 3, memory + 2, 3);
-    mjxball_copy(to + 6, memory + 6, 4);
-}
-
-static inline mjxball_real mjxball_lqg_tilt(int axis, int along, const mjxball_real *observation) {
-    const float *gain = mjxball_lqg_tilts + 4 * axis;
-    mjxball_real far = gain[0] * observation[12 + along] + gain[1] * observation[15 + along];
-    return mjxball_clip(far, mjxball_lqg_limits[0]) - gain[2] * observation[3 + axis] - gain[3] * observation[9 + axis];
-}
-
-static inline mjxball_real mjxball_lqg_difference(
-    mjxball_real led, mjxball_real vertical, const mjxball_real *observation) {
-    mjxball_real level = (mjxball_real)(cos((double)observation[3]) * cos((double)observation[4]));
-    mjxball_real ahead = mjxball_lqg_carried[0] * (MJXBALL_GRAVITY + led);
-    return (ahead - mjxball_lqg_carried[1] * (MJXBALL_GRAVITY + vertical)) / level;
-}
-
-/* command: what is added to the law's, then the sum, of which the vertical part is within its limit. */
-static inline void mjxball_lqg_command(
-    const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *command) {
-    mjxball_real rise = mjxball_lqg_height[0] * observation[14] + mjxball_lqg_height[1] * observation[17], against;
-    rise = mjxball_clip(rise, mjxball_lqg_limits[1]) - memory[7];
-    command[2] = mjxball_clip(2 * rise - led[2] + command[2], mjxball_limit[2]);
-    against = mjxball_lqg_half_length[0] * mjxball_lqg_difference(led[2], command[2], observation) - memory[2];
-    against = mjxball_clip(against / mjxball_lqg_stiffness[0], mjxball_lqg_limits[2]);
-    command[0] += 2 * mjxball_lqg_tilt(0, 1, observation) - led[0];
-    command[1] += 2 * mjxball_lqg_tilt(1, 0, observation) - led[1] + against;
-}
-
-static inline void mjxball_lqg_next(
-    mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, const mjxball_real *command) {
-    memory[8] = mjxball_lqg_stiffness[0] * (led[1] + command[1])
-        - mjxball_lqg_half_length[0] * mjxball_lqg_difference(led[2], command[2], observation);
-    memory[9] = (mjxball_real)0.5 * (led[2] + command[2]);
-}
-"""

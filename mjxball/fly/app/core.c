@@ -1,0 +1,668 @@
+/* See core.h. No allocation, no globals but constants, no library; products and sums must not be contracted. */
+#include "core.h"
+
+#include "rig.h"
+
+#define CEILING 60000.0f      /* [thrust units] */
+#define FLOOR 10001.0f
+#define SPIN_THRUST 16000.0f
+#define SENT_TILT 0.2617994f  /* [rad] 15 degrees, of every setpoint */
+#define MOST_TILT 0.76604444f /* cosine of 40 degrees */
+#define LAPTOP_AGE 500u       /* [ms] */
+#define PEER_AGE 300u
+#define STATE_AGE 100u
+#define RAMP_TIME 1500u
+#define LAND_SPEED 0.25f      /* [m/s] */
+#define SINK_SPEED 0.4f
+#define BLIND_SPEED 0.5f
+#define DESCEND_TIME 4000u    /* [ms] */
+#define STOP_TIME 3000u       /* the firmware counts as flying for 2 s */
+#define SETTLED 300u
+#define SATURATED_TIME 1000u
+#define NEAR_GROUND 0.04f     /* [m] */
+#define STILL 0.12f           /* [m/s] */
+#define VARIANCE 5e-4f        /* [m2] */
+#define MAX_LIFT_DIFFERENCE 1.5f
+#define BRAKE_TILT 0.13962634f /* [rad] 8 degrees */
+
+static const char *const texts[MJXBALL_CAUSES] = {
+    "good",
+    "asked for by the laptop",
+    "the other drone does",
+    "the laptop is not heard",
+    "the other drone is not heard",
+    "the other drone flies another policy",
+    "the mount is not set",
+    "the goal is beyond the fence or not finite",
+    "the policy does not fly with this force curve",
+    "the state is old or not finite",
+    "the network's command is not finite",
+    "the estimator's position cannot be trusted",
+    "beyond the fence",
+    "tilted beyond the limit",
+    "the firmware cannot fly",
+    "thrust at its bound for too long",
+    "the law comes late",
+    "the phase lasted too long",
+    "on the ground",
+    "weights refused: wrong rate, plant, format, size or CRC",
+    "weights refused: not on the ground",
+};
+
+const char *mjxball_text(int cause) {
+    return cause >= 0 && cause < MJXBALL_CAUSES ? texts[cause] : "unknown";
+}
+
+int mjxball_period(void) {
+    return mjxball_rig.period;
+}
+
+uint32_t mjxball_ident(const mjxball_app *app) {
+#if MJXBALL_UPLOADS
+    if (app->follower.weights) return app->upload.crc;
+#endif
+    (void)app;
+    return mjxball_rig.ident;
+}
+
+/* Numbers. */
+
+static float clip(float value, float low, float high) {
+    return value < low ? low : value > high ? high : value;
+}
+
+/* NaN and infinity less themselves are not 0. */
+static bool finite(const float *values, int count) {
+    for (int k = 0; k < count; k++)
+        if (!(values[k] - values[k] == 0)) return false;
+    return true;
+}
+
+static float root(float x) {
+    return x > 0 ? __builtin_sqrtf(x) : 0;
+}
+
+/* Odd Taylor sum within tan(pi / 8), where it is exact to float. */
+static float arctan(float x) {
+    float size = x < 0 ? -x : x, base = 0, square, value = 0;
+    if (size > 2.4142135f) {
+        base = 1.5707963f;
+        size = -1 / size;
+    } else if (size > 0.41421356f) {
+        base = 0.78539816f;
+        size = (size - 1) / (size + 1);
+    }
+    square = size * size;
+    for (int k = 17; k > 0; k -= 2) value = 1 / (float)k - square * value;
+    value = base + size * value;
+    return x < 0 ? -value : value;
+}
+
+static float arctan2(float y, float x) {
+    if (x > 0) return arctan(y / x);
+    if (x < 0) return arctan(y / x) + (y < 0 ? -3.1415927f : 3.1415927f);
+    return y > 0 ? 1.5707963f : y < 0 ? -1.5707963f : 0;
+}
+
+static float cosine(float x) {
+    float square = x * x, value = 1;
+    for (int k = 12; k > 0; k -= 2) value = 1 - square * value / (float)(k * (k - 1));
+    return value;
+}
+
+static void rotation(const float *q, float matrix[3][3]) {
+    float w = q[0], x = q[1], y = q[2], z = q[3];
+    matrix[0][0] = 1 - 2 * (y * y + z * z);
+    matrix[0][1] = 2 * (x * y - w * z);
+    matrix[0][2] = 2 * (x * z + w * y);
+    matrix[1][0] = 2 * (x * y + w * z);
+    matrix[1][1] = 1 - 2 * (x * x + z * z);
+    matrix[1][2] = 2 * (y * z - w * x);
+    matrix[2][0] = 2 * (x * z - w * y);
+    matrix[2][1] = 2 * (y * z + w * x);
+    matrix[2][2] = 1 - 2 * (x * x + y * y);
+}
+
+static void rotate(const float matrix[3][3], const float *vector, float *to) {
+    for (int i = 0; i < 3; i++)
+        to[i] = matrix[i][0] * vector[0] + matrix[i][1] * vector[1] + matrix[i][2] * vector[2];
+}
+
+static void cross(const float *a, const float *b, float *to) {
+    to[0] = a[1] * b[2] - a[2] * b[1];
+    to[1] = a[2] * b[0] - a[0] * b[2];
+    to[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* The pair as this drone sees it. */
+
+typedef struct {
+    float position[3], velocity[3], euler[3], rates[3], matrix[3][3]; /* of O */
+    float level; /* cosine of the drone's tilt */
+} seen;
+
+/* p_O = p - R r. On a stand nothing is believed of what is locked. */
+static void look(const mjxball_parameters *set, const mjxball_state *state, seen *to) {
+    float arm[3], swing[3], sweep[3];
+    rotation(state->quaternion, to->matrix);
+    rotate(to->matrix, set->mount, arm);
+    cross(state->rates, set->mount, swing);
+    rotate(to->matrix, swing, sweep);
+    to->level = to->matrix[2][2];
+    for (int i = 0; i < 3; i++) {
+        to->position[i] = state->position[i] - arm[i];
+        to->velocity[i] = state->velocity[i] - sweep[i];
+        to->rates[i] = state->rates[i];
+    }
+    to->euler[0] = arctan2(to->matrix[2][1], root(1 - to->matrix[2][1] * to->matrix[2][1]));
+    to->euler[1] = arctan2(-to->matrix[2][0], to->matrix[2][2]);
+    to->euler[2] = arctan2(-to->matrix[0][1], to->matrix[1][1]);
+    if (mjxball_rig.stand) {
+        float c = root(1 - to->matrix[2][1] * to->matrix[2][1]), s = to->matrix[2][1];
+        const float roll[3][3] = {{1, 0, 0}, {0, c, -s}, {0, s, c}};
+        for (int i = 0; i < 9; i++) to->matrix[i / 3][i % 3] = roll[i / 3][i % 3];
+        for (int i = 0; i < 2; i++) to->position[i] = to->velocity[i] = to->euler[i + 1] = to->rates[i + 1] = 0;
+    }
+}
+
+/* A place and its motion relative to O, as the laws see them: 0 along what a stand locks. */
+static void arm_of(const seen *one, const float *mount, float *arm, float *sweep) {
+    float swing[3];
+    rotate(one->matrix, mount, arm);
+    cross(one->rates, mount, swing);
+    rotate(one->matrix, swing, sweep);
+    if (mjxball_rig.stand) arm[0] = arm[1] = sweep[0] = sweep[1] = 0;
+}
+
+#if MJXBALL_FOLLOWER
+static void observe(const seen *one, const float *goal, float *to) {
+    float arm[3], sweep[3];
+    arm_of(one, mjxball_rig.mount[1], arm, sweep);
+    for (int i = 0; i < 3; i++) {
+        to[i] = one->position[i] + arm[i];
+        to[3 + i] = one->euler[i];
+        to[6 + i] = one->velocity[i] + sweep[i];
+        to[9 + i] = one->rates[i];
+        to[12 + i] = goal[i] - one->position[i];
+        to[15 + i] = -one->velocity[i];
+    }
+}
+#endif
+
+/* Laws, as in sim/laws.py. */
+
+static void clip_command(float *command) {
+    for (int i = 0; i < 3; i++) command[i] = clip(command[i], -mjxball_limit[i], mjxball_limit[i]);
+}
+
+static void command_of(const float *acceleration, float *command) {
+    command[0] = -acceleration[1] / (float)MJXBALL_GRAVITY;
+    command[1] = acceleration[0] / (float)MJXBALL_GRAVITY;
+    command[2] = acceleration[2];
+    clip_command(command);
+}
+
+static void leader_error(const seen *one, const float *goal, float *error, float *rate) {
+    float arm[3], sweep[3];
+    arm_of(one, mjxball_rig.mount[0], arm, sweep);
+    for (int i = 0; i < 3; i++) {
+        error[i] = goal[i] - one->position[i];
+        rate[i] = -one->velocity[i];
+        if (mjxball_rig.own_error) {
+            error[i] += mjxball_rig.stand && i < 2 ? 0 : mjxball_rig.mount[0][i] - arm[i];
+            rate[i] -= sweep[i];
+        }
+    }
+}
+
+static void pid(const float *error, const float *rate, const float *integral, float *command) {
+    float wanted[3];
+    for (int i = 0; i < 3; i++)
+        wanted[i] = mjxball_rig.kp[i] * error[i] + mjxball_rig.kd[i] * rate[i] + mjxball_rig.ki[i] * integral[i];
+    command_of(wanted, command);
+}
+
+/* What this drone lifts more than the other one to turn the stick. */
+static float lift(const float *integral) {
+    float side = MJXBALL_FOLLOWER ? -mjxball_rig.lift_sign : mjxball_rig.lift_sign;
+    return side * mjxball_rig.tilt_gain * integral[3];
+}
+
+/* One period of this drone's law toward `goal`: `app->command`. False if the network's was not finite. */
+static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
+    const float period = (float)mjxball_rig.period / 1000;
+    float error[3], rate[3], base[3], *command = app->command, *integral = app->integral;
+    bool good = true;
+    leader_error(one, goal, error, rate);
+    if (MJXBALL_FOLLOWER)
+        for (int i = 0; i < 4; i++) integral[i] = app->peer.integral[i];
+    pid(error, rate, integral, base);
+#if MJXBALL_FOLLOWER
+    {
+        float observation[18], more[3], integrated[3];
+        observe(one, goal, observation);
+        if (!app->copying) {
+            mjxball_follow(&app->follower, observation, app->action, command);
+            good = finite(command, 3);
+        }
+        if (app->copying || !good) mjxball_copy_law(observation, command);
+        if (mjxball_rig.shares) {
+            for (int i = 0; i < 3; i++) integrated[i] = mjxball_rig.ki[i] * integral[i];
+            command_of(integrated, more);
+            for (int i = 0; i < 3; i++) command[i] += more[i] - integral[4 + i];
+            command[2] += lift(integral);
+            clip_command(command);
+            base[2] += lift(integral);
+            if (mjxball_rig.washout > 0)
+                for (int i = 0; i < 3; i++) integral[4 + i] += period / mjxball_rig.washout * (command[i] - base[i]);
+        }
+    }
+#else
+    for (int i = 0; i < 3; i++) command[i] = base[i];
+    if (mjxball_rig.shares) {
+        float most = mjxball_rig.tilt_gain > 0 ? MAX_LIFT_DIFFERENCE / mjxball_rig.tilt_gain : 0;
+        command[2] += lift(integral);
+        clip_command(command);
+        integral[3] = clip(integral[3] + period * (base[mjxball_rig.axis] - one->euler[mjxball_rig.axis]), -most, most);
+    }
+    for (int i = 0; i < 3; i++) {
+        float ahead = error[i] + mjxball_rig.lead * rate[i];
+        integral[i] += period * clip(ahead, -mjxball_rig.band[i], mjxball_rig.band[i]);
+    }
+#endif
+    return good;
+}
+
+/* Thrust. */
+
+static float thrust_of_force(const mjxball_map *map, float force) {
+    float a = map->quadratic, b = map->linear, each = force > 0 ? force / 4 : 0;
+    return 65535 * (a > 0 ? (root(b * b + 4 * a * each) - b) / (2 * a) : each / b);
+}
+
+static float hover_of(const mjxball_map *map) {
+    float weight = mjxball_rig.carried[MJXBALL_FOLLOWER] * (float)MJXBALL_GRAVITY;
+    return mjxball_rig.paper ? map->hover : thrust_of_force(map, weight);
+}
+
+static void send_level(mjxball_setpoint *out, float roll, float pitch, float thrust) {
+    const float degrees = 57.295780f;
+    out->active = true;
+    out->roll = degrees * clip(roll, -SENT_TILT, SENT_TILT);
+    out->pitch = -degrees * clip(pitch, -SENT_TILT, SENT_TILT);
+    out->thrust = (float)(int)(clip(thrust, FLOOR, CEILING) + 0.5f);
+}
+
+/* True if the thrust was cut. */
+static bool send_command(const mjxball_app *app, const mjxball_map *map, mjxball_setpoint *out) {
+    float roll = clip(app->command[0], -SENT_TILT, SENT_TILT), pitch = clip(app->command[1], -SENT_TILT, SENT_TILT);
+    float up = app->command[2], thrust = map->hover + map->per_acceleration * up;
+    if (!mjxball_rig.paper) {
+        float force = mjxball_rig.carried[MJXBALL_FOLLOWER] * ((float)MJXBALL_GRAVITY + up);
+        thrust = thrust_of_force(map, force / (cosine(roll) * cosine(pitch)));
+    }
+    send_level(out, roll, pitch, thrust);
+    return thrust < FLOOR || thrust > CEILING;
+}
+
+/* The supervisor. */
+
+static bool in_fence(const float *place) {
+    for (int i = 0; i < 3; i++)
+        if (!(place[i] >= mjxball_rig.fence_low[i] && place[i] <= mjxball_rig.fence_high[i])) return false;
+    return true;
+}
+
+static bool goal_is_good(const mjxball_parameters *set) {
+    for (int drone = 0; drone < 2; drone++) {
+        float place[3];
+        for (int i = 0; i < 3; i++) place[i] = set->goal[i] + mjxball_rig.mount[drone][i];
+        if (!in_fence(place)) return false;
+    }
+    return true;
+}
+
+static bool mount_is_set(const mjxball_parameters *set) {
+    float size = 0;
+    for (int i = 0; i < 3; i++) size += set->mount[i] * set->mount[i];
+    return size > 1e-6f && size < 1;
+}
+
+static bool state_is_good(const mjxball_state *state, uint32_t now) {
+    const float *q = state->quaternion;
+    float size = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+    return finite(state->position, 3) && finite(state->velocity, 3) && finite(state->rates, 3) && size > 0.9f
+        && size < 1.1f && now - state->time <= STATE_AGE;
+}
+
+static bool estimate_is_good(const mjxball_state *state) {
+    for (int i = mjxball_rig.stand ? 2 : 0; i < 3; i++)
+        if (!(state->variance[i] <= VARIANCE)) return false;
+    return true;
+}
+
+static bool peer_is_heard(const mjxball_app *app) {
+    return app->peer_time && app->now - app->peer_time <= PEER_AGE;
+}
+
+static bool laptop_is_heard(const mjxball_app *app) {
+    return app->laptop_time && app->now - app->laptop_time <= LAPTOP_AGE;
+}
+
+/* Why it must not start. */
+static uint8_t refusal_of(const mjxball_app *app, const mjxball_parameters *set, const mjxball_state *state) {
+    if (!mount_is_set(set)) return MJXBALL_NO_MOUNT;
+    if (!goal_is_good(set)) return MJXBALL_BAD_GOAL;
+    if (set->curve > 1 || !mjxball_rig.maps[set->curve].known) return MJXBALL_BAD_CURVE;
+    if (!state_is_good(state, app->now)) return MJXBALL_BAD_STATE;
+    if (!estimate_is_good(state)) return MJXBALL_ESTIMATOR;
+    if (!state->can_fly) return MJXBALL_CANNOT_FLY;
+    if (!peer_is_heard(app)) return MJXBALL_NO_PEER;
+    if (app->peer.key != mjxball_rig.key) return MJXBALL_OTHER_POLICY;
+    return app->peer.phase > MJXBALL_SPIN ? MJXBALL_PEER : MJXBALL_GOOD;
+}
+
+static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_map *map) {
+    float height = app->position[2] - app->origin[2];
+    app->phase = phase;
+    app->cause = cause;
+    app->since = app->now;
+    if (phase == MJXBALL_SPIN) {
+        for (int i = 0; i < 3; i++) app->origin[i] = app->position[i];
+        app->copying = 0;
+        app->trusted = 1;
+        app->late = 0;
+        app->trim = hover_of(map);
+    } else if (phase == MJXBALL_FLY) {
+        for (int i = 0; i < 7; i++) app->integral[i] = 0;
+        app->saturated_since = app->now;
+#if MJXBALL_FOLLOWER
+        mjxball_reset(&app->follower);
+#endif
+    } else if (phase == MJXBALL_LAND) {
+        app->land_height = height;
+    } else if (phase == MJXBALL_DESCEND) {
+        app->height = height;
+        app->climb = app->velocity[2];
+    }
+}
+
+/* The furthest phase that anything asks for. */
+typedef struct {
+    uint8_t phase, cause;
+} wish;
+
+static void ask(wish *one, uint8_t phase, uint8_t cause) {
+    if (phase > one->phase) {
+        one->phase = phase;
+        one->cause = cause;
+    }
+}
+
+static void judge_air(const mjxball_app *app, const seen *one, const mjxball_state *state, bool good, wish *to) {
+    const bool guided = app->phase == MJXBALL_FLY || app->phase == MJXBALL_LAND;
+    const uint8_t gently = app->phase == MJXBALL_RAMP ? MJXBALL_DESCEND : MJXBALL_LAND;
+    const uint32_t elapsed = app->now - app->since;
+    float place[3], landing = (app->land_height + 0.3f) / LAND_SPEED + mjxball_rig.land_spare;
+    for (int i = 0; i < 3; i++) place[i] = state->position[i] - app->origin[i];
+    if (!laptop_is_heard(app)) ask(to, gently, MJXBALL_NO_LAPTOP);
+    if (!peer_is_heard(app)) ask(to, gently, MJXBALL_NO_PEER);
+    if (app->late > 10) ask(to, gently, MJXBALL_LATE);
+    if (!good) ask(to, MJXBALL_DESCEND, MJXBALL_BAD_STATE);
+    if (!app->trusted) ask(to, MJXBALL_DESCEND, MJXBALL_ESTIMATOR);
+    if (good && !in_fence(place)) ask(to, MJXBALL_DESCEND, MJXBALL_FENCE);
+    if (guided && app->now - app->saturated_since >= SATURATED_TIME) ask(to, MJXBALL_DESCEND, MJXBALL_SATURATED);
+    if (app->phase == MJXBALL_LAND && (float)elapsed > 1000 * landing) ask(to, MJXBALL_DESCEND, MJXBALL_TIMEOUT);
+    if (app->phase == MJXBALL_DESCEND && elapsed > DESCEND_TIME) ask(to, MJXBALL_STOP, MJXBALL_TIMEOUT);
+    if (good && one->level < MOST_TILT) ask(to, MJXBALL_STOP, MJXBALL_TILT);
+    if (!state->can_fly) ask(to, MJXBALL_STOP, MJXBALL_CANNOT_FLY);
+    if (peer_is_heard(app) && app->peer.phase == MJXBALL_IDLE) ask(to, MJXBALL_STOP, MJXBALL_PEER);
+    if ((app->phase == MJXBALL_LAND || app->phase == MJXBALL_DESCEND) && elapsed >= SETTLED) {
+        float height = app->position[2] - app->origin[2], climb = app->velocity[2];
+        bool blind = !good || !app->trusted;
+        if (!blind && height < NEAR_GROUND && climb < STILL && climb > -STILL) ask(to, MJXBALL_STOP, MJXBALL_DOWN);
+        if (blind && app->height <= 0) ask(to, MJXBALL_STOP, MJXBALL_DOWN);
+    }
+}
+
+static void supervise(mjxball_app *app, const mjxball_parameters *set, const seen *one, const mjxball_state *state,
+    bool good, const mjxball_map *map) {
+    const uint32_t elapsed = app->now - app->since;
+    const uint8_t order = laptop_is_heard(app) ? app->order : MJXBALL_IDLE;
+    wish to = {app->phase, app->cause};
+    if (app->phase == MJXBALL_IDLE) {
+        app->refusal = order == MJXBALL_SPIN ? refusal_of(app, set, state) : app->refusal;
+        if (order == MJXBALL_SPIN && !app->refusal) enter(app, MJXBALL_SPIN, MJXBALL_ASKED, map);
+        return;
+    }
+    if (app->phase == MJXBALL_STOP) {
+        if (elapsed >= STOP_TIME) enter(app, MJXBALL_IDLE, app->cause, map);
+        return;
+    }
+    ask(&to, order, MJXBALL_ASKED);
+    if (peer_is_heard(app)) ask(&to, app->peer.phase, MJXBALL_PEER);
+    if (app->phase == MJXBALL_SPIN) {
+        if (!laptop_is_heard(app)) ask(&to, MJXBALL_STOP, MJXBALL_NO_LAPTOP);
+        if (!peer_is_heard(app)) ask(&to, MJXBALL_STOP, MJXBALL_NO_PEER);
+        if (!good || !state->can_fly) ask(&to, MJXBALL_STOP, good ? MJXBALL_CANNOT_FLY : MJXBALL_BAD_STATE);
+    } else {
+        if (app->phase == MJXBALL_RAMP && elapsed >= RAMP_TIME) ask(&to, MJXBALL_FLY, MJXBALL_ASKED);
+        judge_air(app, one, state, good, &to);
+    }
+    if (to.phase != app->phase) enter(app, to.phase, to.cause, map);
+}
+
+/* Brake sideways and sink, by what is measured here and by the other drone; else by a model of the fall. */
+static void descend(mjxball_app *app, bool good, mjxball_setpoint *out) {
+    const float period = (float)mjxball_rig.period / 1000;
+    const float own = good && app->trusted, other = peer_is_heard(app) && app->peer.trusted;
+    float velocity[3], braking[3], command[3] = {0, 0, 0}, share;
+    if (own + other > 0) {
+        for (int i = 0; i < 3; i++)
+            velocity[i] = (own * app->velocity[i] + other * app->peer.velocity[i]) / (own + other);
+        for (int i = 0; i < 3; i++) braking[i] = -velocity[i] / 0.7f;
+        if (!mjxball_rig.stand) command_of(braking, command);
+        app->climb = velocity[2];
+        share = 1 + clip(-0.4f * (app->climb + SINK_SPEED), -0.3f, 0.1f);
+    } else {
+        float wanted = clip(3 * (-BLIND_SPEED - app->climb), -3, -0.15f);
+        app->climb += wanted * period;
+        share = 1 + wanted / (float)MJXBALL_GRAVITY;
+    }
+    app->height += app->climb * period;
+    send_level(out, clip(command[0], -BRAKE_TILT, BRAKE_TILT), clip(command[1], -BRAKE_TILT, BRAKE_TILT),
+        app->trim * share);
+}
+
+static void fly(mjxball_app *app, const seen *one, const mjxball_map *map, mjxball_setpoint *out) {
+    const float period = (float)mjxball_rig.period / 1000, hover = hover_of(map);
+    float goal[3];
+    for (int i = 0; i < 3; i++) goal[i] = app->origin[i] + app->goal[i];
+    if (mjxball_rig.stand) goal[0] = goal[1] = 0;
+    if (app->phase == MJXBALL_LAND) {
+        float sunk = LAND_SPEED * (float)(app->now - app->since) / 1000;
+        goal[2] = app->origin[2] + clip(app->land_height - sunk, -1, 10);
+    }
+    if (!fly_law(app, one, goal) || app->late > 10) {
+        app->copying = 1;
+        if (app->phase == MJXBALL_FLY) enter(app, MJXBALL_LAND, app->late > 10 ? MJXBALL_LATE : MJXBALL_BAD_COMMAND, map);
+    }
+    if (!finite(app->command, 3)) {
+        app->trusted = 0;
+        enter(app, MJXBALL_DESCEND, MJXBALL_BAD_STATE, map);
+        descend(app, false, out);
+        return;
+    }
+    if (!send_command(app, map, out)) app->saturated_since = app->now;
+    app->trim = clip(app->trim + period * (out->thrust - app->trim), 0.85f * hover, 1.15f * hover);
+}
+
+void mjxball_defaults(mjxball_parameters *set) {
+    for (int i = 0; i < 3; i++) {
+        set->goal[i] = mjxball_rig.goal[i];
+        set->mount[i] = 0;
+    }
+    set->curve = 0;
+}
+
+void mjxball_start(mjxball_app *app, uint32_t now) {
+    const mjxball_app fresh = {0};
+    *app = fresh;
+    app->now = app->since = now;
+    app->trusted = 1;
+}
+
+void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball_state *state, uint32_t now,
+    mjxball_setpoint *out) {
+    const mjxball_map *map = &mjxball_rig.maps[set->curve == 1];
+    const uint32_t gap = now - app->now;
+    const bool good = state_is_good(state, now);
+    seen one = {.level = 1};
+    const mjxball_setpoint none = {0};
+    *out = none;
+    app->late = 0.99f * app->late + (app->started && gap >= 2u * (uint32_t)mjxball_rig.period ? 1.0f : 0.0f);
+    app->started = 1;
+    app->now = now;
+    if (good) {
+        look(set, state, &one);
+        for (int i = 0; i < 3; i++) {
+            app->position[i] = one.position[i];
+            app->velocity[i] = one.velocity[i];
+        }
+    }
+    if (app->phase > MJXBALL_SPIN && !estimate_is_good(state)) app->trusted = 0;
+    if (goal_is_good(set))
+        for (int i = 0; i < 3; i++) app->goal[i] = set->goal[i];
+    else
+        app->refusal = MJXBALL_BAD_GOAL; /* the one before stays */
+    supervise(app, set, &one, state, good, map);
+    switch (app->phase) {
+    case MJXBALL_IDLE:
+        break;
+    case MJXBALL_SPIN:
+        send_level(out, 0, 0, SPIN_THRUST);
+        break;
+    case MJXBALL_RAMP: {
+        float share = clip((float)(now - app->since) / (float)RAMP_TIME, 0, 1);
+        send_level(out, 0, 0, FLOOR + share * (hover_of(map) - FLOOR));
+        break;
+    }
+    case MJXBALL_FLY:
+    case MJXBALL_LAND:
+        fly(app, &one, map, out);
+        break;
+    case MJXBALL_DESCEND:
+        descend(app, good, out);
+        break;
+    default:
+        out->active = true; /* thrust 0 */
+    }
+}
+
+/* Bytes, little-endian like every machine that this runs on. */
+
+static void copy(void *to, const void *from, unsigned size) {
+    __builtin_memcpy(to, from, size);
+}
+
+void mjxball_send(const mjxball_app *app, uint8_t out[MJXBALL_BEAT_SIZE]) {
+    out[0] = 'M';
+    out[1] = MJXBALL_FOLLOWER;
+    out[2] = app->phase;
+    out[3] = app->trusted;
+    copy(out + 4, &mjxball_rig.key, 4);
+    copy(out + 8, app->integral, 16);
+    copy(out + 24, app->velocity, 12);
+    copy(out + 36, app->position, 8);
+}
+
+void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now) {
+    mjxball_beat beat;
+    if (size != MJXBALL_BEAT_SIZE || data[0] != 'M' || data[1] != !MJXBALL_FOLLOWER || data[2] > MJXBALL_STOP) return;
+    beat.phase = data[2];
+    beat.trusted = data[3];
+    copy(&beat.key, data + 4, 4);
+    copy(beat.integral, data + 8, 16);
+    copy(beat.velocity, data + 24, 12);
+    if (!finite(beat.integral, 4) || !finite(beat.velocity, 3)) return;
+    app->peer = beat;
+    app->peer_time = now ? now : 1;
+}
+
+/* Weights. */
+
+#if MJXBALL_UPLOADS
+static uint32_t crc32_of(const uint8_t *data, uint32_t size) {
+    uint32_t crc = 0xFFFFFFFFu;
+    for (uint32_t k = 0; k < size; k++) {
+        crc ^= data[k];
+        for (int bit = 0; bit < 8; bit++) crc = crc >> 1 ^ (crc & 1 ? 0xEDB88320u : 0u);
+    }
+    return ~crc;
+}
+
+static uint32_t word(const uint8_t *data) {
+    uint32_t value;
+    copy(&value, data, 4);
+    return value;
+}
+
+/* What of an upload is wrong: begin (key, size, CRC), chunk (offset, bytes), or commit. */
+static uint8_t take(mjxball_app *app, const uint8_t *data, int size, uint8_t *memory) {
+    const uint8_t kind = data[0];
+    if (app->phase != MJXBALL_IDLE) return MJXBALL_NOT_ON_GROUND;
+    if (kind == 2) {
+        app->follower.weights = 0; /* the memory is about to change */
+        app->upload.ready = size == 13 && word(data + 1) == mjxball_rig.key && word(data + 5) == mjxball_upload_size();
+        if (!app->upload.ready) return MJXBALL_BAD_UPLOAD;
+        app->upload.size = word(data + 5);
+        app->upload.crc = word(data + 9);
+        app->upload.received = 0;
+        return MJXBALL_GOOD;
+    }
+    if (!app->upload.ready) return MJXBALL_BAD_UPLOAD;
+    if (kind == 3) {
+        uint32_t at = size > 5 ? word(data + 1) : 0, count = size > 5 ? (uint32_t)size - 5 : 0;
+        if (!count || at > app->upload.received || at + count > app->upload.size) return MJXBALL_BAD_UPLOAD;
+        copy(memory + at, data + 5, count);
+        if (at + count > app->upload.received) app->upload.received = at + count;
+        return MJXBALL_GOOD;
+    }
+    app->upload.ready = 0;
+    if (app->upload.received != app->upload.size || crc32_of(memory, app->upload.size) != app->upload.crc)
+        return MJXBALL_BAD_UPLOAD;
+    app->follower.weights = (const mjxball_weights *)(const void *)memory;
+    return MJXBALL_GOOD;
+}
+
+uint32_t mjxball_upload_size(void) {
+    return sizeof(mjxball_weights);
+}
+#else
+static uint8_t take(mjxball_app *app, const uint8_t *data, int size, uint8_t *memory) {
+    (void)app, (void)data, (void)size, (void)memory;
+    return MJXBALL_BAD_UPLOAD;
+}
+
+uint32_t mjxball_upload_size(void) {
+    return 0;
+}
+#endif
+
+int mjxball_laptop(mjxball_app *app, const uint8_t *data, int size, uint32_t now, uint8_t *memory,
+    uint8_t reply[MJXBALL_REPLY_SIZE]) {
+    uint32_t received;
+    if (size == 2 && data[0] == 1 && data[1] <= MJXBALL_STOP) {
+        app->order = data[1];
+        app->laptop_time = now ? now : 1;
+        return 0;
+    }
+    if (size < 1 || data[0] < 2 || data[0] > 4) return 0;
+    reply[0] = data[0];
+    reply[1] = take(app, data, size, memory);
+    if (reply[1]) app->refusal = reply[1];
+    received = app->upload.received;
+    reply[2] = reply[3] = 0;
+    copy(reply + 4, &received, 4);
+    return MJXBALL_REPLY_SIZE;
+}

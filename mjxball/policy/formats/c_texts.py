@@ -1,0 +1,268 @@
+"""C texts of an exported follower, which `c_header` fills in."""
+
+HEADER = """\
+/* Follower {name}, exported by mjxball {version}: {origin}.
+ *
+ *   mjxball_follower follower;
+ *   mjxball_reset(&follower);                                   before every flight
+ *   mjxball_follow(&follower, observation, action, command);    every {period} s
+ *
+ * observation (18), SI units and radians, world axes, body rates in body axes:
+{observation}
+ * action (3): the network's mean in [-1, 1]. command (3): roll [rad], pitch [rad], vertical acceleration [m/s2].
+ *
+ * Network {layers}, ReLU, tanh{weights}. C99 without a library; no allocation, no globals but constants.
+ * Bit for bit the same on every machine with IEEE floats if products and sums are not contracted (-ffp-contract=off).
+ * Flash: {flash} bytes of constants, and the code. RAM: {state} bytes for mjxball_follower,
+ * {stack} bytes of arrays on the stack during mjxball_follow.
+ * Define MJXBALL_REAL as double before including this for arithmetic without rounding to float, at twice the RAM.
+ */
+#ifndef MJXBALL_FOLLOWER_H
+#define MJXBALL_FOLLOWER_H
+
+{includes}#ifndef MJXBALL_REAL
+#define MJXBALL_REAL float
+#endif
+typedef MJXBALL_REAL mjxball_real;
+
+#define MJXBALL_OBSERVATION_SIZE 18
+#define MJXBALL_ACTION_SIZE 3
+#define MJXBALL_MEMORY_SIZE {memory_size}
+#define MJXBALL_WIDEST {broadest}
+{int8}#define MJXBALL_CONTROL_PERIOD {period}
+#define MJXBALL_GRAVITY {gravity}
+
+{weights_type}typedef struct {{
+{memory_field}{weights_field}    int running;
+}} mjxball_follower;
+
+{arrays}
+{compiled}
+static inline void mjxball_copy(mjxball_real *to, const mjxball_real *from, int count) {{
+    for (int i = 0; i < count; i++) to[i] = from[i];
+}}
+static inline mjxball_real mjxball_clip(mjxball_real value, mjxball_real limit) {{
+    return value < -limit ? -limit : value > limit ? limit : value;
+}}
+{helpers}
+/* The leader's PD law on the observed error: what the `copy` follower commands. */
+static inline void mjxball_copy_law(const mjxball_real *observation, mjxball_real *to) {{
+{leader}
+}}
+{lqg}
+/* Forget the past: the next call starts a flight. */
+static inline void mjxball_reset(mjxball_follower *follower) {{
+    follower->running = 0;
+}}
+
+static inline void mjxball_follow(
+    mjxball_follower *follower, const mjxball_real observation[18], mjxball_real action[3], mjxball_real command[3]) {{
+    mjxball_real input[{size}], hidden[2][{widest}];
+{memory_pointer}    int i;
+    mjxball_copy(input, observation, 18);
+{history}
+{network}
+    for (i = 0; i < 3; i++) action[i] = mjxball_tanh(action[i]);
+{command}
+{history_update}
+}}
+
+#endif
+"""
+APPROACH = """
+static inline void mjxball_approach(mjxball_real *average, const mjxball_real *value, int count, float share) {
+    for (int i = 0; i < count; i++) average[i] += share * (value[i] - average[i]);
+}
+"""
+LQG = """
+/* LQG with estimates of the load; its memory: the filter's state (8) and what drives it (2). */
+static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *observation) {
+    memory[0] = observation[4];
+    memory[1] = observation[10];
+    memory[5] = -observation[17];
+}
+
+static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
+    mjxball_real predicted[8], off[3];
+    for (int row = 0; row < 8; row++) {
+        predicted[row] = 0;
+        for (int k = 0; k < 10; k++) predicted[row] += mjxball_lqg_transition[10 * row + k] * memory[k];
+    }
+    off[0] = observation[4] - predicted[0];
+    off[1] = observation[10] - predicted[1];
+    off[2] = -observation[17] - predicted[5];
+    for (int row = 0; row < 8; row++) {
+        memory[row] = predicted[row];
+        for (int k = 0; k < 3; k++) memory[row] += mjxball_lqg_gain[3 * row + k] * off[k];
+    }
+}
+
+static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
+    to[0] = observation[4] - memory[0];
+    to[1] = observation[10] - memory[1];
+    to[2] = -observation[17] - memory[5];
+    mjxball_copy(to + 3, memory + 2, 3);
+    mjxball_copy(to + 6, memory + 6, 4);
+}
+
+static inline mjxball_real mjxball_lqg_tilt(int axis, int along, const mjxball_real *observation) {
+    const float *gain = mjxball_lqg_tilts + 4 * axis;
+    mjxball_real far = gain[0] * observation[12 + along] + gain[1] * observation[15 + along];
+    return mjxball_clip(far, mjxball_lqg_limits[0]) - gain[2] * observation[3 + axis] - gain[3] * observation[9 + axis];
+}
+
+static inline mjxball_real mjxball_lqg_difference(
+    mjxball_real led, mjxball_real vertical, const mjxball_real *observation) {
+    mjxball_real level = mjxball_cos(observation[3]) * mjxball_cos(observation[4]);
+    mjxball_real ahead = mjxball_lqg_carried[0] * ((mjxball_real)MJXBALL_GRAVITY + led);
+    return (ahead - mjxball_lqg_carried[1] * ((mjxball_real)MJXBALL_GRAVITY + vertical)) / level;
+}
+
+/* command: what is added to the law's, then the sum, of which the vertical part is within its limit. */
+static inline void mjxball_lqg_command(
+    const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *command) {
+    mjxball_real rise = mjxball_lqg_height[0] * observation[14] + mjxball_lqg_height[1] * observation[17], against;
+    rise = mjxball_clip(rise, mjxball_lqg_limits[1]) - memory[7];
+    command[2] = mjxball_clip(2 * rise - led[2] + command[2], mjxball_limit[2]);
+    against = mjxball_lqg_half_length[0] * mjxball_lqg_difference(led[2], command[2], observation) - memory[2];
+    against = mjxball_clip(against / mjxball_lqg_stiffness[0], mjxball_lqg_limits[2]);
+    command[0] += 2 * mjxball_lqg_tilt(0, 1, observation) - led[0];
+    command[1] += 2 * mjxball_lqg_tilt(1, 0, observation) - led[1] + against;
+}
+
+static inline void mjxball_lqg_next(
+    mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, const mjxball_real *command) {
+    memory[8] = mjxball_lqg_stiffness[0] * (led[1] + command[1])
+        - mjxball_lqg_half_length[0] * mjxball_lqg_difference(led[2], command[2], observation);
+    memory[9] = (mjxball_real)0.5 * (led[2] + command[2]);
+}
+"""
+
+LAYER = """
+/* to = weight from + bias, two rows at once: what is loaded serves both. Four sums side by side keep a pipelined FPU
+ * busy and round less than one long sum. */
+static inline void mjxball_rows(
+    const float *w, const float *v, int inputs, const mjxball_real *from, mjxball_real *one, mjxball_real *other) {
+    mjxball_real a = 0, b = 0, c = 0, d = 0, e = 0, f = 0, g = 0, h = 0;
+    int k = 0;
+    for (; k < (inputs & ~3); k += 4) {
+        a += w[k] * from[k];
+        e += v[k] * from[k];
+        b += w[k + 1] * from[k + 1];
+        f += v[k + 1] * from[k + 1];
+        c += w[k + 2] * from[k + 2];
+        g += v[k + 2] * from[k + 2];
+        d += w[k + 3] * from[k + 3];
+        h += v[k + 3] * from[k + 3];
+    }
+    for (; k < inputs; k++) {
+        a += w[k] * from[k];
+        e += v[k] * from[k];
+    }
+    *other = (e + f) + (g + h);
+    *one = (a + b) + (c + d);
+}
+
+static inline void mjxball_layer(
+    const float *weight, const float *bias, int inputs, int outputs, const mjxball_real *from, mjxball_real *to) {
+    for (int row = 0; row < outputs; row += 2, weight += 2 * inputs) {
+        const int two = row + 1 < outputs;
+        mjxball_rows(weight, weight + two * inputs, inputs, from, to + row, to + row + two);
+    }
+    for (int row = 0; row < outputs; row++) to[row] += bias[row];
+}
+"""
+LAYER_INT8 = """
+/* Values as 16 bit numbers of the step that is returned: the largest of them takes the whole range. Of every four the
+ * middle ones change places, as `mjxball_pair` wants them. The step is NaN if one of the values is not finite. */
+static inline mjxball_real mjxball_steps(const mjxball_real *from, int count, int16_t *to) {
+    mjxball_real largest = (mjxball_real)1e-30, per_step, wrong = 0;
+    for (int k = 0; k < count; k++) {
+        mjxball_real size = from[k] < 0 ? -from[k] : from[k];
+        if (size > largest) largest = size;
+        wrong += size - size;
+    }
+    per_step = 32767 / largest;
+    if (wrong == 0)
+        for (int k = 0; k < count; k++)
+            to[((k + 1) & 2) ? k ^ 3 : k] = (int16_t)((int)(from[k] * per_step + (mjxball_real)32768.5) - 32768);
+    return largest / 32767 + wrong;
+}
+
+/* Adds four products of each of two rows: two multiplications an instruction where the processor has them. */
+#ifdef __ARM_FEATURE_DSP
+#include <arm_acle.h>
+static inline int32_t mjxball_products(uint32_t four, int16x2_t outer, int16x2_t inner, int32_t sum) {
+    int16x2_t odd;
+    __asm__("sxtb16 %0, %1, ror #8" : "=r"(odd) : "r"(four));
+    return __smlad(odd, inner, __smlad(__sxtb16((int8x4_t)four), outer, sum));
+}
+static inline void mjxball_pair(const int8_t *w, const int8_t *v, const int16_t *steps, int32_t sums[2]) {
+    uint32_t one, other;
+    int16x2_t outer, inner;
+    __builtin_memcpy(&one, w, 4);
+    __builtin_memcpy(&other, v, 4);
+    __builtin_memcpy(&outer, steps, 4);
+    __builtin_memcpy(&inner, steps + 2, 4);
+    sums[0] = mjxball_products(one, outer, inner, sums[0]);
+    sums[1] = mjxball_products(other, outer, inner, sums[1]);
+}
+#else
+static inline int32_t mjxball_products(const int8_t *weight, const int16_t *steps, int32_t sum) {
+    sum += weight[0] * steps[0] + weight[2] * steps[1];
+    return sum + weight[1] * steps[2] + weight[3] * steps[3];
+}
+static inline void mjxball_pair(const int8_t *w, const int8_t *v, const int16_t *steps, int32_t sums[2]) {
+    sums[0] = mjxball_products(w, steps, sums[0]);
+    sums[1] = mjxball_products(v, steps, sums[1]);
+}
+#endif
+
+/* to = step weight from + bias of whole numbers: rows of `stride` weights, of which `inputs` are not 0. */
+static inline void mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
+    int stride, const mjxball_real *from, mjxball_real *to) {
+    int16_t steps[MJXBALL_WIDEST + 7] = {0};
+    mjxball_real size = mjxball_steps(from, inputs, steps);
+    for (int row = 0; row < outputs; row += 2, weight += 2 * stride) {
+        const int two = row + 1 < outputs;
+        int32_t sums[2] = {0, 0};
+        for (int k = 0; k < stride; k += 8) {
+            mjxball_pair(weight + k, weight + two * stride + k, steps + k, sums);
+            mjxball_pair(weight + k + 4, weight + two * stride + k + 4, steps + k + 4, sums);
+        }
+        to[row + two] = (mjxball_real)sums[1] * (size * step[row + two]) + bias[row + two];
+        to[row] = (mjxball_real)sums[0] * (size * step[row]) + bias[row];
+    }
+}
+"""
+EXPONENTIAL = """
+/* exp(-x) for 0 <= x: halved as often as ln 2 goes into x, and a Taylor sum of the rest. */
+static inline mjxball_real mjxball_decay(mjxball_real x) {
+    mjxball_real rest = x, value = 1;
+    int halves = 0;
+    if (!(x < 40)) return 0;
+    for (; rest > (mjxball_real)0.35; halves++)
+        rest = x - (mjxball_real)(halves + 1) * (mjxball_real)0.69314718055994531;
+    for (int k = 12; k > 0; k--) value = 1 - rest * value / (mjxball_real)k;
+    for (; halves > 0; halves--) value *= (mjxball_real)0.5;
+    return value;
+}
+
+/* NaN stays NaN. */
+static inline mjxball_real mjxball_tanh(mjxball_real x) {
+    mjxball_real decay = mjxball_decay(x < 0 ? -2 * x : 2 * x), size = (1 - decay) / (1 + decay);
+    return x < 0 ? -size : x >= 0 ? size : x;
+}
+"""
+COSINE = """
+/* Angles in radians of any size; turns beyond 1e6 are not counted. */
+static inline mjxball_real mjxball_cos(mjxball_real x) {
+    const mjxball_real turn = (mjxball_real)6.2831853071795865;
+    mjxball_real square, value = 1;
+    if (!(x > -1000000 && x < 1000000)) return 1;
+    x -= turn * (mjxball_real)(int)(x / turn + (x < 0 ? (mjxball_real)-0.5 : (mjxball_real)0.5));
+    square = x * x;
+    for (int k = 18; k > 0; k -= 2) value = 1 - square * value / (mjxball_real)(k * (k - 1));
+    return value;
+}
+"""

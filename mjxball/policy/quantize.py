@@ -1,0 +1,33 @@
+"""Weights as whole numbers of 8 bits, a step for each output. NumPy alone."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from mjxball.policy.file import PolicyFile
+
+LARGEST = 127
+
+
+class Rows(NamedTuple):
+    """One layer; its weights are about `step[:, None] * weight`."""
+
+    weight: np.ndarray  # (outputs, inputs) int8
+    step: np.ndarray  # (outputs,) float32
+
+
+def rows_of(weight: np.ndarray) -> Rows:
+    """The layer `weight` (inputs, outputs) in whole steps, the largest weight of each output being 127 of them."""
+    rows = np.asarray(weight, np.float32).T
+    step = np.abs(rows).max(axis=1) / np.float32(LARGEST)
+    whole = np.rint(rows / np.where(step > 0, step, 1)[:, None])
+    return Rows(whole.astype(np.int8), step.astype(np.float32))
+
+
+def quantized(policy: PolicyFile) -> PolicyFile:
+    """`policy` with the weights that its 8 bit export has, as floats: what it flies like, but for its activations."""
+    layers = [rows_of(weight) for weight in policy.weights]
+    return dataclasses.replace(policy, weights=tuple((one.weight * one.step[:, None]).T for one in layers))
