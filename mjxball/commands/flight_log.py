@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,10 @@ import numpy as np
 from mjxball import cli
 from mjxball.control import rotations
 from mjxball.evaluate.metrics import measure
-from mjxball.evaluate.plots import CYCLE, draw_flights
+from mjxball.evaluate.plots import draw_flights
 from mjxball.evaluate.results import Result, scenario_title
 from mjxball.fly.recording import Recording, fly_again, read_recording
 from mjxball.fly.twin.conditions import Conditions
-from mjxball.plotting import pyplot
 from mjxball.sim.rollout import Trajectory
 from mjxball.sim.scenario import Scenario
 
@@ -32,10 +30,8 @@ def evaluate_log(path: Path, out: Path) -> int:
         print(remark, file=sys.stderr)  # noqa: T201
     recorded = result_of(recording, f"{recording.policy}, flown")
     simulated = result_of(fly_again(recording), "the same, simulated")
-    plant = recording.config.plant
-    files = draw(recorded, simulated, plant.stand != "free", plant.drones[plant.leader].mount, out)
     print(differences(recorded, simulated))  # noqa: T201
-    print("figures: " + ", ".join(map(str, files)))  # noqa: T201
+    print(f"figure: {draw(recorded, simulated, out)}")  # noqa: T201
     return 0
 
 
@@ -75,39 +71,12 @@ def trajectory_of(recording: Recording) -> Trajectory:
     )
 
 
-def draw(recorded: Result, simulated: Result, stand: bool, leader_mount: Sequence[float], out: Path) -> list[Path]:
-    """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the files.
-
-    The first is the figure of single flights; on a `stand` the second is the paper's Fig. 7.
-    """
+def draw(recorded: Result, simulated: Result, out: Path) -> Path:
+    """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file."""
     out.mkdir(parents=True, exist_ok=True)
     both = [recorded, _cut(simulated, valid_rows(recorded, simulated))]
-    files = [out / "flight.png"]
-    draw_flights(both, scenario_title(recorded), files[0])
-    if stand:
-        files.append(out / "stand.png")
-        _draw_stand(both, np.array(leader_mount), files[1])
-    return files
-
-
-def _draw_stand(results: Sequence[Result], mount: np.ndarray, path: Path) -> None:
-    """Leader's height, roll and the follower's vertical acceleration over time: the paper's Fig. 7."""
-    plt = pyplot()
-    figure, axes = plt.subplots(3, 1, sharex=True, figsize=(9, 7), constrained_layout=True)
-    for result, colour in zip(results, CYCLE, strict=False):
-        flight, roll = result.flight, result.flight.euler[:, 0]
-        height = flight.position[:, 2] + np.cos(roll) * mount[2] + np.sin(roll) * mount[1]
-        for axis, curve in zip(axes, (height, np.degrees(roll), flight.follower_command[:, 2]), strict=True):
-            axis.plot(flight.time, curve, color=colour, linewidth=1.2, label=result.follower)
-    labels = ("leader's height [m]", "roll [deg]", "follower's vertical command [m/s²]")
-    for axis, label in zip(axes, labels, strict=True):
-        axis.set_ylabel(label, fontsize="small")
-        axis.grid(alpha=0.25)
-        axis.margins(x=0)
-    axes[0].legend(fontsize="small")
-    axes[-1].set_xlabel("time since the motors first turned [s]")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    draw_flights(both, scenario_title(recorded), out / "flight.png")
+    return out / "flight.png"
 
 
 def differences(recorded: Result, simulated: Result) -> str:

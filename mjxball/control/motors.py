@@ -18,7 +18,8 @@ from mjxball.control import crazyflie
 from mjxball.control.constants import hover
 
 Array = Any
-FULL = 65535.0  # PWM of full power, and thrust command of full thrust
+FULL = crazyflie.FULL  # PWM of full power, and thrust command of full thrust
+USUAL_BATTERY = 3.7  # [V] in hover, where none is drawn or measured
 Curve = tuple[float, float]  # force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]
 OLDER: Curve = (0.0915, 0.0677)  # a 2.1's firmware without battery compensation
 LARGEST_HOVER = 60000.0  # of the paper's law, as the firmware caps it

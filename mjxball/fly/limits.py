@@ -15,6 +15,12 @@ from mjxball.fly.telemetry import Rig
 
 STAND_SPARE = 0.25  # [m] above the goal, the height at which a stand's flight is ended
 NAMES = ("leader", "follower")
+LOOP_RATE = 100.0  # [Hz] of the runner's ticks at least
+
+
+def ticks_per_command(control_period: float) -> int:
+    """Ticks of the runner's loop in a policy's `control_period` [s], a whole number."""
+    return math.ceil(control_period * LOOP_RATE - 1e-9)
 
 
 @dataclass(frozen=True)

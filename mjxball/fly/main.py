@@ -38,7 +38,6 @@ from mjxball.policy.formats.c_header import weight_bytes
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
 RETRAINED = (0.004, -0.06, 14.0)  # load that --retrain puts on, unless --twin-load says more: kg, m, s
 DONGLE = re.compile(r"radio://([^/]+)/")
-LOOP_RATE = 100.0  # [Hz] at least: the policy's period is a whole number of ticks
 # Numbers with least and most: of the battery, and of the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
 WORSE = {  # once the motors turn: cflib connects over a good link only
@@ -254,7 +253,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.twin_load is not None:
             check_loaded(config, options.retrain)
         rig = Rig.of_card(policy.card)
-        period = policy.control_period / math.ceil(policy.control_period * LOOP_RATE - 1e-9)
+        period = policy.control_period / limits.ticks_per_command(policy.control_period)
         bounds = Limits() if options.battery is None else Limits(battery=options.battery)
         goal = tuple(options.goal or goal_of(config))
         if not limits.within_fence(goal, rig, bounds):

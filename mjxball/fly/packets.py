@@ -12,6 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjxball.control import crazyflie
+
+THRUST_FLOOR, THRUST_CEILING = crazyflie.THRUST_FLOOR, crazyflie.THRUST_CEILING  # of what is sent [thrust units]
+
 # One log packet holds everything that is known about a drone: 26 bytes, the protocol's limit.
 STATE_VARIABLES: tuple[tuple[str, str], ...] = (
     ("stateEstimateZ.x", "int16_t"),  # [mm]
@@ -43,7 +47,6 @@ MOTORS = (
 ACTING_THRUST = ("controller.cmd_thrust", "float")  # [thrust units] of the setpoint that is in force
 
 CAN_ARM, ARMED, AUTO_ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
-THRUST_FLOOR, THRUST_CEILING = 10001, 60000  # [thrust units] what the firmware's documentation allows
 
 
 class PacketError(ValueError):

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 # autopilot(state, commands, load) -> (loops, rotor forces asked for)
 Autopilot = Callable[[PlantState, Array, Load], tuple[Any, Array]]
-USUAL_BATTERY = 3.7  # [V] in hover, where none is drawn
 
 
 def rotor_targets(
@@ -71,7 +70,9 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
         if config.autopilot.drone and motors.compensates(config.autopilot.motor_curve):
             # A motor gives more than a thrust command of 65 535 where the battery has it: full PWM is the limit.
             usual = commands[..., 0, 0] * 0.0
-            return with_battery(state, commands, load._replace(battery=usual + USUAL_BATTERY, uncompensated=usual))
+            return with_battery(
+                state, commands, load._replace(battery=usual + motors.USUAL_BATTERY, uncompensated=usual)
+            )
         xp, law, gravity = commands.__array_namespace__(), config.autopilot, config.plant.gravity
         sent = crazyflie.setpoints(law, commands, carried_mass(constants, state, load.believed_mass), gravity)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))

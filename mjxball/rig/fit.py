@@ -35,7 +35,6 @@ START_DIFFERENCE = np.array([0.0005, 0.002, 0.002, 0.02, 0.04, 0.08, 0.002])
 COMMON, OWN = len(DIFFERENCE), len(START_DIFFERENCE)
 UNKNOWN_LIFT = 0.1  # [m/s2] standard deviation of `WindowStart.lift` from window to window
 SHORTEST_LAG, LONGEST_DELAY = 0.005, 0.06  # [s]
-USUAL_BATTERY = 3.7  # [V] in hover, where none was measured
 
 
 class RigParameters(NamedTuple):
@@ -84,7 +83,7 @@ def motor_model(config: Config, log: Log) -> MotorModel:
     curve, motor = config.autopilot.motor_curve, motor_of(config)
     if curve[0] > 0:
         return MotorModel(None, lambda command: crazyflie.motor_force(curve, command))
-    volts = np.float64(USUAL_BATTERY if log.volts is None else log.volts)
+    volts = np.float64(motors.USUAL_BATTERY if log.volts is None else log.volts)
     share = curve[1] / motor.max_force
     return MotorModel(
         lambda thrust: motors.compensated(motor, thrust, volts),

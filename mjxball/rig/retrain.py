@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import math
 import os
 import sys
 import threading
@@ -26,6 +25,7 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.fly.card import Controller, config_of
 from mjxball.fly.flight_log import Tail
+from mjxball.fly.limits import ticks_per_command
 from mjxball.fly.supervisor import GUIDED
 from mjxball.policy import Policy, PolicyFile, load_file, save_file
 from mjxball.rig.load import IdentifiedLoad, LoadWatch
@@ -36,7 +36,6 @@ POLL = 0.02  # [s] between two looks at the log
 LOOK = 0.5  # [s] of flight between two looks for a load
 SECONDS = 4.0  # [s] in which a policy is to be polished
 GUIDED_NAMES = tuple(state.value for state in GUIDED)
-LOOP_RATE = 100.0  # [Hz] of the runner's ticks at least
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -152,7 +151,7 @@ class FlightReplay:
     def __init__(self, policy: Policy):
         self._controller = Controller(policy)
         self._laws = Laws(self._controller.config)
-        self._every = math.ceil(policy.control_period * LOOP_RATE - 1e-9)
+        self._every = ticks_per_command(policy.control_period)
         self._count = 0
         self.place: Place | None = None
 
