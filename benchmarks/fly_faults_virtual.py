@@ -64,6 +64,12 @@ def asked(**how: Any) -> Injection:
     return inject
 
 
+def laptop_killed(world: VirtualTwin, drone: int) -> None:
+    """The laptop sends nothing any more; its watchdog process is not part of the virtual twin."""
+    world.killed = True  # type: ignore[attr-defined]
+
+
+ONBOARD: dict[str, Injection] = {"laptop killed": laptop_killed, "heartbeat lost": injected("peer")}  # with apps only
 FAULTS: dict[str, Injection] = {
     "firmware stopped": injected("stopped"),
     "drone without power": injected("power"),
@@ -95,15 +101,17 @@ FAULTS: dict[str, Injection] = {
     "drone crashed": injected("crash"),
     "drone reboots": injected("reboot"),
     "hostile datagrams": injected("garbage"),
+    **ONBOARD,
     "Ctrl-C": asked(interrupts=1),
     "Ctrl-C twice": asked(interrupts=2),
 }
 
 
-def fault(path: Path, kind: str, drone: int, number: int) -> list[Row]:
-    """One flight with one fault."""
+def fault(path: Path, kind: str, drone: int, number: int, onboard: str = "") -> list[Row]:
+    """One flight with one fault; `onboard` as for `world_of`."""
     random = np.random.default_rng([list(FAULTS).index(kind), drone, number])
-    world = world_of(path, 6.0, seed=number)
+    world = world_of(path, 6.0, onboard=onboard, seed=number)
+    world.killed = False  # type: ignore[attr-defined]
     world.later = (math.inf, None)  # type: ignore[attr-defined]
     world.fly_until(State.FLY)
     world.fly_for(float(random.uniform(3.0, 7.0)))
@@ -113,7 +121,10 @@ def fault(path: Path, kind: str, drone: int, number: int) -> list[Row]:
         if world.now >= world.later[0]:  # type: ignore[attr-defined]
             world.later[1]()  # type: ignore[attr-defined]
             world.later = (math.inf, None)  # type: ignore[attr-defined]
-        if not world.tick():
+        if world.killed:  # type: ignore[attr-defined]
+            world.advance(0.02)
+            world.track.append(world.moment())
+        elif not world.tick():
             break
     for _ in range(250):  # whatever turns must stop by itself
         world.advance(0.02)

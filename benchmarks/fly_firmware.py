@@ -174,6 +174,7 @@ def jobs_of(options: argparse.Namespace) -> Iterator[tuple[str, Callable[..., li
         yield from (
             ("faults", fly_faults_virtual.fault, (options.flight, kind, drone, number))
             for kind in fly_faults_virtual.FAULTS
+            if kind not in fly_faults_virtual.ONBOARD
             for drone in range(2)
             for number in range(options.trials)
         )

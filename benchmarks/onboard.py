@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 from pathlib import Path
@@ -58,28 +59,24 @@ int main(void) {
 
 
 def flown(policy: PolicyFile, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """Memory and observation of each step (T, m + 18), and NumPy's action (T, 3); motion as smooth as a flight's."""
+    """Memory and observation of each step (T, m + 18), and NumPy's action (T, 3).
+
+    Observations wander within 1 s or so, with mean and spread that they had in training by the policy's own scaling.
+    """
     follower, random = Policy(policy, "follower"), np.random.default_rng(3)
+    scale, kept = policy.observation_scale[:18].astype(float), 1 - policy.card["control_period"]
+    spread = np.where(scale > 0, 1 / np.where(scale > 0, scale, 1), 0.3)
     records, actions = [], []
     for _ in range(-(-steps // FLIGHT)):
-        noise = random.normal(scale=0.03, size=(FLIGHT, 18))
-        walk = random.normal(scale=0.3, size=18) + np.stack(_walk(noise))
         follower.reset()
-        for seen in walk.astype(np.float32):
-            law = follower._law
-            memory = follower.memory if follower.memory is not None else law.start(seen)
+        place = random.normal(size=18)
+        for noise in random.normal(scale=math.sqrt(1 - kept**2), size=(FLIGHT, 18)):
+            place = kept * place + noise
+            seen = (policy.observation_mean[:18] + spread * place).astype(np.float32)
+            memory = follower.memory if follower.memory is not None else follower._law.start(seen)
             records.append(np.concatenate([memory, seen]).astype(np.float32))
             actions.append(follower.scaled(seen))
     return np.array(records[:steps]), np.array(actions[:steps])
-
-
-def _walk(noise: np.ndarray) -> list[np.ndarray]:
-    """A random walk that is drawn back to 0, so that it stays where flights are."""
-    place, found = np.zeros(noise.shape[1]), []
-    for one in noise:
-        place = 0.99 * place + one
-        found.append(place)
-    return found
 
 
 def compare(policy: PolicyFile, place: Path, int8: bool, steps: int) -> dict[str, Any]:

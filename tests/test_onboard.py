@@ -199,6 +199,13 @@ def test_one_abort_lands_both(cores: Cores):
         assert all((one.thrust == 0) == (phase is Phase.STOP) for one in sent)
     bench = Bench(cores, rig)
     bench.take_off()
+    high = ObjectState(np.array([0.0, 0.0, 0.3]), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3))
+    for _ in range(40):
+        bench.tick(Phase.LAND, high)
+    bench.tick(Phase.LAND, high, variance=[1.0] * 3)  # nothing is known of the ground
+    assert bench.phases[0] is Phase.DESCEND
+    bench = Bench(cores, rig)
+    bench.take_off()
     for _ in range(52):
         bench.tick(None)
     assert bench.phases == [Phase.LAND] * 2

@@ -421,7 +421,7 @@ static void judge_air(const mjxball_app *app, const seen *one, const mjxball_sta
         float height = app->position[2] - app->origin[2], climb = app->velocity[2];
         bool blind = !good || !app->trusted;
         if (!blind && height < NEAR_GROUND && climb < STILL && climb > -STILL) ask(to, MJXBALL_STOP, MJXBALL_DOWN);
-        if (blind && app->height <= 0) ask(to, MJXBALL_STOP, MJXBALL_DOWN);
+        if (blind && app->phase == MJXBALL_DESCEND && app->height <= 0) ask(to, MJXBALL_STOP, MJXBALL_DOWN);
     }
 }
 
