@@ -1,10 +1,13 @@
 """Followers of teams: the load on paths in the plane on rings of 2 to 6 drones, and a free ball on a plate.
 
     python benchmarks/teams.py policies/team.npz --followers copy adaptive lqg --json benchmarks/results/teams.json
+    python benchmarks/teams.py policies/team.npz --random --json benchmarks/results/teams_random.json
     python benchmarks/teams.py --plate policies/plate.npz --json benchmarks/results/plate.json
 
 Teams: N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A
-case counts where `mjxball.plant.trim` finds 15 % margin in every direction. 5 drones are in no training.
+case counts where `mjxball.plant.trim` finds 15 % margin in every direction and the followers' tilt commands reach it.
+The bar: peak in the plane at most that of `adaptive` + 3 mm, settling at most that of `lqg` + 10 %. 5 drones are in no
+training. With --random: random loads, starts and goals that can be trimmed.
 
 Plate: random starts, the ball within 60 % of the rim with up to 0.1 m/s, both uniform in radius, 60 s, noise level 1.
 Beside them the share of these starts from which friction alone stops the ball before the rim of a level plate. No
@@ -28,9 +31,12 @@ from mjxball import cli
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, ball_limit, preset
 from mjxball.control.followers import Follower
+from mjxball.errors import InputError
+from mjxball.evaluate.batch import Batch
+from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.results import fly_scenarios
 from mjxball.physics.motion import ROLLING_FRICTION
+from mjxball.plant import plant_parameters
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude
 from mjxball.sim.disturbances import Disturbance
@@ -39,6 +45,9 @@ from mjxball.sim.scenario import CIRCLE, CgPath, Scenario
 
 SIZES, SPEEDS, AMPLITUDES, MASSES = (2, 3, 4, 5, 6), (0.31, 1.0, 2.0, 3.1), (0.15, 0.3, 0.6), (0.5, 1.0, 1.5)
 EIGHT = CgPath(direction=0.7, width=0.5, ratio=2.0, lead=0.3)
+REACH = {CIRCLE: 1.0, EIGHT: math.hypot(1.0, EIGHT.width)}  # farthest CG over the amplitude
+REFERENCES, MORE_PEAK, LATER = ("adaptive", "lqg"), 0.003, 1.1  # the bar: peak of the first [m], settling of the second
+RANDOM = 10_000
 STARTS, SECONDS, INNER, FASTEST = 100, 60.0, 0.6, 0.1
 ENGINE = "newton-euler"
 
@@ -49,46 +58,106 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz")
     parser.add_argument("--followers", nargs="+", default=["copy"], metavar="NAME", help="baselines (default copy)")
     parser.add_argument("--plate", action="store_true", help="the free ball instead of the paths")
+    parser.add_argument("--random", action="store_true", help=f"{RANDOM:,} random flights instead of the paths")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
-    rows = (plate if options.plate else teams)(options.policies, options.followers)
+    if options.plate and options.random:
+        raise InputError("--plate and --random are two benchmarks; run one after the other")
+    fly = plate if options.plate else random_flights if options.random else teams
+    rows = fly(options.policies, options.followers)
     if options.json:
         options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     return 0
 
 
 def teams(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
-    """Medians and worst cases for every number of drones and every follower."""
+    """Medians and worst cases for every number of drones and every follower, and shares of cases at the bar."""
     rows, base = [], preset("team")
     for count in SIZES:
         config = ring_config(base, count)
-        followers = _followers(config, paths, named)
         radius, nominal = config.plant.object_size[0] / 2, config.plant.object_mass
         cells = [
             Scenario(omega=omega, amplitude=share * radius, mass=factor * nominal, path=path, seconds=30)
             for factor, share, omega, path in itertools.product(MASSES, AMPLITUDES, SPEEDS, (CIRCLE, EIGHT))
         ]
         farthest = {mass: _trimmed(config, mass) for mass in {cell.mass for cell in cells}}
-        reach = {CIRCLE: 1.0, EIGHT: math.hypot(1.0, EIGHT.width)}
-        held = [cell for cell in cells if cell.amplitude * reach[cell.path] <= farthest[cell.mass]]
-        results = fly_scenarios(config, followers, held, ENGINE)
-        for follower in followers:
-            found = [result.metrics for result in results if result.follower == follower.name]
-            flown = [one for one in found if not one.failed]
-            row = {
-                "drones": count,
-                "follower": follower.name,
-                "cases": len(held),
-                "failed": len(found) - len(flown),
-                "plane_peak_median": float(np.median([one.plane_peak for one in flown])),
-                "plane_peak_worst": max(one.plane_peak for one in flown),
-                "settling_10_median": float(np.median([one.settling_time_10 or math.inf for one in flown])),
-                "rmse_median": float(np.median([one.rmse for one in flown])),
-            }
-            rows.append({name: None if value == math.inf else value for name, value in row.items()})
+        held = [cell for cell in cells if cell.amplitude * REACH[cell.path] <= farthest[cell.mass]]
+        references = {name: Batch(config, make_baseline(name, config)).fly(held) for name in REFERENCES}
+        for follower in _followers(config, paths, named):
+            found = references.get(follower.name) or Batch(config, follower).fly(held)
+            rows.append({"drones": count, "follower": follower.name, "cases": len(held), **_row(found, references)})
             print(json.dumps(rows[-1]))
             sys.stdout.flush()
     return rows
+
+
+def _row(found: Sequence[Metrics], references: dict[str, list[Metrics]]) -> dict[str, Any]:
+    """Of one follower: failures, medians, and the shares of cases at the bar, by 2 and by 10 % settling times."""
+
+    def of(name: str, runs: Sequence[Metrics] = found) -> np.ndarray:
+        values = [None if run.failed else getattr(run, name) for run in runs]
+        return np.array([math.inf if value is None else value for value in values])
+
+    small = of("plane_peak") <= of("plane_peak", references["adaptive"]) + MORE_PEAK
+    row = {
+        "failed": sum(run.failed for run in found),
+        "plane_peak_median": float(np.median(of("plane_peak"))),
+        "plane_peak_worst": float(of("plane_peak").max()),
+        "settling_median": float(np.median(of("settling_time"))),
+        "settling_10_median": float(np.median(of("settling_time_10"))),
+        "rmse_median": float(np.median(of("rmse"))),
+        "small_peak": float(small.mean()),
+    }
+    for label, name in (("", "settling_time"), ("_10", "settling_time_10")):
+        told = of(name, references["lqg"])
+        soon = np.where(np.isfinite(told), of(name) <= LATER * told, True)
+        row |= {f"soon{label}": float(soon.mean()), f"both{label}": float((small & soon).mean())}
+    return {name: None if value == math.inf else value for name, value in row.items()}
+
+
+def random_flights(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
+    """Failures and peaks of random loads, starts and goals that can be trimmed, as many with each number of drones."""
+    rows, base = [], preset("team")
+    for count in base.scenario.team_sizes:
+        config, random = ring_config(base, count), np.random.default_rng(count)
+        low, high = config.scenario.object_mass
+        edges = np.linspace(low, high, 9)
+        farthest = [_trimmed(config, mass) for mass in edges[1:]]  # of the heaviest in each part
+        flights = []
+        for _ in range(RANDOM // len(base.scenario.team_sizes)):
+            mass = random.uniform(low, high)
+            path = CgPath(
+                *random.uniform([0, 0], [2 * math.pi, 1]), float(random.integers(1, 3)), random.uniform(0, 6.28)
+            )
+            limit = min(farthest[min(int((mass - low) / (high - low) * 8), 7)], config.plant.object_size[0] / 2)
+            flights.append(
+                Scenario(
+                    omega=random.uniform(*config.scenario.cg_speed),
+                    amplitude=random.uniform(0, limit) / math.hypot(1.0, path.width),
+                    mass=mass,
+                    path=path,
+                    phase=random.uniform(0, 6.28),
+                    goal=_three(random.uniform(-1, 1, 3)),
+                    start_velocity=_three(random.uniform(-0.2, 0.2, 3)),
+                    start_tilt=(random.uniform(-0.05, 0.05), random.uniform(-0.05, 0.05)),
+                    seconds=25.0,
+                )
+            )
+        for follower in _followers(config, paths, named):
+            found = Batch(config, follower).fly(flights)
+            peaks = np.array([math.inf if run.failed else run.plane_peak for run in found])
+            shares = dict(
+                zip(("median", "99 %", "largest"), np.quantile(peaks, (0.5, 0.99, 1.0)).tolist(), strict=True)
+            )
+            row = {"drones": count, "follower": follower.name, "flights": len(flights)}
+            rows.append({**row, "failed": sum(run.failed for run in found), "plane_peak": shares})
+            print(json.dumps(rows[-1]))
+            sys.stdout.flush()
+    return rows
+
+
+def _three(values: np.ndarray) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])
 
 
 def _followers(config: Config, paths: Sequence[Path], named: Sequence[str]) -> list[Follower]:
@@ -96,10 +165,15 @@ def _followers(config: Config, paths: Sequence[Path], named: Sequence[str]) -> l
 
 
 def _trimmed(config: Config, mass: float) -> float:
-    """CG offset [m] that can be trimmed in every direction."""
+    """CG offset [m] that can be trimmed in every direction, and that the followers' tilt commands reach.
+
+    About the axis through a pair's drones the assembly is light, and its attitude gains with it.
+    """
     angles = np.linspace(0, math.pi, 12, endpoint=False)
-    margin = config.scenario.trim_margin
-    return min(largest_amplitude(config.plant, mass, margin, (math.cos(a), math.sin(a))) for a in angles)
+    margin, plant = config.scenario.trim_margin, config.plant
+    gain = min(plant_parameters(plant, config.attitude).gains.kp[:2])
+    reach = (1 - margin) * len(plant.followers) * gain * config.command.tilt_limit / (plant.gravity * mass)
+    return min(reach, *(largest_amplitude(config.plant, mass, margin, (math.cos(a), math.sin(a))) for a in angles))
 
 
 def plate(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:

@@ -13,15 +13,16 @@ from mjxball import rewards
 from mjxball.config import Config, ball_limit
 from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
+from mjxball.control.team_lqg import team_context
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
 from mjxball.physics.motion import object_mass
 from mjxball.physics.step import TRAINING_ENGINES, ControlStep, jax_repeat, make_cg_offset, make_control_step
-from mjxball.plant import PlantParameters
+from mjxball.plant import PlantParameters, plant_parameters
 from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
 from mjxball.sim.disturbances import RandomDisturbances, followers_axis
 from mjxball.sim.follower import follower_law
-from mjxball.sim.randomization import ResetDistribution
+from mjxball.sim.randomization import ResetDistribution, Rig
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -255,13 +256,22 @@ class TransportEnv:
             load=load,
             goal=goal,
             disturbances=disturbances,
-            history=self._law.start(observation) if self._law.size else (),
+            history=self._law.start(observation, self._context(rig)) if self._law.size else (),
             action=jnp.zeros((*self._followers, 3)),
             command=jnp.zeros((*self._followers, 3)),
             steps=jnp.zeros((), jnp.int32),
             rig=numbers,
         )
         return world, observation
+
+    def _context(self, rig: Rig | None) -> Any:
+        """What the followers of a world know of their team; None if their law needs nothing."""
+        if not self._law.needs_context:
+            return None
+        plant = self.config.plant
+        mass = jnp.float32(plant.object_mass) * (1.0 if rig is None else rig.share)
+        numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
+        return team_context(jax.tree.map(jnp.float32, numbers), plant, mass)
 
     def _input(self, observation: Float[Array, "... 18"], world: PipelineState) -> Float[Array, "... input"]:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""

@@ -35,6 +35,14 @@ def contents_of(source: Path) -> PolicyFile:
     return load_file(source) if source.suffix == ".npz" else policy_of_run(source)
 
 
+def _for_any_machine(source: Path) -> PolicyFile:
+    """`contents_of`; InputError for a policy that no other format holds."""
+    policy = contents_of(source)
+    if "context" in policy.card:
+        raise InputError(f"{source} has to be told its team before a flight; only a policy file .npz can hold it")
+    return policy
+
+
 def _write_onnx(out: Path, policy: PolicyFile) -> None:
     from mjxball.policy.formats.onnx_model import onnx_model
 
@@ -59,7 +67,7 @@ def export(source: Path, out: Path, crazyflie: bool = False, int8: bool = False)
         from mjxball.fly.app.generate import check_place, write_app
 
         check_place(out)
-        write_app(contents_of(source), source.stem, out, int8)
+        write_app(_for_any_machine(source), source.stem, out, int8)
         return
     if int8 and out.suffix != ".h":
         raise InputError("--int8 is for C: with --crazyflie, or an output file that ends in .h")
@@ -67,9 +75,9 @@ def export(source: Path, out: Path, crazyflie: bool = False, int8: bool = False)
         raise InputError(f"output file {out} must end in {', '.join(WRITERS)}, which chooses the format")
     output_file(out, out.suffix)
     if int8:
-        _write_header(out, contents_of(source), int8)
+        _write_header(out, _for_any_machine(source), int8)
     else:
-        WRITERS[out.suffix](out, contents_of(source))
+        WRITERS[out.suffix](out, contents_of(source) if out.suffix == ".npz" else _for_any_machine(source))
 
 
 def main(arguments: list[str] | None = None) -> int:

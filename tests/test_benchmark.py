@@ -47,7 +47,7 @@ def test_every_variant_is_sound_for_every_seed() -> None:
         assert len({variant.label for variant in suite.variants}) == len(suite.variants)
         for variant in suite.variants:
             for seed in range(2):
-                check_scenario(variant.config(CONFIG, seed), variant.seeded(seed))
+                check_scenario(variant.config(variant.home(CONFIG), seed), variant.seeded(seed))
 
 
 def test_seeds_are_reproducible_and_differ() -> None:

@@ -132,6 +132,7 @@ REFUSED = {
     ),
     "a Crazyflie that is turned": ('base = "crazyflie"\n[plant.drones.1]\nyaw = 0.5', "no yaw"),
     "nobody leads": (RING.replace("[plant]", "[plant]\nleader = 3", 1), "none of the 3 drones"),
+    "a mount that is no number": (RING.replace("[0.2, 0.0, 0.0]", "[nan, 0.0, 0.0]"), "drones.0.mount must be finite"),
     "negative rotors": (RING + "rotor_force_max = -8.0", "drones.2.rotor_force_max must be at least 0"),
 }
 
@@ -150,7 +151,7 @@ def test_mistakes_are_refused_in_one_sentence(mistake: str, tmp_path: Path, caps
 @rows("name", ["team4", "plate4"])
 def test_what_flies_two_drones_refuses_more(name: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for main, more, said in (
-        (evaluate.main, ["--followers", "copy", "lqg-offset-free"], "balances a free pair along x"),
+        (evaluate.main, ["policies/balance.npz"], "made for a plant of 2 drones, not 4"),
         (train.main, [], "make it a multiple of 3"),
     ):
         out = tmp_path / "out"
@@ -172,3 +173,19 @@ def test_shares_hold_the_load_level() -> None:
     np.testing.assert_allclose(crooked.load_shares, [0.17 / 0.48, 0.31 / 0.48], rtol=1e-12)
     with pytest.raises(InputError, match="nothing holds the load"):
         configs.validate(configs.replace(Config(), "plant.drones.0.mount", (-0.17, 0.3, 0.0)))
+
+
+def test_no_number_of_a_plant_may_be_none_or_endless_or_below_its_bound() -> None:
+    """Every leaf of a team's plant, its drones' own included."""
+    team = configs.with_plant(configs.preset("paper"), "team3")
+    tried = 0
+    for path, value, item in configs.leaves(team.plant):
+        if isinstance(value, (str, int)) and not isinstance(value, float):
+            continue
+        bound = item.metadata["above"] if item.metadata["above"] is not None else item.metadata["low"]
+        for wrong in (math.nan, math.inf, *(() if bound is None else (bound - 1.0,))):
+            changed = (wrong,) * len(value) if isinstance(value, tuple) else wrong
+            with pytest.raises(InputError, match=path.rpartition(".")[2]):
+                configs.validate(configs.replace(team, f"plant.{path}", changed))
+            tried += 1
+    assert tried > 60

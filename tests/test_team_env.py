@@ -37,6 +37,10 @@ QUIET = {
     "scenario.rotor_lag_scale": (1.0, 1.0),
     "follower.privileged_critic": False,
     "follower.observation_averages": (),
+    "follower.base": "pd",
+    "reward.command_change": 0.0,
+    "scenario.thrust_scale": (1.0, 1.0),
+    **{f"scenario.{name}": (1.0, 1.0) for name in Factors._fields},
 }
 
 

@@ -13,6 +13,7 @@ from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
 from mjxball.baselines.lqg import KnownFailuresLqg, Lqg, Memoryless, SlowLqg
 from mjxball.baselines.offset_free import OffsetFree
 from mjxball.baselines.reference import Oracle, Random, Stay
+from mjxball.baselines.team_lqg import TeamOffsetFree
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Copy, Law
 from mjxball.errors import InputError
@@ -46,7 +47,7 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "memoryless": Memoryless,
     "lqg": lambda config: CrazyflieLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
     "lqg-slow": SlowLqg,
-    "lqg-offset-free": OffsetFree,
+    "lqg-offset-free": lambda config: TeamOffsetFree(config) if config.plant.is_team else OffsetFree(config),
     "lqg-known-failures": KnownFailuresLqg,
 }
 # Where no drone fails `lqg-known-failures` is `lqg`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import shlex
@@ -123,8 +124,9 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.check and not paths:
         raise InputError("--check needs a policy")
     here, others = (paths, []) if options.force or options.plant else group_by_plant(paths)
+    team = [path for _, files in others for path in files]
     if chosen and others:
-        if asked:
+        if asked and not any(variant.team for suite in chosen for variant in suite.variants):
             raise InputError(f"--suite flies the paper's plant, and {others[0][1][0]} was made for another")
         others = []
     # Only policies for other plants: then the baselines beside them fly theirs, and nothing the paper's.
@@ -132,7 +134,7 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     groups += [Group(own, native_scenarios(options, own), named or ["copy"], files, True) for own, files in others]
     command = shlex.join(["python", "eval.py", *arguments])
     if chosen:
-        return _benchmark(groups[0], chosen, options, command)
+        return _benchmark(groups[0], chosen, options, command, team)
     return _compare(groups, options, command)
 
 
@@ -160,22 +162,40 @@ class Group:
         return [make_baseline(name, self.setup) for name in dict.fromkeys(self.named if self.asked else every)]
 
 
-def _benchmark(group: Group, suites: list[Suite], options: argparse.Namespace, command: str) -> int:
-    """Fly benchmark suites, with progress on stderr."""
+def _benchmark(
+    group: Group, suites: list[Suite], options: argparse.Namespace, command: str, team: Sequence[Path]
+) -> int:
+    """Fly benchmark suites, with progress on stderr; `team`: policies for teams."""
     policies = group.policies(options)
-    followers: list[Follower] = [*group.baselines(SUITE_BASELINES), *policies]
-    _refuse_same_names([follower.name for follower in followers])
+    one_plant = any(not variant.team for suite in suites for variant in suite.variants)
+    baselines = group.baselines(SUITE_BASELINES) if one_plant else []
+    followers: list[Follower] = [*baselines, *policies]
+    _refuse_same_names([*(follower.name for follower in followers), *(path.stem for path in team)])
     num_seeds, started = options.num_seeds or 3, time.monotonic()
 
     def progress(text: str) -> None:
         print(f"{time.monotonic() - started:6.1f} s  {text}", file=sys.stderr)  # noqa: T201
 
-    scores = run_benchmark(group.setup, followers, suites, num_seeds, options.physics, progress)
+    def crew(home: config.Config) -> list[Follower]:
+        """Whoever flies this team: baselines, and policies that were made for such."""
+        found: list[Follower] = []
+        for name in dict.fromkeys(group.named if group.asked else [*SUITE_BASELINES, "lqg-known-failures"]):
+            with contextlib.suppress(InputError):
+                found.append(make_baseline(name, home))
+        for path in (*group.paths, *team):
+            with contextlib.suppress(InputError):
+                found.append(load_policy(path, home))
+        return found
+
+    scores = run_benchmark(group.setup, followers, suites, num_seeds, options.physics, progress, crew)
+    if not scores:
+        raise InputError("none of these followers flies the teams of these suites")
+    plant = suites[0].variants[0].home(group.setup).plant
     print(text_table(scores))  # noqa: T201
     if options.json:
         options.json.write_text(json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
-        write_report(options.out, group.setup.plant, scores, suites, policies, command, versions())
+        write_report(options.out, plant, scores, suites, policies, command, versions())
         print(f"the report is {options.out / 'report.html'}")  # noqa: T201
     return 0
 

@@ -61,6 +61,11 @@ class Plant:
         return len(self.drones)
 
     @property
+    def is_team(self) -> bool:
+        """Whether followers fly in mount frames: there are several, or the load moves in the plane."""
+        return len(self.drones) > 2 or len(self.directions) == 2
+
+    @property
     def followers(self) -> tuple[int, ...]:
         """Numbers of the drones that follow, in order: all but the leader's."""
         return tuple(number for number in range(len(self.drones)) if number != self.leader)

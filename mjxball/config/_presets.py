@@ -156,6 +156,7 @@ def _team() -> Config:
     return replace(
         apply_overrides(large, read_plant("team6").settings),
         preset="team",
+        follower=replace(large.follower, base="lqg", action_scale_tilt=0.2),
         scenario=replace(
             large.scenario,
             team_sizes=(2, 3, 4, 6),
@@ -164,11 +165,21 @@ def _team() -> Config:
             cg_lissajous_probability=0.3,
             cg_waypoint_probability=0.2,
             object_mass=(0.3, 0.9),
+            drone_mass_scale=(0.9, 1.1),
+            drone_inertia_scale=(0.8, 1.2),
+            mount_scale=(0.9, 1.1),
+            arm_scale=(0.9, 1.1),
+            yaw_per_thrust_scale=(0.8, 1.2),
+            rotor_force_scale=(0.9, 1.1),
+            carrier_scale=(0.5, 1.5),
+            attitude_gain_scale=(0.9, 1.1),
+            thrust_scale=(0.95, 1.05),
         ),
         bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.36),
+        reward=replace(large.reward, velocity=10.5, smoothness=0.2, command_change=40.0),
         sac=replace(large.sac, num_envs=528, replay_size=528_000),
         ppo=Ppo(num_envs=528),
-        gradient=TEAM_GRADIENT,
+        gradient=replace(TEAM_GRADIENT, gradient_steps=40),
     )
 
 

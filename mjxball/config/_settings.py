@@ -105,7 +105,9 @@ class Follower:
         "residual", "residual: added to the PD law on its own observation; direct: the command itself"
     )
     base: Literal["pd", "lqg"] = setting(
-        "pd", "what a residual action is added to: the PD law, or an offset-free LQG that estimates the load's torque"
+        "pd",
+        "what a residual action is added to: the PD law, or an offset-free LQG that estimates the load's torque (in a "
+        "team one of each follower's own)",
     )
     action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", above=0, high=1.2)
     action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", above=0)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from mjxball.control import leader
 from mjxball.control.observation import ObservationHistory, copy_command, scale_action
 from mjxball.control.offset_free import OffsetFreeLqg
+from mjxball.control.team_lqg import TeamLqg
 
 Array = Any
 
@@ -27,7 +28,7 @@ class FollowerLaw(NamedTuple):
     kd: Array  # (3,)
     gravity: float  # [m/s2]
     residual: bool = True  # whether the action is added to a law: `lqg`, or the leader's PD law if that is None
-    lqg: OffsetFreeLqg | None = None
+    lqg: OffsetFreeLqg | TeamLqg | None = None
 
     @property
     def size(self) -> int:
@@ -38,12 +39,18 @@ class FollowerLaw(NamedTuple):
         """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
         return self.history.mask(ignore_position) + [1.0] * (self.size - self.history.size)
 
-    def start(self, observation: Array) -> Array:
-        """Memory (..., m) before the first `observation` (..., 18)."""
+    @property
+    def needs_context(self) -> bool:
+        """Whether a follower has to be told its team, see `team_lqg.team_context`."""
+        return isinstance(self.lqg, TeamLqg)
+
+    def start(self, observation: Array, context: Array | None = None) -> Array:
+        """Memory (..., m) before the first `observation` (..., 18); `context` (..., 5) if `needs_context`."""
         remembered = self.history.start(observation)
         if self.lqg is None:
             return remembered
-        return observation.__array_namespace__().concat([remembered, self.lqg.start(observation)], axis=-1)
+        known = {"context": context} if self.needs_context else {}
+        return observation.__array_namespace__().concat([remembered, self.lqg.start(observation, **known)], axis=-1)
 
     def network_input(self, observation: Array, memory: Array) -> Array:
         """Input of the network (..., 18 + m)."""

@@ -102,17 +102,30 @@ def run_benchmark(
     num_seeds: int,
     physics: str,
     progress: Callable[[str], None] = lambda text: None,
+    crew: Callable[[Config], Sequence[Follower]] | None = None,
 ) -> list[Score]:
-    """Fly everything. The followers are designed for `base` and do not know what a variant changes."""
+    """Fly everything. The followers are designed for `base` and do not know what a variant changes.
+
+    `crew`: those that are made for the home of a variant with a team of its own.
+    """
     scores: list[Score] = []
+    crews: dict[str, Sequence[Follower]] = {}
     for number, suite in enumerate(suites):
         progress(f"{number + 1}/{len(suites)} {suite.name}: {len(suite.variants)} variants x {num_seeds} seeds")
-        flown = dict(_fly(base, followers, suite, num_seeds, physics))
+        homes: dict[str, tuple[Config, list[Variant]]] = {}
         for variant in suite.variants:
-            for index, follower in enumerate(followers):
-                results = [flown[variant.label, seed][index] for seed in range(num_seeds)]
-                metrics = tuple(result.metrics for result in results)
-                scores.append(Score(suite.name, variant.label, follower.name, metrics, results[0]))
+            home = variant.home(base)
+            homes.setdefault(configs.config_hash(home), (home, []))[1].append(variant)
+        for key, (home, variants) in homes.items():
+            own = followers
+            if variants[0].team:
+                crews[key] = own = crews.get(key) or (crew(home) if crew else [])
+            flown = dict(_fly(home, own, replace(suite, variants=tuple(variants)), num_seeds, physics))
+            for variant in variants:
+                for index, follower in enumerate(own):
+                    results = [flown[variant.label, seed][index] for seed in range(num_seeds)]
+                    metrics = tuple(result.metrics for result in results)
+                    scores.append(Score(suite.name, variant.label, follower.name, metrics, results[0]))
     return scores
 
 

@@ -16,6 +16,7 @@ from mjxball.policy import Policy
 def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy:
     """Load a policy and refuse one that was made for another plant or rate, or for other control laws."""
     policy = Policy.load(path)
+    policy.join(config.plant, config.attitude)
     period = config.timing.control_period
     if abs(policy.control_period - period) > 1e-9:
         raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")

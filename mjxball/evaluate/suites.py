@@ -15,8 +15,9 @@ import numpy as np
 from mjxball import config as configs
 from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
+from mjxball.plant.teams import ring_config
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario
+from mjxball.sim.scenario import CIRCLE, CgPath, Scenario, check_scenario
 
 REFERENCE = Scenario()
 # Copy without CG motion, then five speeds of the CG.
@@ -102,15 +103,31 @@ class Variant:
     label: str
     scenario: Scenario
     changes: Mapping[str, Any] = field(default_factory=dict)  # config path -> value
-    waveform: Callable[[int], tuple[tuple[float, ...], tuple[float, ...]]] | None = None  # seed -> times, offsets
+    waveform: Callable[[int], tuple[tuple[float, ...], ...]] | None = None  # seed -> times, offsets, offsets across
+    team: str = ""  # preset whose plant it flies; empty: the command's
+    drones: int = 0  # of a ring of that many; 0: the preset's plant
+    known: Mapping[str, Any] = field(default_factory=dict)  # of a team, settings that its followers are made for
+    scatter: float = 0.0  # of a team, every drone's numbers are drawn within this share of those that followers know
+
+    def home(self, base: Config) -> Config:
+        """What its followers are made for: `base`, or a team of its own."""
+        if not self.team:
+            return base
+        found = configs.preset(self.team)
+        if self.drones:
+            found = ring_config(found, self.drones)
+        for path, value in self.known.items():
+            found = configs.replace(found, path, value)
+        return configs.validate(found)
 
     def config(self, base: Config, seed: int) -> Config:
-        """The configuration of this variant for one seed."""
+        """The configuration of this variant for one seed; `base` is its `home`."""
         for path, value in self.changes.items():
             base = configs.replace(base, path, value)
         if self.waveform:
-            times, offsets = self.waveform(seed)
-            base = dataclasses.replace(base, motion=configs.Motion(kind="waveform", times=times, offsets=offsets))
+            base = dataclasses.replace(base, motion=configs.Motion("waveform", *self.waveform(seed)))
+        if self.scatter:
+            base = dataclasses.replace(base, plant=_scattered(base.plant, self.scatter, seed))
         return configs.validate(base)
 
     def seeded(self, seed: int) -> Scenario:
@@ -167,6 +184,34 @@ def _disturbed(name: str, values: tuple[Any, ...], unit: str = "") -> tuple[Vari
 
 def _with(**disturbance: Any) -> Scenario:
     return Scenario(disturbance=Disturbance(**disturbance))
+
+
+def _places(seed: int) -> tuple[tuple[float, ...], ...]:
+    """The CG goes to a place within 7 cm of O in the plane and stays, every 3 s."""
+    random, times = np.random.default_rng([seed, 17]), []
+    radius, angle = 0.07 * np.sqrt(random.random(15)), 2 * np.pi * random.random(15)
+    places = np.insert(radius * np.exp(1j * angle), 0, 0.0)
+    for number in range(len(places)):
+        times += [3.0 * number + (1.0 if number else 0.0), 3.0 * number + 2.0, 3.0 * number + 3.0]
+    offsets = np.repeat(places, 3)
+    return tuple(times), tuple(map(float, offsets.real)), tuple(map(float, offsets.imag))
+
+
+def _scattered(plant: configs.Plant, share: float, seed: int) -> configs.Plant:
+    """`plant` whose drones differ in mass, inertia, mount, arm, rotors and lag by up to `share` of each number."""
+    random, drones = np.random.default_rng([seed, 19]), []
+    for number, drone in enumerate(plant.drones):
+
+        def near(value: Any) -> Any:
+            return tuple(map(near, value)) if isinstance(value, tuple) else value * random.uniform(1 - share, 1 + share)
+
+        arm, force, lag, yaw = (
+            near(plant.of_drones(name)[number]) for name in ("arm", "rotor_force_max", "rotor_lag", "yaw_per_thrust")
+        )
+        changed = {"mass": near(drone.mass), "inertia": near(drone.inertia), "mount": near(drone.mount)}
+        rotors = {"arm": arm, "rotor_force_max": force, "rotor_lag": lag, "yaw_per_thrust": yaw}
+        drones.append(dataclasses.replace(drone, **changed, **rotors))
+    return dataclasses.replace(plant, drones=tuple(drones))
 
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
@@ -277,6 +322,72 @@ SUITES: tuple[Suite, ...] = (
         ),
     ),
 )
+TEAM_SIZES = (2, 3, 4, 5, 6)
+EIGHT = CgPath(direction=0.7, width=0.5, ratio=2.0, lead=0.3)
+
+
+def _ring(drones: int, omega: float = 1.0, share: float = 0.3, **more: Any) -> Scenario:
+    """The nominal load of a ring of that many drones on a circle of `share` of its radius."""
+    own = ring_config(configs.preset("team"), drones).plant
+    radius = own.object_size[0] / 2
+    return Scenario(**{"omega": omega, "amplitude": share * radius, "mass": own.object_mass, "path": CIRCLE, **more})
+
+
+TEAM_SUITES: tuple[Suite, ...] = (
+    Suite(
+        "team-size",
+        "the load goes round on rings of two to six drones; nobody trains with five",
+        "drones",
+        tuple(Variant(f"{n} drones", _ring(n), team="team", drones=n) for n in TEAM_SIZES),
+    ),
+    Suite(
+        "team-path",
+        "four drones, and a load that moves in the plane on other paths",
+        "path",
+        (
+            *(Variant(f"circle, {w:g} rad/s", _ring(4, w), team="team", drones=4) for w in (0.31, 2.0, 3.1)),
+            Variant("ellipse", _ring(4, path=dataclasses.replace(CIRCLE, width=0.4)), team="team", drones=4),
+            Variant("Lissajous", _ring(4, path=EIGHT), team="team", drones=4),
+            Variant("visits of random places", _ring(4), waveform=_places, team="team", drones=4),
+        ),
+    ),
+    Suite(
+        "team-plate",
+        "four drones carry a plate on which a ball rolls freely; nobody measures it",
+        "start",
+        tuple(
+            Variant(f"{100 * x:g} cm", Scenario(amplitude=0.0, ball_start=x), team="plate") for x in (0.02, 0.05, 0.08)
+        ),
+    ),
+    Suite(
+        "team-weak",
+        "of four drones the follower opposite to the leader gives less thrust than it is asked for",
+        "its thrust",
+        tuple(Variant(f"{x:g}", _ring(4, thrust=(1.0, 1.0, x, 1.0)), team="team", drones=4) for x in (0.95, 0.9, 0.8)),
+    ),
+    Suite(
+        "team-lost",
+        "of six drones, commanded up to 12 m/s2, the rotors of one follower stop after 10 s",
+        "which",
+        tuple(
+            Variant(
+                name,
+                _ring(6, share=0.15, lost=((k, 10.0),)),
+                team="team",
+                drones=6,
+                known={"command.vertical_limit": 12.0},
+            )
+            for name, k in (("next to the leader", 1), ("next but one", 2), ("opposite", 3))
+        ),
+    ),
+    Suite(
+        "team-rig",
+        "four drones no two of which are alike: mass, inertia, mount, arm, rotors and lag of each are drawn",
+        "within",
+        tuple(Variant(f"{100 * x:g} %", _ring(4), team="team", drones=4, scatter=x) for x in (0.05, 0.1, 0.2)),
+    ),
+)
+SUITES = (*SUITES, *TEAM_SUITES)
 BY_NAME = {suite.name: suite for suite in SUITES}
 
 

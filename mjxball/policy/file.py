@@ -15,10 +15,15 @@ import numpy as np
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, ObservationHistory
 from mjxball.control.offset_free import DRIVES, MEASURED, STATES, OffsetFreeLqg
+from mjxball.control.team_lqg import TeamLqg
 from mjxball.errors import InputError
 from mjxball.policy.container import PolicyFileError, read_arrays
 
-FORMAT_VERSIONS = (1, 2)  # 2: with the numbers of an offset-free LQG, card field `lqg`
+# 2: with the numbers of an offset-free LQG of a pair, card field `lqg`; 3: of a team, and what a follower has to know
+# of its team before a flight, card field `context`.
+FORMAT_VERSIONS = (1, 2, 3)
+# `control.team_lqg.team_context`.
+CONTEXT = ("command_share", "roll_per_lift", "pitch_per_lift", "roll_room", "pitch_room")
 FOLDER = "policies"  # of those that come with mjxball
 ARCHIVE = "archive"  # in it: those that a later one does better everywhere
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
@@ -70,12 +75,22 @@ LQG_SHAPES: dict[str, tuple[int, ...]] = {
     "half_length": (),
     "carried": (2,),
 }
+TEAM_LQG_SHAPES: dict[str, tuple[int, ...]] = {
+    "axis": (5, 6),
+    "axis_gain": (5, 2),
+    "height": (3, 4),
+    "height_gain": (3,),
+    "tilt": (4,),
+    "rise": (2,),
+    "limits": (3,),
+    "stiffness": (),
+    "damping": (),
+}
 
 
 def law_of(card: dict[str, Any]) -> FollowerLaw:
     """The laws around the network of a policy file; `filters` is absent from the first files."""
     filters = tuple(card.get("filters", ()))
-    lqg = card.get("lqg")
     return FollowerLaw(
         history=ObservationHistory(card["history"], card["previous_action"], filters, float(card["control_period"])),
         action_scale=tuple(card["action_reach"]),
@@ -84,8 +99,17 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
         kd=tuple(card["leader_kd"]),
         gravity=card["gravity"],
         residual=card["action_mode"] == "residual",
-        lqg=None if lqg is None else OffsetFreeLqg._make(np.array(lqg[name]) for name in LQG_SHAPES),
+        lqg=_lqg_of(card),
     )
+
+
+def _lqg_of(card: dict[str, Any]) -> OffsetFreeLqg | TeamLqg | None:
+    lqg = card.get("lqg")
+    if lqg is None:
+        return None
+    if card["format_version"] == 3:
+        return TeamLqg._make(np.array(lqg[name]) for name in TEAM_LQG_SHAPES)
+    return OffsetFreeLqg._make(np.array(lqg[name]) for name in LQG_SHAPES)
 
 
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
@@ -203,7 +227,7 @@ def _check_array(name: str, label: str, array: np.ndarray, shape: tuple[int, ...
 def _check_card(card: dict[str, Any], name: str) -> None:
     version = card.get("format_version")
     if version not in FORMAT_VERSIONS or isinstance(version, bool):
-        known = " and ".join(map(str, FORMAT_VERSIONS))
+        known = ", ".join(map(str, FORMAT_VERSIONS))
         raise PolicyFileError(f"{name} has policy format {version!r}; this version reads formats {known}")
     for field, kind in CARD_FIELDS.items():
         value = card.get(field)
@@ -247,22 +271,28 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
 
 def _check_lqg(card: dict[str, Any], name: str) -> None:
     """Raise PolicyFileError unless format 2 has the numbers of an offset-free LQG and format 1 has none."""
-    lqg = card.get("lqg")
+    lqg, in_team = card.get("lqg"), card["format_version"] == 3
+    shapes = TEAM_LQG_SHAPES if in_team else LQG_SHAPES
     if card["format_version"] == 1:
         if lqg is not None:
-            raise PolicyFileError(f"{name}: card field lqg belongs to policy format 2, not 1")
+            raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 and 3, not 1")
         return
-    if not isinstance(lqg, dict) or lqg.keys() != LQG_SHAPES.keys() or card["action_mode"] != "residual":
-        raise PolicyFileError(f"{name}: a residual policy of format 2 needs card field lqg: {', '.join(LQG_SHAPES)}")
-    for field, shape in LQG_SHAPES.items():
+    version, positive = card["format_version"], ("stiffness", "limits", "damping" if in_team else "carried")
+    if not isinstance(lqg, dict) or lqg.keys() != shapes.keys() or card["action_mode"] != "residual":
+        raise PolicyFileError(
+            f"{name}: a residual policy of format {version} needs card field lqg: {', '.join(shapes)}"
+        )
+    if in_team and card.get("context") != list(CONTEXT):
+        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(CONTEXT)}")
+    for field, shape in shapes.items():
         try:
             array = np.array(lqg[field], np.float64)
         except (TypeError, ValueError):
             array = np.full(1, np.nan)
         if array.shape != shape or not (np.abs(array) <= MAX_NUMBER).all():
             raise PolicyFileError(f"{name}: card field lqg.{field} must be finite numbers of shape {shape}")
-    if min(lqg["stiffness"], *lqg["limits"], *lqg["carried"]) <= 0:
-        raise PolicyFileError(f"{name}: card field lqg: stiffness, limits and carried must be positive")
+    if min(np.min(lqg[field]) for field in positive) <= 0:
+        raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
 
 
 def _is_finite(value: Any) -> bool:

@@ -9,7 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.config import Attitude, Plant
 from mjxball.control import observation as layout
+from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.team_lqg import TeamLqg, team_context
+from mjxball.errors import InputError
+from mjxball.plant import plant_parameters
 from mjxball.policy.file import PolicyFile, law_of, load_file
 
 Array = Any
@@ -51,12 +56,28 @@ class Policy:
         self._mean: np.ndarray = contents.observation_mean.astype(dtype)
         self._scale: np.ndarray = contents.observation_scale.astype(dtype)
         self._law = law_of(card)
+        self._context: Array | None = None
         self._memory: Array | None = None
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:
         """Load a policy file; raise PolicyFileError with one sentence if it is unsound."""
         return cls(load_file(path), Path(path).stem)
+
+    def join(self, plant: Plant, attitude: Attitude) -> None:
+        """Tell it the team in which it flies, if it needs to know; before its first call.
+
+        Raises InputError if the team's attitude loops are not those that its law is for.
+        """
+        if isinstance(self._law.lqg, TeamLqg):
+            made_for, found = float(self._law.lqg.stiffness) ** 0.5, attitude.natural_frequency[:2]
+            if plant.stand != "free" or max(abs(frequency - made_for) for frequency in found) > 1e-6 * made_for:
+                raise InputError(
+                    f"policy {self.name} was made for free flight with attitude loops of {made_for:g} rad/s, "
+                    f"not {found[0]:g} and {found[1]:g} on a stand that is {plant.stand}"
+                )
+            numbers = plant_parameters(plant, attitude)
+            self._context = team_context(numbers, plant, np.float64(plant.object_mass)).astype(self._dtype)
 
     def reset(self) -> None:
         """Forget past observations: the next call starts an episode."""
@@ -88,7 +109,7 @@ class Policy:
             )
         law, remembers = self._law, self._law.size > 0
         if remembers and self._memory is None:
-            self._memory = law.start(observation)
+            self._memory = law.start(observation, _known(self.name, law, self._context))
         full = law.network_input(observation, self._memory) if remembers else observation
         action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
         command = law.command(action, observation, self._memory)
@@ -106,10 +127,11 @@ class NetworkLaw:
         self.name = policy.name
         self._parts = (policy._weights, policy._biases, policy._mean, policy._scale)
         self._law = policy._law
+        self._context = policy._context
 
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
-        return self._law.start(observation)
+        return self._law.start(observation, _known(self.name, self._law, self._context))
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""
@@ -126,3 +148,10 @@ class NetworkLaw:
         scaled = mean_action(weights, biases, mean, scale, seen)
         command = self._law.command(scaled, observation, memory)
         return scaled, command, self._law.next(memory, observation, scaled, command)
+
+
+def _known(name: str, law: FollowerLaw, context: Array | None) -> Array | None:
+    """`context`, or InputError if the law needs one and there is none."""
+    if law.needs_context and context is None:
+        raise InputError(f"policy {name} has to be told its team before it flies (Policy.join); a file cannot hold it")
+    return context

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from mjxball.config import Config
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.observation import observation_history
@@ -9,11 +11,12 @@ from mjxball.control.observation import observation_history
 
 def follower_law(config: Config) -> FollowerLaw:
     """The laws around the network of `config.follower`; InputError if its plant has none of this kind."""
-    follower, leader, lqg = config.follower, config.leader, None
+    follower, leader = config.follower, config.leader
+    lqg: Any = None
     if follower.base == "lqg":
-        from mjxball.baselines.offset_free import offset_free_lqg  # needs SciPy
+        from mjxball.baselines import offset_free, team_lqg  # need SciPy
 
-        lqg = offset_free_lqg(config)
+        lqg = team_lqg.team_lqg(config) if config.plant.is_team else offset_free.offset_free_lqg(config)
     return FollowerLaw(
         history=observation_history(config),
         action_scale=(follower.action_scale_tilt, follower.action_scale_vertical),

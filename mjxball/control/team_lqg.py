@@ -1,0 +1,158 @@
+"""Offset-free LQG of one follower of a team: what a network with `follower.base = lqg` is added to there.
+
+Every follower runs it for itself, in its mount frame. Closed attitude loops answer to the mean of all N commands alike
+whatever the rig weighs, so that the filter's numbers do not depend on it: two equal ones about roll and pitch, with the
+load's torque over the inertia, and one of the height. What a follower knows of its team is its `Context`. Needs NumPy
+alone: the numbers are made by `baselines.team_lqg` and stand in the policy file.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from mjxball.config import Plant
+from mjxball.control import rotations
+from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_angles
+from mjxball.plant import PlantParameters
+
+Array = Any
+ANGLE_STATES, HEIGHT_STATES, CONTEXT = 5, 3, 5
+STATES = 2 * ANGLE_STATES + HEIGHT_STATES
+
+
+class TeamLqg(NamedTuple):
+    """Numbers of the law (ours).
+
+    State of the filter about an axis: (angle [rad], rate [rad/s], load d [rad/s2], d', rotors' part [rad/s2]), driven
+    by the mean command [rad]; of the height: (climb [m/s], lift [m/s2], lift error [m/s2]), driven by the mean vertical
+    command. x <- A x + B u, then x <- x + K (y - C x) with angle and rate, or climb, measured. The commands that enter
+    are the law's own, without what the network adds: its followers would each expect another sum of commands, and what
+    they make of the difference would drift apart unseen.
+    """
+
+    axis: Array  # (A B) (5, 6)
+    axis_gain: Array  # K (5, 2)
+    height: Array  # (A B) (3, 4)
+    height_gain: Array  # K (3,)
+    tilt: Array  # (4,) feedback on (error, velocity, angle, rate) of pitch; that of roll mirrors it
+    rise: Array  # (2,) feedback on the vertical (error, velocity)
+    limits: Array  # (3,) of the error's part in a tilt [rad], of that in the height [m/s2], against the load [rad]
+    stiffness: float  # natural frequency of the closed attitude loops, squared [1/s2]
+    damping: float  # Kd over Kp of the attitude loops [s]
+
+    @property
+    def size(self) -> int:
+        """Numbers in the memory: the state as it is predicted, and the context."""
+        return STATES + CONTEXT
+
+    def start(self, observation: Array, context: Array) -> Array:
+        """Memory (..., 16) before the first `observation` (..., 18) of followers with `context` (..., 3).
+
+        Context: N / (N - 1); the roll and pitch [rad per m/s2] that all drones would have to command to hold what
+        lifting 1 m/s2 more than the leader does.
+        """
+        xp = observation.__array_namespace__()
+        roll, pitch, roll_rate, pitch_rate, climb = _measured(observation)
+        zero = xp.zeros_like(roll)
+        state = [roll, roll_rate, zero, zero, zero, pitch, pitch_rate, zero, zero, zero, climb, zero, zero]
+        known = xp.broadcast_to(xp.asarray(context, dtype=observation.dtype), (*roll.shape, CONTEXT))
+        return xp.concat([xp.stack(state, axis=-1), known], axis=-1)
+
+    def estimate(self, memory: Array, observation: Array) -> tuple[Array, Array]:
+        """State about roll and pitch (..., 2, 5) and of the height (..., 3) at `observation`."""
+        xp = observation.__array_namespace__()
+        gain, rising = (xp.asarray(part, dtype=observation.dtype) for part in (self.axis_gain, self.height_gain))
+        parts, measured = [], _measured(observation)
+        for number in (0, 1):
+            predicted = memory[..., number * ANGLE_STATES : (number + 1) * ANGLE_STATES]
+            left = xp.stack([measured[number] - predicted[..., 0], measured[2 + number] - predicted[..., 1]], axis=-1)
+            parts.append(predicted + left @ gain.T)
+        predicted = memory[..., 2 * ANGLE_STATES : STATES]
+        turning = xp.stack(parts, axis=-2)
+        return turning, predicted + (measured[4] - predicted[..., 0])[..., None] * rising
+
+    def features(self, memory: Array, observation: Array) -> Array:
+        """(..., 16) for a network: the measured less its estimate (5), the other estimates (8), the context (3)."""
+        xp = observation.__array_namespace__()
+        turning, rising = self.estimate(memory, observation)
+        expected = [turning[..., 0, 0], turning[..., 1, 0], turning[..., 0, 1], turning[..., 1, 1], rising[..., 0]]
+        left = [a - b for a, b in zip(_measured(observation), expected, strict=True)]
+        estimated = [turning[..., 0, 2:], turning[..., 1, 2:], rising[..., 1:], memory[..., STATES:]]
+        return xp.concat([xp.stack(left, axis=-1), *estimated], axis=-1)
+
+    def command(self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
+        """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it.
+
+        `leader`: the arguments of `copy_command` after the observation.
+        """
+        return self._plan(memory, observation, leader)[0] + added
+
+    def next(self, memory: Array, observation: Array, command: Array, leader: tuple[Any, ...]) -> Array:
+        """Memory of the next step, after `observation` was answered; `command` is not read."""
+        xp, dtype = observation.__array_namespace__(), observation.dtype
+        own, turning, rising = self._plan(memory, observation, leader)
+        led, share = copy_command(observation, *leader), memory[..., STATES : STATES + 1]
+        mean = (own + (share - 1.0) * led) / share
+        drive = mean[..., :2] + memory[..., STATES + 1 : STATES + 3] * (own - led)[..., 2:]
+        axis, height = (xp.asarray(part, dtype=dtype).T for part in (self.axis, self.height))
+        angles = [xp.concat([turning[..., k, :], drive[..., k : k + 1]], axis=-1) @ axis for k in (0, 1)]
+        climbing = xp.concat([rising, mean[..., 2:]], axis=-1) @ height
+        return xp.concat([*angles, climbing, memory[..., STATES:]], axis=-1)
+
+    def _plan(self, memory: Array, observation: Array, leader: tuple[Any, ...]) -> tuple[Array, Array, Array]:
+        """(the law's own command, only its vertical part clipped, estimates)."""
+        xp = observation.__array_namespace__()
+        turning, rising = self.estimate(memory, observation)
+        led, share = copy_command(observation, *leader), memory[..., STATES]
+        lever, most = memory[..., STATES + 1 : STATES + 3], memory[..., STATES + 3 :]
+        error, rate = observation[..., ERROR], observation[..., ERROR_RATE]
+        tilt_limit, rise_limit, load_limit = (float(limit) for limit in self.limits)
+        k_error, k_velocity = (float(gain) for gain in self.rise)
+        rise = xp.clip(k_error * error[..., 2] + k_velocity * rate[..., 2], -rise_limit, rise_limit) - rising[..., 2]
+        vertical = xp.clip(share * rise - (share - 1.0) * led[..., 2], -leader[-1], leader[-1])
+        k_error, k_velocity, k_angle, k_rate = (float(gain) for gain in self.tilt)
+        far = k_error * error + k_velocity * rate
+        far = _within(xp, xp.stack([-far[..., 1], far[..., 0]], axis=-1), tilt_limit)
+        wanted = far - k_angle * observation[..., 3:5] - k_rate * observation[..., 9:11]
+        load = turning[..., 2] / self.stiffness + lever * (vertical - led[..., 2])[..., None]
+        wanted = wanted - _within(xp, load, load_limit)
+        own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
+        rest = observation[..., 3:5] + self.damping * observation[..., 9:11]
+        own = rest + most * _within(xp, (own - rest) / most, 1.0)
+        return xp.concat([own, vertical[..., None]], axis=-1), turning, rising
+
+
+def team_context(parameters: PlantParameters, plant: Plant, object_mass: Array) -> Array:
+    """What every follower of a team that carries `object_mass` () [kg] knows of it, (..., F, 3) or of one (..., 3).
+
+    See `TeamLqg.start`; in mount frames. `parameters` are those of teams like `plant`.
+    """
+    xp, lead = parameters.mounts.__array_namespace__(), plant.leader
+    count = xp.astype((parameters.drone_mass > 0).sum(axis=-1), parameters.mounts.dtype)
+    lifted = parameters.known_mass[..., lead] + parameters.share[..., lead] * object_mass
+    x, y = parameters.mounts[..., lead, 0], parameters.mounts[..., lead, 1]
+    per_command = xp.stack([-y, x], axis=-1) * (lifted / count)[..., None] / parameters.gains.kp[..., :2]
+    hover = parameters.gravity * (parameters.known_mass + parameters.share * object_mass[..., None]) / 4
+    room = 2 * parameters.arm * xp.minimum(hover, parameters.rotor_force_max - hover)  # [N m]
+    several = len(plant.followers) > 1
+    angles: Any = mount_angles(plant, parameters.mounts)  # a team has them
+    chosen = xp.asarray(plant.followers) if several else plant.followers[0]
+    room, share, kp = room.take(chosen, axis=-1), count / (count - 1), parameters.gains.kp
+    if several:
+        share, kp = xp.broadcast_to(share[..., None], angles.shape), kp[..., None, :]
+        per_command = xp.broadcast_to(per_command[..., None, :], (*angles.shape, 2))
+    flat = xp.concat([per_command, xp.zeros_like(per_command[..., :1])], axis=-1)
+    along, across = xp.cos(angles) ** 2, xp.sin(angles) ** 2
+    most = [room / (along * kp[..., 0] + across * kp[..., 1]), room / (along * kp[..., 1] + across * kp[..., 0])]
+    turned = rotations.turned_about_z(flat, -angles)[..., :2]
+    return xp.concat([share[..., None], turned, xp.maximum(xp.stack(most, axis=-1), 1e-3)], axis=-1)
+
+
+def _measured(observation: Array) -> list[Array]:
+    """Roll, pitch, their rates, climb."""
+    return [*(observation[..., k] for k in (3, 4, 9, 10)), -observation[..., ERROR_RATE.stop - 1]]
+
+
+def _within(xp: Any, vector: Array, limit: float) -> Array:
+    """`vector` (..., 2) no longer than `limit`, in every mount frame alike."""
+    return vector * (limit / xp.maximum(xp.sqrt((vector * vector).sum(axis=-1, keepdims=True) + 1e-12), limit))

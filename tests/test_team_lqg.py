@@ -1,0 +1,197 @@
+"""Offset-free LQG of teams: what a follower knows of its team, its estimates, noise, policy files."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tables import rows
+
+from mjxball import config as configs
+from mjxball.algorithms.base import PolicyNetwork
+from mjxball.baselines import make_baseline
+from mjxball.baselines.team_lqg import team_lqg
+from mjxball.config import Config, preset
+from mjxball.control.team_lqg import team_context
+from mjxball.env import TransportEnv
+from mjxball.errors import InputError
+from mjxball.evaluate.policies import load_policy
+from mjxball.export import main as export
+from mjxball.plant import plant_parameters
+from mjxball.plant.teams import ring_config
+from mjxball.policy import Policy, PolicyFile
+from mjxball.policy.container import PolicyFileError
+from mjxball.policy.export import policy_file
+from mjxball.policy.file import save_file
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.follower import follower_law
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import Scenario
+
+TEAM = preset("team")
+ENGINE = "newton-euler"
+
+
+def ring(count: int) -> Config:
+    return ring_config(TEAM, count)
+
+
+@rows("count", [2, 3, 6])
+def test_what_a_follower_knows_of_a_ring(count: int) -> None:
+    """Lifts of 1 m/s2 more by all followers turn the ring about the leader's mount, as a command of all N does."""
+    config = ring(count)
+    numbers = plant_parameters(config.plant, config.attitude)
+    known = team_context(numbers, config.plant, np.float64(config.plant.object_mass)).reshape(-1, 5)
+    assert len(known) == count - 1
+    np.testing.assert_allclose(known[:, 0], count / (count - 1))
+    lifted = numbers.known_mass[0] + numbers.share[0] * config.plant.object_mass
+    torque = lifted * np.hypot(*numbers.mounts[0, :2])
+    np.testing.assert_allclose(np.hypot(known[:, 1], known[:, 2]), torque / count / numbers.gains.kp[1], rtol=1e-9)
+    if count % 2 == 0:  # the follower across from the leader has it straight ahead: a pure pitch, nose up to the leader
+        np.testing.assert_allclose(known[count // 2 - 1, 1:3], [0.0, torque / count / numbers.gains.kp[1]], atol=1e-12)
+    room = 2 * numbers.arm[0] * 9.81 * lifted / 4  # all hover below half of their range
+    np.testing.assert_allclose(known[:, 4], room / numbers.gains.kp[1], rtol=1e-9)
+
+
+def test_worlds_of_training_know_what_a_flight_knows() -> None:
+    quiet = {f"scenario.{name}": (1.0, 1.0) for name in ("drone_mass_scale", "mount_scale", "carrier_scale")}
+    quiet |= {f"scenario.{name}": (1.0, 1.0) for name in ("arm_scale", "attitude_gain_scale", "rotor_force_scale")}
+    env = TransportEnv(configs.apply_overrides(TEAM, quiet | {"scenario.drone_inertia_scale": (1.0, 1.0)}), ENGINE)
+    world = jax.jit(env.reset)(jax.random.key(0), 1.0, 1).pipeline_state  # of three drones
+    own = ring(3)
+    numbers = plant_parameters(own.plant, own.attitude)
+    expected = team_context(numbers, own.plant, np.float64(own.plant.object_mass))
+    np.testing.assert_allclose(world.history[:2, -5:], expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_filter_predicts_a_loop_that_turns() -> None:
+    """One period from a random state, by the equations of motion integrated in small steps."""
+    config, state, drive = ring(4), np.array([0.02, -0.1, 3.0, 5.0, -2.0]), 0.05
+    law, lag, steps = team_lqg(config), config.plant.rotor_lag, 20000
+    moved, h = state.copy(), config.timing.control_period / 20000
+    for _ in range(steps):
+        angle, rate, load, growth, rotors = moved
+        asked = 100 * (drive - angle) - 18 * rate
+        slope = (rate, load + rotors, growth - load / 3.0, -growth / 0.3, (asked - rotors) / lag)
+        moved = moved + h * np.array(slope)
+    np.testing.assert_allclose(law.axis @ np.append(state, drive), moved, rtol=1e-4, atol=1e-5)
+
+
+@rows("count", [3, 6])
+def test_it_finds_the_loads_torque(count: int) -> None:
+    """m g c over the inertia, in every mount frame, less the few percent that is forgotten."""
+    config = ring(count)
+    follower, mass, offset = make_baseline("lqg-offset-free", config), config.plant.object_mass, 0.04
+    scenario = Scenario(omega=0.0, phase=math.pi / 2, amplitude=offset, mass=mass, seconds=12.0)
+    flown = simulate(config, follower, scenario, ENGINE)
+    assert np.abs(flown.error[-1]).max() < 5e-3
+    turning, _ = follower.law._law.estimate(follower._state, flown.observation[-1])
+    numbers = plant_parameters(config.plant, config.attitude)
+    inertia = count * numbers.gains.kp[1] / 100
+    found = np.linalg.norm(turning[0, :, :, 2], axis=-1)
+    np.testing.assert_allclose(found, mass * 9.81 * offset / inertia, rtol=0.06)
+
+
+def test_followers_that_measure_apart_do_not_drift_apart() -> None:
+    """For 30 s under noise level 1 and 40 ms of delay: estimates that nothing forgets end up at the rotors' limits."""
+    config = ring(6)
+    scenario = Scenario(mass=0.6, seconds=30.0, disturbance=Disturbance(noise=1.0, delay=0.04))
+    flown = simulate(config, make_baseline("lqg-offset-free", config), scenario, ENGINE)
+    assert np.linalg.norm(flown.error[flown.time > 15], axis=-1).max() < 0.03
+
+
+def silent(config: Config) -> PolicyFile:
+    """A network of zeros."""
+    law = follower_law(config)
+    size = 18 + law.size
+    layers = {"hidden_0": {"kernel": np.zeros((size, 8)), "bias": np.zeros(8)}}
+    layers["hidden_1"] = {"kernel": np.zeros((8, 6)), "bias": np.zeros(6)}
+    learnt = PolicyNetwork(layers, np.zeros(size), np.ones(size), np.ones(size))
+    return policy_file(config, law, learnt, steps=0)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory):
+    path = tmp_path_factory.mktemp("team") / "silent.npz"
+    save_file(path, silent(TEAM))
+    return path
+
+
+@rows("count", [2, 3, 5])
+def test_a_network_of_zeros_flies_the_law(count: int, file) -> None:
+    config = ring(count)
+    scenario = Scenario(amplitude=0.02, omega=1.0, mass=config.plant.object_mass, seconds=5.0)
+    policy = load_policy(file, config)
+    flown, expected = (
+        simulate(config, follower, scenario, ENGINE) for follower in (policy, make_baseline("lqg-offset-free", config))
+    )
+    np.testing.assert_allclose(flown.position, expected.position, rtol=0, atol=2e-4)  # float32 beside float64
+
+
+def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file, tmp_path, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(InputError, match="told its team"):
+        Policy.load(file)(np.zeros((2, 18)))
+    with pytest.raises(InputError, match="2 to 6 drones, not 8"):
+        load_policy(file, ring_config(configs.replace(TEAM, "scenario.team_sizes", ()), 8))
+    with pytest.raises(InputError, match="10 rad/s, not 8"):
+        load_policy(file, configs.replace(ring(4), "attitude.natural_frequency", (8.0, 8.0, 4.0)))
+    with pytest.raises(InputError, match="alike about roll and pitch"):
+        team_lqg(configs.replace(ring(4), "attitude.natural_frequency", (8.0, 10.0, 4.0)))
+    for name in ("follower.onnx", "follower.h"):
+        assert export([str(file), str(tmp_path / name)]) == 2
+        assert "told its team" in capsys.readouterr().err
+        assert not (tmp_path / name).exists()
+
+
+@rows("change", ["another context", "no numbers", "a number that is none", "no damping"])
+def test_unsound_files_are_refused(change, file, tmp_path) -> None:
+    contents = silent(TEAM)
+    given, said = {
+        "another context": ({"context": ["drones"]}, "another context"),
+        "no numbers": ({"lqg": None}, "needs card field lqg"),
+        "a number that is none": ({"lqg": contents.card["lqg"] | {"damping": float("nan")}}, "lqg.damping"),
+        "no damping": ({"lqg": contents.card["lqg"] | {"damping": 0.0}}, "must be positive"),
+    }[change]
+    with pytest.raises(PolicyFileError, match=said):
+        save_file(tmp_path / "unsound.npz", dataclasses.replace(contents, card=contents.card | given))
+
+
+FACTORS = ("drone_mass", "drone_inertia", "mount", "arm", "yaw_per_thrust", "rotor_force", "carrier", "attitude_gain")
+
+
+@pytest.fixture(scope="module")
+def moved():
+    """State after a few steps of strong commands, for a range of one number of the rig at 1.3 and none."""
+    strong = jnp.asarray(np.random.default_rng(2).uniform(-1, 1, (2, 3)), jnp.float32) * jnp.array([0.6, 0.6, 40.0])
+
+    def fly(name: str = "") -> np.ndarray:
+        changes = {
+            "follower.base": "pd",
+            "follower.privileged_critic": False,
+            "command.vertical_limit": 40.0,
+            "scenario.start_tilt": 0.3,
+            **{f"scenario.{one}_scale": (1.0, 1.0) for one in (*FACTORS, "rotor_lag", "thrust", "inertia")},
+            "scenario.team_sizes": (3,),
+        }
+        if name:
+            changes[f"scenario.{name}_scale"] = (1.3, 1.3)
+        base = configs.apply_overrides(preset("team"), changes)
+        env = TransportEnv(base, ENGINE)
+        state = env.reset(jax.random.key(3), 1.0, 0)
+        step = jax.jit(env.step_with_command)
+        for _ in range(3):
+            state = step(state, jnp.concatenate([strong, jnp.zeros((3, 3))]))
+        plant = state.pipeline_state.plant
+        return np.concatenate([np.ravel(leaf) for leaf in (plant.velocity, plant.rates)])
+
+    return fly
+
+
+def test_every_range_of_a_rig_acts(moved) -> None:
+    base = moved()
+    for name in (*FACTORS, "rotor_lag", "thrust", "inertia"):
+        assert np.abs(moved(name) - base).max() > 1e-5, name
