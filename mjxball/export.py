@@ -6,7 +6,9 @@ new directory of apps for both drones; see docs/onboard.md.
 
 from __future__ import annotations
 
+import functools
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from mjxball.cli import make_parser, output_file, quit_on_interrupt, run_command
@@ -49,19 +51,28 @@ def _write_onnx(out: Path, policy: PolicyFile) -> None:
     write_whole(out, onnx_model(policy, out.stem).SerializeToString())
 
 
+def _save_rounded(out: Path, policy: PolicyFile) -> None:
+    from mjxball.policy.quantize import quantized
+
+    save_file(out, quantized(policy))
+
+
 def _write_header(out: Path, policy: PolicyFile, int8: bool = False) -> None:
     from mjxball.policy.formats.c_header import c_header
 
     write_whole(out, c_header(policy, out.stem, int8).encode("ascii"))
 
 
-WRITERS = {".npz": save_file, ".onnx": _write_onnx, ".h": _write_header}
+Writer = Callable[[Path, PolicyFile], None]
+WRITERS: dict[str, Writer] = {".npz": save_file, ".onnx": _write_onnx, ".h": _write_header}
+ROUNDED: dict[str, Writer] = {".npz": _save_rounded, ".h": functools.partial(_write_header, int8=True)}  # with --int8
 
 
 def export(source: Path, out: Path, crazyflie: bool = False, int8: bool = False) -> None:
     """Export `source` to the new file `out`, in the format that its ending names; raise InputError if that fails.
 
-    `crazyflie`: to the new directory `out`, as apps for both drones. `int8`: weights of 8 bits, in an app or a header.
+    `crazyflie`: to the new directory `out`, as apps for both drones. `int8`: weights of 8 bits in an app or a header,
+    floats rounded to them in a policy file.
     """
     if crazyflie:
         from mjxball.fly.app.generate import check_place, write_app
@@ -69,15 +80,14 @@ def export(source: Path, out: Path, crazyflie: bool = False, int8: bool = False)
         check_place(out)
         write_app(_for_any_machine(source), source.stem, out, int8)
         return
-    if int8 and out.suffix != ".h":
-        raise InputError("--int8 is for C: with --crazyflie, or an output file that ends in .h")
+    if int8 and out.suffix not in ROUNDED:
+        raise InputError("--int8 is for --crazyflie, or for an output file that ends in .h or .npz")
     if out.suffix not in WRITERS:
         raise InputError(f"output file {out} must end in {', '.join(WRITERS)}, which chooses the format")
     output_file(out, out.suffix)
-    if int8:
-        _write_header(out, _for_any_machine(source), int8)
-    else:
-        WRITERS[out.suffix](out, contents_of(source) if out.suffix == ".npz" else _for_any_machine(source))
+    read = contents_of if out.suffix == ".npz" else _for_any_machine
+    writers = ROUNDED if int8 else WRITERS
+    writers[out.suffix](out, read(source))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -87,7 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("source", metavar="RUN_DIR", type=Path, help="run directory of train.py, or a policy file .npz")
     parser.add_argument("out", metavar="OUT", type=Path, help="file to write, .npz, .onnx or .h; must not exist")
     parser.add_argument("--crazyflie", action="store_true", help="OUT is a directory: apps for a pair of Crazyflies")
-    parser.add_argument("--int8", action="store_true", help="weights of 8 bits, in an app or a header")
+    parser.add_argument("--int8", action="store_true", help="weights of 8 bits; .npz: rounded to them")
     options = parser.parse_args(arguments)
 
     def command() -> int:

@@ -291,9 +291,76 @@ def test_a_cortex_m4_computes_the_same_bits(int8: bool, tmp_path: Path):
             assert found["error"] <= 1e-5
 
 
-def test_int8_weights_are_near():
+# Each record: state, heartbeat of the other drone, time, order -> setpoint, command, integral, heartbeat.
+REPLAY = r"""
+#include "core.c"
+int file_open(const char *name, int write);
+int file_read(int file, void *to, unsigned size);
+int file_write(int file, const void *from, unsigned size);
+
+int main(void) {
+    static mjxball_app app;
+    static struct { mjxball_state state; uint8_t beat[MJXBALL_BEAT_SIZE]; uint32_t now, order; } in;
+    static struct { float setpoint[3], command[3], integral[7]; uint8_t beat[MJXBALL_BEAT_SIZE]; } out;
+    int from = file_open("in.bin", 0), to = file_open("out.bin", 1);
+    mjxball_parameters set;
+    mjxball_defaults(&set);
+    set.mount[1] = MJXBALL_FOLLOWER ? -0.15f : 0.15f;
+    mjxball_start(&app, 0);
+    while (file_read(from, &in, sizeof in)) {
+        const uint8_t order[2] = {1, (uint8_t)in.order};
+        mjxball_setpoint wanted;
+        mjxball_hear(&app, in.beat, sizeof in.beat, in.now);
+        mjxball_laptop(&app, order, 2, in.now, 0, out.beat);
+        mjxball_tick(&app, &set, &in.state, in.now, &wanted);
+        mjxball_send(&app, out.beat);
+        out.setpoint[0] = wanted.roll, out.setpoint[1] = wanted.pitch, out.setpoint[2] = wanted.thrust;
+        for (int i = 0; i < 3; i++) out.command[i] = app.command[i];
+        for (int i = 0; i < 7; i++) out.integral[i] = app.integral[i];
+        file_write(to, &out, sizeof out);
+    }
+    return 0;
+}
+"""
+
+
+@pytest.mark.slow
+@needs_arm
+def test_a_cortex_m4_flies_the_same_bits(cores: Cores, tmp_path: Path):
+    """Both apps over take-off, motion of the pair, landing and a fence that is left, whose inputs were recorded."""
+    policy = policy_of("flight")
+    bench, random = Bench(cores, Rig.of_card(policy.card)), np.random.default_rng(5)
+    records: list[list[bytes]] = [[], []]
+    place, euler, seen = np.zeros(3), np.zeros(3), set()
+    for step in range(900):
+        order = (Phase.IDLE, Phase.SPIN, Phase.RAMP, Phase.FLY)[min(step // 20, 3)] if step < 700 else Phase.LAND
+        place = place + random.normal(scale=0.002, size=3) if step > 200 else place
+        euler = 0.98 * euler + random.normal(scale=0.004, size=3)
+        far = np.array([0.0, 0.0, 0.0 if step < 60 else 0.4 if step < 800 else 2.0])  # at its goal, then outside
+        moving = ObjectState(place + far, euler[::-1], rotations.quaternion_from_euler(euler), 4 * euler)
+        beats = [app.send() for app in bench.apps][::-1]
+        bench.tick(order, moving)
+        for number, mount in enumerate(bench.rig.mounts):
+            state = bytes(bench.state(moving, mount))
+            records[number].append(state + beats[number] + np.array([bench.now, order], np.uint32).tobytes())
+        seen |= set(bench.phases)
+    assert seen >= {Phase.SPIN, Phase.RAMP, Phase.FLY, Phase.LAND, Phase.DESCEND}
+    for path, text in generate.files_of(policy, "flight", False).items():
+        if path in ("src/core.c", "src/core.h", "src/policy.h", "src/rig.h"):
+            (tmp_path / Path(path).name).write_text(text)
+    for number in range(2):
+        cortex.build(tmp_path, REPLAY, [f"-DMJXBALL_FOLLOWER={number}"])
+        host, arm = cortex.on_both(tmp_path, b"".join(records[number]))
+        assert len(host) == 900 * (13 * 4 + protocol.BEAT_SIZE)
+        assert host == arm
+
+
+def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):
     policy = policy_of("balance")
-    for exact, rounded in zip(policy.weights, quantized(policy).weights, strict=True):
+    assert call(export, [shipped_policy("balance"), tmp_path / "rounded.npz", "--int8"]) == 0
+    saved = load_file(tmp_path / "rounded.npz").weights
+    for exact, rounded, written in zip(policy.weights, quantized(policy).weights, saved, strict=True):
+        np.testing.assert_array_equal(rounded, written)
         step = np.abs(exact).max(axis=0) / 127
         assert (np.abs(exact - rounded) <= step / 2 + 1e-7).all()
         assert np.abs(exact - rounded).max() > 0
@@ -304,7 +371,7 @@ def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.
         ([shipped_policy("balance"), tmp_path / "app", "--crazyflie"], "another plant than a pair of Crazyflies"),
         ([shipped_policy("flight"), tmp_path, "--crazyflie"], "exists"),
         ([shipped_policy("flight"), tmp_path / "a" / "b", "--crazyflie"], "does not exist"),
-        (["saved.npz", tmp_path / "x.npz", "--int8"], "--int8 is for C"),
+        (["saved.npz", tmp_path / "x.onnx", "--int8"], "--int8 is for"),
     ):
         assert call(export, arguments) == 2, text
         error = capsys.readouterr().err

@@ -27,7 +27,7 @@ SOURCES = ("core.h", "core.c", "glue.c")
 ROLES = ("leader", "follower")
 PERIODS = (5, 20)  # [ms] of laws that an app may keep
 STACK = 2400  # [bytes] of the app's task beside the network's arrays
-OPTIONS = "-O2 -ffp-contract=off"
+OPTIONS = "-O2 -ffp-contract=off -fno-math-errno"
 
 
 def sources() -> Path:

@@ -14,7 +14,7 @@ from mjxball.fly.app.generate import ROLES, files_of
 from mjxball.fly.app.protocol import BEAT_SIZE, REPLY_SIZE, Phase
 from mjxball.policy.file import PolicyFile
 
-FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror")
+FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Wall", "-Wextra", "-Werror")
 # Beside the core: what Python must know of structs that it does not spell out.
 ACCESS = """\
 #include "core.c"
