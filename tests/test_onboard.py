@@ -24,6 +24,9 @@ from mjxball.fly.app import generate, protocol
 from mjxball.fly.app.host import App, Library, State, compile_pair
 from mjxball.fly.app.protocol import CAUSES, Phase
 from mjxball.fly.card import Controller
+from mjxball.fly.connection import LinkError
+from mjxball.fly.main import main as fly
+from mjxball.fly.onboard import Apps
 from mjxball.fly.supervisor import State as Laptop
 from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.fly.twin.conditions import Surroundings
@@ -254,6 +257,48 @@ def test_names_are_those_of_the_c_files():
     logged = re.findall(r"LOG_ADD\(LOG_(\w+), (\w+),", glue)
     kinds = {"FLOAT": "float", "UINT8": "uint8_t", "UINT32": "uint32_t"}
     assert [(name, kinds[kind]) for kind, name in logged] == list(protocol.LOGGED)
+
+
+class FakeLink:
+    """A drone whose app has these parameters."""
+
+    def __init__(self, name: str, **values: float):
+        self.name, self.values = name, {f"mjxb.{one}": value for one, value in values.items()}
+        self.parameters = self
+
+    def read(self, names: list[str]) -> dict[str, float]:
+        if missing := [name for name in names if name not in self.values]:
+            raise LinkError(f"the firmware of the {self.name} has no parameter {missing[0]}; update it")
+        return {name: self.values[name] for name in names}
+
+
+def test_the_laptop_refuses_other_apps():
+    apps, said = Apps("flight", (11, 12), 10), list[str]()
+    good = ({"role": 0, "period": 10}, {"role": 1, "period": 10, "ident": 12})
+    apps.check([FakeLink("leader", **good[0]), FakeLink("follower", **good[1])], said.append)  # type: ignore[list-item]
+    assert said == ["on board: flight, 8 bit weights"]
+    for leader, follower, text in (
+        ({}, good[1], "the leader has no app on board"),
+        ({**good[0], "role": 1}, good[1], "exchange the URIs"),
+        (good[0], {**good[1], "period": 20}, "the app of the follower has a period of 20 ms, and flight one of 10 ms"),
+        (good[0], {**good[1], "ident": 13}, "the follower carries another policy than flight"),
+    ):
+        with pytest.raises(InputError, match=text):
+            apps.check([FakeLink("leader", **leader), FakeLink("follower", **follower)], said.append)  # type: ignore[list-item]
+
+
+def test_flags_that_contradict_onboard_are_refused(capsys: pytest.CaptureFixture):
+    flight = shipped_policy("flight")
+    for flags, text in (
+        ([flight, "--rehearse", "--upload"], "--upload takes weights of 8 bits"),
+        ([flight, "--rehearse", "--onboard", "--mass", "0.07"], "leave --thrust, --hover and --mass out"),
+        ([flight, "--rehearse", "--onboard", "--goal", "0", "0", "9"], "beyond the fence"),
+        ([shipped_policy("balance"), "--rehearse", "--onboard"], "another plant than a pair of Crazyflies"),
+    ):
+        assert call(fly, flags) == 2, text
+        error = capsys.readouterr().err
+        assert_one_line(error)
+        assert text in error
 
 
 INTERFACE = Path(__file__).parent / "firmware" / "interface.h"
