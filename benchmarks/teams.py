@@ -146,11 +146,11 @@ def random_flights(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str
         for follower in _followers(config, paths, named):
             found = Batch(config, follower).fly(flights)
             peaks = np.array([math.inf if run.failed else run.plane_peak for run in found])
-            shares = dict(
-                zip(("median", "99 %", "largest"), np.quantile(peaks, (0.5, 0.99, 1.0)).tolist(), strict=True)
-            )
             row = {"drones": count, "follower": follower.name, "flights": len(flights)}
-            rows.append({**row, "failed": sum(run.failed for run in found), "plane_peak": shares})
+            for label, share in (("median", 0.5), ("99", 0.99), ("largest", 1.0)):
+                peak = float(np.quantile(peaks, share, method="higher"))
+                row[f"plane_peak_{label}"] = peak if math.isfinite(peak) else None
+            rows.append({**row, "failed": sum(run.failed for run in found)})
             print(json.dumps(rows[-1]))
             sys.stdout.flush()
     return rows
