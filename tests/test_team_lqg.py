@@ -139,6 +139,8 @@ def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file, tmp_path, ca
         load_policy(file, ring_config(configs.replace(TEAM, "scenario.team_sizes", ()), 8))
     with pytest.raises(InputError, match="10 rad/s, not 8"):
         load_policy(file, configs.replace(ring(4), "attitude.natural_frequency", (8.0, 8.0, 4.0)))
+    with pytest.raises(InputError, match="moves in the plane"):
+        load_policy(file, preset("transport"))
     with pytest.raises(InputError, match="alike about roll and pitch"):
         team_lqg(configs.replace(ring(4), "attitude.natural_frequency", (8.0, 10.0, 4.0)))
     for name in ("follower.onnx", "follower.h"):

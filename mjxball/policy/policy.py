@@ -70,6 +70,8 @@ class Policy:
         Raises InputError if the team's attitude loops are not those that its law is for.
         """
         if isinstance(self._law.lqg, TeamLqg):
+            if not plant.is_team:
+                raise InputError(f"policy {self.name} was made for teams, or a load that moves in the plane")
             made_for, found = float(self._law.lqg.stiffness) ** 0.5, attitude.natural_frequency[:2]
             if plant.stand != "free" or max(abs(frequency - made_for) for frequency in found) > 1e-6 * made_for:
                 raise InputError(
