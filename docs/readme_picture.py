@@ -1,4 +1,4 @@
-"""Render docs/balance.gif, the picture of README: copying and the shipped follower `transport` with the same load.
+"""Render docs/balance.gif, the picture of README: copying and the shipped follower `balance` with the same load.
 
     python docs/readme_picture.py [OUT.gif]
 
@@ -23,7 +23,7 @@ from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 
 START, OMEGA, FRAMES = 25.0, 1.0, 63  # [s], [rad/s], one frame each 0.1 s
-LABELS = ("copying the leader", "transport (trained)")
+LABELS = ("copying the leader", "balance (trained)")
 COLOURS = 96
 
 
@@ -32,7 +32,7 @@ def main() -> None:
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "balance.gif"
     config = preset("transport")
     scenario = Scenario(omega=OMEGA, amplitude=0.10, goal=(1.0, 0.0, 1.0), seconds=START + 7.0)
-    followers = make_baseline("copy", config), Policy.load(shipped_policy("transport"))
+    followers = make_baseline("copy", config), Policy.load(shipped_policy("balance"))
     flights = [simulate(config, follower, scenario, "newton-euler") for follower in followers]
     rows = np.searchsorted(flights[0].time, START + np.arange(FRAMES) * 2 * math.pi / OMEGA / FRAMES)
     arrays = {
