@@ -1,6 +1,6 @@
 """Cell by cell against the classical followers: who beats `adaptive`, and whose commands suit motors?
 
-`python benchmarks/rivals.py [POLICY.npz ...] [--json FILE]`    (the shipped transport, robust and paper)
+`python benchmarks/rivals.py [POLICY.npz ...] [--json FILE]`    (by default balance, transport, robust and paper)
 
 The 70 feasible cells of `benchmarks/cells.py`, mass known, phase 0, undisturbed and with noise at level 1 and 40 ms of
 delay. Of each follower: in how many cells it is strictly better than `adaptive` in peak, overshoot, settling and RMSE;
@@ -30,7 +30,7 @@ from mjxball.sim.scenario import Scenario
 
 CLASSICAL = ("lqg", "lqg-slow", "adaptive", "copy")
 TOLD = CLASSICAL[:2]
-SHIPPED = ("transport", "robust", "paper")
+SHIPPED = ("balance", "transport", "robust", "paper")
 COMMANDS = ("smoothness", "saturation")
 ROUNDED = 1e-6  # float32: what two followers' numbers may differ by and be called equal
 

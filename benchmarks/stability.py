@@ -1,6 +1,6 @@
 """How stable a policy is: eigenvalues and delay margins about hover, and thousands of random flights.
 
-`python benchmarks/stability.py POLICY.npz [--flights N] [--unknown] [--json FILE] [--picture FILE.png]`
+`python benchmarks/stability.py POLICY.npz [--flights N] [--seed N] [--unknown] [--json FILE] [--picture FILE.png]`
 
 - For a grid of CG offsets and object masses that one drone can trim: the spectral radius of leader, policy and plant
   over one control step about hover (below 1: small errors die out), the time constant that goes with it, and the
@@ -122,6 +122,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("policy", type=Path)
     parser.add_argument("--flights", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0, help="of the random flights")
     parser.add_argument("--unknown", action="store_true", help="the hover thrust believes 0.2 kg, whatever the mass")
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--picture", type=Path, metavar="FILE.png")
@@ -148,7 +149,7 @@ def main() -> None:
         for row in mine:
             if not row["stable"]:
                 print(f"    not stable: CG {row['offset']:g} m, {row['mass']:g} kg, radius {row['radius']:.4f}")
-    scenarios = random_scenarios(config, options.flights, options.unknown)
+    scenarios = random_scenarios(config, options.flights, options.unknown, options.seed)
     flown = Batch(config, policy).fly(scenarios)
     failed = sum(metrics.failed for metrics in flown)
     order = sorted(range(len(flown)), key=lambda k: -peak(flown[k]))[:10]
@@ -168,7 +169,9 @@ def main() -> None:
         draw(config, policy, worst, options.picture)
     if options.json:
         sound = sorted(peak for peak in peaks if math.isfinite(peak))
-        found = {"hovers": rows, "flights": len(flown), "failed": failed, "largest peaks": sound[-100:]}
+        quantiles = {"median": middle / 1e3, "99 %": high / 1e3, "largest": most / 1e3}
+        found = {"hovers": rows, "flights": len(flown), "failed": failed, "peaks [m]": quantiles}
+        found["largest peaks"] = sound[-100:]
         options.json.write_text(json.dumps(found, indent=1, default=str) + "\n")
 
 

@@ -46,9 +46,11 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def parts() -> set[str]:
-    """What pages are made of, and the plants that have a name."""
+    """What pages are made of, the plants that have a name, and the C of the apps on board."""
     places = (REPOSITORY / "mjxball" / name for name in ("view/parts", "evaluate/templates", "config/plants"))
-    return {str(path.relative_to(REPOSITORY)) for place in places for path in place.iterdir()}
+    paths = [path for place in places for path in place.iterdir()]
+    paths += (path for path in (REPOSITORY / "mjxball/fly/app").iterdir() if path.suffix in (".c", ".h"))
+    return {str(path.relative_to(REPOSITORY)) for path in paths}
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ FORMAT_VERSIONS = (1, 2, 3)
 # `control.team_lqg.team_context`.
 CONTEXT = ("command_share", "roll_per_lift", "pitch_per_lift", "roll_room", "pitch_room")
 FOLDER = "policies"  # of those that come with mjxball
-ARCHIVE = "archive"  # in it: those that a later one does better everywhere
+ARCHIVE = "archive"  # in it: earlier ones, which documents name
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
 MAX_CARD = 2**20  # characters
 # Metrics that a card may bound, all of them the better the smaller.
