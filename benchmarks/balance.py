@@ -87,7 +87,13 @@ def read_levels() -> list[Suite]:
             disturbance = {name: tupled(value) for name, value in flight.get("disturbance", {}).items()}
             flights.append(Scenario(**numbers, disturbance=Disturbance(**disturbance)))
         changes = {name: tupled(value) for name, value in row.get("changes", {}).items()}
-        level = Level(row["level"], flights[0], changes, None, tuple(flights), tupled(row.get("waveforms", [])))
+        level = Level(
+            row["level"],
+            flights[0],
+            changes,
+            flights=tuple(flights),
+            waveforms=tupled(row.get("waveforms", [])),
+        )
         suites.setdefault(row["suite"], []).append(level)
     return [Suite(name, "frozen", "level", tuple(levels)) for name, levels in suites.items()]
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import opened
 
+from balance import FLIGHTS, read_levels
 from mjxball.baselines import make_baseline
 from mjxball.commands.evaluate import main as evaluate
 from mjxball.config import preset
@@ -223,3 +224,14 @@ def test_report_says_how_it_was_made(report: Path) -> None:
     assert "python eval.py --followers copy adaptive" in text
     assert "card of <b>transport</b>" in text
     assert "image/webp;base64" in text or "No picture: MuJoCo" in text
+
+
+def test_the_frozen_levels_are_flights_of_the_pair() -> None:
+    levels = [level for suite in read_levels() for level in suite.variants]
+    assert len(levels) == 80
+    for level in levels:
+        assert level.home(CONFIG) is CONFIG
+        for seed in range(FLIGHTS):
+            config = level.config(CONFIG, seed)
+            check_scenario(config, level.seeded(seed))
+            assert (config.motion.kind == "waveform") == bool(level.waveforms)
