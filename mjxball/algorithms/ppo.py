@@ -152,7 +152,10 @@ class ProximalPolicyOptimization:
 
 
 def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) -> Any:
-    """Brax's PPO networks: tanh-squashed Gaussian policy and state value, ReLU, on normalised observations."""
+    """Brax's PPO networks: tanh-squashed Gaussian policy and state value on normalised observations.
+
+    The policy has ReLU units, as policy files have; the value, which is never written, the smoother ones of Brax.
+    """
     distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
     policy, value = (normaliser(shown) for shown in (mask, critic_mask))
     return brax_ppo.networks.PPONetworks(
@@ -167,7 +170,7 @@ def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) ->
             len(mask),
             preprocess_observations_fn=value,
             hidden_layer_sizes=config.value_layers,
-            activation=jax.nn.relu,
+            activation=jax.nn.swish,
         ),
         parametric_action_distribution=distribution,
     )

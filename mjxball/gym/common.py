@@ -10,7 +10,7 @@ import numpy as np
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.control.observation import ACTION_SIZE
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 
 Array = Any
@@ -32,7 +32,7 @@ def pair_settings(preset: str, config: Config | None) -> Config:
     return found
 
 
-def spaces(pair: CoupledPairEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def spaces(pair: TransportEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Spaces of observation (n,) and action (3,): what the follower sees and remembers, and [-1, 1]."""
     observations = gymnasium.spaces.Box(-np.inf, np.inf, (pair.policy_input_size,), np.float32)
     return observations, gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)

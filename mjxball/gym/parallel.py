@@ -12,7 +12,7 @@ from gymnasium.utils.seeding import np_random
 
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.gym import common
 from mjxball.gym.single import PICTURE
 from mjxball.physics.step import make_cg_offset, on_the_host
@@ -30,7 +30,7 @@ METADATA: dict[str, Any] = {"name": "mjxball_followers_v0", "render_modes": ["rg
 class Program(NamedTuple):
     """The compiled functions of one world."""
 
-    env: CoupledPairEnv
+    env: TransportEnv
     start: Any  # chain -> (chain, State)
     step: Any  # (State, actions (F, 3), of a pair (3,)) -> State
 
@@ -39,7 +39,7 @@ class Program(NamedTuple):
 def compiled_program(config: Config, physics: str) -> Program:
     """The program of `config` on `physics`, compiled once for all environments of a process."""
     enable_compilation_cache()
-    env = CoupledPairEnv(config, physics)
+    env = TransportEnv(config, physics)
 
     def start(chain: Array) -> tuple[Array, Any]:
         chain, key = jax.random.split(chain)

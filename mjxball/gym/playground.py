@@ -14,7 +14,7 @@ import numpy as np
 
 from mjxball.assembly import build_model
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv, PipelineState, State
+from mjxball.env import PipelineState, State, TransportEnv
 from mjxball.gym import common
 
 Array = Any
@@ -33,7 +33,7 @@ class PlaygroundState:
 
 
 class PlaygroundEnv:
-    """`CoupledPairEnv` with the attributes of Playground's `MjxEnv`. For its `wrap_for_brax_training`.
+    """`TransportEnv` with the attributes of Playground's `MjxEnv`. For its `wrap_for_brax_training`.
 
     Worlds are randomised by every reset, so Playground's `randomization_fn` has nothing to do here; use
     `full_reset=True`, or every episode of a world repeats its first one.
@@ -41,15 +41,15 @@ class PlaygroundEnv:
 
     def __init__(self, preset: str = "transport", config: Config | None = None, physics: str = "mjx"):
         self.config = common.pair_settings(preset, config)
-        self._pair = CoupledPairEnv(self.config, physics)
+        self._pair = TransportEnv(self.config, physics)
         self._model: mujoco.MjModel | None = None
 
     def reset(self, rng: Array) -> PlaygroundState:
-        """See `CoupledPairEnv.reset`."""
+        """See `TransportEnv.reset`."""
         return _playground(self._pair.reset(rng))
 
     def step(self, state: PlaygroundState, action: Array) -> PlaygroundState:
-        """See `CoupledPairEnv.step`."""
+        """See `TransportEnv.step`."""
         given = State(state.data, state.obs, state.reward, state.done, state.metrics, state.info)
         return _playground(self._pair.step(given, action))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.gym import common
 from mjxball.physics.engine import Load, PlantState
@@ -25,7 +25,7 @@ PICTURE = (360, 480)  # height, width of a rendered frame
 class Laws(NamedTuple):
     """The compiled parts of `mjxball.env` around the physics."""
 
-    pair: CoupledPairEnv
+    pair: TransportEnv
     start: Any  # chain -> (chain, State)
     commands: Any  # (State, action (3,)) -> (commands (2, 3), Load)
     arrive: Any  # (State, action (3,), PlantState that the physics came to) -> State
@@ -35,7 +35,7 @@ class Laws(NamedTuple):
 def compiled_laws(config: Config) -> Laws:
     """The laws of `config`, compiled once for all environments of a process."""
     enable_compilation_cache()
-    pair = CoupledPairEnv(config, "newton-euler")  # its own physics is never called
+    pair = TransportEnv(config, "newton-euler")  # its own physics is never called
 
     def start(chain: Array) -> tuple[Array, Any]:
         chain, key = jax.random.split(chain)

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.gym import common
 
 Array = Any
@@ -23,7 +23,7 @@ METADATA: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.
 class Program(NamedTuple):
     """The compiled functions of N worlds."""
 
-    pair: CoupledPairEnv
+    pair: TransportEnv
     start: Any  # chains (N,) -> (chains, State)
     next_step: Any  # (chains, State, actions (N, 3)) -> (chains, State): ended worlds start anew instead of stepping
     same_step: Any  # likewise -> (chains, State as stepped, State with the ended worlds started anew)
@@ -33,7 +33,7 @@ class Program(NamedTuple):
 def compiled_program(config: Config, physics: str) -> Program:
     """The program of `config` on `physics`, compiled once for each number of worlds."""
     enable_compilation_cache()
-    pair = CoupledPairEnv(config, physics)
+    pair = TransportEnv(config, physics)
 
     def start(chain: Array) -> tuple[Array, Any]:
         chain, key = jax.random.split(chain)

@@ -14,7 +14,7 @@ import jax
 
 from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv
+from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.quiet import import_brax_env
 
@@ -85,7 +85,7 @@ def make_env(extensions: Extensions, config: Config, physics: str) -> Any:
     """The environment to train on: checked, with its reward, and with a time limit if it keeps none itself."""
     kind = extensions.env
     if kind is None:
-        env: Any = CoupledPairEnv(config, physics)
+        env: Any = TransportEnv(config, physics)
     else:
         env = _made(kind, config, physics)
         _check_env(env, name_of(extensions.env))
@@ -101,7 +101,7 @@ def make_env(extensions: Extensions, config: Config, physics: str) -> Any:
 
 def is_pair(env: Any) -> bool:
     """Whether `env` is the coupled pair, whose policies are policy files."""
-    return isinstance(getattr(env, "unwrapped", env), CoupledPairEnv)
+    return isinstance(getattr(env, "unwrapped", env), TransportEnv)
 
 
 class Rewarded:

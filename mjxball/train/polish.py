@@ -20,7 +20,7 @@ import numpy as np
 from mjxball.algorithms.base import Phase
 from mjxball.algorithms.gradient import LEAST_DEVIATION, FirstOrderGradient, GradientState
 from mjxball.config import Config
-from mjxball.env import CoupledPairEnv, PipelineState
+from mjxball.env import PipelineState, TransportEnv
 from mjxball.policy import PolicyFile
 from mjxball.sim.disturbances import Sample
 from mjxball.sim.follower import follower_law
@@ -100,15 +100,15 @@ class Polished(NamedTuple):
     seconds: float  # that it took
 
 
-class LoadedEnv(CoupledPairEnv):
-    """`CoupledPairEnv` whose worlds begin at one state of a flight, or nearly so, with one known load."""
+class LoadedEnv(TransportEnv):
+    """`TransportEnv` whose worlds begin at one state of a flight, or nearly so, with one known load."""
 
     def __init__(self, config: Config, load: KnownLoad, flight: FlightState):
         super().__init__(config, "newton-euler")
         self._known, self._flight = load, flight
 
     def reset(self, rng: Array, difficulty: Any = 1.0, number: Any = None) -> Any:
-        """A world with that load; see `CoupledPairEnv.reset`."""
+        """A world with that load; see `TransportEnv.reset`."""
         state = super().reset(rng, difficulty, number)
         world: PipelineState = state.pipeline_state
         known, flight, draw = self._known, self._flight, jax.random.normal(jax.random.fold_in(rng, 11), (11,))
