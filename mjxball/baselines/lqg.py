@@ -6,6 +6,7 @@ leader's command, which they compute from what they see, each its part.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -273,14 +274,27 @@ def kalman(model: AssemblyModel, axis: int, torque_walk: float) -> Filter:
     a[1, 2] = a[1, 4] = 1.0 / model.inertia[axis]
     a[4] = np.array([-drones * model.kp[axis], -drones * model.kd[axis], 0.0, 0.0, -1.0]) / model.lag
     b = np.array([[0.0], [0.0], [0.0], [0.0], [1.0 / model.lag]])
-    transition, drive = discretise(a, b, model.period)
-    process_noise = np.zeros((5, 5))
-    process_noise[3, 3] = torque_walk * model.period
-    measured = np.eye(2, 5)
-    measurement_noise = np.diag([THETA_NOISE**2, RATE_NOISE**2])
+    noise = {0: THETA_NOISE, 1: RATE_NOISE}
+    transition, drive, gain = steady_filter(a, b, model.period, {3: torque_walk}, noise)
+    return Filter(transition, drive[:, 0], gain)
+
+
+def steady_filter(
+    a: np.ndarray, b: np.ndarray, period: float, walks: Mapping[int, float], noise: Mapping[int, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(A (n, n), B (n, m), K (n, k)) of the steady-state Kalman filter of x' = a x + b u, sampled every `period` [s].
+
+    `walks`: intensity of the white noise that drives a state, by its number. `noise`: deviation of the measurement of
+    a state, by its number; K has a column for each.
+    """
+    transition, drive = discretise(a, b, period)
+    process_noise = np.zeros_like(a)
+    for state, intensity in walks.items():
+        process_noise[state, state] = intensity * period
+    measured, measurement_noise = np.eye(len(a))[list(noise)], np.diag([value**2 for value in noise.values()])
     predicted = solve_discrete_are(transition.T, measured.T, process_noise, measurement_noise)
     gain = predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + measurement_noise)
-    return Filter(transition, drive[:, 0], gain)
+    return transition, drive, gain
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
 from mjxball.baselines.lqg import (
+    CLIMB_NOISE,
     CORRECTION_LIMIT,
     RATE_NOISE,
     THETA_NOISE,
     VERTICAL_LIMIT,
     Tuning,
-    discretise,
     feedback,
+    steady_filter,
 )
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
@@ -26,7 +26,6 @@ from mjxball.errors import InputError
 Array = Any
 NAME = "lqg-offset-free"
 TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=0.003, tilt_limit=0.3)
-CLIMB_NOISE = 0.02  # deviation of a measurement [m/s]
 LIFT_WALK = 0.01  # intensity of the white noise that drives the lift error [(m/s2)2/s]
 
 
@@ -50,16 +49,12 @@ def offset_free_lqg(config: Config) -> OffsetFreeLqg:
     a[5, 6] = a[5, 7] = 1.0
     a[6, 6] = -1.0 / pair.lag
     b[4, 0] = b[6, 1] = 1.0 / pair.lag
-    transition, drive = discretise(a, b, pair.period)
-    process = np.zeros((STATES, STATES))
-    process[3, 3], process[7, 7] = TUNING.torque_walk * pair.period, LIFT_WALK * pair.period
-    measured = np.eye(STATES)[[0, 1, 5]]
-    noise = np.diag([THETA_NOISE**2, RATE_NOISE**2, CLIMB_NOISE**2])
-    predicted = solve_discrete_are(transition.T, measured.T, process, noise)
+    walks, noise = {3: TUNING.torque_walk, 7: LIFT_WALK}, {0: THETA_NOISE, 1: RATE_NOISE, 5: CLIMB_NOISE}
+    transition, drive, gain = steady_filter(a, b, pair.period, walks, noise)
     gains, mass = feedback(pair, TUNING), config.plant.object_mass
     return OffsetFreeLqg(
         transition=np.hstack([transition, drive]),
-        gain=predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + noise),
+        gain=gain,
         tilt=np.array([gains.roll, gains.pitch]),
         height=np.array(gains.height),
         limits=np.array([TUNING.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
@@ -76,7 +71,8 @@ class OffsetFree:
     needs_privileged = False
 
     def __init__(self, config: Config):
-        self._law, self._leader = offset_free_lqg(config), copy_gains(config)
+        self._law: Any = offset_free_lqg(config)
+        self._leader = copy_gains(config)
 
     def start(self, observation: Array) -> Array:
         """See `Law.start`."""

@@ -5,20 +5,25 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
-from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
-from mjxball.baselines.lqg import CORRECTION_LIMIT, RATE_NOISE, VERTICAL_LIMIT, Tuning, discretise, feedback
-from mjxball.baselines.offset_free import CLIMB_NOISE, LIFT_WALK
+from mjxball.baselines.assembly_model import ideal_model
+from mjxball.baselines.lqg import (
+    CLIMB_NOISE,
+    CORRECTION_LIMIT,
+    RATE_NOISE,
+    VERTICAL_LIMIT,
+    Tuning,
+    feedback,
+    steady_filter,
+)
+from mjxball.baselines.offset_free import LIFT_WALK, NAME, OffsetFree
 from mjxball.config import Config
-from mjxball.control.followers import PrivilegedInfo, copy_gains
-from mjxball.control.leader import clip_command
+from mjxball.control.followers import copy_gains
 from mjxball.control.team_lqg import TeamLqg, team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 
 Array = Any
-NAME = "lqg-offset-free"
 TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=20.0, tilt_limit=0.3)  # of a load's torque over the inertia
 # [s] in which the estimates of d, d' and the lift error are forgotten.
 LOAD_TIME, RATE_TIME, LIFT_TIME = 3.0, 0.3, 5.0
@@ -37,18 +42,18 @@ def team_lqg(config: Config, tuning: Tuning = TUNING) -> TeamLqg:
     a[2, 2], a[3, 3] = -1.0 / LOAD_TIME, -1.0 / RATE_TIME
     a[4] = np.array([-stiffness, -damping, 0.0, 0.0, -1.0]) / model.lag
     b[4] = stiffness / model.lag
-    axis = _filter(a, b, model, (0, 1), (3, tuning.torque_walk), (ANGLE_NOISE, RATE_NOISE))
+    *axis, axis_gain = steady_filter(a, b, model.period, {3: tuning.torque_walk}, {0: ANGLE_NOISE, 1: RATE_NOISE})
     a, b = np.zeros((3, 3)), np.zeros((3, 1))
     a[0, 1] = a[0, 2] = 1.0
     a[2, 2] = -1.0 / LIFT_TIME
     a[1, 1], b[1] = -1.0 / model.lag, 1.0 / model.lag
-    height = _filter(a, b, model, (0,), (2, LIFT_WALK), (CLIMB_NOISE,))
+    *height, height_gain = steady_filter(a, b, model.period, {2: LIFT_WALK}, {0: CLIMB_NOISE})
     gains = feedback(model, tuning)
     return TeamLqg(
-        axis=axis[0],
-        axis_gain=axis[1],
-        height=height[0],
-        height_gain=height[1][:, 0],
+        axis=np.hstack(axis),
+        axis_gain=axis_gain,
+        height=np.hstack(height),
+        height_gain=height_gain[:, 0],
         tilt=np.array(gains.pitch),
         rise=np.array(gains.height),
         limits=np.array([tuning.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
@@ -57,24 +62,8 @@ def team_lqg(config: Config, tuning: Tuning = TUNING) -> TeamLqg:
     )
 
 
-def _filter(
-    a: np.ndarray, b: np.ndarray, model: AssemblyModel, seen: tuple[int, ...], walk: tuple[int, float], noise: Any
-) -> tuple[np.ndarray, np.ndarray]:
-    """((A B), K) of the steady-state Kalman filter that sees the states `seen`; `walk`: a state and its intensity."""
-    transition, drive = discretise(a, b, model.period)
-    process = np.zeros_like(a)
-    process[walk[0], walk[0]] = walk[1] * model.period
-    measured, own = np.eye(len(a))[list(seen)], np.diag(np.square(noise))
-    predicted = solve_discrete_are(transition.T, measured.T, process, own)
-    gain = predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + own)
-    return np.hstack([transition, drive]), gain
-
-
-class TeamOffsetFree:
+class TeamOffsetFree(OffsetFree):
     """What a team's network with `follower.base = lqg` starts from, flying alone. It is not told the object's mass."""
-
-    name = NAME
-    needs_privileged = False
 
     def __init__(self, config: Config):
         self._law, self._leader = team_lqg(config), copy_gains(config)
@@ -84,9 +73,3 @@ class TeamOffsetFree:
     def start(self, observation: Array) -> Array:
         """See `Law.start`."""
         return self._law.start(observation, self._context)
-
-    def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
-        """See `Law.step`."""
-        nothing = observation.__array_namespace__().zeros_like(observation[..., :3])
-        command = clip_command(self._law.command(nothing, state, observation, self._leader), *self._leader[-2:])
-        return self._law.next(state, observation, command, self._leader), command

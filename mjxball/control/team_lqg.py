@@ -2,8 +2,8 @@
 
 Every follower runs it for itself, in its mount frame. Closed attitude loops answer to the mean of all N commands alike
 whatever the rig weighs, so that the filter's numbers do not depend on it: two equal ones about roll and pitch, with the
-load's torque over the inertia, and one of the height. What a follower knows of its team is its `Context`. Needs NumPy
-alone: the numbers are made by `baselines.team_lqg` and stand in the policy file.
+load's torque over the inertia, and one of the height. What a follower knows of its team is its context
+(`team_context`). Needs NumPy alone: the numbers are made by `baselines.team_lqg` and stand in the policy file.
 """
 
 from __future__ import annotations
@@ -46,10 +46,11 @@ class TeamLqg(NamedTuple):
         return STATES + CONTEXT
 
     def start(self, observation: Array, context: Array) -> Array:
-        """Memory (..., 16) before the first `observation` (..., 18) of followers with `context` (..., 3).
+        """Memory (..., 18) before the first `observation` (..., 18) of followers with `context` (..., 5).
 
         Context: N / (N - 1); the roll and pitch [rad per m/s2] that all drones would have to command to hold what
-        lifting 1 m/s2 more than the leader does.
+        lifting 1 m/s2 more than the leader does; how far a roll and a pitch command may be from where the follower's
+        loop asks for no torque, before its rotors cannot follow [rad].
         """
         xp = observation.__array_namespace__()
         roll, pitch, roll_rate, pitch_rate, climb = _measured(observation)
@@ -72,7 +73,7 @@ class TeamLqg(NamedTuple):
         return turning, predicted + (measured[4] - predicted[..., 0])[..., None] * rising
 
     def features(self, memory: Array, observation: Array) -> Array:
-        """(..., 16) for a network: the measured less its estimate (5), the other estimates (8), the context (3)."""
+        """(..., 18) for a network: the measured less its estimate (5), the other estimates (8), the context (5)."""
         xp = observation.__array_namespace__()
         turning, rising = self.estimate(memory, observation)
         expected = [turning[..., 0, 0], turning[..., 1, 0], turning[..., 0, 1], turning[..., 1, 1], rising[..., 0]]
@@ -123,7 +124,7 @@ class TeamLqg(NamedTuple):
 
 
 def team_context(parameters: PlantParameters, plant: Plant, object_mass: Array) -> Array:
-    """What every follower of a team that carries `object_mass` () [kg] knows of it, (..., F, 3) or of one (..., 3).
+    """What every follower of a team that carries `object_mass` () [kg] knows of it, (..., F, 5) or of one (..., 5).
 
     See `TeamLqg.start`; in mount frames. `parameters` are those of teams like `plant`.
     """
