@@ -23,6 +23,7 @@ from mjxball.sim.closed_loop import ClosedLoop, Commands, LoopState
 from mjxball.sim.disturbances import RandomDisturbances, followers_axis
 from mjxball.sim.follower import follower_law
 from mjxball.sim.randomization import ResetDistribution, Rig
+from mjxball.sim.rigs import RigTable, whole
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -65,6 +66,9 @@ class PipelineState(NamedTuple):
     def plant(self) -> PlantState:
         """State of the rigid assembly."""
         return self.loop.plant
+
+
+NOMINAL_CONTEXT = (1.5, 0.0, 0.0, 0.15, 0.15)
 
 
 class TransportEnv:
@@ -144,10 +148,14 @@ class TransportEnv:
         return self.config.timing.control_period
 
     def reset(
-        self, rng: Array, difficulty: Float[Array, ""] | float = 1.0, number: Int[Array, ""] | None = None
+        self,
+        rng: Array,
+        difficulty: Float[Array, ""] | float = 1.0,
+        number: Int[Array, ""] | None = None,
+        rig: RigTable | None = None,
     ) -> State:
-        """A fresh world at rest or nearly so; `difficulty` and the world's `number` as in `ResetDistribution.draw`."""
-        world, observation = self._fresh_world(rng, difficulty, number)
+        """A fresh world at rest or nearly so; `difficulty`, its `number` and `rig` as in `ResetDistribution.draw`."""
+        world, observation = self._fresh_world(rng, difficulty, number, rig)
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
@@ -238,14 +246,18 @@ class TransportEnv:
 
     def _loop_of(self, rig: Any) -> ClosedLoop:
         """The closed loop of a world with that `rig`."""
-        return self._loop or self._make_loop(rig)
+        return self._loop or self._make_loop(whole(rig, self.config.plant.gravity) if self.config.rigs.number else rig)
 
     def _fresh_world(
-        self, rng: Array, difficulty: Float[Array, ""] | float, number: Int[Array, ""] | None = None
+        self,
+        rng: Array,
+        difficulty: Float[Array, ""] | float,
+        number: Int[Array, ""] | None = None,
+        chosen: RigTable | None = None,
     ) -> tuple[PipelineState, Float[Array, "... 18"]]:
         """(world, observation at its start)."""
-        load, plant, goal, rig = self._resets.draw(rng, difficulty, number)
-        numbers = () if rig is None else rig.numbers
+        load, plant, goal, rig = self._resets.draw(rng, difficulty, number, chosen)
+        numbers = () if rig is None else rig.numbers if rig.drawn is None else rig.drawn.numbers
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         delay = disturbances.delay if self._disturbances.present else 0
         begins = self._resets.has_battery and self.config.follower.residual_on_pid
@@ -269,6 +281,8 @@ class TransportEnv:
         if not self._law.needs_context:
             return None
         plant = self.config.plant
+        if self.config.rigs.number:
+            return jnp.array(NOMINAL_CONTEXT)
         mass = jnp.float32(plant.object_mass) * (1.0 if rig is None else rig.share)
         numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
         return team_context(jax.tree.map(jnp.float32, numbers), plant, mass)

@@ -96,13 +96,16 @@ class FirstOrderGradient:
     def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
         policy, decay = self.policy(state._replace(layers=layers)), self._config.gradient_decay
 
-        def step(envs: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
+        def step(carry: tuple[Any, Array], _: None) -> tuple[Any, tuple[Array, Array]]:
+            envs, flies = carry
             envs = envs._replace(states=_decayed(envs.states, decay)) if decay < 1 else envs
             seen = envs.states.obs
             envs, after = self._environments.step(envs, policy(seen), None)
-            return _forget(envs), (after.reward, jax.lax.stop_gradient(seen))
+            reward = after.reward * flies if self._config.until_termination else after.reward
+            return (_forget(envs), flies * (1.0 - after.terminated)), (reward, jax.lax.stop_gradient(seen))
 
-        envs, (rewards, seen) = jax.lax.scan(step, envs, length=self._config.horizon)
+        start = envs, jnp.ones_like(envs.states.reward)
+        (envs, _), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
 
     def update(

@@ -16,11 +16,13 @@ from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
+from mjxball.plant import plant_parameters
 
 Array = Any
 TILT, VERTICAL = 0.15, 1.0  # [rad], [m/s2] that cost 1
 VERTICAL_LIMIT = 2.0  # of the position and velocity part [m/s2]
 CORRECTION_LIMIT = 0.6  # of all followers' roll and pitch against the load's torque [rad]
+PAIR_INERTIA = 0.0644  # of the pair about pitch, for which the tunings below are [kg m2]
 LIMITS = (1.0, 0.6)  # of a command, about an axis that the load turns and about another [rad]
 THETA_NOISE, RATE_NOISE, CLIMB_NOISE = 2e-3, 2e-2, 2e-2  # deviations of a measurement [rad], [rad/s], [m/s]
 
@@ -117,7 +119,7 @@ class Takeover:
         lifting, level = given * carried, xp.cos(observation[..., 3]) * xp.cos(observation[..., 4])
         led, first = copy_command(observation, *self._law), given[..., model.leader, None]
 
-        left = carried.sum(axis=-1) * (model.gravity + desired[..., 2])
+        left = self._weighing(carried, privileged) * (model.gravity + desired[..., 2])
         left = left - lifting[..., model.leader] * (model.gravity + led[..., 2])
         alike = xp.clip(left / model.of_followers(lifting).sum(axis=-1) - model.gravity, -limits[2], limits[2])
         # Where the rotors of a drone that is commanded there give no torque.
@@ -128,7 +130,7 @@ class Takeover:
         wanted = kp * (count * (desired[..., :2] - rest) - first * (led[..., :2] - rest))
         wanted = wanted - xp.clip(model.on_axes(turns), -most, most)
         wrench = xp.concat([0.0 * wanted[..., :1], wanted], axis=-1)
-        followed = xp.clip(base + model.corrections(wrench, carried, thrust), -limits, limits)
+        followed = self._limited(base, base + model.corrections(wrench, carried, thrust), carried, limits)
 
         angles = first * led[..., :2] + (model.of_followers(given)[..., None] * followed[..., :2]).sum(axis=-2)
         # The filter knows N loops; what drones do not give of theirs is taken off.
@@ -138,6 +140,14 @@ class Takeover:
     def _thrust(self, privileged: PrivilegedInfo) -> Array | None:
         """What drones give of what they are asked for (..., N), if that is known."""
         return None
+
+    def _limited(self, base: Array, followed: Array, carried: Array, limits: Array) -> Array:
+        """Commands `followed` (..., F, 3) within what may be sent; at `base` (..., F, 3) rotors only lift."""
+        return followed.__array_namespace__().clip(followed, -limits, limits)
+
+    def _weighing(self, carried: Array, privileged: PrivilegedInfo) -> Array:
+        """Mass (...) that all drones lift, as far as it is known, of what each believes to carry (..., N) [kg]."""
+        return carried.sum(axis=-1)
 
     def _in_order(self, led: Array, followed: Array) -> Array:
         """Commands of all drones (..., N, 3)."""
@@ -224,6 +234,47 @@ class KnownFailuresLqg(Lqg):
 
     def _thrust(self, privileged: PrivilegedInfo) -> Array | None:
         return None if privileged.thrust is None else self._model.of_flight(privileged.thrust, axes=1)
+
+
+class ToldLqg(KnownFailuresLqg):
+    """`lqg` that is told everything of its rig but where the CG is: `config` is the rig's, the true mass included.
+
+    The load's torque is expected to wander in proportion to the assembly's inertia, so that one tuning serves rigs of
+    all sizes, and no command asks rotors for more torque than they have.
+    """
+
+    name = "lqg-told"
+
+    def __init__(self, config: Config):
+        super().__init__(config)
+        model, walk = self._model, self.tuning.torque_walk
+        scaled = [kalman(model, axis, walk * (model.inertia[axis] / PAIR_INERTIA) ** 2) for axis in model.axes]
+        self._filter = Filter(*(np.stack(parts) for parts in zip(*scaled, strict=True)))
+        numbers, followers = plant_parameters(config.plant, config.attitude), list(config.plant.followers)
+        self._rotors = numbers.arm[followers], numbers.rotor_force_max[followers]
+
+    def _limited(self, base: Array, followed: Array, carried: Array, limits: Array) -> Array:
+        """Commands `followed` (..., F, 3) within what may be sent; at `base` (..., F, 3) rotors only lift."""
+        return followed.__array_namespace__().clip(followed, -limits, limits)
+
+    def _weighing(self, carried: Array, privileged: PrivilegedInfo) -> Array:
+        return self._model.of_flight(privileged.total_mass)
+
+    def _limited(self, base: Array, followed: Array, carried: Array, limits: Array) -> Array:
+        xp = followed.__array_namespace__()
+        kp, arm, most = (xp.asarray(part, dtype=followed.dtype) for part in (self._model.kp, *self._rotors))
+        hover = self._model.of_followers(carried) * (self._model.gravity + followed[..., 2]) / 4
+        room = 2 * arm * xp.maximum(xp.minimum(hover, most - hover), 0.1 * most)
+        reach = 0.95 * room[..., None] / kp
+        tilts = base[..., :2] + xp.clip(followed[..., :2] - base[..., :2], -reach, reach)
+        return xp.clip(xp.concat([tilts, followed[..., 2:]], axis=-1), -limits, limits)
+
+
+class SlowToldLqg(ToldLqg):
+    """The same with the tuning of `lqg-slow`."""
+
+    name = "lqg-slow-told"
+    tuning = SLOW
 
 
 def filtered(kalman: Filter, estimate: Array, drive: Array, measured: Array, started: Array) -> Array:

@@ -89,3 +89,6 @@ class Gradient:
         1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1
     )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
+    until_termination: bool = setting(
+        False, "what follows the end of an episode counts no more until the next window, whose gradient it would dominate"
+    )

@@ -8,7 +8,8 @@ from dataclasses import replace
 from mjxball.config._crazyflie import LARGE_SAC, flight, stand
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant_file import read_plant
-from mjxball.config._settings import Bounds, Config, Follower, Reward, ScenarioRanges
+from mjxball.config._rigs import Rigs
+from mjxball.config._settings import Bounds, Command, Config, Follower, Reward, ScenarioRanges
 from mjxball.config._tree import apply_overrides
 from mjxball.errors import InputError
 
@@ -183,6 +184,42 @@ def _team() -> Config:
     )
 
 
+def _universal() -> Config:
+    """One follower for teams of any drones and loads, which is told nothing of its rig."""
+    large = _transport_large()
+    return replace(
+        apply_overrides(large, read_plant("team4").settings),
+        preset="universal",
+        command=Command(tilt_limit=0.6, vertical_limit=8.0),
+        follower=replace(
+            large.follower,
+            action_scale_tilt=0.6,
+            action_scale_vertical=8.0,
+            observation_averages=(0.05, 0.2, 1.0),
+            privileged_critic=False,
+        ),
+        scenario=replace(
+            large.scenario,
+            team_sizes=(2, 3, 4),
+            cg_speed=(0.1, 6.0),
+            cg_amplitude=(0.0, 0.2),
+            cg_width=(0.0, 1.0),
+            cg_lissajous_probability=0.3,
+            cg_waypoint_probability=0.3,
+            delay=(0.0, 0.05),
+            estimator_drift=(0.0, 1.0),
+            rotor_lag_scale=(1.0, 1.0),
+            mass_known=False,
+        ),
+        rigs=Rigs(number=512, mass_step=0.3),
+        bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.36),
+        reward=replace(large.reward, error_scale=0.016, velocity=10.5, smoothness=0.2, command_change=40.0),
+        gradient=replace(
+            TEAM_GRADIENT, num_envs=240, gradient_steps=400, policy_layers=(48, 32), until_termination=True
+        ),
+    )
+
+
 def _plate() -> Config:
     """Four drones at the corners of a plate, on which a free ball rolls that nobody measures."""
     large = _transport_large()
@@ -210,7 +247,7 @@ PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
         made.preset: made
         for made in (
             *(_transport(), _paper(), _transport_large(), _robust(), _balance()),
-            *(_team(), _plate(), stand(), flight()),
+            *(_team(), _plate(), _universal(), stand(), flight()),
         )
     }
 )

@@ -8,6 +8,7 @@ from typing import Literal
 from mjxball.config._leaf import Range, Vector3, drawn, setting
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant import Plant
+from mjxball.config._rigs import Rigs
 
 
 @dataclass(frozen=True)
@@ -275,6 +276,7 @@ class Config:
     follower: Follower = Follower()
     timing: Timing = Timing()
     scenario: ScenarioRanges = ScenarioRanges()
+    rigs: Rigs = Rigs()
     reward: Reward = Reward()
     sac: Sac = Sac()
     ppo: Ppo = Ppo()

@@ -93,6 +93,7 @@ class Load(NamedTuple):
     uncompensated: Scalar | None = None  # 1 where the firmware does not compensate for the battery, else 0
     cg_shape: PathShape | None = None  # of the path in a plane; None: a sine along x
     stop_time: Float[Array, "... drones"] | None = None  # when each drone's rotors are let stop [s]; None: never
+    thrust_fade: Scalar | None = None  # share of all rotor forces that is lost in a second [1/s]; None: none
 
 
 class Wrench(NamedTuple):

@@ -71,6 +71,8 @@ def make_control_step(
         keep, mean = _rotor_shares(shared(numbers.rotor_lag, state.rotor_force), load.rotor_lag_scale, h)
         if load.thrust_scale is not None:
             target = target * load.thrust_scale[..., None]
+        if load.thrust_fade is not None:
+            target = target * (1.0 - load.thrust_fade * state.time)[..., None, None]
         if load.stop_time is not None:
             target = target * (state.time[..., None] < load.stop_time)[..., None]
         acting = target + mean * (state.rotor_force - target)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from mjxball.physics.engine import Load, PathShape, PlantState
 from mjxball.physics.step import start_state
 from mjxball.plant import PlantParameters, plant_parameters, teams
 from mjxball.plant.trim import safe_radius
+from mjxball.sim import rigs
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -41,6 +42,7 @@ class Rig(NamedTuple):
     flies: Float[Array, " drones"]  # 1 for a drone that there is, 0 for one that pads
     proportion: Scalar  # its radius over the plant's, by which CG amplitudes are multiplied
     share: Scalar  # its number of drones over the plant's, by which the object's mass is multiplied
+    drawn: rigs.RigTable | None = None  # the row of `config.rigs`, whose load is its own
 
 
 class ResetDistribution:
@@ -61,11 +63,12 @@ class ResetDistribution:
         self.varies = any(scale != (1.0, 1.0) for scale in scales)
         self.has_battery = scenario.battery[1] > 0
         plant, self._ranges = config.plant, [getattr(scenario, name) for name in teams.Factors._fields]
-        self.rigs = bool(scenario.team_sizes) or any(ends != (1.0, 1.0) for ends in self._ranges)
+        self.rigs = bool(scenario.team_sizes or config.rigs.number) or any(ends != (1.0, 1.0) for ends in self._ranges)
         self._in_plane, self._several = len(plant.directions) == 2, plant.count > 2
         sizes = scenario.team_sizes or (plant.count,)
         self._sizes = np.array(sizes)
-        self._table = teams.table(config) if scenario.team_sizes else None
+        self._table = teams.table(config) if scenario.team_sizes and not config.rigs.number else None
+        self._drawn = rigs.training_rigs(config) if config.rigs.number and scenario.team_sizes else None
         self._constants = constants = plant_parameters(config.plant, config.attitude)
         self._motor = motors.MOTORS[config.autopilot.drone or "2.1"]
         self._lever = 2 * min(map(abs, constants.mounts[:, plant.directions[0]]))
@@ -74,15 +77,20 @@ class ResetDistribution:
         self._object = constants.object_inertia_per_mass
 
     def draw(
-        self, rng: Array, difficulty: Scalar | float = 1.0, number: Int[Array, ""] | None = None
+        self,
+        rng: Array,
+        difficulty: Scalar | float = 1.0,
+        number: Int[Array, ""] | None = None,
+        chosen: rigs.RigTable | None = None,
     ) -> tuple[Load, PlantState, Vector, Rig | None]:
         """(load, plant at rest or nearly so, goal (3,) of O [m], the world's own rig if it has one).
 
         `difficulty` () in [0, 1]: the lower share of the ranges of the CG's amplitude and speed, which is drawn from.
-        `number` of the world, of which its team's size follows; None: any of `scenario.team_sizes`.
+        `number` of the world, of which its team's size follows; None: any of `scenario.team_sizes`. `chosen`: its rig.
         """
         scenario = self.config.scenario
-        rig = self._rig(jax.random.fold_in(rng, 6), number) if self.rigs else None
+        rig = self._rig(jax.random.fold_in(rng, 6), number) if self.rigs and chosen is None else None
+        rig = rig if chosen is None else self._drawn_rig(chosen)
         # One draw for everything: a reset runs beside every training step, and each draw is kernels to launch.
         drawn = iter(jnp.split(jax.random.uniform(rng, (DRAWS,)), DRAWS))
 
@@ -113,6 +121,8 @@ class ResetDistribution:
             mass_change=between(*scenario.mass_change)[None],
             mass_change_time=between(*MASS_CHANGE_TIME)[None],
         )
+        if rig is not None and rig.drawn is not None:
+            load = self._of_rig(load, rig, jax.random.fold_in(rng, 13))
         if self.varies:
             load = self._varied(load, jax.random.fold_in(rng, 2))
         if self.has_battery:
@@ -139,8 +149,25 @@ class ResetDistribution:
             plant = plant._replace(ball_rate=self._direction(rng, 11) * speed if self._in_plane else speed)
         return load, plant, symmetric(scenario.goal_range), rig
 
+    def _of_rig(self, load: Load, rig: Rig, key: Array) -> Load:
+        """`load` with the masses, thrusts and reach of the drawn `rig`."""
+        own: Any = rig.drawn
+        ranges = self.config.rigs
+        far, stepped = jax.random.uniform(key, (2,))
+        load = load._replace(object_mass=own.object_mass, believed_mass=own.believed_mass, thrust_scale=own.thrust)
+        change = ranges.mass_step * (2 * stepped - 1) * own.object_mass
+        told = (own.believed_mass, own.thrust, self.config.scenario.trim_margin, *rigs.command_limits(self.config))
+        later = rigs.trimmed_reach(rig.numbers, own.object_mass + change, *told)
+        change = jnp.where(later < 0, 0.0, change)
+        reach = jnp.where(later < 0, own.reach, jnp.minimum(own.reach, later))
+        return load._replace(
+            cg_amplitude=far * reach, mass_change=change[None], thrust_fade=own.fade if ranges.fade[1] > 0 else None
+        )
+
     def trimmed(self, load: Load, rig: Rig | None = None) -> Scalar:
         """CG amplitude that can be trimmed before and after the mass changes [m]; negative: none."""
+        if rig is not None and rig.drawn is not None:  # the amplitude was drawn so
+            return load.cg_amplitude
         masses = (load.object_mass, load.object_mass + load.mass_change[0])
         if self._several or self._in_plane or rig is not None:
             numbers, leader = (self._constants if rig is None else rig.numbers), self.config.plant.leader
@@ -194,6 +221,8 @@ class ResetDistribution:
         plant, attitude = self.config.plant, self.config.attitude
         index = jax.random.randint(jax.random.fold_in(key, 1), (), 0, len(self._sizes)) if number is None else number
         index = index % len(self._sizes)
+        if self._drawn is not None:
+            return self._one_of_drawn(jax.random.fold_in(key, 2), index)
         numbers = jax.tree.map(jnp.float32, self._constants)
         size = jnp.asarray(self._sizes, jnp.float32)[index]
         if self._table is not None:
@@ -203,6 +232,16 @@ class ResetDistribution:
         numbers = teams.varied(numbers, factors, attitude, share * attitude.design_object_mass)
         flies = (jnp.arange(plant.count) < size).astype(jnp.float32)
         return Rig(numbers, flies, numbers.ball_limit / self._constants.ball_limit, share)
+
+    def _one_of_drawn(self, key: Array, index: Int[Array, ""]) -> Rig:
+        """Any of the drawn rigs of the size `index`."""
+        number = jax.random.randint(key, (), 0, self.config.rigs.number)
+        return self._drawn_rig(jax.tree.map(lambda part: jnp.asarray(part, jnp.float32)[index, number], self._drawn))
+
+    def _drawn_rig(self, own: rigs.RigTable) -> Rig:
+        flies = (jnp.arange(self.config.plant.count) < own.size).astype(jnp.float32)
+        one = jnp.ones(())
+        return Rig(rigs.whole(own.numbers, self.config.plant.gravity), flies, one, one, own)
 
     def _in_the_plane(self, load: Load, key: Array, rig: Rig | None) -> Load:
         """`load` whose CG goes along a path of its own in the plane, within the carrier and what can be trimmed."""
@@ -218,7 +257,9 @@ class ResetDistribution:
         if load.follows_path is not None:
             longest = jnp.where(load.follows_path > 0, 1.0, longest)
         proportion: Scalar | float = 1.0 if rig is None else rig.proportion
-        limit = jnp.minimum(cg_limit(self.config.plant) * proportion, jnp.maximum(self.trimmed(load, rig), 0.0))
+        limit = jnp.maximum(self.trimmed(load, rig), 0.0)
+        if rig is None or rig.drawn is None:
+            limit = jnp.minimum(cg_limit(self.config.plant) * proportion, limit)
         return load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude * proportion, limit / longest), cg_shape=shape)
 
     def _losing(self, load: Load, key: Array, rig: Rig | None) -> Load:

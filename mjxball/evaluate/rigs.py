@@ -1,0 +1,134 @@
+"""Followers on random rigs: many rigs at once, each with its own numbers, and laws that are told them."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjxball.config import Config
+from mjxball.control.followers import Law, PrivilegedInfo
+from mjxball.env import PipelineState, State, TransportEnv
+from mjxball.physics.motion import object_mass
+from mjxball.sim.rigs import HELD_OUT, RigTable, draw_rigs, rig_config, unpadded
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+SECONDS, STEADY_AFTER, SETTLED = 30.0, 20.0, 0.02  # [s], [s], of the first error
+Change = Callable[[PipelineState], PipelineState]
+
+
+class Flown(NamedTuple):
+    """Flights of R rigs, K each."""
+
+    error: Float[np.ndarray, "R K T"]  # |e_o| at every control step, the start first [m]
+    failed: Bool[np.ndarray, "R K"]  # it left scenario.termination_distance, or diverged
+
+    def settling(self, period: float) -> Float[np.ndarray, "R K"]:
+        """Last time at which the error exceeds 2 % of the first one [s]; inf: it never settles."""
+        late = self.error > SETTLED * self.error[..., :1]
+        last = self.error.shape[-1] - 1 - late[..., ::-1].argmax(axis=-1)
+        return np.where(self.failed | (last > self.error.shape[-1] - 6), np.inf, period * last)
+
+    def peak(self, period: float) -> Float[np.ndarray, "R K"]:
+        """Largest error after 20 s [m]; inf of a flight that failed."""
+        return np.where(self.failed, np.inf, self.error[..., round(STEADY_AFTER / period) :].max(axis=-1))
+
+
+def held_out(config: Config, size: int, count: int) -> RigTable:
+    """`count` rigs of `size` drones that no training draws, without padding."""
+    return unpadded(draw_rigs(config, size, count, HELD_OUT).rigs, size)
+
+
+def fly(
+    config: Config,
+    rigs: RigTable,
+    laws: Law | Sequence[Law],
+    flights: int = 3,
+    seconds: float = SECONDS,
+    seed: int = 0,
+    change: tuple[float, Change] | None = None,
+) -> Flown:
+    """Fly `flights` random flights of every rig (R) of one size, the same ones for every follower.
+
+    `laws`: one for all rigs, or R of one class, each made for its rig. `change`: (when [s], what then happens to the
+    world). In float32 on JAX's default device.
+    """
+    size = int(rigs.size[0])
+    own = rig_config(config, rigs, 0)  # of its plant only the number of drones counts
+    env = TransportEnv(dataclasses.replace(own, rigs=dataclasses.replace(config.rigs, number=1)), "newton-euler")
+    one = not isinstance(laws, Sequence)
+    example: Law = laws if one else laws[0]
+    numbers, rebuild = (None, lambda _: example) if one else stacked(laws)
+    steps = round(seconds / env.dt)
+    at = -1 if change is None else round(change[0] / env.dt)
+
+    def flight(key: Any, rig: RigTable, law: Law) -> tuple[Any, Any]:
+        state = env.reset(key, 1.0, None, rig)
+
+        def step(carry: tuple[State, Any, Any], number: Any) -> Any:
+            state, memory, far = carry
+            if change is not None:
+                world = change[1](state.pipeline_state)
+                world = jax.tree.map(lambda new, old: jnp.where(number == at, new, old), world, state.pipeline_state)
+                state = state.replace(pipeline_state=world)
+            world = state.pipeline_state
+            error = jnp.linalg.norm(world.goal - world.loop.plant.position)
+            far = far | (error > config.scenario.termination_distance) | world.loop.diverged
+            memory, command = law.step(memory, state.obs[..., :18], _told(world, size))
+            return (env.step_with_command(state, command), memory, far), error
+
+        start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool))
+        (_, _, far), error = jax.lax.scan(step, start, jnp.arange(steps + 1))
+        return error, far
+
+    def rig_flights(rig: RigTable, numbers: Any, keys: Any) -> tuple[Any, Any]:
+        return jax.vmap(lambda key: flight(key, rig, rebuild(numbers)))(keys)
+
+    keys = jax.random.split(jax.random.key(seed), (rigs.count, flights))
+    single = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), (rigs, numbers))
+    with jax.default_matmul_precision("highest"):
+        error, failed = jax.jit(jax.vmap(rig_flights))(*single, keys)
+    return Flown(np.asarray(error), np.asarray(failed))
+
+
+def told_laws(config: Config, rigs: RigTable, make: Callable[[Config], Law]) -> list[Law]:
+    """`make` of every rig's own configuration."""
+    return [make(rig_config(config, rigs, row)) for row in range(rigs.count)]
+
+
+def stacked(laws: Sequence[Law]) -> tuple[list[Any], Callable[[list[Any]], Law]]:
+    """(the numbers of `laws` of one class, stacked; a law from one row of them)."""
+    example, structure = jax.tree.flatten(vars(laws[0]))
+    varies = [isinstance(leaf, (float, np.ndarray, np.floating)) for leaf in example]
+    rows = [jax.tree.leaves(vars(law)) for law in laws]
+    numbers = [np.stack([row[place] for row in rows]) for place, drawn in enumerate(varies) if drawn]
+
+    def rebuild(row: list[Any]) -> Law:
+        found, values = copy.copy(laws[0]), iter(row)
+        leaves = [next(values) if drawn else leaf for leaf, drawn in zip(example, varies, strict=True)]
+        vars(found).update(jax.tree.unflatten(structure, leaves))
+        return found
+
+    return numbers, rebuild
+
+
+def _told(world: PipelineState, size: int) -> PrivilegedInfo:
+    """What a classical follower may know of its world; nothing of where the CG is."""
+    load: Any = world.load
+    mass = object_mass(world.loop.plant.time, load)
+    thrust = load.thrust_scale
+    if load.thrust_fade is not None:
+        thrust = thrust * (1.0 - load.thrust_fade * world.loop.plant.time)
+    total = world.rig.drone_mass.sum() + world.rig.carrier_mass + mass
+    zero = jnp.zeros(2)
+    told = PrivilegedInfo(load.believed_mass, zero, zero, total, thrust)
+    if size == 2:
+        return told
+    return PrivilegedInfo(*(jnp.broadcast_to(part, (size - 1, *part.shape)) for part in told))

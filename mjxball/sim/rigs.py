@@ -1,0 +1,338 @@
+"""Random rigs: teams of drones, carriers and loads of every size, from the ranges of `config.rigs` (ours).
+
+Lengths grow with the cube root of a drone's mass, inertia with mass and square of length, as they do from a Crazyflie to
+a drone of 3 kg; factors of a draw come on top. Needs NumPy alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjxball.config import Attitude, Config, Drone, Plant, Range
+from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, rigid_inertia
+from mjxball.plant.trim import safe_radius
+
+Array = Any
+# A drone of 1 kg: arm [m], inertia over mass and arm^2 about (roll, pitch, yaw); the pair's.
+ARM, GYRATION = 0.12, np.array([0.16, 0.16, 0.28])
+CARRIER_THICKNESS = 0.04  # edge of the carrier across, over its diameter
+FREQUENCY_RATIO = (0.8, 1.25)  # of the roll loop to that of pitch
+YAW_RATIO = 0.4  # of the yaw loop to that of pitch
+# Wrong beliefs and uneven thrusts are drawn back by three tenths, at most 8 times, while they leave the CG less than a
+# tenth of the rig's length; a rig whose CG can go less far than a fiftieth is drawn anew.
+TRAINING, HELD_OUT = 1, 2  # seeds
+DRAWN_BACK, WANTED_REACH, LEAST_REACH = 8, 0.1, 0.02
+
+
+class RigTable(NamedTuple):
+    """R rigs, padded to as many drones as the largest team has. Drone 0 leads, the others stand behind it in order."""
+
+    numbers: PlantParameters  # (R, ...); None for what is the same for all rigs, see `whole`
+    size: Array  # (R,) how many drones fly
+    object_mass: Array  # (R,) true [kg]
+    believed_mass: Array  # (R,) that every drone assumes [kg]
+    thrust: Array  # (R, N) share that each drone gives of the force it is asked for, with a full battery
+    fade: Array  # (R,) share of all thrust that is lost in a second as batteries empty [1/s]
+    reach: Array  # (R,) how far the CG may be from O, so that followers can trim it and it stays on the carrier [m]
+    length: Array  # (R,) largest distance of a drone from O [m]
+    frequency: Array  # (R, 3) natural frequency of the attitude loops about roll, pitch, yaw [rad/s]
+    damping: Array  # (R,) of these without rotor lag
+
+    @property
+    def count(self) -> int:
+        """R."""
+        return len(self.size)
+
+    def rows(self, chosen: Any) -> RigTable:
+        """The rigs `chosen`, any index of the first axis."""
+        return RigTable(_each(lambda part: part[chosen], self.numbers), *(part[chosen] for part in self[1:]))
+
+
+class Drawn(NamedTuple):
+    """Rigs, and what became of the draws."""
+
+    rigs: RigTable
+    draws: int
+    unstable: int  # rejected: poles of the attitude loop with its rotor lag are damped by less than least_damping, or
+    # the rotors are too weak for the slowest loop
+    untrimmed: int  # rejected: followers cannot hold the load at O, however close beliefs and thrusts are to the truth
+
+
+def draw_rigs(config: Config, size: int, count: int, seed: int) -> Drawn:
+    """`count` rigs of `size` drones from `config.rigs`, padded to the plant's drones; the same for the same `seed`."""
+    random = np.random.default_rng([seed, size])
+    parts: list[RigTable] = []
+    draws = damped = untrimmed = 0
+    while sum(part.count for part in parts) < count:
+        table, steady, held = _draw(config, size, 2 * count + 16, random)
+        good = steady & held
+        missing = count - sum(part.count for part in parts)
+        last = np.flatnonzero(good)[:missing][-1] + 1 if good.sum() >= missing else len(good)
+        draws, damped, untrimmed = draws + last, damped + (~steady[:last]).sum(), untrimmed + (steady & ~held)[:last].sum()
+        parts.append(table.rows(np.flatnonzero(good[:last])))
+    return Drawn(joined(parts), int(draws), int(damped), int(untrimmed))
+
+
+def training_rigs(config: Config) -> RigTable:
+    """`rigs.number` rigs of each of `scenario.team_sizes`, (sizes, number, ...), in float32."""
+    drawn = [draw_rigs(config, size, config.rigs.number, TRAINING).rigs for size in config.scenario.team_sizes]
+    table = joined(drawn)
+    shape = (len(drawn), config.rigs.number)
+
+    def folded(part: Array) -> Array:
+        return np.asarray(part, np.float32).reshape(*shape, *part.shape[1:])
+
+    return RigTable(_each(folded, table.numbers), *(folded(part) for part in table[1:]))
+
+
+def joined(tables: list[RigTable]) -> RigTable:
+    """All rigs of `tables`, one after the other."""
+    numbers = _each(lambda *parts: np.concatenate(parts), *(table.numbers for table in tables))
+    return RigTable(numbers, *(np.concatenate(parts) for parts in zip(*(t[1:] for t in tables), strict=True)))
+
+
+def whole(numbers: PlantParameters, gravity: float) -> PlantParameters:
+    """`numbers` with what is the same for all rigs, as constants that fold into a compiled program."""
+    count = numbers.drone_mass.shape[-1]
+    return numbers._replace(
+        yaw=np.zeros(count),
+        moving_fraction=np.array(1.0),
+        shell_inertia_per_mass=np.zeros(3),
+        gravity=np.array(gravity),
+    )
+
+
+def _each(function: Callable[..., Any], *numbers: PlantParameters) -> PlantParameters:
+    """`function` of every array of all `numbers`."""
+    found = {}
+    for name in PlantParameters._fields:
+        parts = [getattr(one, name) for one in numbers]
+        if name == "gains":
+            found[name] = AttitudeGains(*(function(*gains) for gains in zip(*parts, strict=True)))
+        else:
+            found[name] = None if parts[0] is None else function(*parts)
+    return PlantParameters(**found)
+
+
+def loop_damping(frequency: Array, damping: Array, lag: Array) -> Array:
+    """Damping (...) of the least damped poles of an attitude loop (rad/s, 1) behind rotors with a `lag` [s].
+
+    Poles p of T p^3 + p^2 + 2 zeta p + 1 in units of the natural frequency, T = lag wn: a real one, found by bisection,
+    and two others (closed form).
+    """
+    scaled = np.asarray(lag * frequency, float)
+    low, high = np.zeros_like(scaled) - (1 / scaled + 2 * damping + 2), np.zeros_like(scaled)
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        above = ((scaled * middle + 1) * middle + 2 * damping) * middle + 1 > 0
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    real = 0.5 * (low + high)
+    product = -1 / (scaled * real)
+    return (1 / scaled + real) / 2 / np.sqrt(product)
+
+
+def _draw(config: Config, size: int, count: int, random: np.random.Generator) -> tuple[RigTable, Array, Array]:
+    """(rigs, whether their loops are damped, whether their loads can be trimmed), `count` of each."""
+    ranges, most, gravity = config.rigs, config.plant.count, config.plant.gravity
+
+    def even(ends: Range, *shape: int) -> Array:
+        return random.uniform(*ends, (count, *shape))
+
+    def by_factor(ends: Range, *shape: int) -> Array:
+        return np.exp(even((math.log(ends[0]), math.log(ends[1])), *shape))
+
+    mass = by_factor(ranges.drone_mass)
+    arm = ARM * np.cbrt(mass) * even(ranges.arm_scale)
+    inertia = (mass * arm**2)[:, None] * GYRATION * even(ranges.inertia_scale)[:, None]
+    radius = arm * even(ranges.spacing) / (2 * math.sin(math.pi / size))
+    jitter = ranges.mount_jitter if size > 2 else 0.0  # two drones hold only what lies on the line between them
+    around = 2 * np.pi / size * (np.arange(size) + even((-jitter, jitter), size))
+    away = radius[:, None] * (1 + even((-ranges.mount_jitter, ranges.mount_jitter), size))
+    mounts = np.stack([away * np.cos(around), away * np.sin(around), 0.0 * away], axis=-1)
+    length = away.max(axis=-1)
+    carrier = mass * size * even(ranges.carrier_share)
+    load = mass * size * even(ranges.object_share)
+    believed = load * by_factor((1 / ranges.believed_factor, ranges.believed_factor))
+    thrust = even(ranges.thrust_scale, size)
+    strongest = even(ranges.thrust_to_weight) * gravity * (mass * size + carrier + load) / (4 * size)
+    lag = by_factor(ranges.rotor_lag)
+    place, ratio = random.uniform(0, 1, count), by_factor(FREQUENCY_RATIO)
+    damping = even(ranges.loop_damping)
+    fade = even(ranges.fade)
+    shares = _load_shares(mounts)
+
+    def alike(value: Array) -> Array:
+        return np.repeat(value[:, None], size, axis=1)
+
+    own = alike(mass)
+    ball = 0.4 * (0.1 * length) ** 2
+    numbers = PlantParameters(
+        drone_mass=own,
+        own_inertia=np.repeat(inertia[:, None], size, axis=1),
+        mounts=mounts,
+        yaw=None,
+        arm=alike(arm),
+        yaw_per_thrust=alike(arm * even(ranges.yaw_per_thrust)),
+        rotor_force_max=alike(strongest),
+        rotor_lag=alike(lag),
+        known_mass=own + shares * carrier[:, None],
+        share=shares,
+        gains=AttitudeGains(np.zeros((count, 3)), np.zeros((count, 3))),
+        carrier_mass=carrier,
+        carrier_inertia=(carrier * length**2)[:, None] * np.array([0.25, 0.25, 0.5]),
+        moving_fraction=None,
+        shell_inertia_per_mass=None,
+        ball_inertia_per_mass=np.stack([ball] * 3, axis=-1),
+        ball_limit=length,
+        gravity=None,
+    )
+    rows = rigid_inertia(whole(numbers, gravity))
+    about = [rows[axis][axis] + load * ball for axis in range(3)]
+    # The loop is as fast as it was drawn, up to what the rotors can give for a step of `authority`.
+    hover = gravity * (mass * size + carrier + load) / (4 * size)
+    room = 2 * arm * np.minimum(hover, strongest - hover)
+    slowest, fastest = ranges.loop_frequency
+    stiffest = np.sqrt(size * room / ranges.authority / np.maximum(about[0] * ratio**2, about[1]))
+    pitch = slowest * (np.clip(stiffest, slowest, fastest) / slowest) ** place
+    frequency = np.stack([pitch * ratio, pitch, YAW_RATIO * pitch], axis=-1)
+    kp, kd = (np.stack(list(gain), axis=-1) for gain in design_gains(about, frequency.T, damping, size))
+    numbers = numbers._replace(gains=AttitudeGains(kp, kd))
+    steady = loop_damping(frequency[:, :2].max(axis=-1), damping, lag) >= ranges.least_damping
+    steady &= stiffest >= slowest
+
+    constants, limits = whole(numbers, gravity), (config.scenario.trim_margin, *command_limits(config))
+    reach = trimmed_reach(constants, load, believed, thrust, *limits)
+    for _ in range(DRAWN_BACK):
+        short = reach < WANTED_REACH * length
+        believed = np.where(short, load * (believed / load) ** 0.7, believed)
+        thrust = np.where(short[:, None], 1 + 0.7 * (thrust - 1), thrust)
+        reach = trimmed_reach(constants, load, believed, thrust, *limits)
+    table = RigTable(
+        numbers=_padded(numbers, most),
+        size=np.full(count, size),
+        object_mass=load,
+        believed_mass=believed,
+        thrust=np.concatenate([thrust, np.ones((count, most - size))], axis=1),
+        fade=fade,
+        reach=np.minimum(reach, 0.9 * radius),
+        length=length,
+        frequency=frequency,
+        damping=damping,
+    )
+    return table, steady, reach >= LEAST_REACH * length
+
+
+def trimmed_reach(
+    numbers: PlantParameters,
+    load: Array,
+    believed: Array,
+    thrust: Array,
+    margin: float,
+    tilt_limit: float,
+    vertical_limit: float,
+) -> Array:
+    """How far the CG may be from O (...) by the followers' rotors and by what commands may ask for [m]; negative: not.
+
+    `safe_radius`, with the same `margin` of the commands' limits (rad, m/s2) left: tilt commands hold the load's moment
+    and that of uneven thrusts, vertical ones lift alike what the leader does not.
+    """
+    xp = load.__array_namespace__()
+    rotors = safe_radius(numbers, 0, load, margin, believed, thrust)
+    gravity = float(numbers.gravity)
+    flies = xp.astype(numbers.drone_mass > 0, load.dtype)[..., 1:]
+    followers = flies.sum(axis=-1)
+    fair = gravity * (numbers.known_mass + numbers.share * load[..., None])
+    assumed = numbers.known_mass + numbers.share * believed[..., None]
+    lacking = fair[..., 0] - gravity * assumed[..., 0] * thrust[..., 0]
+    middle = (flies[..., None] * numbers.mounts[..., 1:, :2]).sum(axis=-2) / followers[..., None]
+    lever = middle - numbers.mounts[..., 0, :2]
+    uneven = xp.abs(lacking) * xp.hypot(lever[..., 0], lever[..., 1])
+    gain = xp.min(numbers.gains.kp[..., :2], axis=-1) * (flies * thrust[..., 1:]).sum(axis=-1)
+    held = (1 - margin) * gain * tilt_limit
+    wanted = (fair[..., 1:] + (lacking / followers)[..., None]) / thrust[..., 1:]
+    asked = xp.abs(wanted / xp.where(flies > 0, assumed[..., 1:], 1.0) - gravity)
+    lifts = xp.max(flies * asked, axis=-1) < (1 - margin) * vertical_limit
+    return xp.where(lifts, xp.minimum(rotors, (held - uneven) / (gravity * load)), -1.0)
+
+
+def command_limits(config: Config) -> tuple[float, float]:
+    """What a follower may command in all: rad, m/s2; a residual may be tighter."""
+    follower, most = config.follower, config.command
+    return min(follower.action_scale_tilt, most.tilt_limit), min(follower.action_scale_vertical, most.vertical_limit)
+
+
+def _load_shares(mounts: Array) -> Array:
+    """(R, N) share of the load's weight that each drone carries, see `config.Plant.load_shares`."""
+    places = mounts[..., :2]
+    mean = places.mean(axis=1)
+    off = places - mean[:, None]
+    scatter = np.einsum("rni,rnj->rij", off, off)
+    weights = np.einsum("rij,rj->ri", np.linalg.pinv(scatter, rcond=1e-6), mean)
+    return 1 / places.shape[1] - np.einsum("rni,ri->rn", off, weights)
+
+
+def _padded(numbers: PlantParameters, count: int) -> PlantParameters:
+    """`numbers` with drones behind the last up to `count` that weigh, lift and believe nothing."""
+    missing = count - numbers.size
+    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "share", "known_mass"}
+    found = {}
+    for name in (*nothing, "mounts", "arm", "yaw_per_thrust", "rotor_lag"):
+        value = getattr(numbers, name)
+        more = np.repeat(value[:, -1:], missing, axis=1)
+        found[name] = np.concatenate([value, 0.0 * more if name in nothing else more], axis=1)
+    return numbers._replace(**found)
+
+
+def unpadded(rigs: RigTable, size: int) -> RigTable:
+    """`rigs`, all of `size` drones, without the drones that pad."""
+    padded = {"drone_mass", "own_inertia", "rotor_force_max", "share", "known_mass", "mounts", "arm"}
+    padded |= {"yaw_per_thrust", "rotor_lag"}
+    cut = {name: getattr(rigs.numbers, name)[:, :size] for name in padded}
+    return rigs._replace(numbers=rigs.numbers._replace(**cut), thrust=rigs.thrust[:, :size])
+
+
+def rig_config(config: Config, rigs: RigTable, row: int) -> Config:
+    """`config` for the rig `row` alone: its plant, attitude loops and nominal load, for whoever is told the rig."""
+    numbers, size = rigs.numbers, int(rigs.size[row])
+    drones = tuple(
+        Drone(
+            mass=float(numbers.drone_mass[row, k]),
+            inertia=_tuple(numbers.own_inertia[row, k]),
+            mount=_tuple(numbers.mounts[row, k]),
+            arm=float(numbers.arm[row, k]),
+            rotor_force_max=float(numbers.rotor_force_max[row, k]),
+            rotor_lag=float(numbers.rotor_lag[row, k]),
+            yaw_per_thrust=float(numbers.yaw_per_thrust[row, k]),
+        )
+        for k in range(size)
+    )
+    length, load = float(rigs.length[row]), float(rigs.object_mass[row])
+    plant = Plant(
+        drones=drones,
+        carrier_mass=float(numbers.carrier_mass[row]),
+        carrier_inertia=_tuple(numbers.carrier_inertia[row]),
+        object_mass=load,
+        object_size=(2 * length, 2 * length, 2 * CARRIER_THICKNESS * length),
+        ball_radius=0.1 * length,
+        cg_axis="xy",
+        arm=drones[0].arm,
+        rotor_force_max=drones[0].rotor_force_max,
+        rotor_lag=drones[0].rotor_lag,
+        yaw_per_thrust=drones[0].yaw_per_thrust,
+        gravity=config.plant.gravity,
+    )
+    attitude = Attitude(_tuple(rigs.frequency[row]), float(rigs.damping[row]), load)
+    scenario = dataclasses.replace(
+        config.scenario, team_sizes=(), object_mass=(load, load), cg_amplitude=(0.0, float(rigs.reach[row]))
+    )
+    rigs_off = dataclasses.replace(config.rigs, number=0)
+    return dataclasses.replace(config, plant=plant, attitude=attitude, scenario=scenario, rigs=rigs_off)
+
+
+def _tuple(values: Array) -> Any:
+    return tuple(float(value) for value in values)
