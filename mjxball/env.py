@@ -13,7 +13,7 @@ from mjxball import rewards
 from mjxball.config import Config, ball_limit
 from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
-from mjxball.control.team_lqg import team_context
+from mjxball.control.team_lqg import nominal_context, team_context
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
 from mjxball.physics.motion import object_mass
@@ -66,9 +66,6 @@ class PipelineState(NamedTuple):
     def plant(self) -> PlantState:
         """State of the rigid assembly."""
         return self.loop.plant
-
-
-NOMINAL_CONTEXT = (1.5, 0.0, 0.0, 0.15, 0.15)
 
 
 class TransportEnv:
@@ -282,7 +279,7 @@ class TransportEnv:
             return None
         plant = self.config.plant
         if self.config.rigs.number:
-            return jnp.array(NOMINAL_CONTEXT)
+            return nominal_context(plant.count if rig is None else rig.drawn.size)
         mass = jnp.float32(plant.object_mass) * (1.0 if rig is None else rig.share)
         numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
         return team_context(jax.tree.map(jnp.float32, numbers), plant, mass)

@@ -9,7 +9,7 @@ from mjxball.config._crazyflie import LARGE_SAC, flight, stand
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant_file import read_plant
 from mjxball.config._rigs import Rigs
-from mjxball.config._settings import Bounds, Command, Config, Follower, Reward, ScenarioRanges
+from mjxball.config._settings import Attitude, Bounds, Command, Config, Follower, Reward, ScenarioRanges
 from mjxball.config._tree import apply_overrides
 from mjxball.errors import InputError
 
@@ -187,15 +187,19 @@ def _team() -> Config:
 def _universal() -> Config:
     """One follower for teams of any drones and loads, which is told nothing of its rig."""
     large = _transport_large()
+    team = apply_overrides(large, read_plant("team4").settings)
     return replace(
-        apply_overrides(large, read_plant("team4").settings),
+        team,
         preset="universal",
+        plant=replace(team.plant, rotor_lag=0.04),
+        # Of the law that the network is added to: in the middle of what rigs are drawn with.
+        attitude=Attitude(natural_frequency=(7.0, 7.0, 3.0), damping=0.8, design_object_mass=0.4),
         command=Command(tilt_limit=0.6, vertical_limit=8.0),
         follower=replace(
             large.follower,
+            base="lqg",
             action_scale_tilt=0.6,
             action_scale_vertical=8.0,
-            observation_averages=(0.05, 0.2, 1.0),
             privileged_critic=False,
         ),
         scenario=replace(
@@ -215,7 +219,14 @@ def _universal() -> Config:
         bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.36),
         reward=replace(large.reward, error_scale=0.016, velocity=10.5, smoothness=0.2, command_change=40.0),
         gradient=replace(
-            TEAM_GRADIENT, num_envs=240, gradient_steps=400, policy_layers=(48, 32), until_termination=True
+            TEAM_GRADIENT,
+            num_envs=240,
+            horizon=100,
+            windows_per_episode=6,
+            gradient_steps=400,
+            learning_rate=8e-3,
+            policy_layers=(40, 32),
+            until_termination=True,
         ),
     )
 

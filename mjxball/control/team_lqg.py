@@ -16,6 +16,7 @@ from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_a
 from mjxball.plant import PlantParameters
 
 Array = Any
+UNKNOWN_ROOM = 0.15  # [rad] that the rotors of a rig which nobody knows can follow
 ANGLE_STATES, HEIGHT_STATES, CONTEXT = 5, 3, 5
 STATES = 2 * ANGLE_STATES + HEIGHT_STATES
 
@@ -147,6 +148,13 @@ def team_context(parameters: PlantParameters, plant: Plant, object_mass: Array) 
     most = [room / (along * kp[..., 0] + across * kp[..., 1]), room / (along * kp[..., 1] + across * kp[..., 0])]
     turned = rotations.turned_about_z(flat, -angles)[..., :2]
     return xp.concat([share[..., None], turned, xp.maximum(xp.stack(most, axis=-1), 1e-3)], axis=-1)
+
+
+def nominal_context(count: Array) -> Array:
+    """As `team_context` (..., 5) where nobody knows more of a team than how many drones it has, `count` (...)."""
+    xp = count.__array_namespace__()
+    one = xp.ones_like(count)
+    return xp.stack([count / (count - 1), 0.0 * one, 0.0 * one, UNKNOWN_ROOM * one, UNKNOWN_ROOM * one], axis=-1)
 
 
 def _measured(observation: Array) -> list[Array]:
