@@ -60,9 +60,10 @@ def fly(
     `laws`: one for all rigs, or R of one class, each made for its rig. `change`: (when [s], what then happens to the
     world). In float32 on JAX's default device.
     """
-    size = int(rigs.size[0])
-    own = rig_config(config, rigs, 0)  # of its plant only the number of drones counts
-    env = TransportEnv(dataclasses.replace(own, rigs=dataclasses.replace(config.rigs, number=1)), "newton-euler")
+    size, one_rig = int(rigs.size[0]), dataclasses.replace(config.rigs, number=1)
+    # Of its plant only the number of drones counts, and its attitude loops are those of the preset's own law.
+    own = dataclasses.replace(rig_config(config, rigs, 0), attitude=config.attitude, rigs=one_rig)
+    env = TransportEnv(own, "newton-euler")
     one = not isinstance(laws, Sequence)
     example: Law = laws if one else laws[0]
     numbers, rebuild = (None, lambda _: example) if one else stacked(laws)

@@ -1,0 +1,181 @@
+"""One follower on 1000 rigs that no training drew, beside laws that are told each rig.
+
+    python benchmarks/rigs.py policies/universal.npz --json benchmarks/results/rigs.json
+    python benchmarks/rigs.py policies/universal.npz --steps --figure docs/images/rigs_steps.png
+
+Rigs of 2 to 6 drones in equal numbers, three random flights of 30 s each, the same for everybody; noise, drift and
+delay as in training (`config.rigs` and `scenario` of the preset `universal`). `lqg-told` and `lqg-slow-told` know the
+rig: masses, inertia, mounts, loops, rotors, what each drone gives of its thrust; they estimate the load's torque alone.
+The better of both is the reference of a rig, by the median of its flights, in settling and in peak apart. A rig is met
+where the policy's median settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over
+0.17 m where that is larger, above the reference's, or where the reference itself has none.
+
+With --steps: at 15 s the object's mass changes by 30 %, or the CG jumps to where it would be half a period later.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball import cli
+from mjxball.baselines.adaptive import Adaptive
+from mjxball.baselines.lqg import SlowToldLqg, ToldLqg
+from mjxball.config import Config, preset
+from mjxball.control.followers import Copy, Law
+from mjxball.control.team_lqg import nominal_context
+from mjxball.evaluate.rigs import Flown, fly, held_out, told_laws
+from mjxball.policy import Policy
+from mjxball.policy.policy import NetworkLaw
+from mjxball.sim.rigs import RigTable
+
+SIZES, RIGS, FLIGHTS = (2, 3, 4, 5, 6), 200, 3
+LATER, MORE, LENGTH = 1.25, 0.005, 0.17  # the bar: settling, peak [m], of a rig of that length [m]
+TOLD = ("lqg-told", "lqg-slow-told")
+
+Made = tuple[str, Callable[[Config, RigTable], Law | list[Law]]]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly, print, write."""
+    parser = cli.make_parser("python benchmarks/rigs.py", __doc__.split("\n\n")[0])
+    parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz")
+    parser.add_argument("--rigs", type=int, default=RIGS, metavar="N", help="of each number of drones (default 200)")
+    parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), metavar="N", help="numbers of drones")
+    parser.add_argument("--steps", action="store_true", help="a step of the mass or the CG in flight")
+    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="error against time since the step")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    options = parser.parse_args(arguments)
+    if options.figure and not options.steps:
+        raise InputError("--figure is of --steps")
+    config = preset("universal")
+    found = steps(config, options) if options.steps else compare(config, options)
+    if options.json:
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    return 0
+
+
+def followers(paths: Sequence[Path]) -> list[Made]:
+    """(name, what makes its law for rigs of one size), the two told ones first."""
+    return [
+        ("lqg-told", lambda config, rigs: told_laws(config, rigs, ToldLqg)),
+        ("lqg-slow-told", lambda config, rigs: told_laws(config, rigs, SlowToldLqg)),
+        ("copy", lambda config, rigs: Copy(config)),
+        ("adaptive-mass", lambda config, rigs: told_laws(config, rigs, _adaptive)),
+        *((path.stem, functools.partial(_network, path)) for path in paths),
+    ]
+
+
+def _network(path: Path, config: Config, rigs: RigTable) -> Law:
+    return NetworkLaw(load_policy(path, rig_config(config, rigs, 0)))
+
+
+def _adaptive(config: Config) -> Law:
+    """With mass adaptation, and limits of its estimates that grow with the rig as they are for the pair."""
+    law, plant = Adaptive(config, adapts_mass=True), config.plant
+    weight = plant.object_mass / PAIR_LOAD
+    length = max(math.hypot(*drone.mount) for drone in plant.drones) / LENGTH
+    law._estimate_limits = tuple(limit * max(1.0, weight * length) for limit in law._estimate_limits)
+    law._mass_limit *= max(1.0, weight)
+    return law
+
+
+def compare(config: Config, options: Any) -> dict[str, Any]:
+    """Every follower on held-out rigs of all sizes, and the shares of rigs that are met."""
+    period, rows, whole = config.timing.control_period, [], {}
+    for size in options.sizes:
+        drawn = draw_rigs(config, size, options.rigs, HELD_OUT)
+        rigs = unpadded(drawn.rigs, size)
+        flown: dict[str, Flown] = {}
+        for name, make in followers(options.policies):
+            begun = time.perf_counter()
+            flown[name] = fly(config, rigs, make(config, rigs), FLIGHTS)
+            row = {"drones": size, "follower": name, **_row(flown, name, rigs, period)}
+            rows.append({**row, "seconds": round(time.perf_counter() - begun, 1)})
+            whole.setdefault(name, []).append(row)
+            print(json.dumps(rows[-1]))
+            sys.stdout.flush()
+        rejected = {"drawn": drawn.draws, "unstable": drawn.unstable, "untrimmed": drawn.untrimmed}
+        rows.append({"drones": size, "rigs": options.rigs, **rejected})
+    shares = {
+        name: {key: round(float(np.mean([row[key] for row in parts])), 4) for key in SHARES if key in parts[0]}
+        for name, parts in whole.items()
+    }
+    print(json.dumps(shares, indent=1))
+    return {"rows": rows, "all": shares}
+
+
+def _row(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) -> dict[str, Any]:
+    """Shares of failed flights, medians over rigs, and the shares of rigs that are met."""
+    settling, peak = (np.median(getattr(flown[name], part)(period), axis=1) for part in ("settling", "peak"))
+    row = {
+        "failed": float(flown[name].failed.mean()),
+        "unsettled": float(np.isinf(settling).mean()),
+        **{f"settling_{q}": _quantile(settling, q) for q in (50, 90)},
+        **{f"peak_{q}": _quantile(peak, q) for q in (50, 90)},
+    }
+    if not set(TOLD) <= flown.keys() or name in TOLD:
+        return row
+    told = [flown[one] for one in TOLD]
+    best, smallest = (
+        np.min([np.median(getattr(one, part)(period), axis=1) for one in told], axis=0) for part in ("settling", "peak")
+    )
+    soon = (settling <= LATER * best) | np.isinf(best)
+    small = (peak <= smallest + MORE * np.maximum(rigs.length / LENGTH, 1.0)) | np.isinf(smallest)
+    alone = flown[name].failed & ~np.all([one.failed for one in told], axis=0)
+    return {
+        **row,
+        "crashed_alone": float(alone.mean()),
+        "crashed_alone_flights": int(alone.sum()),
+        "soon": float(soon.mean()),
+        "small": float(small.mean()),
+        "met": float((soon & small).mean()),
+        "sooner": float((settling < best).mean()),
+    }
+
+
+def _quantile(values: np.ndarray, share: int) -> float | None:
+    """None if it is beyond what was reached."""
+    found = float(np.quantile(values, share / 100, method="higher"))
+    return found if math.isfinite(found) else None
+
+
+def steps(config: Config, options: Any) -> dict[str, Any]:
+    """Error after a step at 15 s, of the mass and of the CG: shares that are back within 2 % after 1.5 s."""
+    period, rows, curves = config.timing.control_period, [], {}
+    steady = dataclasses.replace(config, rigs=dataclasses.replace(config.rigs, mass_step=0.3))
+    for kind, made in CHANGES.items():
+        for size in options.sizes:
+            rigs = held_out(config, size, options.rigs)
+            for name, make in followers(options.policies):
+                found = fly(
+                    steady if kind == "mass" else config, rigs, make(config, rigs), FLIGHTS, STEP + 5.0, 1, made
+                )
+                before, after = round(STEP / period), round((STEP + BACK) / period)
+                start = found.error[..., :1]
+                level = 0.02 * start + found.error[..., before - 100 : before].max(axis=-1, keepdims=True)
+                back = (found.error[..., after:] <= level).all(axis=-1) & ~found.failed
+                strict = (found.error[..., after:] <= 0.02 * start).all(axis=-1) & ~found.failed
+                row = {"step": kind, "drones": size, "follower": name, "failed": float(found.failed.mean())}
+                row |= {"back": float((np.median(back, axis=1) > 0).mean())}
+                rows.append({**row, "within_2_percent": float((np.median(strict, axis=1) > 0).mean())})
+                print(json.dumps(rows[-1]))
+                sys.stdout.flush()
+                since = found.error[..., before - 50 :]
+                curves.setdefault((kind, name), []).append(np.where(found.failed[..., None], np.inf, since))
+    if options.figure:
+        _draw(curves, period, options.figure)
+    return {"rows": rows}
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run_command(main))
