@@ -247,10 +247,10 @@ def test_weights_are_uploaded_on_the_ground_only():
 
 
 def test_names_are_those_of_the_c_files():
-    core, glue = ((generate.sources() / name).read_text() for name in ("core.c", "glue.c"))
-    texts = re.search(r"texts\[MJXBALL_CAUSES\] = \{(.*?)\};", core, re.S)
-    assert texts is not None
-    assert tuple(re.findall(r'"(.*)"', texts[1])) == CAUSES
+    header, glue = ((generate.sources() / name).read_text() for name in ("core.h", "glue.c"))
+    causes = re.search(r"\{([^{}]*) +MJXBALL_CAUSES,\s*\} mjxball_cause;", header)
+    assert causes is not None
+    assert len(re.findall(r"MJXBALL_\w+,", causes[1])) == len(CAUSES)
     parameters = re.findall(r"PARAM_ADD\((PARAM_\w+)( \| PARAM_RONLY)?, (\w+),", glue)
     kinds = {"PARAM_FLOAT": "float", "PARAM_UINT8": "uint8_t", "PARAM_UINT32": "uint32_t"}
     assert [(name, kinds[kind], bool(fixed)) for kind, fixed, name in parameters] == list(protocol.PARAMETERS)

@@ -25,32 +25,8 @@
 #define MAX_LIFT_DIFFERENCE 1.5f
 #define BRAKE_TILT 0.13962634f /* [rad] 8 degrees */
 
-static const char *const texts[MJXBALL_CAUSES] = {
-    "good",
-    "asked for by the laptop",
-    "the other drone does",
-    "the laptop is not heard",
-    "the other drone is not heard",
-    "the other drone flies another policy",
-    "the mount is not set",
-    "the goal is beyond the fence or not finite",
-    "the policy does not fly with this force curve",
-    "the state is old or not finite",
-    "the network's command is not finite",
-    "the estimator's position cannot be trusted",
-    "beyond the fence",
-    "tilted beyond the limit",
-    "the firmware cannot fly",
-    "thrust at its bound for too long",
-    "the law comes late",
-    "the phase lasted too long",
-    "on the ground",
-    "weights refused: wrong rate, plant, format, size or CRC",
-    "weights refused: not on the ground",
-};
-
 const char *mjxball_text(int cause) {
-    return cause >= 0 && cause < MJXBALL_CAUSES ? texts[cause] : "unknown";
+    return cause >= 0 && cause < MJXBALL_CAUSES ? mjxball_texts[cause] : "unknown";
 }
 
 int mjxball_period(void) {

@@ -29,7 +29,7 @@ typedef enum {
     MJXBALL_STOP,     /* motors off, until the firmware no longer counts as flying */
 } mjxball_phase;
 
-/* Why a drone does not start, or why it moved on. `mjxball_text` has a sentence for each. */
+/* Why a drone does not start, or why it moved on. `rig.h` has a sentence for each, of `protocol.CAUSES`. */
 typedef enum {
     MJXBALL_GOOD,
     MJXBALL_ASKED,       /* by the laptop */

@@ -16,6 +16,7 @@ import numpy as np
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.fly import card
+from mjxball.fly.app.protocol import CAUSES
 from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.handover import SAME
 from mjxball.fly.limits import Limits
@@ -61,7 +62,7 @@ def check_policy(policy: PolicyFile, name: str) -> Config:
 
 
 def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
-    """`rig.h`: the numbers of both laws and of the supervisor."""
+    """`rig.h`: the numbers of both laws and of the supervisor, and a sentence for each of its causes."""
     law, plant, stand = config.leader, config.plant, config.plant.stand != "free"
     goal, bounds, rig = card.goal_of(config), Limits(), Rig.of_plant(config.plant)
     bounds = bounds.on_stand(goal[2]) if stand else bounds
@@ -94,7 +95,11 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
         "maps": [_map(variants[0].get(name)) for name in CURVE_NAMES],
     }
     lines = ",\n".join(f"    .{name} = {_literal(value)}" for name, value in fields.items())
-    return f"/* See core.h. */\nstatic const mjxball_rig_numbers mjxball_rig = {{\n{lines},\n}};\n"
+    causes = ",\n".join(f'    "{text}"' for text in CAUSES)
+    return (
+        f"/* See core.h. */\nstatic const mjxball_rig_numbers mjxball_rig = {{\n{lines},\n}};\n\n"
+        f"static const char *const mjxball_texts[MJXBALL_CAUSES] = {{\n{causes},\n}};\n"
+    )
 
 
 def _map(variant: Any) -> list[Any]:

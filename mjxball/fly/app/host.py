@@ -64,7 +64,6 @@ class Library:
             ("mjxball_size", ctypes.c_uint32),
             ("mjxball_ident", ctypes.c_uint32),
             ("mjxball_upload_size", ctypes.c_uint32),
-            ("mjxball_text", ctypes.c_char_p),
             ("mjxball_command", ctypes.POINTER(ctypes.c_float)),
             ("mjxball_integral", ctypes.POINTER(ctypes.c_float)),
         ):
@@ -147,10 +146,6 @@ class App:
         reply = ctypes.create_string_buffer(REPLY_SIZE)
         size = self._c.laptop(self._core, data, len(data), ctypes.c_uint32(now), self._memory, reply)
         return reply.raw[:size]
-
-    def text(self, cause: int) -> str:
-        """The sentence of a cause."""
-        return bytes(self._c.text(cause)).decode()
 
     @property
     def phase(self) -> Phase:

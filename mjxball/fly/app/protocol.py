@@ -42,7 +42,7 @@ class Phase(enum.IntEnum):
     STOP = 6
 
 
-# `mjxball_cause`, in its order.
+# The sentence of every `mjxball_cause`, in its order.
 CAUSES = (
     "good",
     "asked for by the laptop",
