@@ -24,7 +24,7 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
-from mjxball.evaluate.suites import standard_scenarios
+from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
