@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.fly.app.host import Library, compile_pair
-from mjxball.fly.card import Controller, goal_of, times_of
-from mjxball.fly.limits import FlightSettings, Limits
+from mjxball.fly.card import Controller, goal_of, limits_of, times_of
+from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import Surroundings, drone_kind
 from mjxball.fly.twin.virtual import MemoryLog, VirtualTwin
@@ -28,8 +28,7 @@ def settings_of(policy: Policy, seconds: float) -> FlightSettings:
     """What the command line would make of `policy`'s card."""
     config = Controller(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
-    bounds = Limits().on_stand(goal[2]) if stand else Limits()
-    return FlightSettings(seconds, goal, stand=stand, limits=bounds, times=times_of(config))
+    return FlightSettings(seconds, goal, stand=stand, limits=limits_of(config, goal), times=times_of(config))
 
 
 @functools.cache

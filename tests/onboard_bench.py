@@ -46,7 +46,7 @@ class Bench:
         seen.position[:] = pair.position + matrix @ mount
         seen.velocity[:] = pair.velocity + matrix @ np.cross(pair.rates, mount)
         seen.quaternion[:], seen.rates[:] = pair.quaternion, pair.rates
-        seen.variance[:], seen.time, seen.can_fly = [1e-5] * 3, self.now, True
+        seen.variance[:], seen.time, seen.can_fly, seen.voltage = [1e-5] * 3, self.now, True, 4.0
         return seen
 
     def tick(self, order: Phase | None, pair: ObjectState | None = None, **wrong: Any) -> list[Any]:
@@ -60,7 +60,7 @@ class Bench:
                 app.laptop(protocol.order(order).data, self.now)
             state = self.state(pair or AT_REST, mount)
             for name, value in wrong.items() if app is self.apps[0] else ():
-                if isinstance(value, bool):
+                if isinstance(value, bool | float):
                     setattr(state, name, value)
                 else:
                     getattr(state, name)[:] = value

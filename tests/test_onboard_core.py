@@ -77,6 +77,7 @@ def test_an_app_refuses_to_start():
     bench = Bench(cores_of(), rig)
     for wrong, text in (
         ({"can_fly": False}, "the firmware cannot fly"),
+        ({"voltage": 3.1}, "the battery is low"),
         ({"position": [float("nan")] * 3}, "the state is old or not finite"),
         ({"variance": [1.0] * 3}, "the estimator's position cannot be trusted"),
     ):

@@ -13,7 +13,7 @@ from mjxball.fly.twin.conditions import Surroundings
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
-from virtual_flight import SETTLE, code_of, settings_of
+from virtual_flight import SETTLE, cause_of, code_of, settings_of
 
 
 def world(seconds: float = 6.0, **around: Any) -> VirtualTwin:
@@ -50,3 +50,29 @@ def test_the_apps_land_without_a_laptop():
     assert twin.touchdown_speed() < 0.4
     assert [drone.app.phase for drone in twin.drones if drone.app] == [Phase.IDLE] * 2
     assert not any(drone.firmware.locked for drone in twin.drones)
+
+
+@needs_gcc
+def test_a_low_battery_lands_both():
+    """One drone finds its battery low for 5 s, without the laptop's knowledge; a moment does not count."""
+    twin = world(seconds=30.0)
+    twin.fly_until(Laptop.FLY)
+    twin.fly_for(3.0)
+    follower = twin.links[1]
+    follower.write_parameters({"mjxb.battery": 4.2})
+    twin.fly_for(4.0)
+    follower.write_parameters({"mjxb.battery": 3.2})
+    twin.fly_for(2.0)
+    assert twin.flight.supervisor.state is Laptop.FLY
+    follower.write_parameters({"mjxb.battery": 4.2})
+    twin.fly_for(4.5)
+    assert twin.flight.supervisor.state is Laptop.FLY
+    twin.run()
+    notes = [record for record in twin.log.records if record["kind"] == "app" and record["phase"] == "land"]
+    assert {one["drone"]: one["cause"] for one in notes} == {
+        "leader": "the other drone does",
+        "follower": "the battery is low",
+    }
+    assert cause_of(twin).startswith("APP_LANDS")
+    assert twin.touchdown_speed() < 0.4
+    assert twin.running() == [False, False]

@@ -18,6 +18,7 @@ GROUP = "mjxb"
 PARAMETERS = (
     *((f"{what}{axis}", "float", False) for what in ("goal", "mount") for axis in "XYZ"),
     ("curve", "uint8_t", False),
+    ("battery", "float", False),
     ("ident", "uint32_t", True),
     ("role", "uint8_t", True),
     ("period", "uint8_t", True),
@@ -65,6 +66,7 @@ CAUSES = (
     "on the ground",
     "weights refused: wrong rate, plant, format, size or CRC",
     "weights refused: not on the ground",
+    "the battery is low",
 )
 
 
