@@ -40,7 +40,7 @@ from mjxball.config import Config, preset
 from mjxball.control.followers import Follower
 from mjxball.evaluate.benchmark import Score, by_variant, run_benchmark
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.suites import Suite, Variant
+from mjxball.evaluate.variants import Suite, Variant
 from mjxball.policy.file import shipped_policy
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario

@@ -53,22 +53,32 @@ def numbers_of(metrics: Any) -> dict[str, float]:
     return {"peak": max(peaks), "overshoot": metrics.overshoot, "settling": settling, "rmse": metrics.rmse}
 
 
-def fly(follower: Follower, cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Any]:
-    """Medians over the seeds for every cell, all infinite where any of its flights failed."""
-    config, scenarios = preset("paper"), []
+def scenarios_of(cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Scenario]:
+    """All cells at the first CG phase, then at the next."""
+    scenarios = []
     for seed in range(seeds):
         disturbance = Disturbance(noise=1.0, delay=0.04, seed=seed) if disturbed else Disturbance()
         phase = 2 * math.pi * seed / seeds
         scenarios += [
             Scenario(omega=w, amplitude=a, mass=m, phase=phase, disturbance=disturbance, **common) for w, a, m in cells
         ]
-    flown, found = Batch(config, follower).fly(scenarios), []
-    for i in range(len(cells)):
-        runs = flown[i :: len(cells)]
-        medians = {name: statistics.median(numbers_of(run)[name] for run in runs) for name in WANTED}
+    return scenarios
+
+
+def medians(flown: list[Any], cells: int) -> list[dict[str, Any]]:
+    """Over the seeds for every one of the cells, all infinite where any of its flights failed."""
+    found = []
+    for i in range(cells):
+        runs = flown[i::cells]
+        middle = {name: statistics.median(numbers_of(run)[name] for run in runs) for name in WANTED}
         failed = sum(run.failed for run in runs)
-        found.append({**(dict.fromkeys(WANTED, math.inf) if failed else medians), "failed": failed})
+        found.append({**(dict.fromkeys(WANTED, math.inf) if failed else middle), "failed": failed})
     return found
+
+
+def fly(follower: Follower, cells: list[Any], common: dict[str, Any], disturbed: bool, seeds: int) -> list[Any]:
+    """`medians` of a follower's flights."""
+    return medians(Batch(preset("paper"), follower).fly(scenarios_of(cells, common, disturbed, seeds)), len(cells))
 
 
 def reach_of(config: Config, mass: float, known: bool) -> float:

@@ -16,12 +16,10 @@ sockets or clock. Numbers are of the twin's true state.
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import multiprocessing
 import statistics
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,7 +34,7 @@ from mjxball.fly.twin.virtual import MemoryLog, VirtualTwin
 from mjxball.physics.step import start_state
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
-from virtual_flight import SETTLE, Row, cause_of, code_of, settings_of, world_of
+from virtual_flight import SETTLE, Job, Row, campaign, cause_of, code_of, settings_of, world_of
 
 SETTLED, HOVER = 5.0, 20.0  # [s]
 
@@ -155,7 +153,7 @@ def _rms(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else math.nan
 
 
-def jobs_of(options: argparse.Namespace) -> Iterator[tuple[str, Callable[..., list[Row]], tuple[Any, ...]]]:
+def jobs_of(options: argparse.Namespace) -> Iterator[Job]:
     """(part, function, arguments) of everything that is asked for, the longest first."""
     if "flights" in options.parts:
         yield from (("flights", flights_in_a_row, (path, 20)) for path in (options.stand, options.flight))
@@ -178,11 +176,6 @@ def jobs_of(options: argparse.Namespace) -> Iterator[tuple[str, Callable[..., li
             for drone in range(2)
             for number in range(options.trials)
         )
-
-
-def _run(job: tuple[str, Callable[..., list[Row]], tuple[Any, ...]]) -> tuple[str, list[Row]]:
-    part, function, arguments = job
-    return part, function(*arguments)
 
 
 def table(part: str, rows: Sequence[Row]) -> None:
@@ -226,18 +219,7 @@ def main() -> int:
     parser.add_argument("--trials", type=int, default=4)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    found: dict[str, list[Row]] = {part: [] for part in options.parts}
-    jobs = list(jobs_of(options))
-    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        for number, (part, rows) in enumerate(pool.imap_unordered(_run, jobs), 1):
-            found[part] += rows
-            print(f"\r{number} of {len(jobs)}", end="", file=sys.stderr, flush=True)
-    for part, rows in found.items():
-        table(part, rows)
-    if options.json:
-        command = "python benchmarks/fly_firmware.py " + " ".join(sys.argv[1:])
-        options.json.write_text(json.dumps({"command": command, **found}, indent=1) + "\n", encoding="utf-8")
-    return 0 if all(row["stopped"] for row in found.get("faults", [])) else 1
+    return campaign("fly_firmware", options, jobs_of(options), table)
 
 
 if __name__ == "__main__":

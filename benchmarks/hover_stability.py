@@ -58,19 +58,33 @@ def linearised_hovers(
     config: Config, law: Law, cases: Sequence[tuple[float, float, float]], delay: int = 0
 ) -> list[Hover]:
     """The hover of every case: (CG offset [m], object mass [kg], believed mass [kg])."""
+    return linearised(config, lambda _: law, np.zeros(1), cases, delay)[0]
+
+
+def linearised(
+    config: Config, law: Callable[[Any], Law], numbers: Any, cases: Sequence[tuple[float, float, float]], delay: int
+) -> list[list[Hover]]:
+    """`linearised_hovers` of every one of k laws, `law` of traced numbers: a tree of arrays (k, ...)."""
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
-        start, step = closed_loop(config, law, delay)
         scenarios = [
             Scenario(omega=0.0, phase=np.pi / 2, amplitude=offset, mass=mass, believed_mass=believed)
             for offset, mass, believed in cases
         ]
         loads = jax.tree.map(jnp.asarray, rollout.load_of(scenarios))
-        found = jax.jit(jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load))))(loads)
-        points, residuals, jacobians = map(np.asarray, found)
-    radii = [_radius(jacobian) for jacobian in jacobians]
+
+        def of_one(own: Any) -> tuple[Array, Array, Array]:
+            start, step = closed_loop(config, law(own), delay)
+            return jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load)))(loads)
+
+        found = map(np.asarray, jax.jit(jax.vmap(of_one))(jax.tree.map(jnp.asarray, numbers)))
     return [
-        Hover(offset, mass, delay, float(residual), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4])), radius)
-        for (offset, mass, _), z, residual, radius in zip(cases, points, residuals, radii, strict=True)
+        [
+            Hover(
+                offset, mass, delay, float(left), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4])), _radius(j)
+            )
+            for (offset, mass, _), z, left, j in zip(cases, *one, strict=True)
+        ]
+        for one in zip(*found, strict=True)
     ]
 
 

@@ -72,7 +72,7 @@ def judge(found: list[tuple[float, Path]]) -> list[dict[str, Any]]:
     from mjxball.config import preset
     from mjxball.evaluate.policies import load_policy
     from mjxball.evaluate.results import fly_scenarios
-    from mjxball.evaluate.suites import REFERENCE
+    from mjxball.evaluate.scenarios import REFERENCE
     from mjxball.policy.file import load_file
     from mjxball.policy.policy import mean_action
     from mjxball.train.program import Program

@@ -12,18 +12,15 @@ The twin in virtual time, as in `fly_firmware.py`; on board it runs the apps' ow
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import multiprocessing
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import fly_faults_virtual
 from fly_firmware import hover
 from mjxball.policy.file import shipped_policy
-from virtual_flight import Row
+from virtual_flight import Job, Row, campaign
 
 DELAYS = (0.0, 0.01, 0.02, 0.04)  # [s] each way
 WHERE = {"laptop": "", "on board": "float32", "on board, int8": "int8"}
@@ -35,7 +32,7 @@ def delayed(path: Path, where: str, delay: float, seed: int) -> list[Row]:
     return [{**row, "delay": delay}]
 
 
-def jobs_of(options: argparse.Namespace) -> Iterator[tuple[str, Callable[..., list[Row]], tuple[Any, ...]]]:
+def jobs_of(options: argparse.Namespace) -> Iterator[Job]:
     """(part, function, arguments) of everything that is asked for."""
     for delay in DELAYS if "delay" in options.parts else ():
         for where in WHERE:
@@ -44,11 +41,6 @@ def jobs_of(options: argparse.Namespace) -> Iterator[tuple[str, Callable[..., li
         for drone in range(2):
             for number in range(options.trials):
                 yield "faults", fly_faults_virtual.fault, (options.policy, kind, drone, number, "float32")
-
-
-def _run(job: tuple[str, Callable[..., list[Row]], tuple[Any, ...]]) -> tuple[str, list[Row]]:
-    part, function, arguments = job
-    return part, function(*arguments)
 
 
 def table(part: str, rows: list[Row]) -> None:
@@ -74,18 +66,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    found: dict[str, list[Row]] = {part: [] for part in options.parts}
-    jobs = list(jobs_of(options))
-    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        for number, (part, rows) in enumerate(pool.imap_unordered(_run, jobs), 1):
-            found[part] += rows
-            print(f"\r{number} of {len(jobs)}", end="", file=sys.stderr, flush=True)
-            if options.json:  # as far as it has come
-                command = "python benchmarks/onboard_flights.py " + " ".join(sys.argv[1:])
-                options.json.write_text(json.dumps({"command": command, **found}, indent=1) + "\n", encoding="utf-8")
-    for part, rows in found.items():
-        table(part, rows)
-    return 0 if all(row["stopped"] for row in found.get("faults", [])) else 1
+    return campaign("onboard_flights", options, jobs_of(options), table)
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def evaluate(rows: list[dict[str, Any]]) -> None:
     from mjxball.config import preset
     from mjxball.evaluate.policies import load_policy
     from mjxball.evaluate.results import fly_scenarios
-    from mjxball.evaluate.suites import REFERENCE
+    from mjxball.evaluate.scenarios import REFERENCE
 
     settings = preset("transport")
     policies = [load_policy(row["policy"], settings) for row in rows]

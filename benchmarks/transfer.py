@@ -9,7 +9,7 @@ backend (`positional`, as there), the same network sizes and steps. Both SACs ev
 steps. PPO is not evaluated while the clock runs. Brax publishes PPO for both environments; its SAC has those of
 walker2d, the nearest that it publishes.
 
-One process, one after the other, each with an empty compilation cache of its own for the first seed (cold), which
+One process, trainers in turn, each with an empty compilation cache of its own for the first seed (cold), which
 the other seeds find filled (warm). Seconds are those of the whole call: tracing, compiling, training. Every policy
 then flies the same 128 episodes of 1000 steps, without noise, up to its first termination.
 """
@@ -17,7 +17,9 @@ then flies the same 128 episodes of 1000 steps, without noise, up to its first t
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
+import math
 import statistics
 import tempfile
 import time
@@ -27,6 +29,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.experimental.compilation_cache import compilation_cache
 
 from mjxball import config as configs
 from mjxball.algorithms.ppo import ProximalPolicyOptimization
@@ -99,6 +102,7 @@ def our_config(algorithm: str, given: dict[str, Any]) -> configs.Config:
             "epochs": given["num_updates_per_batch"],
             "minibatches": given["num_minibatches"],
             "policy_layers": PPO_POLICY,
+            "activation": "swish",
             "value_layers": PPO_VALUE,
             "entropy_cost": given["entropy_cost"],
             "clipping": 0.3,
@@ -109,17 +113,20 @@ def our_config(algorithm: str, given: dict[str, Any]) -> configs.Config:
     return configs.replace(config, "timing.episode_steps", EPISODE)
 
 
-def ours(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Callable[[Any], Any]:
-    """Train; the policy as a function of observations."""
+Policy = tuple[Callable[[Any, Any], Any], Any]  # action of (parameters, observation), and the parameters
+
+
+def ours(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Policy:
+    """Train."""
     config = our_config(algorithm, given)
     kind = {"sac": SoftActorCritic, "ppo": ProximalPolicyOptimization}[algorithm]
     policy, _ = jax.jit(lambda key: train(config, key, env=env, algorithm=kind, evaluate=algorithm == "sac"))(
         jax.random.PRNGKey(seed)
     )
-    return jax.block_until_ready(policy)
+    return lambda network, observation: network(observation), jax.block_until_ready(policy)
 
 
-def stock(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Callable[[Any], Any]:
+def stock(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Policy:
     """The same with Brax's trainer."""
     from brax.training.agents.ppo import train as ppo
     from brax.training.agents.sac import train as sac
@@ -135,24 +142,28 @@ def stock(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Callabl
         **({"run_evals": False} if algorithm == "ppo" else {}),
         **given,
     )
-    policy = make_policy(jax.block_until_ready(parameters), deterministic=True)
-    return lambda observation: policy(observation, jax.random.PRNGKey(0))[0]
+
+    def act(known: Any, observation: Any) -> Any:
+        return make_policy(known, deterministic=True)(observation, jax.random.PRNGKey(0))[0]
+
+    return act, jax.block_until_ready(parameters)
 
 
-def mean_return(env: Any, act: Callable[[Any], Any]) -> float:
+def mean_return(env: Any, policy: Policy) -> float:
     """Mean return of the same episodes for every policy."""
-
-    def step(carry: Any, _: None) -> tuple[Any, None]:
-        states, alive, total = carry
-        states = jax.vmap(env.step)(states, act(states.obs))
-        return (states, alive * (1 - states.done), total + alive * states.reward), None
+    act, known = policy
 
     @jax.jit
-    def fly(keys: Any) -> Any:
+    def fly(known: Any, keys: Any) -> Any:
+        def step(carry: Any, _: None) -> tuple[Any, None]:
+            states, alive, total = carry
+            states = jax.vmap(env.step)(states, act(known, states.obs))
+            return (states, alive * (1 - states.done), total + alive * states.reward), None
+
         start = (jax.vmap(env.reset)(keys), jnp.ones(EPISODES), jnp.zeros(EPISODES))
         return jax.lax.scan(step, start, length=EPISODE)[0][2].mean()
 
-    return float(fly(jax.random.split(jax.random.PRNGKey(1), EPISODES)))
+    return float(fly(known, jax.random.split(jax.random.PRNGKey(1), EPISODES)))
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -192,23 +203,26 @@ def main() -> None:
     settings: Any = jax.config
     settings.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     settings.update("jax_default_matmul_precision", "highest")  # what ours trains with
-    tasks = [name for name in TASKS if name[0] in options.envs and name[1] in options.algorithms]
+    jnp.zeros(1).block_until_ready()  # the device has started before the clock runs
+    tasks = list(itertools.product(options.envs, options.algorithms))
     with tempfile.TemporaryDirectory() as place:
         for env_name, algorithm in tasks:
             given = dict(TASKS[env_name, algorithm])
-            rounds = round(given["num_timesteps"] * options.scale / given["num_envs"])
-            given["num_timesteps"] = rounds * given["num_envs"]
+            # Brax's PPO rounds up to whole updates.
+            unit = given["num_envs"] if algorithm == "sac" else PPO["unroll_length"] * PPO["num_minibatches"]
+            unit *= 1 if algorithm == "sac" else given["batch_size"]
+            given["num_timesteps"] = math.ceil(given["num_timesteps"] * options.scale / unit) * unit
             env = envs.get_environment(env_name, backend=options.backend)
-            for trainer in options.trainers:
+            for seed, trainer in itertools.product(range(options.seeds), options.trainers):
                 settings.update("jax_compilation_cache_dir", f"{place}/{env_name}-{algorithm}-{trainer}")
-                for seed in range(options.seeds):
-                    started = time.perf_counter()
-                    policy = trainers[trainer](env, algorithm, given, seed)
-                    seconds = time.perf_counter() - started
-                    row = {"env": env_name, "algorithm": algorithm, "trainer": trainer, "seed": seed}
-                    row |= {"steps": given["num_timesteps"], "seconds": seconds, "return": mean_return(env, policy)}
-                    rows.append(row)
-                    say(row)
+                compilation_cache.reset_cache()
+                started = time.perf_counter()
+                policy = trainers[trainer](env, algorithm, given, seed)
+                seconds = time.perf_counter() - started
+                row = {"env": env_name, "algorithm": algorithm, "trainer": trainer, "seed": seed}
+                row |= {"steps": given["num_timesteps"], "seconds": seconds, "return": mean_return(env, policy)}
+                rows.append(row)
+                say(row)
                 if options.json:  # what is measured stays, whatever ends the rest
                     options.json.write_text(json.dumps(result(options, rows), indent=2) + "\n")
     for row in summary(rows):

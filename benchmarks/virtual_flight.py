@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import functools
+import json
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from mjxball.fly.app.host import Library, compile_pair
-from mjxball.fly.card import Controller, goal_of, times_of
-from mjxball.fly.limits import FlightSettings, Limits
+from mjxball.fly.card import Controller, goal_of, limits_of, times_of
+from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import Surroundings, drone_kind
 from mjxball.fly.twin.virtual import MemoryLog, VirtualTwin
@@ -16,14 +21,14 @@ from mjxball.policy import Policy, load_file
 
 SETTLE = 1.0  # [s] that estimators get before a flight, as the check before a real one gives them
 Row = dict[str, Any]
+Job = tuple[str, Callable[..., list[Row]], tuple[Any, ...]]  # part, function, arguments
 
 
 def settings_of(policy: Policy, seconds: float) -> FlightSettings:
     """What the command line would make of `policy`'s card."""
     config = Controller(policy).config
     goal, stand = goal_of(config), config.plant.stand != "free"
-    bounds = Limits().on_stand(goal[2]) if stand else Limits()
-    return FlightSettings(seconds, goal, stand=stand, limits=bounds, times=times_of(config))
+    return FlightSettings(seconds, goal, stand=stand, limits=limits_of(config, goal), times=times_of(config))
 
 
 @functools.cache
@@ -60,3 +65,29 @@ def cause_of(world: VirtualTwin) -> str:
     """What ended the flight early, empty if nothing did."""
     cause = world.flight.supervisor.cause
     return "" if cause is None else f"{cause.event.name} {cause.detail}"
+
+
+def campaign(
+    script: str, options: argparse.Namespace, jobs: Iterable[Job], table: Callable[[str, list[Row]], None]
+) -> int:
+    """Run `jobs` in `options.jobs` processes, print each part, write `options.json` as far as it has come.
+
+    The exit code: 1 if a motor still turned after a fault.
+    """
+    found: dict[str, list[Row]] = {part: [] for part in options.parts}
+    jobs = list(jobs)
+    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
+        for number, (part, rows) in enumerate(pool.imap_unordered(_run, jobs), 1):
+            found[part] += rows
+            print(f"\r{number} of {len(jobs)}", end="", file=sys.stderr, flush=True)
+            if options.json:
+                command = f"python benchmarks/{script}.py " + " ".join(sys.argv[1:])
+                options.json.write_text(json.dumps({"command": command, **found}, indent=1) + "\n", encoding="utf-8")
+    for part, rows in found.items():
+        table(part, rows)
+    return 0 if all(row["stopped"] for row in found.get("faults", [])) else 1
+
+
+def _run(job: Job) -> tuple[str, list[Row]]:
+    part, function, arguments = job
+    return part, function(*arguments)

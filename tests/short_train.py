@@ -7,7 +7,7 @@ import sys
 
 from mjxball.commands import train
 from mjxball.config import Config
-from mjxball.evaluate.suites import standard_scenarios
+from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.sim.scenario import Scenario
 
 

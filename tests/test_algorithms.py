@@ -180,6 +180,7 @@ def test_a_run_by_gradient_writes_a_policy_and_resumes(tmp_path: Path, monkeypat
         (["--gradient.horizon", "10"], "--algorithm gradient"),
         (["--algorithm", "td3"], "sac, ppo, gradient, package.module:Name"),
         (["--algorithm", "ppo", "--ppo.minibatches", "7"], "ppo.minibatches"),
+        (["--algorithm", "ppo", "--ppo.activation", "swish"], "policy files hold relu"),
     ],
 )
 def test_what_does_not_fit_is_refused(

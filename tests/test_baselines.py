@@ -11,7 +11,7 @@ from mjxball.config import preset, replace
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure
 from mjxball.evaluate.results import Result, fly_scenarios
-from mjxball.evaluate.suites import REFERENCE, cross
+from mjxball.evaluate.scenarios import REFERENCE, cross
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario

@@ -20,13 +20,14 @@ from mjxball.evaluate import report as report_page
 from mjxball.evaluate import suites
 from mjxball.evaluate.benchmark import Score, bootstrap, by_variant, run_benchmark, wins
 from mjxball.evaluate.report import compare, verdict
+from mjxball.evaluate.variants import Suite
 from mjxball.sim.scenario import check_scenario
 
 CONFIG = preset("paper")
 SHORT = ("delay", "mass-change")
 
 
-def shortened(name: str, seconds: float = 24.0) -> suites.Suite:
+def shortened(name: str, seconds: float = 24.0) -> Suite:
     """A suite whose flights are cut short."""
     suite = suites.BY_NAME[name]
     variants = tuple(

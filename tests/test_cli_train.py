@@ -7,7 +7,6 @@ import csv
 import io
 import json
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -38,6 +37,7 @@ from mjxball.policy import Policy
 STEPS = 4096
 LONG = 96_000  # several seconds of training, so that Ctrl-C arrives in the middle
 ROW = re.compile(r"^\s*[\d,]+ / [\d,]+ steps")
+COMPILING = re.compile("compiling the training program")
 EVALUATED = {"eval_return", "eval_steady_error", "eval_peak", "eval_tilt_error", "eval_vertical_error"}
 
 
@@ -124,12 +124,10 @@ def test_export_of_the_run_is_its_policy(finished: Path, tmp_path: Path, capsys:
 # --- Ctrl-C and resume ----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that got one Ctrl-C after its first row of progress."""
-    here = tmp_path_factory.mktemp("interrupted")
+def stopped(here: Path, line: re.Pattern[str], number: int, **settings: Any) -> str:
+    """Output of a short run in `here` that got signal `number` after a line on stderr; it ended with 130."""
     child = subprocess.Popen(
-        [sys.executable, str(script("train.py")), *tiny(out="run", sac__total_steps=LONG)],
+        [sys.executable, str(script("train.py")), *tiny(out="run", **settings)],
         cwd=here,
         env=environment(),
         stdout=subprocess.PIPE,
@@ -140,10 +138,10 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     guard.start()
     try:
         seen = []
-        for line in child.stderr:
-            seen.append(line)
-            if ROW.match(line):
-                child.send_signal(signal.SIGINT)
+        for text in child.stderr:
+            seen.append(text)
+            if line.match(text):
+                child.send_signal(number)
                 break
         output, errors = child.communicate()
     finally:
@@ -151,7 +149,14 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
         child.kill()
     assert child.returncode == 130, (seen, output, errors)
     assert "Traceback" not in errors
-    assert "run/policy.npz" in output
+    return output + errors
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that got one Ctrl-C after its first row of progress."""
+    here = tmp_path_factory.mktemp("interrupted")
+    assert "run/policy.npz" in stopped(here, ROW, signal.SIGINT, sac__total_steps=LONG)
     return here / "run"
 
 
@@ -175,11 +180,10 @@ def test_export_of_an_interrupted_run(interrupted: Path, tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_a_run_quit_while_it_compiled_is_started_anew(finished: Path, tmp_path: Path, short_verdict: None) -> None:
-    """Ctrl-C twice before the first checkpoint leaves `config.json` and an empty table: enough to resume from."""
+    """SIGTERM before the first checkpoint leaves the configuration and an empty table: enough to resume from."""
     run_directory = tmp_path / "run"
-    (run_directory / "checkpoints").mkdir(parents=True)
-    shutil.copy(finished / "config.json", run_directory)
-    (run_directory / "metrics.csv").write_text((finished / "metrics.csv").read_text().splitlines()[0] + "\n")
+    assert "before training began" in stopped(tmp_path, COMPILING, signal.SIGTERM, seed=3, sac__total_steps=STEPS)
+    assert {path.name for path in run_directory.iterdir()} == {"config.json", "metrics.csv", "tensorboard"}
     assert call(main, ["--resume", run_directory]) == 0
     np.testing.assert_array_equal(command_of(run_directory / "policy.npz"), command_of(finished / "policy.npz"))
 

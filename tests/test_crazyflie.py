@@ -22,7 +22,6 @@ STOCK = Autopilot(kind="crazyflie")
 LEVEL, STILL = np.zeros(3), np.zeros(3)
 HOVER = np.array([0.0, 0.0, 0.0, 46000.0])
 OLDER, LINEAR = (0.0915, 0.0677), (0.0, 0.12)
-STRONGER = [("thrust-upgrade", 0.0345, 0.18), ("brushless", 0.0393, 0.20)]
 VARIANTS = [name for name in PLANTS if name.startswith("crazyflie")]
 
 
@@ -108,7 +107,7 @@ class TestLoops:
 
     @pytest.mark.parametrize("thrust", [0.0, 999.0])
     def test_without_thrust_motors_stop_and_loops_are_reset(self, thrust: float) -> None:
-        wound = np.full(crazyflie.LOOPS, 5.0)
+        wound = np.full(13, 5.0)
         loops, motors = tick(STOCK, (5.0, 5.0, 0.0, thrust), euler=np.radians([1.0, 2.0, 3.0]), loops=wound)
         assert not motors.any()
         parts = crazyflie.unpack(loops)

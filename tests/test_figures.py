@@ -19,7 +19,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate import stand_figure
 from mjxball.evaluate.paper_figures import NAMES, draw_reward, read_curve, swings
 from mjxball.evaluate.results import fly_scenarios
-from mjxball.evaluate.suites import REFERENCE
+from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 

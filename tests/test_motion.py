@@ -14,7 +14,7 @@ from mjxball.commands.train import main as train
 from mjxball.config import Attitude, Drone, Motion, Plant, replace
 from mjxball.control import rotations
 from mjxball.errors import InputError
-from mjxball.evaluate.suites import read_waveform
+from mjxball.evaluate.scenarios import read_waveform
 from mjxball.physics import motion, newton_euler
 from mjxball.physics.engine import Load, PathShape, PlantState, Wrench
 from mjxball.sim.rollout import simulate

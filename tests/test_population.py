@@ -18,7 +18,7 @@ from conftest import with_settings
 from mjxball.commands.train import main as train
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.evaluate.suites import standard_scenarios
+from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.policy import Policy
 from mjxball.policy.file import load_file
 from mjxball.train import program as programs

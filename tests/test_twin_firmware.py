@@ -656,7 +656,7 @@ def test_a_stabilizer_that_hangs_holds_pwm_and_estimate() -> None:
 
 def test_row_tables_have_the_real_size() -> None:
     assert (len(protocol.PARAMETERS), len(logs.LOG_VARIABLES)) == (240, 355)
-    for items in (protocol.PARAM_ITEMS, logs.LOG_ITEMS):
+    for items in ([logs.item(one.type_byte, one.name) for one in protocol.PARAMETERS], logs.LOG_ITEMS):
         assert len(set(items)) == len(items)
         assert max(map(len, items)) + 3 <= 30  # one packet each
     by_name = {parameter.name: parameter for parameter in protocol.PARAMETERS}

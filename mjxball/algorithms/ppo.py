@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, Transition
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, SwishNetwork, Transition
 from mjxball.algorithms.networks import normaliser
 from mjxball.config import Config, Ppo
 from mjxball.errors import InputError
@@ -133,7 +133,8 @@ class ProximalPolicyOptimization:
     def policy(self, state: PpoState) -> PolicyNetwork:
         """The policy, and what it knows of its observations."""
         mask = jnp.asarray(self._mask, jnp.float32)
-        return PolicyNetwork(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
+        kind = {"relu": PolicyNetwork, "swish": SwishNetwork}[self._config.activation]
+        return kind(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> PpoState:
         """The rollout is cut, the rest is whole."""
@@ -154,7 +155,7 @@ class ProximalPolicyOptimization:
 def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) -> Any:
     """Brax's PPO networks: tanh-squashed Gaussian policy and state value on normalised observations.
 
-    The policy has ReLU units, as policy files have; the value, which is never written, the smoother ones of Brax.
+    The value, which is never written, has the smooth units of Brax.
     """
     distribution = brax.distribution.NormalTanhDistribution(event_size=action_size)
     policy, value = (normaliser(shown) for shown in (mask, critic_mask))
@@ -164,7 +165,7 @@ def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) ->
             len(mask),
             preprocess_observations_fn=policy,
             hidden_layer_sizes=config.policy_layers,
-            activation=jax.nn.relu,
+            activation=getattr(jax.nn, config.activation),
         ),
         value_network=brax.networks.make_value_network(
             len(mask),

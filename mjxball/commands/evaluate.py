@@ -24,8 +24,10 @@ from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant, load_policy, native_config
 from mjxball.evaluate.report import write_page, write_report
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
+from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
 from mjxball.evaluate.stand_figure import stand_config
-from mjxball.evaluate.suites import REFERENCE, Suite, find_suites, list_suites, standard_scenarios
+from mjxball.evaluate.suites import find_suites, list_suites
+from mjxball.evaluate.variants import Suite
 from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy, PolicyFileError
 from mjxball.policy.file import shipped_policies

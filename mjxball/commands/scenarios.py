@@ -9,7 +9,7 @@ from typing import Any
 
 from mjxball import cli, config
 from mjxball.errors import InputError
-from mjxball.evaluate.suites import REFERENCE, STANDARD, cross, read_waveform, standard_scenarios
+from mjxball.evaluate.scenarios import REFERENCE, STANDARD, cross, read_waveform, standard_scenarios
 from mjxball.sim.scenario import Scenario, check_scenario
 
 SCENARIO_FLAGS = (

@@ -24,7 +24,7 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
-from mjxball.evaluate.suites import standard_scenarios
+from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
@@ -173,6 +173,8 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
+    if options.algorithm == "ppo" and settings.ppo.activation != "relu":
+        raise InputError(f"--ppo.activation {settings.ppo.activation}: policy files hold relu; see mjxball.train.train")
     out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)
     members = 1 if options.num_seeds is None else options.num_seeds

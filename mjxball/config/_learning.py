@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from mjxball.config._leaf import setting
 
@@ -57,6 +58,9 @@ class Ppo:
     epochs: int = setting(4, "passes over these steps in an update", low=1)
     minibatches: int = setting(8, "parts of the unrolls that each pass is cut into", low=1)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
+    activation: Literal["relu", "swish"] = setting(
+        "relu", "units of the policy; policy files hold relu alone, swish is for `mjxball.train.train`"
+    )
     value_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the state value", low=1)
     learning_rate: float = setting(1e-3, "Adam's rate at the start", above=0)
     learning_rate_final_ratio: float = setting(

@@ -127,19 +127,21 @@ def _balance() -> Config:
             unknown_mass_probability=0.4,
             unknown_mass=(0.1, 0.4),
             gust=(0.0, 0.2),
-            # Half as much again as a user's delay may be: what is stable there is well damped at 60 ms.
-            delay=(0.0, 0.1),
+            # Nearly twice what a user's delay may be: what is stable there is well damped at 60 ms.
+            delay=(0.0, 0.11),
             rotor_lag_scale=(0.7, 1.5),
             inertia_scale=(0.8, 1.2),
             cg_waypoint_probability=0.3,
         ),
         bounds=Bounds(x_peak=0.005, settling_time=2.2, rmse=0.335),
-        reward=replace(large.reward, error_scale=0.016, velocity=10.5, smoothness=0.2, command_change=40.0),
+        # Speed is so dear that no seed overshoots by the 2 % within which it is to settle.
+        reward=replace(large.reward, error_scale=0.016, velocity=12.0, smoothness=0.2, command_change=45.0),
         gradient=Gradient(
-            gradient_steps=1000,
+            gradient_steps=1500,
             num_envs=64,
             windows_per_episode=5,
             learning_rate=6e-3,
+            learning_rate_final_ratio=0.002,  # the last steps' noise would stand as an error of half a millimetre
             gradient_decay=0.97,
         ),
     )

@@ -180,6 +180,11 @@ class ScenarioRanges:
         0.0, "probability of a firmware that does not compensate for the battery", low=0, high=1
     )
     gust: Range = drawn((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0)
+    relay_probability: float = setting(
+        0.0, "probability that the object's error reaches the follower by messages, held in between", low=0, high=1
+    )
+    relay_rate: Range = drawn((5.0, 10.0), "messages a second in these flights [Hz]", above=0)
+    relay_loss: Range = drawn((0.0, 0.0), "share of their messages that is lost", low=0, high=0.9)
     rotor_lag_scale: Range = drawn((1.0, 1.0), "factor on the rotors' time constant", above=0)
     thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0)
     thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", above=0)

@@ -26,7 +26,6 @@ ATTITUDE_LIMITS = (20.0, 20.0, 360.0)  # of the attitude integrals of roll, pitc
 RATE_LIMITS = (33.3, 33.3, 166.7)  # of the rate integrals [deg]
 LARGEST = 32767.0  # of a rate loop's output
 SIGNS = (1.0, -1.0, 1.0)  # ours -> firmware's roll, pitch, yaw
-LOOPS = 13  # numbers that the loops of one drone carry, see `Loops`
 # "pid_attitude.roll_kp" -> (field of `Autopilot`, place in it)
 PARAMETERS: dict[str, tuple[str, int]] = {
     f"{group}.{axis}_{gain}": (f"{axis}{suffix}", place)

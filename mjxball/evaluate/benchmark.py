@@ -15,7 +15,7 @@ from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.results import Result, fly_scenarios, scenario_title
-from mjxball.evaluate.suites import Suite, Variant
+from mjxball.evaluate.variants import Suite, Variant
 
 # What the tables show and rank: less is better in each.
 RANKED = ("rmse", "settling_time", "overshoot", "x_peak", "peak", "max_tilt", "effort", "smoothness", "saturation")

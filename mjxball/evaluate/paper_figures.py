@@ -15,8 +15,9 @@ from mjxball.control.followers import Follower
 from mjxball.errors import InputError
 from mjxball.evaluate.plots import Figure, as_svg, colours, legend_above, panels, thinned
 from mjxball.evaluate.results import Result, fly_scenarios
+from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.evaluate.stand_figure import draw_stand
-from mjxball.evaluate.suites import BY_NAME, REFERENCE
+from mjxball.evaluate.suites import BY_NAME
 from mjxball.plotting import pyplot
 from mjxball.policy import Policy
 

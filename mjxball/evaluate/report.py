@@ -15,7 +15,8 @@ from mjxball.config import Plant
 from mjxball.evaluate import plots
 from mjxball.evaluate.benchmark import RANKED, Score, Summary, by_variant, winners, wins
 from mjxball.evaluate.render import film
-from mjxball.evaluate.suites import GRID, Suite
+from mjxball.evaluate.suites import GRID
+from mjxball.evaluate.variants import Suite
 from mjxball.policy import Policy
 
 TEMPLATES = Path(__file__).parent / "templates"

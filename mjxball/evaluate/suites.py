@@ -1,155 +1,18 @@
-"""Scenarios of the evaluation: the reference, the standard list, waveforms, and the suites of the benchmark."""
+"""Suites of the benchmark: those of a pair, those of `team_suites`, and how they are found by name."""
 
 from __future__ import annotations
 
-import csv
-import dataclasses
-import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjxball import config as configs
-from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
-from mjxball.plant.teams import ring_config
+from mjxball.evaluate.team_suites import TEAM_SUITES
+from mjxball.evaluate.variants import Suite, Variant
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.scenario import CIRCLE, CgPath, Scenario, check_scenario
-
-REFERENCE = Scenario()
-# Copy without CG motion, then five speeds of the CG.
-STANDARD = (
-    dataclasses.replace(REFERENCE, amplitude=0.0),
-    *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.31, 0.62, 1.0, 2.0, 3.1)),
-)
-MOST_SAMPLES = 100_000
-
-
-def cross(
-    omegas: Sequence[float], amplitudes: Sequence[float], masses: Sequence[float], **common: Any
-) -> tuple[Scenario, ...]:
-    """Full cross product of the lists, in the given order."""
-    cells = itertools.product(omegas, amplitudes, masses)
-    return tuple(Scenario(omega=w, amplitude=a, mass=m, **common) for w, a, m in cells)
-
-
-def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
-    """The standard scenarios as far as the plant allows them, the reference one last; raise InputError if unsound.
-
-    The object has the plant's mass, the CG keeps to the object and to what training draws, a stand's locked axes have
-    goal 0, and the goal is drawn in to what training may draw. A waveform or a rolling ball makes one scenario. In the
-    plane the CG goes round in a circle.
-    """
-    plant = settings.plant
-    distance = min(REFERENCE.goal[0], settings.scenario.goal_range)
-    free = {"free": (1, 1, 1), "pivot": (0, 0, 0), "heave": (0, 0, 1)}[plant.stand]
-    common: dict[str, Any] = {"mass": plant.object_mass, "goal": tuple(distance * float(axis) for axis in free)}
-    if len(plant.directions) == 2:
-        common["path"] = CIRCLE
-    reference = dataclasses.replace(
-        REFERENCE,
-        amplitude=min(REFERENCE.amplitude, cg_limit(plant), settings.scenario.cg_amplitude[1]),
-        ball_start=min(settings.scenario.ball_start, ball_limit(plant)),
-        **common,
-    )
-    others = [
-        dataclasses.replace(reference, omega=s.omega, amplitude=min(s.amplitude, reference.amplitude))
-        for s in STANDARD
-        if s != REFERENCE and settings.motion.kind == "sine"
-    ]
-    scenarios = (*others, reference)
-    for scenario in scenarios:
-        check_scenario(settings, scenario)
-    return scenarios
-
-
-def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Times [s] and offsets [m] from a CSV file with two columns; a header line is allowed.
-
-    Raises InputError if the file cannot be read; order and range are checked with the configuration.
-    """
-    try:
-        with path.open(newline="") as stream:
-            lines = [line for line in csv.reader(stream) if line]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"waveform {path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if len(lines) > MOST_SAMPLES:
-        raise InputError(f"waveform {path} has more than {MOST_SAMPLES:,} lines")
-    samples = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            time, offset = map(float, line)
-        except ValueError:
-            if number == 1 and not any(field.strip()[:1] in set("+-.0123456789") for field in line):
-                continue  # a header: none of its fields begins like a number
-            raise InputError(f"waveform {path}, line {number}: expected two numbers, time and offset") from None
-        samples.append((time, offset))
-    if not samples:
-        raise InputError(f"waveform {path} has no samples")
-    times, offsets = zip(*samples, strict=True)
-    return times, offsets
-
+from mjxball.sim.scenario import Scenario
 
 WALK_STEP, WALK_SIGMA = 0.5, 0.03  # time [s] between the samples of a random walk, deviation of one move [m]
-
-
-@dataclass(frozen=True)
-class Variant:
-    """One case of a suite: a scenario, and the settings that differ from the reference."""
-
-    label: str
-    scenario: Scenario
-    changes: Mapping[str, Any] = field(default_factory=dict)  # config path -> value
-    waveform: Callable[[int], tuple[tuple[float, ...], ...]] | None = None  # seed -> times, offsets, offsets across
-    team: str = ""  # preset whose plant it flies; empty: the command's
-    drones: int = 0  # of a ring of that many; 0: the preset's plant
-    known: Mapping[str, Any] = field(default_factory=dict)  # of a team, settings that its followers are made for
-    scatter: float = 0.0  # of a team, every drone's numbers are drawn within this share of those that followers know
-
-    def home(self, base: Config) -> Config:
-        """What its followers are made for: `base`, or a team of its own."""
-        if not self.team:
-            return base
-        found = configs.preset(self.team)
-        if self.drones:
-            found = ring_config(found, self.drones)
-        for path, value in self.known.items():
-            found = configs.replace(found, path, value)
-        return configs.validate(found)
-
-    def config(self, base: Config, seed: int) -> Config:
-        """The configuration of this variant for one seed; `base` is its `home`."""
-        for path, value in self.changes.items():
-            base = configs.replace(base, path, value)
-        if self.waveform:
-            base = dataclasses.replace(base, motion=configs.Motion("waveform", *self.waveform(seed)))
-        if self.scatter:
-            base = dataclasses.replace(base, plant=_scattered(base.plant, self.scatter, seed))
-        return configs.validate(base)
-
-    def seeded(self, seed: int) -> Scenario:
-        """The scenario of one seed. Seed 0 starts the CG at phase 0, the others at a place drawn from the seed."""
-        random = np.random.default_rng([seed, 7])
-        phase = 0.0 if seed == 0 else float(random.uniform(0, 2 * np.pi))
-        # A rolling ball has no phase: it starts on either side, up to 30 % nearer to O.
-        start = self.scenario.ball_start * (
-            1.0 if seed == 0 else float(random.choice([-1, 1]) * random.uniform(0.7, 1))
-        )
-        disturbance = dataclasses.replace(self.scenario.disturbance, seed=seed)
-        return dataclasses.replace(self.scenario, phase=phase, ball_start=start, disturbance=disturbance)
-
-
-@dataclass(frozen=True)
-class Suite:
-    """Variants along one axis of difficulty."""
-
-    name: str
-    about: str
-    axis: str  # what the variants' labels say
-    variants: tuple[Variant, ...]
 
 
 def _steps(seed: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -186,38 +49,10 @@ def _with(**disturbance: Any) -> Scenario:
     return Scenario(disturbance=Disturbance(**disturbance))
 
 
-def _places(seed: int) -> tuple[tuple[float, ...], ...]:
-    """The CG goes to a place within 7 cm of O in the plane and stays, every 3 s."""
-    random, times = np.random.default_rng([seed, 17]), []
-    radius, angle = 0.07 * np.sqrt(random.random(15)), 2 * np.pi * random.random(15)
-    places = np.insert(radius * np.exp(1j * angle), 0, 0.0)
-    for number in range(len(places)):
-        times += [3.0 * number + (1.0 if number else 0.0), 3.0 * number + 2.0, 3.0 * number + 3.0]
-    offsets = np.repeat(places, 3)
-    return tuple(times), tuple(map(float, offsets.real)), tuple(map(float, offsets.imag))
-
-
-def _scattered(plant: configs.Plant, share: float, seed: int) -> configs.Plant:
-    """`plant` whose drones differ in mass, inertia, mount, arm, rotors and lag by up to `share` of each number."""
-    random, drones = np.random.default_rng([seed, 19]), []
-    for number, drone in enumerate(plant.drones):
-
-        def near(value: Any) -> Any:
-            return tuple(map(near, value)) if isinstance(value, tuple) else value * random.uniform(1 - share, 1 + share)
-
-        arm, force, lag, yaw = (
-            near(plant.of_drones(name)[number]) for name in ("arm", "rotor_force_max", "rotor_lag", "yaw_per_thrust")
-        )
-        changed = {"mass": near(drone.mass), "inertia": near(drone.inertia), "mount": near(drone.mount)}
-        rotors = {"arm": arm, "rotor_force_max": force, "rotor_lag": lag, "yaw_per_thrust": yaw}
-        drones.append(dataclasses.replace(drone, **changed, **rotors))
-    return dataclasses.replace(plant, drones=tuple(drones))
-
-
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
 MASSES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 GRID = "speed-mass"  # drawn as heat maps
-SUITES: tuple[Suite, ...] = (
+PAIR_SUITES: tuple[Suite, ...] = (
     Suite("cg-speed", "the CG moves as a sine of 5 cm", "CG speed [rad/s]", _variants("omega", SPEEDS)),
     Suite(
         "cg-amplitude",
@@ -322,72 +157,7 @@ SUITES: tuple[Suite, ...] = (
         ),
     ),
 )
-TEAM_SIZES = (2, 3, 4, 5, 6)
-EIGHT = CgPath(direction=0.7, width=0.5, ratio=2.0, lead=0.3)
-
-
-def _ring(drones: int, omega: float = 1.0, share: float = 0.3, **more: Any) -> Scenario:
-    """The nominal load of a ring of that many drones on a circle of `share` of its radius."""
-    own = ring_config(configs.preset("team"), drones).plant
-    radius = own.object_size[0] / 2
-    return Scenario(**{"omega": omega, "amplitude": share * radius, "mass": own.object_mass, "path": CIRCLE, **more})
-
-
-TEAM_SUITES: tuple[Suite, ...] = (
-    Suite(
-        "team-size",
-        "the load goes round on rings of two to six drones; nobody trains with five",
-        "drones",
-        tuple(Variant(f"{n} drones", _ring(n), team="team", drones=n) for n in TEAM_SIZES),
-    ),
-    Suite(
-        "team-path",
-        "four drones, and a load that moves in the plane on other paths",
-        "path",
-        (
-            *(Variant(f"circle, {w:g} rad/s", _ring(4, w), team="team", drones=4) for w in (0.31, 2.0, 3.1)),
-            Variant("ellipse", _ring(4, path=dataclasses.replace(CIRCLE, width=0.4)), team="team", drones=4),
-            Variant("Lissajous", _ring(4, path=EIGHT), team="team", drones=4),
-            Variant("visits of random places", _ring(4), waveform=_places, team="team", drones=4),
-        ),
-    ),
-    Suite(
-        "team-plate",
-        "four drones carry a plate on which a ball rolls freely; nobody measures it",
-        "start",
-        tuple(
-            Variant(f"{100 * x:g} cm", Scenario(amplitude=0.0, ball_start=x), team="plate") for x in (0.02, 0.05, 0.08)
-        ),
-    ),
-    Suite(
-        "team-weak",
-        "of four drones the follower opposite to the leader gives less thrust than it is asked for",
-        "its thrust",
-        tuple(Variant(f"{x:g}", _ring(4, thrust=(1.0, 1.0, x, 1.0)), team="team", drones=4) for x in (0.95, 0.9, 0.8)),
-    ),
-    Suite(
-        "team-lost",
-        "of six drones, commanded up to 12 m/s2, the rotors of one follower stop after 10 s",
-        "which",
-        tuple(
-            Variant(
-                name,
-                _ring(6, share=0.15, lost=((k, 10.0),)),
-                team="team",
-                drones=6,
-                known={"command.vertical_limit": 12.0},
-            )
-            for name, k in (("next to the leader", 1), ("next but one", 2), ("opposite", 3))
-        ),
-    ),
-    Suite(
-        "team-rig",
-        "four drones no two of which are alike: mass, inertia, mount, arm, rotors and lag of each are drawn",
-        "within",
-        tuple(Variant(f"{100 * x:g} %", _ring(4), team="team", drones=4, scatter=x) for x in (0.05, 0.1, 0.2)),
-    ),
-)
-SUITES = (*SUITES, *TEAM_SUITES)
+SUITES = (*PAIR_SUITES, *TEAM_SUITES)
 BY_NAME = {suite.name: suite for suite in SUITES}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -15,13 +15,14 @@ from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
 from mjxball.fly.handover import Handover
-from mjxball.fly.limits import Times
+from mjxball.fly.limits import Limits, Times
 from mjxball.fly.telemetry import Rig
 from mjxball.policy import Policy
 from mjxball.sim.laws import Body, Laws
 
 GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
 STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
+LOW_BATTERY = {"brushless": 3.35}  # [V], where it is not that of `Limits`
 UNKNOWN_MASS = 0.07  # of all that flies, where the card's plant is not a pair of Crazyflies [kg]
 
 
@@ -59,6 +60,13 @@ def goal_of(config: Config) -> tuple[float, float, float]:
 def times_of(config: Config) -> Times:
     """How long the flight's states last: the paper's thrust law follows its goal down too weakly to wait for it."""
     return Times(land_spare=0.0) if config.autopilot.thrust_law == "paper" else Times()
+
+
+def limits_of(config: Config, goal: Sequence[float], battery: float | None = None) -> Limits:
+    """Bounds of a flight to `goal` [m]; `battery` [V]: land below it, None for what suits the drones."""
+    bounds = Limits()
+    bounds = replace(bounds, battery=battery or LOW_BATTERY.get(drone_of(config), bounds.battery))
+    return bounds if config.plant.stand == "free" else bounds.on_stand(goal[2])
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class Limits:
     hold_tilt: float = math.radians(25)  # the same while the other one is not heard: it may be off [rad]
     stick_tilt: float = math.radians(30)  # of the line between the drones from level [rad]
     stick_error: float = 0.1  # of the distance between the drones [m]
-    battery: float = 3.2  # [V]; 3.35 for the brushless
+    battery: float = 3.2  # [V]
     battery_time: float = 5.0  # below it [s]
     saturation_time: float = 1.0  # of thrust at a bound [s]
     missed_deadlines: int = 10  # within a second

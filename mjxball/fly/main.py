@@ -21,7 +21,17 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.fly import limits, onboard
 from mjxball.fly.app import generate
-from mjxball.fly.card import Controller, ThrustChoice, drone_of, goal_of, is_crazyflie, motor_of, times_of, variants
+from mjxball.fly.card import (
+    Controller,
+    ThrustChoice,
+    drone_of,
+    goal_of,
+    is_crazyflie,
+    limits_of,
+    motor_of,
+    times_of,
+    variants,
+)
 from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
@@ -229,7 +239,7 @@ def on_board(
     idents = [generate.ident_of(policy, int8) for int8 in (False, True)]
     weights = (weight_bytes(policy), generate.key_of(policy)) if options.upload else None
     apps = onboard.Apps(name, idents, round(1000 * policy.card["control_period"]), weights)
-    variants = onboard.variants_of(setup.variants, setup.rig, settings.goal)
+    variants = onboard.variants_of(setup.variants, setup.rig, settings)
     return replace(setup, variants=variants, apps=apps), onboard.settings_of(settings)
 
 
@@ -254,12 +264,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             check_loaded(config, options.retrain)
         rig = Rig.of_card(policy.card)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)
-        bounds = Limits() if options.battery is None else Limits(battery=options.battery)
         goal = tuple(options.goal or goal_of(config))
-        if not limits.within_fence(goal, rig, bounds):
+        if not limits.within_fence(goal, rig, Limits()):
             raise InputError(f"--goal {' '.join(f'{value:g}' for value in goal)} puts a drone beyond the fence")
-        stand = config.plant.stand != "free"
-        bounds = bounds.on_stand(goal[2]) if stand else bounds
+        bounds, stand = limits_of(config, goal, options.battery), config.plant.stand != "free"
         settings = FlightSettings(
             options.seconds, goal, options.dry_run, period, motor_of(config), stand, bounds, times_of(config)
         )

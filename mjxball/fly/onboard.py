@@ -102,14 +102,15 @@ def settings_of(settings: FlightSettings) -> FlightSettings:
     return replace(settings, limits=replace(settings.limits, state_age=STATE_AGE))
 
 
-def variants_of(variants: Sequence[Variants], rig: Rig, goal: Sequence[float]) -> list[Variants]:
-    """`variants` whose gains hold the apps' parameters as well: mount, goal of O from the start [m], force curve."""
+def variants_of(variants: Sequence[Variants], rig: Rig, settings: FlightSettings) -> list[Variants]:
+    """`variants` whose gains hold the apps' parameters as well: mount, goal of O from the start, battery, curve."""
     found: list[Variants] = []
     for own, mount in zip(variants, rig.mounts, strict=True):
-        places = {"goal": goal, "mount": mount}
+        places = {"goal": settings.goal, "mount": mount}
         told = {
             f"{GROUP}.{what}{axis}": float(place[i]) for what, place in places.items() for i, axis in enumerate("XYZ")
         }
+        told[f"{GROUP}.battery"] = settings.limits.battery
         curves: dict[CurveName, Variant] = {}
         for name, variant in own.items():
             gains = {**variant.gains, **told, f"{GROUP}.curve": float(CURVE_NAMES.index(name))}

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     # Of the load along its directions: (...) on a line, (..., 2) in a plane.
     Coordinates = Float[Array, "..."]
     Vector = Float[Array, "... 3"]
-    Matrix = Float[Array, "... 3 3"]
 # A flight beyond one of these has diverged: the physics no longer holds, and no flight came back from there.
 MAX_POSITION, MAX_RATE = 1e3, 50.0  # [m] each coordinate, [rad/s] norm
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 from mjxball.config import Attitude, Plant
@@ -25,9 +24,6 @@ class Balance(NamedTuple):
     down: Parts  # u = R^T E3
     force: Parts  # right-hand side f [N]
     torque: Parts  # right-hand side n [N m]
-
-
-Solve = Callable[[Balance], tuple[Parts, Parts]]  # -> (a_b, w') in body axes
 
 
 def make_engine(plant: Plant, attitude: Attitude, parameters: PlantParameters | None = None) -> Engine:

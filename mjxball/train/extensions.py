@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib
 import inspect
@@ -88,6 +89,7 @@ def make_env(extensions: Extensions, config: Config, physics: str) -> Any:
         env: Any = TransportEnv(config, physics)
     else:
         env = _made(kind, config, physics)
+        env = env if is_pair(env) else TracedOnce(env)
         _check_env(env, name_of(extensions.env))
         if "truncation" not in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).info:
             import_brax_env()
@@ -102,6 +104,33 @@ def make_env(extensions: Extensions, config: Config, physics: str) -> Any:
 def is_pair(env: Any) -> bool:
     """Whether `env` is the coupled pair, whose policies are policy files."""
     return isinstance(getattr(env, "unwrapped", env), TransportEnv)
+
+
+class TracedOnce:
+    """A foreign environment. Its functions may take seconds to trace, and are needed in several places."""
+
+    def __init__(self, env: Any):
+        self.env = env
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    @functools.cached_property
+    def reset(self) -> Any:
+        """See the environment's own."""
+        return jax.jit(self.env.reset)
+
+    @functools.cached_property
+    def step(self) -> Any:
+        """See the environment's own."""
+        return jax.jit(self.env.step)
+
+    @functools.cached_property
+    def observation_size(self) -> Any:
+        """Brax's are measured by a reset."""
+        return self.env.observation_size
 
 
 class Rewarded:

@@ -41,7 +41,7 @@ def train(
     program = Program(config, physics, overrides, extensions=Extensions(env, reward, algorithm))
     program.algorithm.check_parts(1)
     state = program.create(key)
-    fresh = program.evaluation_envs(jax.random.PRNGKey(0))
+    fresh = program.evaluation_envs(jax.random.PRNGKey(0)) if evaluate else state.envs
     episode = config.timing.episode_steps
 
     def phase(carry: TrainState, mode: Mode) -> tuple[TrainState, dict[str, Array]]:

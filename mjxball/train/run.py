@@ -40,11 +40,12 @@ class Stop:
     """Set by the first Ctrl-C; training then ends after the chunk in flight."""
 
     requested: bool = False
+    begun: bool = False  # there is something to save
 
 
 @contextlib.contextmanager
 def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
-    """Turn the first Ctrl-C or SIGTERM into a request to stop; a second one interrupts at once."""
+    """Turn the first Ctrl-C or SIGTERM into a request to stop; before training, or a second time, it acts at once."""
     stop = Stop()
     defaults = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
@@ -55,6 +56,9 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
     def handler(number: int, frame: Any) -> None:
         stop.requested = True
         restore()
+        if not stop.begun and jax.process_count() == 1:
+            progress.say("stopped before training began; --resume begins it")
+            os._exit(130)  # what XLA compiles cannot be cut short
         progress.say("stopping: saving the policy and a checkpoint (Ctrl-C again to quit at once)")
 
     for number in defaults:
@@ -121,6 +125,7 @@ class Run:
         with contextlib.closing(self), contextlib.closing(self.progress):
             with graceful_interrupt(self.progress) as stop:
                 self._start()
+                stop.begun = True
                 beside()
                 self._loop(stop)
                 self._save()

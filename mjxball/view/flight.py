@@ -170,7 +170,7 @@ def read_log(path: Path) -> Flight:
 def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None) -> Flight:
     from mjxball.baselines import LAWS, make_baseline
     from mjxball.evaluate.policies import load_policy, native_config
-    from mjxball.evaluate.suites import REFERENCE, standard_scenarios
+    from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
     from mjxball.sim.rollout import simulate
 
     setup, reference, path = plant_setup(plant), REFERENCE, Path(source)

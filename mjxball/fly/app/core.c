@@ -19,38 +19,15 @@
 #define STOP_TIME 3000u       /* the firmware counts as flying for 2 s */
 #define SETTLED 300u
 #define SATURATED_TIME 1000u
+#define BATTERY_TIME 5000u
 #define NEAR_GROUND 0.04f     /* [m] */
 #define STILL 0.12f           /* [m/s] */
 #define VARIANCE 5e-4f        /* [m2] */
 #define MAX_LIFT_DIFFERENCE 1.5f
 #define BRAKE_TILT 0.13962634f /* [rad] 8 degrees */
 
-static const char *const texts[MJXBALL_CAUSES] = {
-    "good",
-    "asked for by the laptop",
-    "the other drone does",
-    "the laptop is not heard",
-    "the other drone is not heard",
-    "the other drone flies another policy",
-    "the mount is not set",
-    "the goal is beyond the fence or not finite",
-    "the policy does not fly with this force curve",
-    "the state is old or not finite",
-    "the network's command is not finite",
-    "the estimator's position cannot be trusted",
-    "beyond the fence",
-    "tilted beyond the limit",
-    "the firmware cannot fly",
-    "thrust at its bound for too long",
-    "the law comes late",
-    "the phase lasted too long",
-    "on the ground",
-    "weights refused: wrong rate, plant, format, size or CRC",
-    "weights refused: not on the ground",
-};
-
 const char *mjxball_text(int cause) {
-    return cause >= 0 && cause < MJXBALL_CAUSES ? texts[cause] : "unknown";
+    return cause >= 0 && cause < MJXBALL_CAUSES ? mjxball_texts[cause] : "unknown";
 }
 
 int mjxball_period(void) {
@@ -357,6 +334,7 @@ static uint8_t refusal_of(const mjxball_app *app, const mjxball_parameters *set,
     if (!state_is_good(state, app->now)) return MJXBALL_BAD_STATE;
     if (!estimate_is_good(state)) return MJXBALL_ESTIMATOR;
     if (!state->can_fly) return MJXBALL_CANNOT_FLY;
+    if (!(state->voltage >= set->battery)) return MJXBALL_BATTERY;
     if (!peer_is_heard(app)) return MJXBALL_NO_PEER;
     if (app->peer.key != mjxball_rig.key) return MJXBALL_OTHER_POLICY;
     return app->peer.phase > MJXBALL_SPIN ? MJXBALL_PEER : MJXBALL_GOOD;
@@ -408,6 +386,7 @@ static void judge_air(const mjxball_app *app, const seen *one, const mjxball_sta
     if (!laptop_is_heard(app)) ask(to, gently, MJXBALL_NO_LAPTOP);
     if (!peer_is_heard(app)) ask(to, gently, MJXBALL_NO_PEER);
     if (app->late > 10) ask(to, gently, MJXBALL_LATE);
+    if (app->now - app->charged >= BATTERY_TIME) ask(to, gently, MJXBALL_BATTERY);
     if (!good) ask(to, MJXBALL_DESCEND, MJXBALL_BAD_STATE);
     if (!app->trusted) ask(to, MJXBALL_DESCEND, MJXBALL_ESTIMATOR);
     if (good && !in_fence(place)) ask(to, MJXBALL_DESCEND, MJXBALL_FENCE);
@@ -503,12 +482,13 @@ void mjxball_defaults(mjxball_parameters *set) {
         set->mount[i] = 0;
     }
     set->curve = 0;
+    set->battery = mjxball_rig.battery;
 }
 
 void mjxball_start(mjxball_app *app, uint32_t now) {
     const mjxball_app fresh = {0};
     *app = fresh;
-    app->now = app->since = now;
+    app->now = app->since = app->charged = now;
     app->trusted = 1;
 }
 
@@ -523,6 +503,7 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
     app->late = 0.99f * app->late + (app->started && gap >= 2u * (uint32_t)mjxball_rig.period ? 1.0f : 0.0f);
     app->started = 1;
     app->now = now;
+    if (state->voltage >= set->battery) app->charged = now;
     if (good) {
         look(set, state, &one);
         for (int i = 0; i < 3; i++) {

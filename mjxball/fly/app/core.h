@@ -29,7 +29,7 @@ typedef enum {
     MJXBALL_STOP,     /* motors off, until the firmware no longer counts as flying */
 } mjxball_phase;
 
-/* Why a drone does not start, or why it moved on. `mjxball_text` has a sentence for each. */
+/* Why a drone does not start, or why it moved on. `rig.h` has a sentence for each, of `protocol.CAUSES`. */
 typedef enum {
     MJXBALL_GOOD,
     MJXBALL_ASKED,       /* by the laptop */
@@ -52,6 +52,7 @@ typedef enum {
     MJXBALL_DOWN,        /* it stands on the ground */
     MJXBALL_BAD_UPLOAD,
     MJXBALL_NOT_ON_GROUND,
+    MJXBALL_BATTERY,     /* low */
     MJXBALL_CAUSES,
 } mjxball_cause;
 
@@ -78,6 +79,7 @@ typedef struct {
     float goal[3];         /* from the start [m] */
     float fence_low[3], fence_high[3];
     float land_spare;      /* [s] */
+    float battery;         /* [V] */
     mjxball_map maps[2];   /* firmware with battery compensation, and without */
 } mjxball_rig_numbers;
 
@@ -85,6 +87,7 @@ typedef struct {
     float goal[3];  /* of O from where it stood at the start [m] */
     float mount[3]; /* of this drone from O, body axes [m]; 0 0 0: not set */
     uint8_t curve;  /* of the firmware: 0 linear, 1 older */
+    float battery;  /* land below it [V] */
 } mjxball_parameters;
 
 typedef struct {
@@ -92,6 +95,7 @@ typedef struct {
     float quaternion[4];            /* w, x, y, z; body -> world */
     float rates[3];                 /* body axes [rad/s] */
     float variance[3];              /* of the position [m2] */
+    float voltage;                  /* of the battery [V] */
     uint32_t time;                  /* [ms] */
     bool can_fly;                   /* the firmware's supervisor lets motors run */
 } mjxball_state;
@@ -118,7 +122,7 @@ typedef struct {
     uint8_t copying;  /* the copying law flies in the network's place */
     uint8_t trusted;  /* its own estimate */
     uint8_t started;
-    uint32_t since, now, laptop_time, peer_time, saturated_since;
+    uint32_t since, now, laptop_time, peer_time, saturated_since, charged;
     float late;       /* ticks that came late, forgotten within a second or so */
     float origin[3], goal[3], land_height;
     float position[3], velocity[3]; /* of O */
@@ -138,7 +142,7 @@ const char *mjxball_text(int cause);
 /* The law's period [ms], and the CRC of the weights in use. */
 int mjxball_period(void);
 uint32_t mjxball_ident(const mjxball_app *app);
-/* Parameters as they are at boot: the policy's goal, no mount. */
+/* Parameters as they are at boot: the policy's goal and drone, no mount. */
 void mjxball_defaults(mjxball_parameters *set);
 void mjxball_start(mjxball_app *app, uint32_t now);
 /* Once a period. */

@@ -16,9 +16,9 @@ import numpy as np
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.fly import card
+from mjxball.fly.app.protocol import CAUSES
 from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.handover import SAME
-from mjxball.fly.limits import Limits
 from mjxball.fly.telemetry import Rig
 from mjxball.policy.file import PolicyFile
 from mjxball.policy.formats.c_header import c_header, float_bytes, footprint, weight_bytes
@@ -61,10 +61,10 @@ def check_policy(policy: PolicyFile, name: str) -> Config:
 
 
 def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
-    """`rig.h`: the numbers of both laws and of the supervisor."""
+    """`rig.h`: the numbers of both laws and of the supervisor, and a sentence for each of its causes."""
     law, plant, stand = config.leader, config.plant, config.plant.stand != "free"
-    goal, bounds, rig = card.goal_of(config), Limits(), Rig.of_plant(config.plant)
-    bounds = bounds.on_stand(goal[2]) if stand else bounds
+    goal, rig = card.goal_of(config), Rig.of_plant(config.plant)
+    bounds = card.limits_of(config, goal)
     variants = card.variants(config)
     axis = 0 if plant.cg_axis == "y" else 1
     first = next(iter(variants[0]))
@@ -91,10 +91,15 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
         "fence_low": bounds.fence_low,
         "fence_high": bounds.fence_high,
         "land_spare": card.times_of(config).land_spare,
+        "battery": bounds.battery,
         "maps": [_map(variants[0].get(name)) for name in CURVE_NAMES],
     }
     lines = ",\n".join(f"    .{name} = {_literal(value)}" for name, value in fields.items())
-    return f"/* See core.h. */\nstatic const mjxball_rig_numbers mjxball_rig = {{\n{lines},\n}};\n"
+    causes = ",\n".join(f'    "{text}"' for text in CAUSES)
+    return (
+        f"/* See core.h. */\nstatic const mjxball_rig_numbers mjxball_rig = {{\n{lines},\n}};\n\n"
+        f"static const char *const mjxball_texts[MJXBALL_CAUSES] = {{\n{causes},\n}};\n"
+    )
 
 
 def _map(variant: Any) -> list[Any]:

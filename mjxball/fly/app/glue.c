@@ -127,6 +127,7 @@ static void say(void) {
 void appMain(void) {
     const logVarId_t variances[3] = {
         logGetVarId("kalman", "varX"), logGetVarId("kalman", "varY"), logGetVarId("kalman", "varZ")};
+    const logVarId_t voltage = logGetVarId("pm", "vbat");
     TickType_t wake = xTaskGetTickCount();
     period = (uint8_t)mjxball_period();
     mjxball_defaults(&set);
@@ -146,6 +147,7 @@ void appMain(void) {
             memcpy(&state, &newest, sizeof state);
         } while (count != stateCount);
         for (int i = 0; i < 3; i++) state.variance[i] = logGetFloat(variances[i]);
+        state.voltage = logGetFloat(voltage);
         state.can_fly = supervisorCanFly();
         mjxball_tick(&core, &set, &state, now, &wanted);
         send(&wanted);
@@ -172,6 +174,7 @@ PARAM_ADD(PARAM_FLOAT, mountX, &set.mount[0]) /* of this drone from O, body axes
 PARAM_ADD(PARAM_FLOAT, mountY, &set.mount[1])
 PARAM_ADD(PARAM_FLOAT, mountZ, &set.mount[2])
 PARAM_ADD(PARAM_UINT8, curve, &set.curve)     /* of the firmware: 0 linear, 1 older */
+PARAM_ADD(PARAM_FLOAT, battery, &set.battery) /* land below it [V] */
 PARAM_ADD(PARAM_UINT32 | PARAM_RONLY, ident, &ident)   /* CRC of the weights in use */
 PARAM_ADD(PARAM_UINT8 | PARAM_RONLY, role, &role)      /* 0 leader, 1 follower */
 PARAM_ADD(PARAM_UINT8 | PARAM_RONLY, period, &period)  /* of the law [ms] */

@@ -27,7 +27,12 @@ const float *mjxball_integral(const mjxball_app *app) { return app->integral; }
 class Parameters(ctypes.Structure):
     """`mjxball_parameters`."""
 
-    _fields_ = (("goal", ctypes.c_float * 3), ("mount", ctypes.c_float * 3), ("curve", ctypes.c_uint8))
+    _fields_ = (
+        ("goal", ctypes.c_float * 3),
+        ("mount", ctypes.c_float * 3),
+        ("curve", ctypes.c_uint8),
+        ("battery", ctypes.c_float),
+    )
 
 
 class State(ctypes.Structure):
@@ -39,6 +44,7 @@ class State(ctypes.Structure):
         ("quaternion", ctypes.c_float * 4),
         ("rates", ctypes.c_float * 3),
         ("variance", ctypes.c_float * 3),
+        ("voltage", ctypes.c_float),
         ("time", ctypes.c_uint32),
         ("can_fly", ctypes.c_bool),
     )
@@ -64,7 +70,6 @@ class Library:
             ("mjxball_size", ctypes.c_uint32),
             ("mjxball_ident", ctypes.c_uint32),
             ("mjxball_upload_size", ctypes.c_uint32),
-            ("mjxball_text", ctypes.c_char_p),
             ("mjxball_command", ctypes.POINTER(ctypes.c_float)),
             ("mjxball_integral", ctypes.POINTER(ctypes.c_float)),
         ):
@@ -110,8 +115,8 @@ class App:
 
     def set(self, name: str, value: float) -> None:
         """Write the parameter `name`, such as goalX."""
-        if name == "curve":
-            self._set.curve = int(value)
+        if name in ("curve", "battery"):
+            setattr(self._set, name, int(value) if name == "curve" else value)
         else:
             getattr(self._set, name[:-1])["XYZ".index(name[-1])] = value
 
@@ -120,8 +125,8 @@ class App:
         places = {
             f"{what}{axis}": getattr(self._set, what)[i] for what in ("goal", "mount") for i, axis in enumerate("XYZ")
         }
-        fixed = {"curve": self._set.curve, "ident": self.ident, "role": self.role, "period": self.period}
-        return {**places, **fixed}
+        others = {"curve": self._set.curve, "battery": self._set.battery}
+        return {**places, **others, "ident": self.ident, "role": self.role, "period": self.period}
 
     def tick(self, state: State, now: int) -> Wanted:
         """Once a period: what it sends to the commander."""
@@ -147,10 +152,6 @@ class App:
         reply = ctypes.create_string_buffer(REPLY_SIZE)
         size = self._c.laptop(self._core, data, len(data), ctypes.c_uint32(now), self._memory, reply)
         return reply.raw[:size]
-
-    def text(self, cause: int) -> str:
-        """The sentence of a cause."""
-        return bytes(self._c.text(cause)).decode()
 
     @property
     def phase(self) -> Phase:

@@ -18,6 +18,7 @@ GROUP = "mjxb"
 PARAMETERS = (
     *((f"{what}{axis}", "float", False) for what in ("goal", "mount") for axis in "XYZ"),
     ("curve", "uint8_t", False),
+    ("battery", "float", False),
     ("ident", "uint32_t", True),
     ("role", "uint8_t", True),
     ("period", "uint8_t", True),
@@ -42,7 +43,7 @@ class Phase(enum.IntEnum):
     STOP = 6
 
 
-# `mjxball_cause`, in its order.
+# The sentence of every `mjxball_cause`, in its order.
 CAUSES = (
     "good",
     "asked for by the laptop",
@@ -65,6 +66,7 @@ CAUSES = (
     "on the ground",
     "weights refused: wrong rate, plant, format, size or CRC",
     "weights refused: not on the ground",
+    "the battery is low",
 )
 
 

@@ -137,6 +137,7 @@ class TwinDrone:
         estimate.position[:], estimate.velocity[:] = seen.position.tolist(), report.velocity[mine].tolist()
         estimate.quaternion[:], estimate.rates[:] = report.quaternion[mine].tolist(), report.rates[mine].tolist()
         estimate.variance[:] = report.variance[mine][:3].tolist()
+        estimate.voltage = seen.voltage
         clock = round(1000 * now)
         self._estimated = self._estimated if self.faults.stabilizer_dead else clock
         estimate.time, estimate.can_fly = self._estimated, self.firmware.supervisor.can_fly

@@ -103,7 +103,6 @@ PARAMETERS = tuple(
     Parameter(row["name"], row["type"], DEFAULTS.get(row["name"], 0.0), row["access"] == "r", row["access"] == "p")
     for row in listed("param")
 )
-PARAM_ITEMS = [item(parameter.type_byte, parameter.name) for parameter in PARAMETERS]
 OF_APP = tuple(Parameter(f"{GROUP}.{name}", kind, 0.0, read_only) for name, kind, read_only in APP_PARAMETERS)
 
 

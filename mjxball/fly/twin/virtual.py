@@ -190,7 +190,7 @@ class VirtualTwin:
         self.settings = dataclasses.replace(settings, motor=motor_of(self.config))
         if self._onboard:
             self.settings = onboard.settings_of(self.settings)
-            self.variants = onboard.variants_of(self.variants, self.rig, self.settings.goal)
+            self.variants = onboard.variants_of(self.variants, self.rig, self.settings)
         self.track: list[Moment] = []
         self._start_flight(settle)
 

@@ -224,11 +224,19 @@ def stride(inputs: int) -> int:
     return -(-inputs // 8) * 8
 
 
+def rows_up(outputs: int) -> int:
+    """Rows of weights of 8 bits, a multiple of 4."""
+    return -(-outputs // 4) * 4
+
+
 def _weights_type(sizes: Sequence[int]) -> str:
     """The struct whose bytes are `weight_bytes`."""
     floats = [f"mean[{sizes[0]}]", f"scale[{sizes[0]}]"]
     floats += [f"{kind}_{n}[{outputs}]" for n, outputs in enumerate(sizes[1:]) for kind in ("step", "bias")]
-    whole = [f"weight_{n}[{outputs * stride(inputs)}]" for n, (inputs, outputs) in enumerate(itertools.pairwise(sizes))]
+    whole = [
+        f"weight_{n}[{rows_up(outputs) * stride(inputs)}]"
+        for n, (inputs, outputs) in enumerate(itertools.pairwise(sizes))
+    ]
     fields = [*(f"float {one}" for one in floats), *(f"int8_t {one}" for one in whole)]
     return "typedef struct {\n" + "".join(f"    {one};\n" for one in fields) + "} mjxball_weights;\n\n"
 
@@ -256,8 +264,9 @@ def float_bytes(policy: PolicyFile) -> bytes:
 
 
 def _padded(weight: np.ndarray) -> np.ndarray:
-    """Rows of `weight` (outputs, inputs), filled up with zeros."""
-    return np.pad(weight, ((0, 0), (0, stride(weight.shape[1]) - weight.shape[1])))
+    """Rows of `weight` (outputs, inputs), both filled up with zeros."""
+    outputs, inputs = weight.shape
+    return np.pad(weight, ((0, rows_up(outputs) - outputs), (0, stride(inputs) - inputs)))
 
 
 def _compiled(policy: PolicyFile) -> str:

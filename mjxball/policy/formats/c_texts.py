@@ -173,65 +173,82 @@ static inline void mjxball_layer(
 }
 """
 LAYER_INT8 = """
-/* Values as 16 bit numbers of the step that is returned: the largest of them takes the whole range. Of every four the
- * middle ones change places, as `mjxball_pair` wants them. The step is NaN if one of the values is not finite. */
-static inline mjxball_real mjxball_steps(const mjxball_real *from, int count, int16_t *to) {
-    mjxball_real largest = (mjxball_real)1e-30, per_step, wrong = 0;
-    for (int k = 0; k < count; k++) {
-        mjxball_real size = from[k] < 0 ? -from[k] : from[k];
-        if (size > largest) largest = size;
-        wrong += size - size;
-    }
-    per_step = 32767 / largest;
-    if (wrong == 0)
-        for (int k = 0; k < count; k++)
-            to[((k + 1) & 2) ? k ^ 3 : k] = (int16_t)((int)(from[k] * per_step + (mjxball_real)32768.5) - 32768);
-    return largest / 32767 + wrong;
+/* The nearest whole number of a value within 16 bits. */
+static inline int16_t mjxball_whole(mjxball_real value) {
+    return (int16_t)((int)(value + (mjxball_real)32768.5) - 32768);
 }
 
-/* Adds four products of each of two rows: two multiplications an instruction where the processor has them. */
+/* Values as 16 bit numbers of the step that is returned: the largest of them takes the whole range; zeros up to
+ * `stride`. Of every four the middle ones change places, as `mjxball_products` wants them. The step is NaN, and nothing
+ * is written, if one of the values is not finite. */
+static inline mjxball_real mjxball_steps(const mjxball_real *from, int count, int stride, int16_t *to) {
+    mjxball_real largest = (mjxball_real)1e-30, per_step;
+    int k = 0;
+    for (; k < count; k++) {
+        mjxball_real size = from[k] < 0 ? -from[k] : from[k];
+        if (!(size <= largest)) largest = size + 0 * largest; /* NaN stays */
+    }
+    if (largest - largest != 0) return largest - largest;
+    per_step = 32767 / largest;
+    for (k = stride - 8; k < stride; k++) to[k] = 0;
+    for (k = 0; k < (count & ~3); k += 4) {
+        to[k] = mjxball_whole(from[k] * per_step);
+        to[k + 2] = mjxball_whole(from[k + 1] * per_step);
+        to[k + 1] = mjxball_whole(from[k + 2] * per_step);
+        to[k + 3] = mjxball_whole(from[k + 3] * per_step);
+    }
+    for (; k < count; k++) to[((k + 1) & 2) ? k ^ 3 : k] = mjxball_whole(from[k] * per_step);
+    return largest / 32767;
+}
+
+/* The sum and four products of a row: two multiplications an instruction where the processor has them. */
 #ifdef __ARM_FEATURE_DSP
 #include <arm_acle.h>
-static inline int32_t mjxball_products(uint32_t four, int16x2_t outer, int16x2_t inner, int32_t sum) {
-    int16x2_t odd;
+static inline int32_t mjxball_products(const int8_t *weight, const int16_t *steps, int32_t sum) {
+    uint32_t four;
+    int16x2_t outer, inner, odd;
+    __builtin_memcpy(&four, weight, 4);
+    __builtin_memcpy(&outer, steps, 4);
+    __builtin_memcpy(&inner, steps + 2, 4);
     __asm__("sxtb16 %0, %1, ror #8" : "=r"(odd) : "r"(four));
     return __smlad(odd, inner, __smlad(__sxtb16((int8x4_t)four), outer, sum));
 }
-static inline void mjxball_pair(const int8_t *w, const int8_t *v, const int16_t *steps, int32_t sums[2]) {
-    uint32_t one, other;
-    int16x2_t outer, inner;
-    __builtin_memcpy(&one, w, 4);
-    __builtin_memcpy(&other, v, 4);
-    __builtin_memcpy(&outer, steps, 4);
-    __builtin_memcpy(&inner, steps + 2, 4);
-    sums[0] = mjxball_products(one, outer, inner, sums[0]);
-    sums[1] = mjxball_products(other, outer, inner, sums[1]);
-}
+/* Loads that follow stay behind: registers are few. */
+#define MJXBALL_HERE __asm__ volatile("" ::: "memory")
 #else
+#define MJXBALL_HERE (void)0
 static inline int32_t mjxball_products(const int8_t *weight, const int16_t *steps, int32_t sum) {
     sum += weight[0] * steps[0] + weight[2] * steps[1];
     return sum + weight[1] * steps[2] + weight[3] * steps[3];
 }
-static inline void mjxball_pair(const int8_t *w, const int8_t *v, const int16_t *steps, int32_t sums[2]) {
-    sums[0] = mjxball_products(w, steps, sums[0]);
-    sums[1] = mjxball_products(v, steps, sums[1]);
-}
 #endif
 
-/* to = step weight from + bias of whole numbers: rows of `stride` weights, of which `inputs` are not 0. */
+/* to = step weight from + bias of whole numbers: rows of `stride` weights, of which `inputs` are not 0, four rows at
+ * once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four. */
 static inline void mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
     int stride, const mjxball_real *from, mjxball_real *to) {
-    int16_t steps[MJXBALL_WIDEST + 7] = {0};
-    mjxball_real size = mjxball_steps(from, inputs, steps);
-    for (int row = 0; row < outputs; row += 2, weight += 2 * stride) {
-        const int two = row + 1 < outputs;
-        int32_t sums[2] = {0, 0};
+    int16_t steps[MJXBALL_WIDEST + 7];
+    mjxball_real size = mjxball_steps(from, inputs, stride, steps);
+    if (size != size) {
+        for (int row = 0; row < outputs; row++) to[row] = size;
+        return;
+    }
+    for (int row = 0; row < outputs; row += 4, weight += 4 * stride) {
+        int32_t a = 0, b = 0, c = 0, d = 0;
         for (int k = 0; k < stride; k += 8) {
-            mjxball_pair(weight + k, weight + two * stride + k, steps + k, sums);
-            mjxball_pair(weight + k + 4, weight + two * stride + k + 4, steps + k + 4, sums);
+            a = mjxball_products(weight + k, steps + k, a);
+            b = mjxball_products(weight + stride + k, steps + k, b);
+            c = mjxball_products(weight + 2 * stride + k, steps + k, c);
+            d = mjxball_products(weight + 3 * stride + k, steps + k, d);
+            MJXBALL_HERE;
+            a = mjxball_products(weight + k + 4, steps + k + 4, a);
+            b = mjxball_products(weight + stride + k + 4, steps + k + 4, b);
+            c = mjxball_products(weight + 2 * stride + k + 4, steps + k + 4, c);
+            d = mjxball_products(weight + 3 * stride + k + 4, steps + k + 4, d);
         }
-        to[row + two] = (mjxball_real)sums[1] * (size * step[row + two]) + bias[row + two];
-        to[row] = (mjxball_real)sums[0] * (size * step[row]) + bias[row];
+        const int32_t sums[4] = {a, b, c, d};
+        for (int i = 0; i < 4 && row + i < outputs; i++)
+            to[row + i] = (mjxball_real)sums[i] * (size * step[row + i]) + bias[row + i];
     }
 }
 """

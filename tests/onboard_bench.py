@@ -1,0 +1,83 @@
+"""The apps' C compiled for this computer, and two of them on a rig that is held in the hand."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjxball.fly.app import protocol
+from mjxball.fly.app.host import App, Library, State, compile_pair
+from mjxball.fly.app.protocol import CAUSES, Phase
+from mjxball.fly.telemetry import ObjectState, Rig
+from mjxball.policy import PolicyFile, load_file
+from mjxball.policy.file import shipped_policy
+
+needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc is installed")
+AT_REST = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3))
+
+
+def policy_of(name: str) -> PolicyFile:
+    return load_file(shipped_policy(name))
+
+
+@functools.cache
+def cores_of(name: str = "flight") -> tuple[Library, Library]:
+    """Leader and follower, compiled once a process."""
+    return compile_pair(policy_of(name), name)
+
+
+class Bench:
+    """Two apps on a rig that is held in the hand."""
+
+    def __init__(self, cores: tuple[Library, Library], rig: Rig):
+        self.apps = [App(core, number) for number, core in enumerate(cores)]
+        self.rig, self.now = rig, 1000
+        for app, mount in zip(self.apps, rig.mounts, strict=True):
+            for axis, value in zip("XYZ", mount, strict=True):
+                app.set(f"mount{axis}", value)
+
+    def state(self, pair: ObjectState, mount: np.ndarray) -> State:
+        """What the drone at `mount` estimates."""
+        seen, matrix = State(), pair.matrix
+        seen.position[:] = pair.position + matrix @ mount
+        seen.velocity[:] = pair.velocity + matrix @ np.cross(pair.rates, mount)
+        seen.quaternion[:], seen.rates[:] = pair.quaternion, pair.rates
+        seen.variance[:], seen.time, seen.can_fly, seen.voltage = [1e-5] * 3, self.now, True, 4.0
+        return seen
+
+    def tick(self, order: Phase | None, pair: ObjectState | None = None, **wrong: Any) -> list[Any]:
+        """A period of both; `wrong` values of the leader's state. Returns both setpoints."""
+        beats = [app.send() for app in self.apps]
+        self.now += self.apps[0].period
+        sent = []
+        for app, beat, mount in zip(self.apps, beats[::-1], self.rig.mounts, strict=True):
+            app.hear(beat, self.now)
+            if order is not None:
+                app.laptop(protocol.order(order).data, self.now)
+            state = self.state(pair or AT_REST, mount)
+            for name, value in wrong.items() if app is self.apps[0] else ():
+                if isinstance(value, bool | float):
+                    setattr(state, name, value)
+                else:
+                    getattr(state, name)[:] = value
+            sent.append(app.tick(state, self.now))
+        return sent
+
+    def take_off(self) -> None:
+        """To the first period under the laws."""
+        for phase, periods in ((Phase.IDLE, 3), (Phase.SPIN, 5), (Phase.RAMP, 160)):
+            for _ in range(periods):
+                self.tick(phase)
+                if self.apps[0].phase is Phase.FLY:
+                    return
+
+    @property
+    def phases(self) -> list[Phase]:
+        return [app.phase for app in self.apps]
+
+    def cause(self, number: int = 0) -> str:
+        return CAUSES[int(self.apps[number].logged()["cause"])]

@@ -1,0 +1,139 @@
+"""Followers on board: the apps' C against the laptop's laws, and what it refuses or ends."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from onboard_bench import AT_REST, Bench, cores_of, needs_gcc, policy_of
+
+from mjxball.control import rotations
+from mjxball.fly.app import generate, protocol
+from mjxball.fly.app.host import App
+from mjxball.fly.app.protocol import CAUSES, Phase
+from mjxball.fly.card import Controller
+from mjxball.fly.telemetry import ObjectState, Rig
+from mjxball.policy import Policy
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["flight", "stand"])
+def test_the_apps_command_what_the_laptop_would(name: str):
+    """Leader and follower over 5 s of motion: float32 on board, float64 laws on the laptop."""
+    policy = policy_of(name)
+    bench = Bench(cores_of(name), Rig.of_card(policy.card))
+    controller = Controller(Policy(policy, name))
+    free = controller.config.plant.stand == "free"
+    goal = np.array([0.0, 0.0, 0.4 if free else 0.08])
+    random, euler = np.random.default_rng(0), np.zeros(3)
+    position, velocity, rates = np.zeros(3), np.zeros(3), np.zeros(3)
+    bench.take_off()  # the last period was one of the laws', at rest
+    controller.step(AT_REST, goal)
+    worst, spread = np.zeros(6), np.zeros(6)
+    for number in range(500):  # noqa: B007
+        velocity = 0.95 * velocity + random.normal(scale=0.01, size=3)
+        position, rates = 0.99 * position + 0.01 * velocity, 0.9 * rates + random.normal(scale=0.02, size=3)
+        euler = 0.97 * euler + 0.01 * rates
+        moving = [np.array(one) for one in (position, velocity, euler, rates)]
+        if not free:
+            moving[0][:2] = moving[1][:2] = moving[2][1:] = moving[3][1:] = 0.0
+        pair = ObjectState(moving[0], moving[1], rotations.quaternion_from_euler(moving[2]), moving[3])
+        bench.tick(Phase.FLY, pair)
+        wanted = controller.step(pair, goal)
+        both = np.concatenate([wanted.leader, wanted.follower])
+        found = np.concatenate([app.command for app in bench.apps])
+        if bench.phases != [Phase.FLY] * 2:
+            break
+        worst, spread = np.maximum(worst, abs(found - both)), np.maximum(spread, abs(both))
+    assert number > 50
+    # Float rounding, fed back through the follower's memory; m/s2 beside rad.
+    assert worst.max() < 1e-4
+    assert spread[5] > 0.05
+    assert spread[2] > 0.05
+
+
+REFUSED: tuple[tuple[str, Any], ...] = (
+    ("the mount is not set", lambda bench: bench.apps[0].set("mountY", 0.0)),
+    ("the goal is beyond the fence or not finite", lambda bench: bench.apps[0].set("goalZ", 9.0)),
+    ("the goal is beyond the fence or not finite", lambda bench: bench.apps[0].set("goalX", float("nan"))),
+    ("the policy does not fly with this force curve", lambda bench: bench.apps[0].set("curve", 2)),
+)
+
+
+@needs_gcc
+def test_an_app_refuses_to_start():
+    rig = Rig.of_card(policy_of("flight").card)
+    for text, spoil in REFUSED:
+        bench = Bench(cores_of(), rig)
+        bench.tick(Phase.IDLE)
+        spoil(bench)
+        for _ in range(5):
+            sent = bench.tick(Phase.SPIN)
+        assert bench.apps[0].phase is Phase.IDLE, text
+        assert CAUSES[int(bench.apps[0].logged()["refusal"])] == text
+        assert not sent[0].active
+    bench = Bench(cores_of(), rig)
+    for wrong, text in (
+        ({"can_fly": False}, "the firmware cannot fly"),
+        ({"voltage": 3.1}, "the battery is low"),
+        ({"position": [float("nan")] * 3}, "the state is old or not finite"),
+        ({"variance": [1.0] * 3}, "the estimator's position cannot be trusted"),
+    ):
+        for _ in range(3):
+            bench.tick(Phase.SPIN, **wrong)
+        assert CAUSES[int(bench.apps[0].logged()["refusal"])] == text
+    alone = App(cores_of()[1], 1)
+    alone.set("mountY", -0.15)
+    alone.laptop(protocol.order(Phase.SPIN).data, 1000)
+    alone.tick(bench.state(AT_REST, np.zeros(3)), bench.now)
+    assert alone.phase is Phase.IDLE
+
+
+@needs_gcc
+def test_one_abort_lands_both():
+    """Whatever the leader finds moves the follower within two periods, and the other way round for silence."""
+    rig = Rig.of_card(policy_of("flight").card)
+    for wrong, phase, text in (
+        ({"position": [5.0, 0.15, 0.0]}, Phase.DESCEND, "beyond the fence"),
+        ({"position": [float("inf"), 0.0, 0.0]}, Phase.DESCEND, "the state is old or not finite"),
+        ({"variance": [1.0, 0.0, 0.0]}, Phase.DESCEND, "the estimator's position cannot be trusted"),
+        ({"quaternion": [0.9, 0.4359, 0.0, 0.0]}, Phase.STOP, "tilted beyond the limit"),
+        ({"can_fly": False}, Phase.STOP, "the firmware cannot fly"),
+    ):
+        bench = Bench(cores_of(), rig)
+        bench.take_off()
+        assert bench.phases == [Phase.FLY] * 2
+        bench.tick(Phase.FLY, **wrong)
+        sent = bench.tick(Phase.FLY, **wrong)
+        assert bench.phases == [phase] * 2, text
+        assert (bench.cause(0), bench.cause(1)) == (text, "the other drone does")
+        assert all(np.isfinite([one.roll, one.pitch, one.thrust]).all() for one in sent)
+        assert all((one.thrust == 0) == (phase is Phase.STOP) for one in sent)
+    bench = Bench(cores_of(), rig)
+    bench.take_off()
+    high = AT_REST._replace(position=np.array([0.0, 0.0, 0.3]))
+    for _ in range(40):
+        bench.tick(Phase.LAND, high)
+    bench.tick(Phase.LAND, high, variance=[1.0] * 3)  # nothing is known of the ground
+    assert bench.phases[0] is Phase.DESCEND
+    bench = Bench(cores_of(), rig)
+    bench.take_off()
+    for _ in range(52):
+        bench.tick(None)
+    assert bench.phases == [Phase.LAND] * 2
+    assert "the laptop is not heard" in (bench.cause(0), bench.cause(1))
+
+
+def test_names_are_those_of_the_c_files():
+    header, glue = ((generate.sources() / name).read_text() for name in ("core.h", "glue.c"))
+    causes = re.search(r"\{([^{}]*) +MJXBALL_CAUSES,\s*\} mjxball_cause;", header)
+    assert causes is not None
+    assert len(re.findall(r"MJXBALL_\w+,", causes[1])) == len(CAUSES)
+    parameters = re.findall(r"PARAM_ADD\((PARAM_\w+)( \| PARAM_RONLY)?, (\w+),", glue)
+    kinds = {"PARAM_FLOAT": "float", "PARAM_UINT8": "uint8_t", "PARAM_UINT32": "uint32_t"}
+    assert [(name, kinds[kind], bool(fixed)) for kind, fixed, name in parameters] == list(protocol.PARAMETERS)
+    logged = re.findall(r"LOG_ADD\(LOG_(\w+), (\w+),", glue)
+    kinds = {"FLOAT": "float", "UINT8": "uint8_t", "UINT32": "uint32_t"}
+    assert [(name, kinds[kind]) for kind, name in logged] == list(protocol.LOGGED)

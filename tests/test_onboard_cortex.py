@@ -1,0 +1,123 @@
+"""Followers on board: the apps compile against the firmware's interface, and a Cortex-M4F computes the same bits."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import call
+from onboard_bench import Bench, cores_of, needs_gcc, policy_of
+
+import cortex
+import onboard as benchmark
+from mjxball.control import rotations
+from mjxball.export import main as export
+from mjxball.fly.app import generate, protocol
+from mjxball.fly.app.protocol import Phase
+from mjxball.fly.telemetry import ObjectState, Rig
+from mjxball.policy.file import shipped_policy
+
+needs_arm = pytest.mark.skipif(bool(cortex.missing()), reason=f"not installed: {cortex.missing()}")
+
+
+INTERFACE = Path(__file__).parent / "firmware" / "interface.h"
+
+
+@pytest.mark.slow
+@needs_gcc
+@pytest.mark.parametrize("name", ["flight", "flight --int8", "stand"])
+def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
+    policy, *flags = name.split()
+    assert call(export, [shipped_policy(policy), tmp_path / "app", "--crazyflie", *flags]) == 0
+    glue = (tmp_path / "app/src/glue.c").read_text()
+    (tmp_path / "include").mkdir()
+    for header in set(re.findall(r'#include "(\w+\.h)"', glue)) - {"core.h"}:
+        (tmp_path / "include" / header).write_text(f'#include "{INTERFACE}"\n')
+    strict = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion", "-I", str(tmp_path / "include"), "-c"]
+    compilers = [["gcc"], *([[*cortex.ARM]] if not cortex.missing() else [])]
+    for compiler, (number, role) in itertools.product(compilers, enumerate(generate.ROLES)):
+        for source in ("core", "glue"):
+            options = [*compiler, *strict, f"-DMJXBALL_FOLLOWER={number}", f"src/{source}.c", "-o", "out.o"]
+            done = subprocess.run(options, cwd=tmp_path / "app" / role, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+    words = int(re.search(r"STACKSIZE=(\d+)", (tmp_path / "app/follower/app-config").read_text())[1])
+    assert 500 < words < 2000
+
+
+@pytest.mark.slow
+@needs_arm
+@pytest.mark.parametrize("int8", [False, True])
+def test_a_cortex_m4_computes_the_same_bits(int8: bool, tmp_path: Path):
+    for name in ("balance", "flight"):
+        found = benchmark.compare(policy_of(name), tmp_path, int8, 500)
+        assert found["identical"], name
+        if not int8:
+            assert found["error"] <= 1e-5
+
+
+# Each record: state, heartbeat of the other drone, time, order -> setpoint, command, integral, heartbeat.
+REPLAY = r"""
+#include "core.c"
+int file_open(const char *name, int write);
+int file_read(int file, void *to, unsigned size);
+int file_write(int file, const void *from, unsigned size);
+
+int main(void) {
+    static mjxball_app app;
+    static struct { mjxball_state state; uint8_t beat[MJXBALL_BEAT_SIZE]; uint32_t now, order; } in;
+    static struct { float setpoint[3], command[3], integral[7]; uint8_t beat[MJXBALL_BEAT_SIZE]; } out;
+    int from = file_open("in.bin", 0), to = file_open("out.bin", 1);
+    mjxball_parameters set;
+    mjxball_defaults(&set);
+    set.mount[1] = MJXBALL_FOLLOWER ? -0.15f : 0.15f;
+    mjxball_start(&app, 0);
+    while (file_read(from, &in, sizeof in)) {
+        const uint8_t order[2] = {1, (uint8_t)in.order};
+        mjxball_setpoint wanted;
+        mjxball_hear(&app, in.beat, sizeof in.beat, in.now);
+        mjxball_laptop(&app, order, 2, in.now, 0, out.beat);
+        mjxball_tick(&app, &set, &in.state, in.now, &wanted);
+        mjxball_send(&app, out.beat);
+        out.setpoint[0] = wanted.roll, out.setpoint[1] = wanted.pitch, out.setpoint[2] = wanted.thrust;
+        for (int i = 0; i < 3; i++) out.command[i] = app.command[i];
+        for (int i = 0; i < 7; i++) out.integral[i] = app.integral[i];
+        file_write(to, &out, sizeof out);
+    }
+    return 0;
+}
+"""
+
+
+@pytest.mark.slow
+@needs_arm
+def test_a_cortex_m4_flies_the_same_bits(tmp_path: Path):
+    """Both apps over take-off, motion of the pair, landing and a fence that is left, whose inputs were recorded."""
+    policy = policy_of("flight")
+    bench, random = Bench(cores_of(), Rig.of_card(policy.card)), np.random.default_rng(5)
+    records: list[list[bytes]] = [[], []]
+    place, euler, seen = np.zeros(3), np.zeros(3), set()
+    for step in range(900):
+        order = (Phase.IDLE, Phase.SPIN, Phase.RAMP, Phase.FLY)[min(step // 20, 3)] if step < 700 else Phase.LAND
+        place = place + random.normal(scale=0.002, size=3) if step > 200 else place
+        euler = 0.98 * euler + random.normal(scale=0.004, size=3)
+        far = np.array([0.0, 0.0, 0.0 if step < 60 else 0.4 if step < 800 else 2.0])  # at its goal, then outside
+        moving = ObjectState(place + far, euler[::-1], rotations.quaternion_from_euler(euler), 4 * euler)
+        beats = [app.send() for app in bench.apps][::-1]
+        bench.tick(order, moving)
+        for number, mount in enumerate(bench.rig.mounts):
+            state = bytes(bench.state(moving, mount))
+            records[number].append(state + beats[number] + np.array([bench.now, order], np.uint32).tobytes())
+        seen |= set(bench.phases)
+    assert seen >= {Phase.SPIN, Phase.RAMP, Phase.FLY, Phase.LAND, Phase.DESCEND}
+    for path, text in generate.files_of(policy, "flight", False).items():
+        if path in ("src/core.c", "src/core.h", "src/policy.h", "src/rig.h"):
+            (tmp_path / Path(path).name).write_text(text)
+    for number in range(2):
+        cortex.build(tmp_path, REPLAY, [f"-DMJXBALL_FOLLOWER={number}"])
+        host, arm = cortex.on_both(tmp_path, b"".join(records[number]))
+        assert len(host) == 900 * (13 * 4 + protocol.BEAT_SIZE)
+        assert host == arm

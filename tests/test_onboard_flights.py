@@ -1,0 +1,78 @@
+"""Followers on board, flown by the twin in virtual time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from onboard_bench import cores_of, needs_gcc
+
+from mjxball.fly.app.protocol import Phase
+from mjxball.fly.supervisor import State as Laptop
+from mjxball.fly.twin.conditions import Surroundings
+from mjxball.fly.twin.virtual import VirtualTwin
+from mjxball.policy import Policy
+from mjxball.policy.file import shipped_policy
+from virtual_flight import SETTLE, cause_of, code_of, settings_of
+
+
+def world(seconds: float = 6.0, **around: Any) -> VirtualTwin:
+    policy = Policy.load(shipped_policy("flight"))
+    settings = settings_of(policy, seconds)
+    return VirtualTwin(policy, settings, surroundings=Surroundings(**around), settle=SETTLE, cores=cores_of())
+
+
+@needs_gcc
+def test_radio_delay_does_not_matter_on_board():
+    errors = []
+    for delay in (0.0, 0.04):
+        twin = world(delay=delay)
+        twin.run()
+        assert code_of(twin) == 0
+        flown = [moment for moment in twin.track if moment.state == "fly"][300:]
+        off = np.array([moment.position for moment in flown]) - twin.flight.goal(twin.now)
+        errors.append(float(np.sqrt((off**2).sum(axis=1).mean())))
+    assert max(errors) < 0.03
+    assert abs(errors[1] - errors[0]) < 0.005  # other phases of the noise
+
+
+@needs_gcc
+def test_the_apps_land_without_a_laptop():
+    twin = world()
+    twin.fly_until(Laptop.FLY)
+    twin.fly_for(3.0)
+    height = twin.moment().position[2] - twin.rest
+    assert height > 0.2
+    for _ in range(400):  # no tick of the flight any more
+        twin.advance(0.02)
+        twin.track.append(twin.moment())
+    assert twin.running() == [False, False]
+    assert twin.touchdown_speed() < 0.4
+    assert [drone.app.phase for drone in twin.drones if drone.app] == [Phase.IDLE] * 2
+    assert not any(drone.firmware.locked for drone in twin.drones)
+
+
+@needs_gcc
+def test_a_low_battery_lands_both():
+    """One drone finds its battery low for 5 s, without the laptop's knowledge; a moment does not count."""
+    twin = world(seconds=30.0)
+    twin.fly_until(Laptop.FLY)
+    twin.fly_for(3.0)
+    follower = twin.links[1]
+    follower.write_parameters({"mjxb.battery": 4.2})
+    twin.fly_for(4.0)
+    follower.write_parameters({"mjxb.battery": 3.2})
+    twin.fly_for(2.0)
+    assert twin.flight.supervisor.state is Laptop.FLY
+    follower.write_parameters({"mjxb.battery": 4.2})
+    twin.fly_for(4.5)
+    assert twin.flight.supervisor.state is Laptop.FLY
+    twin.run()
+    notes = [record for record in twin.log.records if record["kind"] == "app" and record["phase"] == "land"]
+    assert {one["drone"]: one["cause"] for one in notes} == {
+        "leader": "the other drone does",
+        "follower": "the battery is low",
+    }
+    assert cause_of(twin).startswith("APP_LANDS")
+    assert twin.touchdown_speed() < 0.4
+    assert twin.running() == [False, False]

@@ -1,0 +1,128 @@
+"""Followers on board: exported apps and weights, and what the laptop says to them before a flight."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import assert_one_line, call
+from onboard_bench import Bench, needs_gcc, policy_of
+
+from mjxball.errors import InputError
+from mjxball.export import main as export
+from mjxball.fly.app import generate, protocol
+from mjxball.fly.app.host import compile_pair
+from mjxball.fly.app.protocol import CAUSES, Phase
+from mjxball.fly.connection import LinkError
+from mjxball.fly.main import main as fly
+from mjxball.fly.onboard import Apps
+from mjxball.fly.telemetry import Rig
+from mjxball.policy import load_file
+from mjxball.policy.file import shipped_policy
+from mjxball.policy.formats.c_header import weight_bytes
+from mjxball.policy.quantize import quantized
+
+
+def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):
+    policy = policy_of("balance")
+    assert call(export, [shipped_policy("balance"), tmp_path / "rounded.npz", "--int8"]) == 0
+    saved = load_file(tmp_path / "rounded.npz").weights
+    for exact, rounded, written in zip(policy.weights, quantized(policy).weights, saved, strict=True):
+        np.testing.assert_array_equal(rounded, written)
+        step = np.abs(exact).max(axis=0) / 127
+        assert (np.abs(exact - rounded) <= step / 2 + 1e-7).all()
+        assert np.abs(exact - rounded).max() > 0
+
+
+def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.CaptureFixture):
+    for arguments, text in (
+        ([shipped_policy("balance"), tmp_path / "app", "--crazyflie"], "another plant than a pair of Crazyflies"),
+        ([shipped_policy("flight"), tmp_path, "--crazyflie"], "exists"),
+        ([shipped_policy("flight"), tmp_path / "a" / "b", "--crazyflie"], "does not exist"),
+        (["saved.npz", tmp_path / "x.onnx", "--int8"], "--int8 is for"),
+    ):
+        assert call(export, arguments) == 2, text
+        error = capsys.readouterr().err
+        assert_one_line(error)
+        assert text in error
+    slow = policy_of("flight")
+    with pytest.raises(InputError, match="control period of 40 ms"):
+        generate.files_of(dataclasses.replace(slow, card={**slow.card, "control_period": 0.04}), "slow", False)
+    assert not list(tmp_path.iterdir())
+
+
+@needs_gcc
+def test_weights_are_uploaded_on_the_ground_only():
+    policy = policy_of("flight")
+    other = dataclasses.replace(policy, biases=tuple(bias + np.float32(0.01) for bias in policy.biases))
+    bench = Bench(compile_pair(policy, "flight", int8=True), Rig.of_card(policy.card))
+    follower, key, data = bench.apps[1], generate.key_of(policy), weight_bytes(other)
+    assert key == generate.key_of(other)
+    assert follower.ident == zlib.crc32(weight_bytes(policy)) == generate.ident_of(policy, True)
+
+    def upload(packets: Any) -> int:
+        replies = [protocol.reply_of(follower.laptop(packet.data, bench.now)) for packet in packets]
+        return next((reply.status for reply in replies if reply is not None and reply.status), 0)
+
+    bad = CAUSES.index("weights refused: wrong rate, plant, format, size or CRC")
+    packets = list(protocol.upload(data, key))
+    assert upload(protocol.upload(data, key + 1)) == bad  # another rate or plant
+    assert upload(protocol.upload(data[:-8], key)) == bad
+    assert upload([*packets[:7], *packets[8:]]) == bad  # a chunk is lost
+    broken = [*packets[:7], packets[7]._replace(data=packets[7].data[:-1] + b"\x55"), *packets[8:]]
+    assert upload(broken) == bad
+    assert follower.ident == generate.ident_of(policy, True)
+    assert upload([*packets[:5], *packets[3:]]) == 0  # repeated ones do no harm
+    assert follower.ident == generate.ident_of(other, True)
+    bench.take_off()
+    flown = [bench.tick(Phase.FLY)[1] for _ in range(3)]
+    new = Bench(compile_pair(other, "flight", int8=True), bench.rig)
+    new.take_off()
+    assert [one.thrust for one in flown] == [new.tick(Phase.FLY)[1].thrust for _ in range(3)]
+    assert upload(protocol.upload(data, key)) == CAUSES.index("weights refused: not on the ground")
+
+
+class FakeLink:
+    """A drone whose app has these parameters."""
+
+    def __init__(self, name: str, **values: float):
+        self.name, self.values = name, {f"mjxb.{one}": value for one, value in values.items()}
+        self.parameters = self
+
+    def read(self, names: list[str]) -> dict[str, float]:
+        if missing := [name for name in names if name not in self.values]:
+            raise LinkError(f"the firmware of the {self.name} has no parameter {missing[0]}; update it")
+        return {name: self.values[name] for name in names}
+
+
+def test_the_laptop_refuses_other_apps():
+    apps, said = Apps("flight", (11, 12), 10), list[str]()
+    good = ({"role": 0, "period": 10}, {"role": 1, "period": 10, "ident": 12})
+    apps.check([FakeLink("leader", **good[0]), FakeLink("follower", **good[1])], said.append)  # type: ignore[list-item]
+    assert said == ["on board: flight, 8 bit weights"]
+    for leader, follower, text in (
+        ({}, good[1], "the leader has no app on board"),
+        ({**good[0], "role": 1}, good[1], "exchange the URIs"),
+        (good[0], {**good[1], "period": 20}, "the app of the follower has a period of 20 ms, and flight one of 10 ms"),
+        (good[0], {**good[1], "ident": 13}, "the follower carries another policy than flight"),
+    ):
+        with pytest.raises(InputError, match=text):
+            apps.check([FakeLink("leader", **leader), FakeLink("follower", **follower)], said.append)  # type: ignore[list-item]
+
+
+def test_flags_that_contradict_onboard_are_refused(capsys: pytest.CaptureFixture):
+    flight = shipped_policy("flight")
+    for flags, text in (
+        ([flight, "--rehearse", "--upload"], "--upload takes weights of 8 bits"),
+        ([flight, "--rehearse", "--onboard", "--mass", "0.07"], "leave --thrust, --hover and --mass out"),
+        ([flight, "--rehearse", "--onboard", "--goal", "0", "0", "9"], "beyond the fence"),
+        ([shipped_policy("balance"), "--rehearse", "--onboard"], "another plant than a pair of Crazyflies"),
+    ):
+        assert call(fly, flags) == 2, text
+        error = capsys.readouterr().err
+        assert_one_line(error)
+        assert text in error
