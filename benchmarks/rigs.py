@@ -10,6 +10,8 @@ The better of both is the reference of a rig, by the median of its flights, in s
 where the policy's median settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over
 0.17 m where that is larger, above the reference's, or where the reference itself has none.
 
+With --beyond: outside one range of training at a time, on rigs that are drawn like the others.
+
 With --steps: at 15 s the object's mass changes by 30 %, or the CG jumps to where it would be half a period later.
 """
 
@@ -30,17 +32,34 @@ import numpy as np
 from mjxball import cli
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.lqg import SlowToldLqg, ToldLqg
-from mjxball.config import Config, preset
+from mjxball.config import Config, preset, replace
 from mjxball.control.followers import Copy, Law
-from mjxball.control.team_lqg import nominal_context
+from mjxball.env import PipelineState
+from mjxball.errors import InputError
+from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.rigs import Flown, fly, held_out, told_laws
-from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
-from mjxball.sim.rigs import RigTable
+from mjxball.sim.rigs import HELD_OUT, RigTable, draw_rigs, rig_config, unpadded
 
 SIZES, RIGS, FLIGHTS = (2, 3, 4, 5, 6), 200, 3
 LATER, MORE, LENGTH = 1.25, 0.005, 0.17  # the bar: settling, peak [m], of a rig of that length [m]
 TOLD = ("lqg-told", "lqg-slow-told")
+PAIR_LOAD = 0.2  # [kg]
+STEP, BACK, AFTER = 15.0, 1.5, 5.0  # [s] when the load changes, within which it is balanced again, what is flown then
+BEYOND = {
+    "rigs.drone_mass": (3.0, 6.0),
+    "rigs.object_share": (0.6, 0.8),
+    "rigs.thrust_to_weight": (1.4, 1.6),
+    "rigs.rotor_lag": (0.15, 0.2),
+    "rigs.loop_frequency": (3.0, 4.0),
+    "rigs.loop_damping": (0.4, 0.5),
+    "rigs.thrust_scale": (0.7, 0.8),
+    "scenario.cg_speed": (6.0, 8.0),
+    "scenario.delay": (0.06, 0.08),
+    "scenario.noise": (1.0, 2.0),
+}
+MASS_STEP = 0.3  # largest, of the object's mass
+SHARES = (*("failed", "unsettled", "crashed_alone", "soon", "small", "met", "sooner"),)
 
 Made = tuple[str, Callable[[Config, RigTable], Law | list[Law]]]
 
@@ -51,14 +70,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz")
     parser.add_argument("--rigs", type=int, default=RIGS, metavar="N", help="of each number of drones (default 200)")
     parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), metavar="N", help="numbers of drones")
+    parser.add_argument("--beyond", action="store_true", help="rigs just outside one range at a time instead")
     parser.add_argument("--steps", action="store_true", help="a step of the mass or the CG in flight")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="error against time since the step")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args(arguments)
     if options.figure and not options.steps:
         raise InputError("--figure is of --steps")
+    if options.beyond and options.steps:
+        raise InputError("--beyond and --steps are two benchmarks; run one after the other")
     config = preset("universal")
-    found = steps(config, options) if options.steps else compare(config, options)
+    made = steps if options.steps else beyond if options.beyond else compare
+    found = made(config, options)
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0
@@ -114,6 +137,23 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
     return {"rows": rows, "all": shares}
 
 
+def beyond(config: Config, options: Any) -> dict[str, Any]:
+    """The told LQGs and the policies outside one range at a time."""
+    rows = []
+    for path, ends in BEYOND.items():
+        outside = replace(config, path, ends)
+        for size in options.sizes:
+            rigs, flown = held_out(outside, size, options.rigs), {}
+            for name, make in followers(options.policies):
+                if name not in WORST:
+                    flown[name] = fly(outside, rigs, make(outside, rigs), FLIGHTS)
+                    row = _row(flown, name, rigs, config.timing.control_period)
+                    rows.append({"setting": path, "range": ends, "drones": size, "follower": name, **row})
+                    print(json.dumps(rows[-1]))
+                    sys.stdout.flush()
+    return {"rows": rows}
+
+
 def _row(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) -> dict[str, Any]:
     """Shares of failed flights, medians over rigs, and the shares of rigs that are met."""
     settling, peak = (np.median(getattr(flown[name], part)(period), axis=1) for part in ("settling", "peak"))
@@ -152,13 +192,15 @@ def _quantile(values: np.ndarray, share: int) -> float | None:
 def steps(config: Config, options: Any) -> dict[str, Any]:
     """Error after a step at 15 s, of the mass and of the CG: shares that are back within 2 % after 1.5 s."""
     period, rows, curves = config.timing.control_period, [], {}
-    steady = dataclasses.replace(config, rigs=dataclasses.replace(config.rigs, mass_step=0.3))
+    none, some = (
+        dataclasses.replace(config, rigs=dataclasses.replace(config.rigs, mass_step=most)) for most in (0.0, MASS_STEP)
+    )
     for kind, made in CHANGES.items():
         for size in options.sizes:
             rigs = held_out(config, size, options.rigs)
             for name, make in followers(options.policies):
                 found = fly(
-                    steady if kind == "mass" else config, rigs, make(config, rigs), FLIGHTS, STEP + 5.0, 1, made
+                    some if kind == "mass" else none, rigs, make(config, rigs), FLIGHTS, STEP + AFTER, 1, (STEP, made)
                 )
                 before, after = round(STEP / period), round((STEP + BACK) / period)
                 start = found.error[..., :1]
@@ -175,6 +217,44 @@ def steps(config: Config, options: Any) -> dict[str, Any]:
     if options.figure:
         _draw(curves, period, options.figure)
     return {"rows": rows}
+
+
+def _mass_changes(world: PipelineState) -> PipelineState:
+    """The change of the object's mass that was drawn happens now."""
+    load = world.load
+    return world._replace(load=load._replace(mass_change_time=0.0 * load.mass_change_time))
+
+
+def _cg_jumps(world: PipelineState) -> PipelineState:
+    """The CG is where it would be half a period later, from one moment to the next."""
+    return world._replace(load=world.load._replace(cg_phase=world.load.cg_phase + math.pi))
+
+
+CHANGES = {"mass": _mass_changes, "CG": _cg_jumps}
+
+
+def _draw(curves: dict[Any, list[np.ndarray]], period: float, path: Path) -> None:
+    """Error against time since the step: median and 10 to 90 %, for the told LQGs and the policies."""
+    from mjxball.plotting import pyplot
+
+    figure, axes = pyplot().subplots(1, len(CHANGES), figsize=(9, 3.6), sharey=True, layout="constrained")
+    for kind, place in zip(CHANGES, axes, strict=True):
+        for color, (name, parts) in enumerate((n, p) for (k, n), p in curves.items() if k == kind and n not in WORST):
+            error = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
+            low, middle, high = (1e3 * np.quantile(error, q, axis=0, method="lower") for q in (0.1, 0.5, 0.9))
+            since = period * (np.arange(error.shape[-1]) - 50)
+            place.plot(since, middle, color=f"C{color}", label=name)
+            place.fill_between(since, low, high, color=f"C{color}", alpha=0.15, linewidth=0)
+        place.set(
+            title=f"step of the {'mass' if kind == 'mass' else 'CG'}", xlabel="time since the step [s]", ylim=(0, 150)
+        )
+        place.grid(alpha=0.3)
+    axes[0].set_ylabel("error of the object [mm]")
+    axes[0].legend(frameon=False)
+    figure.savefig(path, dpi=120)
+
+
+WORST = ("copy", "adaptive-mass")
 
 
 if __name__ == "__main__":

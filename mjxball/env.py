@@ -278,8 +278,8 @@ class TransportEnv:
         if not self._law.needs_context:
             return None
         plant = self.config.plant
-        if self.config.rigs.number:
-            return nominal_context(plant.count if rig is None else rig.drawn.size)
+        if rig is not None and rig.drawn is not None:
+            return nominal_context(rig.drawn.size)
         mass = jnp.float32(plant.object_mass) * (1.0 if rig is None else rig.share)
         numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
         return team_context(jax.tree.map(jnp.float32, numbers), plant, mass)

@@ -253,10 +253,6 @@ class ToldLqg(KnownFailuresLqg):
         numbers, followers = plant_parameters(config.plant, config.attitude), list(config.plant.followers)
         self._rotors = numbers.arm[followers], numbers.rotor_force_max[followers]
 
-    def _limited(self, base: Array, followed: Array, carried: Array, limits: Array) -> Array:
-        """Commands `followed` (..., F, 3) within what may be sent; at `base` (..., F, 3) rotors only lift."""
-        return followed.__array_namespace__().clip(followed, -limits, limits)
-
     def _weighing(self, carried: Array, privileged: PrivilegedInfo) -> Array:
         return self._model.of_flight(privileged.total_mass)
 

@@ -94,5 +94,6 @@ class Gradient:
     )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
     until_termination: bool = setting(
-        False, "what follows the end of an episode counts no more until the next window, whose gradient it would dominate"
+        False,
+        "what follows the end of an episode counts no more until the next window, whose gradient it would dominate",
     )

@@ -150,6 +150,8 @@ def _validate_team(config: Config) -> None:
         raise InputError("scenario.lost_follower_probability needs a plant of three drones or more")
     if config.follower.load_axis_only and len(plant.directions) == 2:
         raise InputError("follower.load_axis_only is for a load that moves along a line, not in the plane")
+    if config.rigs.number and not scenario.team_sizes:
+        raise InputError("rigs.number needs scenario.team_sizes, the numbers of drones of random rigs")
     if not scenario.team_sizes:
         return
     if max(scenario.team_sizes) > plant.count:

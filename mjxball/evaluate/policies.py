@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ from mjxball.config import Config, with_current_names
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
+from mjxball.policy.file import COUNT
+from mjxball.sim.rigs import outside
 
 
 def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy:
@@ -21,6 +24,12 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     if abs(policy.control_period - period) > 1e-9:
         raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
     made_for = configs.from_record({"plant": policy.card["plant"]}).plant
+    if told_nothing(policy):
+        if config.plant.stand != "free":
+            raise InputError(f"{path} was made for free flight, not for a stand")
+        for text in outside(config, trained_rigs(policy)):
+            print(f"warning: {path} was not trained for this rig: {text}", file=sys.stderr)  # noqa: T201
+        return policy
     if sizes := team_sizes(policy):
         _refuse_other_teams(path, sizes, config)
         return policy
@@ -33,6 +42,17 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     if compare_laws:
         _refuse_other_laws(path, policy.card, config)
     return policy
+
+
+def told_nothing(policy: Policy) -> bool:
+    """Whether `policy` flies any rig, of which it is told the number of drones alone."""
+    return policy.card.get("context") == list(COUNT)
+
+
+def trained_rigs(policy: Policy) -> Config:
+    """The configuration that a policy for any rig was trained with; the preset's where its card has none."""
+    settings = policy.card.get("config")
+    return configs.from_record(settings) if isinstance(settings, dict) else configs.preset("universal")
 
 
 def team_sizes(policy: Policy) -> tuple[int, ...]:

@@ -64,14 +64,21 @@ def fly(
     # Of its plant only the number of drones counts, and its attitude loops are those of the preset's own law.
     own = dataclasses.replace(rig_config(config, rigs, 0), attitude=config.attitude, rigs=one_rig)
     env = TransportEnv(own, "newton-euler")
-    one = not isinstance(laws, Sequence)
-    example: Law = laws if one else laws[0]
-    numbers, rebuild = (None, lambda _: example) if one else stacked(laws)
+    numbers: list[Any] | None = None
+    if isinstance(laws, Sequence):
+        numbers, rebuild = stacked(laws)
+    else:
+        alike: Law = laws
+        rebuild = lambda _: alike  # noqa: E731
     steps = round(seconds / env.dt)
     at = -1 if change is None else round(change[0] / env.dt)
 
     def flight(key: Any, rig: RigTable, law: Law) -> tuple[Any, Any]:
         state = env.reset(key, 1.0, None, rig)
+        if change is not None:  # nothing of its own before
+            later = state.pipeline_state.load
+            later = later._replace(mass_change_time=later.mass_change_time + jnp.inf)
+            state = state.replace(pipeline_state=state.pipeline_state._replace(load=later))
 
         def step(carry: tuple[State, Any, Any], number: Any) -> Any:
             state, memory, far = carry
@@ -92,7 +99,7 @@ def fly(
     def rig_flights(rig: RigTable, numbers: Any, keys: Any) -> tuple[Any, Any]:
         return jax.vmap(lambda key: flight(key, rig, rebuild(numbers)))(keys)
 
-    keys = jax.random.split(jax.random.key(seed), (rigs.count, flights))
+    keys = jax.random.split(jax.random.key(seed), (rigs.total, flights))
     single = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), (rigs, numbers))
     with jax.default_matmul_precision("highest"):
         error, failed = jax.jit(jax.vmap(rig_flights))(*single, keys)
@@ -101,7 +108,7 @@ def fly(
 
 def told_laws(config: Config, rigs: RigTable, make: Callable[[Config], Law]) -> list[Law]:
     """`make` of every rig's own configuration."""
-    return [make(rig_config(config, rigs, row)) for row in range(rigs.count)]
+    return [make(rig_config(config, rigs, row)) for row in range(rigs.total)]
 
 
 def stacked(laws: Sequence[Law]) -> tuple[list[Any], Callable[[list[Any]], Law]]:
@@ -132,4 +139,4 @@ def _told(world: PipelineState, size: int) -> PrivilegedInfo:
     told = PrivilegedInfo(load.believed_mass, zero, zero, total, thrust)
     if size == 2:
         return told
-    return PrivilegedInfo(*(jnp.broadcast_to(part, (size - 1, *part.shape)) for part in told))
+    return jax.tree.map(lambda part: jnp.broadcast_to(part, (size - 1, *part.shape)), told)

@@ -15,7 +15,7 @@ from mjxball.config import Config, config_hash, to_dict
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.motors import firmware
 from mjxball.control.observation import ACTION, OBSERVATION, commanded
-from mjxball.policy.file import CONTEXT, PolicyFile, write_whole
+from mjxball.policy.file import CONTEXT, COUNT, PolicyFile, write_whole
 
 
 def policy_file(
@@ -40,7 +40,7 @@ def policy_file(
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
         **({} if law.lqg is None else {"lqg": {k: np.asarray(v).tolist() for k, v in law.lqg._asdict().items()}}),
-        **({"context": list(CONTEXT)} if law.needs_context else {}),
+        **({"context": list(COUNT if config.rigs.number else CONTEXT)} if law.needs_context else {}),
         "action_reach": action_scale,
         "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
         "leader_kp": list(leader.kp),

@@ -24,6 +24,7 @@ from mjxball.policy.container import PolicyFileError, read_arrays
 FORMAT_VERSIONS = (1, 2, 3)
 # `control.team_lqg.team_context`.
 CONTEXT = ("command_share", "roll_per_lift", "pitch_per_lift", "roll_room", "pitch_room")
+COUNT = ("drones",)  # or this alone, see `control.team_lqg.nominal_context`
 FOLDER = "policies"  # of those that come with mjxball
 ARCHIVE = "archive"  # in it: earlier ones, which documents name
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
@@ -282,7 +283,7 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
         raise PolicyFileError(
             f"{name}: a residual policy of format {version} needs card field lqg: {', '.join(shapes)}"
         )
-    if in_team and card.get("context") != list(CONTEXT):
+    if in_team and card.get("context") not in (list(CONTEXT), list(COUNT)):
         raise PolicyFileError(f"{name} needs another context than this version's {', '.join(CONTEXT)}")
     for field, shape in shapes.items():
         try:

@@ -12,10 +12,10 @@ import numpy as np
 from mjxball.config import Attitude, Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.team_lqg import TeamLqg, team_context
+from mjxball.control.team_lqg import TeamLqg, nominal_context, team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
-from mjxball.policy.file import PolicyFile, law_of, load_file
+from mjxball.policy.file import COUNT, PolicyFile, law_of, load_file
 
 Array = Any
 
@@ -70,6 +70,9 @@ class Policy:
         Raises InputError if the team's attitude loops are not those that its law is for.
         """
         if isinstance(self._law.lqg, TeamLqg):
+            if self.card["context"] == list(COUNT):
+                self._context = nominal_context(np.array(plant.count, self._dtype))
+                return
             if not plant.is_team:
                 raise InputError(f"policy {self.name} was made for teams, or a load that moves in the plane")
             made_for, found = float(self._law.lqg.stiffness) ** 0.5, attitude.natural_frequency[:2]

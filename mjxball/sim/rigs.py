@@ -1,14 +1,14 @@
 """Random rigs: teams of drones, carriers and loads of every size, from the ranges of `config.rigs` (ours).
 
-Lengths grow with the cube root of a drone's mass, inertia with mass and square of length, as they do from a Crazyflie to
-a drone of 3 kg; factors of a draw come on top. Needs NumPy alone.
+Lengths grow with the cube root of a drone's mass, inertia with mass and square of length, as they do from a Crazyflie
+to a drone of 3 kg; factors of a draw come on top. Needs NumPy alone.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,7 +44,7 @@ class RigTable(NamedTuple):
     damping: Array  # (R,) of these without rotor lag
 
     @property
-    def count(self) -> int:
+    def total(self) -> int:
         """R."""
         return len(self.size)
 
@@ -64,16 +64,20 @@ class Drawn(NamedTuple):
 
 
 def draw_rigs(config: Config, size: int, count: int, seed: int) -> Drawn:
-    """`count` rigs of `size` drones from `config.rigs`, padded to the plant's drones; the same for the same `seed`."""
+    """`count` rigs of `size` drones from `config.rigs`, padded to the plant's drones; a `seed` draws the same."""
     random = np.random.default_rng([seed, size])
     parts: list[RigTable] = []
     draws = damped = untrimmed = 0
-    while sum(part.count for part in parts) < count:
+    while sum(part.total for part in parts) < count:
         table, steady, held = _draw(config, size, 2 * count + 16, random)
         good = steady & held
-        missing = count - sum(part.count for part in parts)
+        missing = count - sum(part.total for part in parts)
         last = np.flatnonzero(good)[:missing][-1] + 1 if good.sum() >= missing else len(good)
-        draws, damped, untrimmed = draws + last, damped + (~steady[:last]).sum(), untrimmed + (steady & ~held)[:last].sum()
+        draws, damped, untrimmed = (
+            draws + last,
+            damped + (~steady[:last]).sum(),
+            untrimmed + (steady & ~held)[:last].sum(),
+        )
         parts.append(table.rows(np.flatnonzero(good[:last])))
     return Drawn(joined(parts), int(draws), int(damped), int(untrimmed))
 
@@ -109,7 +113,7 @@ def whole(numbers: PlantParameters, gravity: float) -> PlantParameters:
 
 def _each(function: Callable[..., Any], *numbers: PlantParameters) -> PlantParameters:
     """`function` of every array of all `numbers`."""
-    found = {}
+    found: dict[str, Any] = {}
     for name in PlantParameters._fields:
         parts = [getattr(one, name) for one in numbers]
         if name == "gains":
@@ -138,7 +142,7 @@ def loop_damping(frequency: Array, damping: Array, lag: Array) -> Array:
 
 def _draw(config: Config, size: int, count: int, random: np.random.Generator) -> tuple[RigTable, Array, Array]:
     """(rigs, whether their loops are damped, whether their loads can be trimmed), `count` of each."""
-    ranges, most, gravity = config.rigs, config.plant.count, config.plant.gravity
+    ranges, most, gravity = config.rigs, max(config.plant.count, size), config.plant.gravity
 
     def even(ends: Range, *shape: int) -> Array:
         return random.uniform(*ends, (count, *shape))
@@ -280,7 +284,7 @@ def _padded(numbers: PlantParameters, count: int) -> PlantParameters:
     """`numbers` with drones behind the last up to `count` that weigh, lift and believe nothing."""
     missing = count - numbers.size
     nothing = {"drone_mass", "own_inertia", "rotor_force_max", "share", "known_mass"}
-    found = {}
+    found: dict[str, Any] = {}
     for name in (*nothing, "mounts", "arm", "yaw_per_thrust", "rotor_lag"):
         value = getattr(numbers, name)
         more = np.repeat(value[:, -1:], missing, axis=1)
@@ -292,7 +296,7 @@ def unpadded(rigs: RigTable, size: int) -> RigTable:
     """`rigs`, all of `size` drones, without the drones that pad."""
     padded = {"drone_mass", "own_inertia", "rotor_force_max", "share", "known_mass", "mounts", "arm"}
     padded |= {"yaw_per_thrust", "rotor_lag"}
-    cut = {name: getattr(rigs.numbers, name)[:, :size] for name in padded}
+    cut: dict[str, Any] = {name: getattr(rigs.numbers, name)[:, :size] for name in padded}
     return rigs._replace(numbers=rigs.numbers._replace(**cut), thrust=rigs.thrust[:, :size])
 
 
@@ -332,6 +336,41 @@ def rig_config(config: Config, rigs: RigTable, row: int) -> Config:
     )
     rigs_off = dataclasses.replace(config.rigs, number=0)
     return dataclasses.replace(config, plant=plant, attitude=attitude, scenario=scenario, rigs=rigs_off)
+
+
+def outside(config: Config, trained: Config) -> list[str]:
+    """What of the rig of `config` lies outside the ranges that `trained` draws rigs from, one phrase each."""
+    plant, ranges = config.plant, trained.rigs
+    drones, gravity, sizes = plant.drones, plant.gravity, trained.scenario.team_sizes
+    masses = [drone.mass for drone in drones]
+    weight = sum(masses) + plant.carrier_mass + plant.object_mass
+    strongest = 4 * sum(plant.of_drones("rotor_force_max"))
+    found: list[tuple[str, Sequence[float], Range, str]] = [
+        ("drones", [plant.count], (min(sizes), max(sizes)), ""),
+        ("mass of a drone", masses, ranges.drone_mass, " kg"),
+        ("rotor arm over 0.12 m (mass / kg)^(1/3)", _over_usual_arm(plant), ranges.arm_scale, ""),
+        ("object's mass over that of all drones", [plant.object_mass / sum(masses)], ranges.object_share, ""),
+        ("largest thrust over the weight", [strongest / gravity / weight], ranges.thrust_to_weight, ""),
+        ("rotor lag", plant.of_drones("rotor_lag"), ranges.rotor_lag, " s"),
+    ]
+    if config.autopilot.kind == "ideal":
+        loops, damping = config.attitude.natural_frequency[:2], config.attitude.damping
+        slow, fast = ranges.loop_frequency
+        found += [
+            ("attitude loop", loops, (slow * FREQUENCY_RATIO[0], fast * FREQUENCY_RATIO[1]), " rad/s"),
+            ("damping of the attitude loop", [damping], ranges.loop_damping, ""),
+        ]
+    return [
+        f"{name} {value:.3g}{unit}, trained from {low:g} to {high:g}{unit}"
+        for name, values, (low, high), unit in found
+        for value in sorted({min(values), max(values)})
+        if not low * (1 - 1e-6) <= value <= high * (1 + 1e-6)
+    ]
+
+
+def _over_usual_arm(plant: Plant) -> list[float]:
+    arms = zip(plant.drones, plant.of_drones("arm"), strict=True)
+    return [arm / ARM / math.cbrt(drone.mass) for drone, arm in arms]
 
 
 def _tuple(values: Array) -> Any:

@@ -107,9 +107,9 @@ class LoadedEnv(TransportEnv):
         super().__init__(config, "newton-euler")
         self._known, self._flight = load, flight
 
-    def reset(self, rng: Array, difficulty: Any = 1.0, number: Any = None) -> Any:
+    def reset(self, rng: Array, difficulty: Any = 1.0, number: Any = None, rig: Any = None) -> Any:
         """A world with that load; see `TransportEnv.reset`."""
-        state = super().reset(rng, difficulty, number)
+        state = super().reset(rng, difficulty, number, rig)
         world: PipelineState = state.pipeline_state
         known, flight, draw = self._known, self._flight, jax.random.normal(jax.random.fold_in(rng, 11), (11,))
         mass = known.mass * (1.0 + MASS_SPREAD * draw[0])

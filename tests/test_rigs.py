@@ -1,0 +1,175 @@
+"""Random rigs: what is drawn is sound, padded and told alike, and the follower for any rig is told nothing of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tables import rows
+
+from mjxball.baselines.lqg import SlowToldLqg
+from mjxball.config import preset, replace, validate, with_plant
+from mjxball.control.followers import PrivilegedInfo
+from mjxball.control.team_lqg import nominal_context
+from mjxball.env import TransportEnv
+from mjxball.errors import InputError
+from mjxball.evaluate.policies import load_policy
+from mjxball.evaluate.rigs import Flown, fly, held_out, stacked, told_laws
+from mjxball.physics.newton_euler import make_engine
+from mjxball.physics.step import make_control_step
+from mjxball.plant import plant_parameters
+from mjxball.plant.trim import largest_margin
+from mjxball.policy.file import load_file, save_file, shipped_policy
+from mjxball.policy.policy import NetworkLaw
+from mjxball.sim.rigs import TRAINING, draw_rigs, loop_damping, outside, rig_config, unpadded, whole
+from mjxball.sim.rollout import load_of, start_of
+from mjxball.sim.scenario import Scenario
+
+UNIVERSAL = preset("universal")
+POLICY = shipped_policy("universal")
+
+
+def test_a_row_is_the_plant_of_its_configuration() -> None:
+    for size in (2, 4):
+        rigs = held_out(UNIVERSAL, size, 3)
+        for row in range(3):
+            config = rig_config(UNIVERSAL, rigs, row)
+            found = plant_parameters(config.plant, config.attitude)
+            drawn = whole(rigs.rows(row).numbers, config.plant.gravity)
+            for name in set(found._fields) - {"gains", "ball_limit"}:
+                np.testing.assert_allclose(
+                    getattr(drawn, name), getattr(found, name), rtol=1e-9, atol=1e-15, err_msg=name
+                )
+            for mine, theirs in zip(drawn.gains, found.gains, strict=True):
+                np.testing.assert_allclose(mine, theirs, rtol=1e-9)
+
+
+def test_draws_are_seeded_within_their_ranges_and_never_those_of_training() -> None:
+    drawn, again = draw_rigs(UNIVERSAL, 3, 40, TRAINING), draw_rigs(UNIVERSAL, 3, 40, TRAINING)
+    assert drawn.draws == again.draws
+    assert drawn.unstable > 0
+    np.testing.assert_array_equal(drawn.rigs.reach, again.rigs.reach)
+    assert not np.isin(held_out(UNIVERSAL, 3, 40).reach, drawn.rigs.reach).any()
+    for row in range(40):
+        assert not outside(rig_config(UNIVERSAL, drawn.rigs, row), UNIVERSAL)
+
+
+def test_damping_is_that_of_the_roots() -> None:
+    random = np.random.default_rng(0)
+    frequency, damping, lag = random.uniform(4, 20, 50), random.uniform(0.5, 1.1, 50), random.uniform(0.015, 0.15, 50)
+    for w, z, t, found in zip(frequency, damping, lag, loop_damping(frequency, damping, lag), strict=True):
+        roots = np.roots([t, 1.0, 2 * z * w, w * w])
+        least = (-roots.real / np.abs(roots)).min()
+        assert min(found, 1.0) == pytest.approx(least, abs=1e-9)
+
+
+def test_followers_can_hold_every_load_as_far_as_it_goes() -> None:
+    margin = UNIVERSAL.scenario.trim_margin
+    for size in (2, 3, 6):
+        rigs = held_out(UNIVERSAL, size, 8)
+        for row in range(8):
+            plant, thrust = rig_config(UNIVERSAL, rigs, row).plant, tuple(rigs.thrust[row])
+            for angle in np.linspace(0, 2 * np.pi, 5):
+                place = tuple(0.999 * rigs.reach[row] * np.array([np.cos(angle), np.sin(angle)]))
+                mass, believed = float(rigs.object_mass[row]), float(rigs.believed_mass[row])
+                assert largest_margin(plant, mass, place, believed, thrust=thrust).margin > margin - 1e-6
+
+
+def test_told_laws_fly_together_as_each_alone() -> None:
+    rigs = held_out(UNIVERSAL, 3, 3)
+    laws = told_laws(UNIVERSAL, rigs, SlowToldLqg)
+    numbers, rebuild = stacked(laws)
+    random = np.random.default_rng(0)
+    observation = 0.1 * random.standard_normal((2, 18))
+    for row, law in enumerate(laws):
+        known = PrivilegedInfo(np.full(2, 0.3), None, None, np.full(2, 4.0), np.ones((2, 3)))
+        alone = law.step(law.start(observation), observation, known)[1]
+        together = rebuild([part[row] for part in numbers])
+        np.testing.assert_array_equal(together.step(together.start(observation), observation, known)[1], alone)
+
+
+def test_a_padded_rig_flies_as_it_does_alone() -> None:
+    rigs = draw_rigs(UNIVERSAL, 3, 2, 7).rigs
+    alone = dataclasses.replace(
+        rig_config(UNIVERSAL, rigs, 0), attitude=UNIVERSAL.attitude, rigs=dataclasses.replace(UNIVERSAL.rigs, number=1)
+    )
+    flown = []
+    for config, table in ((UNIVERSAL, rigs), (alone, unpadded(rigs, 3))):
+        still = dataclasses.replace(config.scenario, noise=(0.0, 0.0), delay=(0.0, 0.0), estimator_drift=(0.0, 0.0))
+        simple = dataclasses.replace(config.follower, base="pd")
+        env = TransportEnv(dataclasses.replace(config, scenario=still, follower=simple), "newton-euler")
+        own = jax.tree.map(lambda part: jnp.asarray(part[1], jnp.float32), table)
+        state, step = env.reset(jax.random.key(3), 1.0, None, own), jax.jit(env.step)
+        for _ in range(25):
+            state = step(state, jnp.zeros((len(env.config.plant.followers), 3)))
+        flown.append(state)
+    np.testing.assert_allclose(flown[0].obs[:2], flown[1].obs, atol=2e-4)
+    assert float(jnp.abs(flown[1].obs[:, 6:9]).max()) > 0.05  # it moves
+
+
+def test_thrust_falls_as_the_battery_empties() -> None:
+    config = preset("paper")
+    step = make_control_step(config, make_engine(config.plant, config.attitude))
+    scenario = [Scenario(seconds=1.0)]
+    load, state = load_of(scenario), start_of(config, scenario)
+    for fade in (0.0, 0.1):
+        flown = state
+        for _ in range(100):
+            flown = step(flown, np.zeros((1, 2, 3)), load._replace(thrust_fade=np.full(1, fade)))
+        # The lost force is a ramp, sampled at the beginning of each physics step, behind the rotors' lag.
+        lag = config.plant.rotor_lag
+        ramp = ((2.0 - config.physics_step / 2 - lag) ** 2 + lag**2) / 2
+        expected = -config.plant.gravity * fade * ramp
+        assert flown.velocity[0, 2] == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+class TestUniversal:
+    def test_it_is_told_the_number_of_drones_alone(self) -> None:
+        card = load_file(POLICY).card
+        assert card["context"] == ["drones"]
+        np.testing.assert_allclose(nominal_context(np.array(4.0)), [4 / 3, 0, 0, 0.15, 0.15])
+
+    def test_it_fails_on_no_rig_that_it_has_never_seen(self) -> None:
+        for size in (2, 5):
+            rigs = held_out(UNIVERSAL, size, 4)
+            law = NetworkLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
+            found = fly(UNIVERSAL, rigs, law, flights=2, seconds=12.0)
+            assert not found.failed.any()
+            assert np.median(found.error[..., 300:].max(axis=-1)) < 0.1
+
+    def test_a_rig_outside_is_flown_with_a_warning(self, capsys: pytest.CaptureFixture[str]) -> None:
+        load_policy(POLICY, with_plant(UNIVERSAL, "team4"))
+        paper = preset("paper")
+        load_policy(POLICY, paper)
+        assert capsys.readouterr().err == ""
+        heavy = dataclasses.replace(paper, plant=dataclasses.replace(paper.plant, object_mass=2.0, rotor_force_max=9.0))
+        load_policy(POLICY, heavy)
+        assert "object's mass over that of all drones 1, trained from 0.05 to 0.6" in capsys.readouterr().err
+
+    def test_it_flies_no_stand(self) -> None:
+        with pytest.raises(InputError, match="made for free flight, not for a stand"):
+            load_policy(POLICY, replace(preset("paper"), "plant.stand", "pivot"))
+
+    def test_another_context_is_refused(self, tmp_path: object) -> None:
+        contents = load_file(POLICY)
+        card = json.loads(json.dumps(contents.card)) | {"context": ["mass"]}
+        with pytest.raises(InputError, match="needs another context"):
+            save_file(f"{tmp_path}/odd.npz", dataclasses.replace(contents, card=card))
+
+
+@rows("error, settling, peak", [([1.0, 0.5, 0.01, 0.01], 0.02, 0.01), ([1.0, 0.01, 0.5, 0.01], 0.04, 0.01)])
+def test_settling_is_the_last_time_beyond_two_percent(error: list[float], settling: float, peak: float) -> None:
+    long = np.array([[[*error, *[0.01] * 2000]]])
+    flown = Flown(long, np.zeros((1, 1), bool))
+    assert flown.settling(0.02)[0, 0] == pytest.approx(settling)
+    assert flown.peak(0.02)[0, 0] == pytest.approx(peak)
+    assert np.isinf(flown._replace(failed=np.ones((1, 1), bool)).peak(0.02)).all()
+
+
+def test_rigs_need_numbers_of_drones() -> None:
+    with pytest.raises(InputError, match=r"rigs\.number needs scenario\.team_sizes"):
+        validate(replace(UNIVERSAL, "scenario.team_sizes", ()))
