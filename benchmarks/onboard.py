@@ -20,13 +20,15 @@ import numpy as np
 
 import cortex
 from mjxball.errors import InputError
+from mjxball.export import in_team
 from mjxball.fly.app.generate import rig_header, sources
 from mjxball.fly.card import config_of
 from mjxball.policy import Policy, PolicyFile
-from mjxball.policy.file import load_file, shipped_policies
+from mjxball.policy.file import law_of, load_file, shipped_policies
 from mjxball.policy.formats.c_header import c_header, footprint
 
 FLIGHT = 500  # steps of a flight
+PAIR = Path("pair")  # the plant of a policy that has to be told its team
 MAIN = r"""
 #include "policy.h"
 int file_open(const char *name, int write);
@@ -73,7 +75,7 @@ def flown(policy: PolicyFile, steps: int) -> tuple[np.ndarray, np.ndarray]:
         for noise in random.normal(scale=math.sqrt(1 - kept**2), size=(FLIGHT, 18)):
             place = kept * place + noise
             seen = (policy.observation_mean[:18] + spread * place).astype(np.float32)
-            memory = follower.memory if follower.memory is not None else follower._law.start(seen)
+            memory = follower.memory if follower.memory is not None else follower._law.start(seen, follower._context)
             records.append(np.concatenate([memory, seen]).astype(np.float32))
             actions.append(follower.scaled(seen))
     return np.array(records[:steps]), np.array(actions[:steps])
@@ -111,9 +113,15 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> dict[str, Any]:
     return {**row, "flash": cortex.sizes(place, flags, "core.c"), "stack": stack}
 
 
+def policy_of(path: Path) -> PolicyFile:
+    """The policy in `path`, as the follower of a pair if it has to be told."""
+    policy = load_file(path)
+    return in_team(policy, path.stem, PAIR if law_of(policy.card).needs_context else None)
+
+
 def measure(path: Path, int8: bool, steps: int) -> dict[str, Any]:
     """One row of the table."""
-    policy = load_file(path)
+    policy = policy_of(path)
     with tempfile.TemporaryDirectory() as place:
         compared = compare(policy, Path(place), int8, steps)
         row = {"policy": path.stem, "weights": "int8" if int8 else "float32", **compared}
@@ -127,8 +135,7 @@ def main() -> int:
     parser.add_argument("--observations", type=int, default=10_000)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    if options.policies is None:  # what has to be told its team has no C
-        options.policies = [path for path in shipped_policies() if "context" not in load_file(path).card]
+    options.policies = options.policies or shipped_policies()
     if cortex.missing():
         print(f"not installed: {cortex.missing()}", file=sys.stderr)
         return 2

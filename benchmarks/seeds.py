@@ -96,9 +96,9 @@ def fly(config: Config, policies: list[Policy], scenarios: Sequence[Scenario]) -
 
 
 def metric(flown: Metrics, name: str) -> float:
-    """Infinite where a flight failed or never settled."""
+    """Infinite where a flight failed or never settled; without float32's last digits, since levels may be shared."""
     value = getattr(flown, name)
-    return math.inf if flown.failed or value is None or math.isnan(value) else value
+    return math.inf if flown.failed or value is None or math.isnan(value) else round(value, 6)
 
 
 def of_levels(config: Config, policies: list[Policy]) -> list[dict[str, Any]]:
@@ -222,8 +222,10 @@ def main() -> None:
         print(f"flights, mass {where}: {sum(one['failed'] for one in flights)} failed", end="; ")
         print("; ".join(f"{name} {spread([1e3 * one[name] for one in flights])} mm" for name in list(flights[0])[1:]))
     if options.json:
-        finite = json.loads(json.dumps(rows), parse_constant=lambda _: None)
-        options.json.write_text(json.dumps(finite, indent=1) + "\n")
+        finite = json.loads(
+            json.dumps(rows), parse_constant=lambda _: None, parse_float=lambda x: float(f"{float(x):.4g}")
+        )
+        options.json.write_text("[" + ",\n".join(json.dumps(row) for row in finite) + "]\n")
 
 
 if __name__ == "__main__":

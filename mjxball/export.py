@@ -9,11 +9,20 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from mjxball.cli import make_parser, output_file, quit_on_interrupt, run_command
+import numpy as np
+
+from mjxball import config as configs
+from mjxball.cli import make_parser, output_file, plant_setup, quit_on_interrupt, run_command
+from mjxball.config import Config
+from mjxball.control.motors import firmware
+from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, load_file, save_file, write_whole
+from mjxball.policy.file import CONTEXT, PolicyFile, law_of, load_file, save_file, write_whole
+from mjxball.policy.policy import context_of
 
 
 def policy_of_run(run: Path) -> PolicyFile:
@@ -37,12 +46,41 @@ def contents_of(source: Path) -> PolicyFile:
     return load_file(source) if source.suffix == ".npz" else policy_of_run(source)
 
 
-def _for_any_machine(source: Path) -> PolicyFile:
-    """`contents_of`; InputError for a policy that no other format holds."""
-    policy = contents_of(source)
-    if "context" in policy.card:
-        raise InputError(f"{source} has to be told its team before a flight; only a policy file .npz can hold it")
-    return policy
+def in_team(policy: PolicyFile, name: str, plant: Path | None, drone: int | None = None) -> PolicyFile:
+    """`policy` as `drone` of the team on the plant file `plant` flies it; itself if it is told nothing of its team.
+
+    Its card then has `team`, and plant and configuration of that team. Raises InputError for what does not fit.
+    """
+    if not law_of(policy.card).needs_context:
+        if plant is not None or drone is not None:
+            raise InputError(f"{name} is told nothing of its team: leave --plant and --drone out")
+        return policy
+    if plant is None and drone is None and "team" in policy.card:
+        return policy
+    config = None if plant is None else plant_setup(plant)
+    followers: tuple[int, ...] = (1,) if config is None else config.plant.followers
+    if drone not in (followers if len(followers) > 1 else (None, *followers)):
+        raise InputError(f"--drone must be a follower of --plant: {', '.join(map(str, followers))}")
+    place = 0 if drone is None else followers.index(drone)
+    if config is None:  # InputError, unless any pair will do
+        context, angles, about = context_of(name, policy.card, None, None), np.zeros(1), {}
+    else:
+        context = context_of(name, policy.card, config.plant, config.attitude)
+        angles, about = np.ravel(mount_frames(config.plant)), _card_of(config, policy.card)
+    told = context.reshape(-1, len(CONTEXT))[place].tolist()
+    team = {"drone": followers[place], "mount_angle": float(angles[place]), "context": told}
+    return replace(policy, card={**policy.card, **about, "team": team})
+
+
+def _card_of(config: Config, card: dict[str, Any]) -> dict[str, Any]:
+    """What `card` says of plant and configuration where its policy flies on the plant of `config`."""
+    own = configs.from_record({"plant": {}, **card.get("config", {})})
+    timing = replace(own.timing, physics_steps=round(own.timing.control_period / config.physics_step))
+    flown = configs.validate(
+        replace(config, preset=own.preset, leader=own.leader, command=own.command, follower=own.follower, timing=timing)
+    )
+    drones = {"firmware": firmware(config)} if config.autopilot.kind == "crazyflie" else {}
+    return {"plant": configs.to_dict(config.plant), "config": configs.to_dict(flown), **drones}
 
 
 def _write_onnx(out: Path, policy: PolicyFile) -> None:
@@ -68,26 +106,36 @@ WRITERS: dict[str, Writer] = {".npz": save_file, ".onnx": _write_onnx, ".h": _wr
 ROUNDED: dict[str, Writer] = {".npz": _save_rounded, ".h": functools.partial(_write_header, int8=True)}  # with --int8
 
 
-def export(source: Path, out: Path, crazyflie: bool = False, int8: bool = False) -> None:
+def export(
+    source: Path,
+    out: Path,
+    crazyflie: bool = False,
+    int8: bool = False,
+    plant: Path | None = None,
+    drone: int | None = None,
+) -> None:
     """Export `source` to the new file `out`, in the format that its ending names; raise InputError if that fails.
 
     `crazyflie`: to the new directory `out`, as apps for both drones. `int8`: weights of 8 bits in an app or a header,
-    floats rounded to them in a policy file.
+    floats rounded to them in a policy file. `plant`, `drone`: see `in_team`; a policy file need not be told them.
     """
+
+    def policy() -> PolicyFile:
+        return contents_of(source) if untold else in_team(contents_of(source), source.stem, plant, drone)
+
+    untold = out.suffix == ".npz" and not crazyflie and plant is None and drone is None
     if crazyflie:
         from mjxball.fly.app.generate import check_place, write_app
 
         check_place(out)
-        write_app(_for_any_machine(source), source.stem, out, int8)
+        write_app(policy(), source.stem, out, int8)
         return
     if int8 and out.suffix not in ROUNDED:
         raise InputError("--int8 is for --crazyflie, or for an output file that ends in .h or .npz")
     if out.suffix not in WRITERS:
         raise InputError(f"output file {out} must end in {', '.join(WRITERS)}, which chooses the format")
     output_file(out, out.suffix)
-    read = contents_of if out.suffix == ".npz" else _for_any_machine
-    writers = ROUNDED if int8 else WRITERS
-    writers[out.suffix](out, read(source))
+    (ROUNDED if int8 else WRITERS)[out.suffix](out, policy())
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -98,10 +146,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("out", metavar="OUT", type=Path, help="file to write, .npz, .onnx or .h; must not exist")
     parser.add_argument("--crazyflie", action="store_true", help="OUT is a directory: apps for a pair of Crazyflies")
     parser.add_argument("--int8", action="store_true", help="weights of 8 bits; .npz: rounded to them")
+    about = f"team in which a policy flies that has to be told: {', '.join(configs.PLANTS)}, or a rig in TOML or JSON"
+    parser.add_argument("--plant", metavar="NAME|FILE", type=Path, help=about)
+    parser.add_argument("--drone", metavar="N", type=int, help="its number in --plant where several drones follow")
     options = parser.parse_args(arguments)
 
     def command() -> int:
-        export(options.source, options.out, options.crazyflie, options.int8)
+        export(options.source, options.out, options.crazyflie, options.int8, options.plant, options.drone)
         print(options.out)  # noqa: T201
         return 0
 

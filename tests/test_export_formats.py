@@ -15,7 +15,8 @@ import pytest
 from command_line import assert_one_line, call, listing, load_arrays, run, write_arrays
 from conftest import Trained
 
-from mjxball.export import main
+from mjxball.cli import plant_setup
+from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
@@ -75,11 +76,15 @@ def limited(remembering: Trained) -> PolicyFile:
     params=[
         *("trained", "direct", "remembering", "limited", "estimating"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
+        *("team pair", "team team3"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
-    if request.param in ("balance", "transport", "robust", "flight", "stand", "paper"):
-        return load_file(shipped_policy(request.param))
+    name, _, plant = request.param.partition(" ")
+    if plant:
+        return in_team(load_file(shipped_policy(name)), name, Path(plant), None if plant == "pair" else 2)
+    if name in ("balance", "transport", "robust", "flight", "stand", "paper"):
+        return load_file(shipped_policy(name))
     made = request.getfixturevalue(request.param)
     return made.contents if isinstance(made, Trained) else made
 
@@ -222,20 +227,40 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
         ("none.npz", "follower.h", "none.npz does not exist"),
         ("broken.npz", "follower.onnx", "broken.npz: card field history is missing"),
         ("no-run", "follower.onnx", "no-run"),
+        ("follower.npz", "a.h --plant team4", "is told nothing of its team"),
+        ("team.npz", "a.h", "has to be told its team: --plant NAME"),
+        ("team.npz", "a.onnx --plant team4", "--drone must be a follower of --plant: 1, 2, 3"),
+        ("team.npz", "a.onnx --plant team4 --drone 0", "--drone must be a follower of --plant: 1, 2, 3"),
+        ("team.npz", "a.onnx --drone 1", "has to be told its team: --plant NAME"),
+        ("team.npz", "a.onnx --plant stand", "free flight with attitude loops of 10 rad/s"),
+        ("team.npz", "a.npz --plant nothing", "plant file nothing cannot be read"),
     ],
 )
 def test_refusals(source: str, out: str, message: str, saved: Path, monkeypatch, capsys):
+    shutil.copy(shipped_policy("team"), saved.parent / "team.npz")
     (saved.parent / "taken.h").write_text("mine")
     arrays, card = load_arrays(saved)
     del card["history"]
     write_arrays(saved.parent / "broken.npz", arrays, card)
     before = listing(saved.parent)
     monkeypatch.chdir(saved.parent)
-    assert call(main, [source, out]) == 2
+    assert call(main, [source, *out.split()]) == 2
     errors = capsys.readouterr().err
     assert_one_line(errors)
     assert message in errors
     assert listing(saved.parent) == before
+
+
+def test_a_policy_that_was_told_its_team_flies_as_one_that_joined(tmp_path: Path):
+    out = tmp_path / "third.npz"
+    assert call(main, [shipped_policy("team"), out, "--plant", "team4", "--drone", "3"]) == 0
+    config, joined, told = plant_setup(Path("team4")), Policy.load(shipped_policy("team")), Policy.load(out)
+    joined.join(config.plant, config.attitude)
+    for seen in np.random.default_rng(0).normal(scale=0.2, size=(5, 18)):
+        np.testing.assert_allclose(told(seen), joined(np.stack([seen] * 3))[2], rtol=0, atol=1e-5)
+    assert call(main, [out, tmp_path / "third.onnx"]) == 0  # it need not be told again
+    mount = config.plant.drones[3].mount
+    assert told.card["team"]["mount_angle"] == pytest.approx(np.arctan2(-mount[1], -mount[0]))
 
 
 def test_a_missing_package_is_named_with_its_extra(saved: Path):

@@ -140,6 +140,7 @@ NOT_LAWS = {
     "crazyflie.integral_shares",
     "observation.commanded",
     "observation.mount_angles",
+    "observation.mount_frames",
     "observation.observation_history",
     *(
         f"crazyflie.{name}"

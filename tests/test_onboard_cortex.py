@@ -52,8 +52,8 @@ def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsy
 @needs_arm
 @pytest.mark.parametrize("int8", [False, True])
 def test_a_cortex_m4_computes_the_same_bits(int8: bool, tmp_path: Path):
-    for name in ("balance", "flight"):
-        found = benchmark.compare(policy_of(name), tmp_path, int8, 500)
+    for name in ("balance", "flight", "team"):
+        found = benchmark.compare(benchmark.policy_of(shipped_policy(name)), tmp_path, int8, 500)
         assert found["identical"], name
         if not int8:
             assert found["error"] <= 1e-5

@@ -47,7 +47,7 @@ def test_a_figure_has_a_line_for_each_follower_and_coordinate(
     plt.close("all")
     kinds = [kind for kind, _, _ in plots.PANELS]
     offset, commands = drawn[kinds.index("cg_offset")], drawn[kinds.index("command")]
-    assert len(offset) == 2 * 2
+    assert len(offset) == 2  # the same in both flights
     np.testing.assert_array_equal(offset[1], flown[0].flight.cg_offset[:, 1])
     assert len(commands) == 2 * (2 + 1)  # of both results, two followers and their leader
     np.testing.assert_allclose(commands[1], np.degrees(flown[0].flight.follower_command[:, 1, 0]))

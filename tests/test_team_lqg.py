@@ -20,7 +20,6 @@ from mjxball.control.team_lqg import team_context
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.export import main as export
 from mjxball.plant import plant_parameters
 from mjxball.plant.teams import ring_config
 from mjxball.policy import Policy, PolicyFile
@@ -132,7 +131,7 @@ def test_a_network_of_zeros_flies_the_law(count: int, file) -> None:
     np.testing.assert_allclose(flown.position, expected.position, rtol=0, atol=2e-4)  # float32 beside float64
 
 
-def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file, tmp_path, capsys: pytest.CaptureFixture) -> None:
+def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file) -> None:
     with pytest.raises(InputError, match="told its team"):
         Policy.load(file)(np.zeros((2, 18)))
     with pytest.raises(InputError, match="2 to 6 drones, not 8"):
@@ -143,19 +142,19 @@ def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file, tmp_path, ca
         load_policy(file, preset("transport"))
     with pytest.raises(InputError, match="alike about roll and pitch"):
         team_lqg(configs.replace(ring(4), "attitude.natural_frequency", (8.0, 10.0, 4.0)))
-    for name in ("follower.onnx", "follower.h"):
-        assert export([str(file), str(tmp_path / name)]) == 2
-        assert "told its team" in capsys.readouterr().err
-        assert not (tmp_path / name).exists()
 
 
-@rows("change", ["another context", "no numbers", "a number that is none", "no damping"])
+@rows(
+    "change", ["another context", "no numbers", "a number that is none", "no damping", "no such team", "a pair of one"]
+)
 def test_unsound_files_are_refused(change, file, tmp_path) -> None:
     contents = silent(TEAM)
     given, said = {
         "another context": ({"context": ["drones"]}, "another context"),
         "no numbers": ({"lqg": None}, "needs card field lqg"),
         "a number that is none": ({"lqg": contents.card["lqg"] | {"damping": float("nan")}}, "lqg.damping"),
+        "no such team": ({"team": {"drone": 1, "mount_angle": 0.0, "context": [2.0] * 4}}, "team.context must be"),
+        "a pair of one": ({"team": {"drone": 1, "mount_angle": 0.0, "context": [1.0] * 5}}, "must be above 1"),
         "no damping": ({"lqg": contents.card["lqg"] | {"damping": 0.0}}, "must be positive"),
     }[change]
     with pytest.raises(PolicyFileError, match=said):

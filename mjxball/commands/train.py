@@ -173,7 +173,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
-    if options.algorithm == "ppo" and settings.ppo.activation != "relu":
+    if settings.ppo.activation != "relu":
         raise InputError(f"--ppo.activation {settings.ppo.activation}: policy files hold relu; see mjxball.train.train")
     out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)

@@ -66,8 +66,11 @@ def mount_angles(plant: Plant, mounts: Array | None = None) -> Array | None:
     for a pair whose load moves along a line: its follower sees body axes. `mounts` (..., N, 3) if they are not the
     plant's; without F where there is one follower.
     """
-    if len(plant.followers) == 1 and len(plant.directions) == 1:
-        return None
+    return mount_frames(plant, mounts) if plant.is_team else None
+
+
+def mount_frames(plant: Plant, mounts: Array | None = None) -> Array:
+    """`mount_angles`, of every pair too."""
     places: Any = np.array([drone.mount for drone in plant.drones]) if mounts is None else mounts
     followers = list(plant.followers) if len(plant.followers) > 1 else plant.followers[0]
     own = places[..., followers, :]

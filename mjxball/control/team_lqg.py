@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from mjxball.config import Plant
 from mjxball.control import rotations
-from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_angles
+from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_frames
 from mjxball.plant import PlantParameters
 
 Array = Any
@@ -137,7 +137,7 @@ def team_context(parameters: PlantParameters, plant: Plant, object_mass: Array) 
     hover = parameters.gravity * (parameters.known_mass + parameters.share * object_mass[..., None]) / 4
     room = 2 * parameters.arm * xp.minimum(hover, parameters.rotor_force_max - hover)  # [N m]
     several = len(plant.followers) > 1
-    angles: Any = mount_angles(plant, parameters.mounts)  # a team has them
+    angles = mount_frames(plant, parameters.mounts)
     chosen = xp.asarray(plant.followers) if several else plant.followers[0]
     room, share, kp = room.take(chosen, axis=-1), count / (count - 1), parameters.gains.kp
     if several:

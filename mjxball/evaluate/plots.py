@@ -35,10 +35,12 @@ COLOURS = {
 POLICY_COLOURS = ("#1b6ca8", "#6f4a8e", "#00798c", "#c2571a", "#7a9e1f")
 CYCLE = ("#1b6ca8", "#d1495b", "#2e933c", "#edae49", "#6f4a8e", "#00798c", "#8d6a4f", "#444444")  # in PNG files
 LEAST_SPAN = 0.01  # of an axis [m], [deg], [m/s2]
+LEAST_ERROR = 0.1  # of the axis of distances [mm]
 PANELS = (
     ("position", 0, "x [m]"),
     ("position", 1, "y [m]"),
     ("position", 2, "z [m]"),
+    ("error", None, "distance to goal [mm]"),
     ("cg_offset", None, "CG offset [m]"),
     ("command", 0, "roll command [deg]"),
     ("command", 1, "pitch command [deg]"),
@@ -165,15 +167,15 @@ def as_svg(figure: Any) -> str:
 
 
 def draw_flights(results: Sequence[Result], title: str, path: Path) -> None:
-    """Draw all followers of one scenario over time: position with goal, CG offset (y dotted), all drones' commands."""
+    """Draw all followers of one scenario over time: position and distance, CG offset (y dotted), all commands."""
     plt = pyplot()
     # Fixed margins: to fit them takes Matplotlib as long as to draw.
     margins = {"left": 0.1, "right": 0.985, "top": 0.96, "bottom": 0.035, "hspace": 0.1}
-    figure, axes = plt.subplots(len(PANELS), 1, sharex=True, figsize=(9, 13), gridspec_kw=margins)
+    figure, axes = plt.subplots(len(PANELS), 1, sharex=True, figsize=(9, 14.5), gridspec_kw=margins)
     for axis, panel in zip(axes, PANELS, strict=True):
         _draw_panel(axis, results, *panel)
     axes[0].legend(loc="lower right", ncol=3, fontsize="small")
-    axes[4].legend(loc="upper right", ncol=4, fontsize="small")
+    axes[5].legend(loc="upper right", ncol=4, fontsize="small")
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     figure.suptitle(title, y=0.985)
@@ -184,13 +186,20 @@ def draw_flights(results: Sequence[Result], title: str, path: Path) -> None:
 def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | None, label: str) -> None:
     time = results[0].flight.time
     if kind == "position":
-        axis.axhline(results[0].flight.goal[index], color="black", linestyle=":", linewidth=1, label="goal")
+        goal = results[0].flight.target[:, index]
+        axis.plot(time, goal, color="black", linestyle=":", linewidth=1, label="goal")
     for number, (result, colour) in enumerate(zip(results, itertools.cycle(CYCLE), strict=False)):
         if kind == "position":
             axis.plot(time, result.flight.position[:, index], color=colour, linewidth=1.3, label=result.follower)
+        elif kind == "error":
+            error = 1e3 * np.linalg.norm(result.flight.position - result.flight.target, axis=1)
+            axis.plot(time, np.maximum(error, LEAST_ERROR), color=colour, linewidth=1.1)
         elif kind == "cg_offset":
-            for along, style in zip(result.flight.cg_offset.reshape(len(time), -1).T, CG_STYLES, strict=False):
-                axis.plot(time, along, color=colour, linewidth=1.2, linestyle=style)
+            moved = result.flight.cg_offset
+            if number and np.array_equal(moved, results[0].flight.cg_offset):
+                continue
+            for along, style in zip(moved.reshape(len(time), -1).T, CG_STYLES, strict=False):
+                axis.plot(time, along, color="black" if not number else colour, linewidth=1.2, linestyle=style)
         else:
             factor = 1.0 if index == 2 else 57.29577951308232
             flight, name = result.flight, None if number else "dashed: leader"
@@ -199,6 +208,8 @@ def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | No
                 axis.plot(time, factor * followed, color=colour, linewidth=1.1, label=own)
             dashed: dict[str, Any] = {"linewidth": 0.8, "linestyle": "--", "alpha": 0.7, "label": name}
             axis.plot(time, factor * flight.leader_command[:, index], color=colour, **dashed)
+    if kind == "error":
+        axis.set_yscale("log")
     low, high = axis.get_ylim()
     if high - low < LEAST_SPAN:  # rounding errors must not look like motion
         axis.set_ylim((low + high - LEAST_SPAN) / 2, (low + high + LEAST_SPAN) / 2)

@@ -107,8 +107,8 @@ def _framing(plant: Plant, position: np.ndarray, goal: np.ndarray) -> tuple[np.n
     points = points[np.abs(points - centre).max(axis=-1) < 3.0]  # a flight that failed leaves the picture
     low, high = points.min(axis=0), points.max(axis=0)
     arms = max(np.linalg.norm(drone.mount) for drone in plant.drones) + 1.6 * plant.arm
-    room = 0.85 if plant.count == 2 else 1.0  # of several drones some are always at the side
-    return (low + high) / 2, float(room * (np.linalg.norm(high - low) / 2 + arms) / np.tan(np.radians(22.5)))
+    radius = 1.08 * (np.linalg.norm(high - low) / 2 + arms)  # what comes nearer to the camera looks larger
+    return (low + high) / 2, float(radius / np.tan(np.radians(22.5)))
 
 
 def _render(folder: Path) -> None:

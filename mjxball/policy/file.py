@@ -286,14 +286,31 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
     if in_team and card.get("context") not in (list(CONTEXT), list(COUNT)):
         raise PolicyFileError(f"{name} needs another context than this version's {', '.join(CONTEXT)}")
     for field, shape in shapes.items():
-        try:
-            array = np.array(lqg[field], np.float64)
-        except (TypeError, ValueError):
-            array = np.full(1, np.nan)
-        if array.shape != shape or not (np.abs(array) <= MAX_NUMBER).all():
-            raise PolicyFileError(f"{name}: card field lqg.{field} must be finite numbers of shape {shape}")
+        _check_numbers(name, f"lqg.{field}", lqg[field], shape)
+    if in_team and "team" in card:
+        _check_team(card["team"], name)
     if min(np.min(lqg[field]) for field in positive) <= 0:
         raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
+
+
+def _check_team(team: Any, name: str) -> None:
+    """Raise PolicyFileError unless `team` says in which team, and as which of its drones, a policy flies."""
+    if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
+        raise PolicyFileError(f"{name}: card field team must hold drone, mount_angle and context")
+    for field, shape in (("drone", ()), ("mount_angle", ()), ("context", (len(CONTEXT),))):
+        _check_numbers(name, f"team.{field}", team[field], shape)
+    share, _, _, *room = team["context"]
+    if share <= 1 or min(room) <= 0:
+        raise PolicyFileError(f"{name}: card field team.context: command_share must be above 1 and both rooms positive")
+
+
+def _check_numbers(name: str, field: str, value: Any, shape: tuple[int, ...]) -> None:
+    try:
+        array = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        array = np.full(1, np.nan)
+    if array.shape != shape or not (np.abs(array) <= MAX_NUMBER).all():
+        raise PolicyFileError(f"{name}: card field {field} must be finite numbers of shape {shape}")
 
 
 def _is_finite(value: Any) -> bool:

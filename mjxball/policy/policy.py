@@ -12,12 +12,42 @@ import numpy as np
 from mjxball.config import Attitude, Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.team_lqg import TeamLqg, nominal_context, team_context
+from mjxball.control.team_lqg import nominal_context, team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import COUNT, PolicyFile, law_of, load_file
 
 Array = Any
+
+
+def context_of(name: str, card: dict[str, Any], plant: Plant | None, attitude: Attitude | None) -> np.ndarray:
+    """What each follower of a team on `plant` is told, (F, 5), or (5,) of one follower; see `team_lqg.team_context`.
+
+    `name` and `card` of a policy of format 3. One that is told the number of drones alone flies in any team, by default
+    in a pair. Raises InputError if the attitude loops are not those that its law is for, or without a plant.
+    """
+    if card["context"] == list(COUNT):
+        followers = 1 if plant is None else len(plant.followers)
+        alike = nominal_context(np.array(followers + 1.0))
+        return alike if followers == 1 else np.broadcast_to(alike, (followers, alike.size))
+    if plant is None or attitude is None:
+        raise InputError(f"policy {name} has to be told its team: --plant NAME or FILE.toml, such as team4")
+    made_for, found = float(card["lqg"]["stiffness"]) ** 0.5, attitude.natural_frequency[:2]
+    if plant.stand != "free" or max(abs(frequency - made_for) for frequency in found) > 1e-6 * made_for:
+        raise InputError(
+            f"policy {name} was made for free flight with attitude loops of {made_for:g} rad/s, "
+            f"not {found[0]:g} and {found[1]:g} on a stand that is {plant.stand}"
+        )
+    return np.asarray(team_context(plant_parameters(plant, attitude), plant, np.float64(plant.object_mass)))
+
+
+def known_context(card: dict[str, Any], name: str) -> np.ndarray | None:
+    """What a policy of format 3 has in its card of the team that it is for, (5,); None for other formats.
+
+    Raises InputError if it is told its team by `Policy.join` alone.
+    """
+    team = card.get("team")
+    return _known(name, law_of(card), None if team is None else np.array(team["context"]))
 
 
 def mean_action(
@@ -56,7 +86,8 @@ class Policy:
         self._mean: np.ndarray = contents.observation_mean.astype(dtype)
         self._scale: np.ndarray = contents.observation_scale.astype(dtype)
         self._law = law_of(card)
-        self._context: Array | None = None
+        told = self._law.needs_context and "team" in card
+        self._context: Array | None = np.array(card["team"]["context"], dtype) if told else None
         self._memory: Array | None = None
 
     @classmethod
@@ -69,20 +100,10 @@ class Policy:
 
         Raises InputError if the team's attitude loops are not those that its law is for.
         """
-        if isinstance(self._law.lqg, TeamLqg):
-            if self.card["context"] == list(COUNT):
-                self._context = nominal_context(np.array(plant.count, self._dtype))
-                return
-            if not plant.is_team:
+        if self._law.needs_context:
+            if not plant.is_team and self.card["context"] != list(COUNT):
                 raise InputError(f"policy {self.name} was made for teams, or a load that moves in the plane")
-            made_for, found = float(self._law.lqg.stiffness) ** 0.5, attitude.natural_frequency[:2]
-            if plant.stand != "free" or max(abs(frequency - made_for) for frequency in found) > 1e-6 * made_for:
-                raise InputError(
-                    f"policy {self.name} was made for free flight with attitude loops of {made_for:g} rad/s, "
-                    f"not {found[0]:g} and {found[1]:g} on a stand that is {plant.stand}"
-                )
-            numbers = plant_parameters(plant, attitude)
-            self._context = team_context(numbers, plant, np.float64(plant.object_mass)).astype(self._dtype)
+            self._context = context_of(self.name, self.card, plant, attitude).astype(self._dtype)
 
     def reset(self) -> None:
         """Forget past observations: the next call starts an episode."""
@@ -158,5 +179,5 @@ class NetworkLaw:
 def _known(name: str, law: FollowerLaw, context: Array | None) -> Array | None:
     """`context`, or InputError if the law needs one and there is none."""
     if law.needs_context and context is None:
-        raise InputError(f"policy {name} has to be told its team before it flies (Policy.join); a file cannot hold it")
+        raise InputError(f"policy {name} has to be told its team before it flies (Policy.join)")
     return context

@@ -53,6 +53,8 @@ def check_policy(policy: PolicyFile, name: str) -> Config:
     drones = plant.get("drones", ())
     if policy.card.get("firmware") is None or (drones and len(drones) != 2):
         raise InputError(f"{name} was trained for another plant than a pair of Crazyflies, such as that of flight")
+    if abs(policy.card.get("team", {}).get("mount_angle", 0.0)) > 1e-6:
+        raise InputError(f"{name} sees and commands in its mount frame; an app keeps body axes: pairs along x alone")
     period = 1000 * float(policy.card["control_period"])
     if abs(period - round(period)) > 1e-6 or not PERIODS[0] <= round(period) <= PERIODS[1]:
         wanted = f"whole milliseconds from {PERIODS[0]} to {PERIODS[1]}"

@@ -19,11 +19,19 @@ from mjxball.control.observation import (
     OBSERVATION,
     OBSERVATION_SIZE,
 )
+from mjxball.control.offset_free import OffsetFreeLqg
+from mjxball.control.team_lqg import CONTEXT, TeamLqg
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
+from mjxball.policy.policy import known_context
 from mjxball.policy.quantize import Rows, rows_of
 
 FLOAT = 4  # bytes
+LQG_TEXTS = {  # helpers, law
+    type(None): ("", ""),
+    OffsetFreeLqg: (c_texts.COSINE, c_texts.LQG),
+    TeamLqg: (c_texts.ROOT, c_texts.TEAM_LQG),
+}
 
 
 @dataclass(frozen=True)
@@ -42,6 +50,7 @@ def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     widest = max(len(bias) for bias in biases)
     lqg = law_of(policy.card).lqg
     constants = 2 * ACTION_SIZE + (0 if lqg is None else sum(np.size(value) for value in lqg))
+    constants += CONTEXT if isinstance(lqg, TeamLqg) else 0
     state, stack = FLOAT * (size - OBSERVATION_SIZE) + 4, FLOAT * (size + 2 * widest)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
@@ -54,8 +63,10 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
     """The header's text. `mjxball_follow` computes what `mjxball.Policy` computes, in float.
 
     With `int8` the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the
-    same layout may be put in place at run time, `mjxball_follower.weights`.
+    same layout may be put in place at run time, `mjxball_follower.weights`. A policy of format 3 is that of the one
+    follower that `team` in its card names; InputError without it.
     """
+    context = known_context(policy.card, name)
     law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)
     history = law.history
     sizes = [len(policy.observation_mean), *map(len, mean_layers(policy)[1])]
@@ -67,8 +78,10 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
             _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
             for name, value in law.lqg._asdict().items()
         ]
+    if context is not None:
+        arrays += [_array("lqg_context", context)]
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
-    helpers += (c_texts.APPROACH if history.filters else "") + (c_texts.COSINE if law.lqg is not None else "")
+    helpers += (c_texts.APPROACH if history.filters else "") + LQG_TEXTS[type(law.lqg)][0]
     layers = _network_int8(sizes) if int8 else _network(sizes)
     return c_texts.HEADER.format(
         name=_plain(name),
@@ -94,13 +107,23 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
         memory_size=law.size,
         memory_field=f"    mjxball_real memory[{law.size}];\n" if law.size else "",
         helpers=helpers,
-        lqg=c_texts.LQG if law.lqg is not None else "",
+        lqg=LQG_TEXTS[type(law.lqg)][1],
+        team="" if context is None else _team(card["team"]),
+        mount_angle="" if context is None else f"#define MJXBALL_MOUNT_ANGLE {_number(card['team']['mount_angle'])}\n",
         memory_pointer="    mjxball_real *memory = follower->memory;\n" if law.size else "",
         arrays="\n".join(arrays),
         history=_history(law, card),
         history_update=_history_update(law),
         network=layers,
         command=_command(law, card),
+    )
+
+
+def _team(team: dict[str, Any]) -> str:
+    """Lines of the comment on the frame of a follower of a team."""
+    return (
+        f" * It is drone {int(team['drone'])} of its team. Observation and command are in its mount frame: world and\n"
+        " * body axes turned by MJXBALL_MOUNT_ANGLE [rad] about body z, so that its mount lies at negative x.\n"
     )
 
 
@@ -180,7 +203,9 @@ def _history_update(law: FollowerLaw) -> str:
         lines += [f"    mjxball_approach(memory + {place + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
     if history.previous_action:
         lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
-    if law.lqg is not None:
+    if isinstance(law.lqg, TeamLqg):
+        lines += [f"    mjxball_lqg_next(memory + {history.size}, led, own);"]
+    elif law.lqg is not None:
         lines += [f"    mjxball_lqg_next(memory + {history.size}, observation, led, command);"]
     return "\n".join(lines)
 
@@ -305,6 +330,14 @@ def _leader(card: dict[str, Any], to: str) -> list[str]:
 def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
     """Lines that make the command of `action`, which is added to a law unless it is direct."""
     added = "mjxball_action_scale[i] * action[i]"
+    if isinstance(law.lqg, TeamLqg):
+        return "\n".join(
+            [
+                "    mjxball_real own[3];",
+                f"    mjxball_lqg_command(memory + {law.history.size}, observation, led, own);",
+                f"    for (i = 0; i < 3; i++) command[i] = mjxball_clip(own[i] + {added}, mjxball_limit[i]);",
+            ]
+        )
     if law.lqg is not None:
         lines = [f"    for (i = 0; i < 3; i++) command[i] = {added};"]
         lines += [f"    mjxball_lqg_command(memory + {law.history.size}, observation, led, command);"]

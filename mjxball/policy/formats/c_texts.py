@@ -10,7 +10,7 @@ HEADER = """\
  * observation (18), SI units and radians, world axes, body rates in body axes:
 {observation}
  * action (3): the network's mean in [-1, 1]. command (3): roll [rad], pitch [rad], vertical acceleration [m/s2].
- *
+{team} *
  * Network {layers}, ReLU, tanh{weights}. C99 without a library; no allocation, no globals but constants.
  * Bit for bit the same on every machine with IEEE floats if products and sums are not contracted (-ffp-contract=off).
  * Flash: {flash} bytes of constants, and the code. RAM: {state} bytes for mjxball_follower,
@@ -31,7 +31,7 @@ typedef MJXBALL_REAL mjxball_real;
 #define MJXBALL_WIDEST {broadest}
 {int8}#define MJXBALL_CONTROL_PERIOD {period}
 #define MJXBALL_GRAVITY {gravity}
-
+{mount_angle}
 {weights_type}typedef struct {{
 {memory_field}{weights_field}    int running;
 }} mjxball_follower;
@@ -170,6 +170,100 @@ static inline void mjxball_layer(
         mjxball_rows(weight, weight + two * inputs, inputs, from, to + row, to + row + two);
     }
     for (int row = 0; row < outputs; row++) to[row] += bias[row];
+}
+"""
+ROOT = """
+/* By Heron, from above: the same bits on every machine. */
+static inline mjxball_real mjxball_root(mjxball_real square) {
+    mjxball_real last, value = (mjxball_real)0.5 * (1 + square);
+    do {
+        last = value;
+        value = (mjxball_real)0.5 * (last + square / last);
+    } while (value < last);
+    return last;
+}
+"""
+TEAM_LQG = """
+/* LQG of one of a team; its memory: the filter's state about roll (5), about pitch (5), of the height (3), and what it
+ * is told of its team (5). */
+static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *observation) {
+    for (int axis = 0; axis < 2; axis++) {
+        memory[5 * axis] = observation[3 + axis];
+        memory[5 * axis + 1] = observation[9 + axis];
+    }
+    memory[10] = -observation[17];
+    for (int k = 0; k < 5; k++) memory[13 + k] = mjxball_lqg_context[k];
+}
+
+static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
+    mjxball_real off = -observation[17] - memory[10];
+    for (int row = 0; row < 3; row++) memory[10 + row] += off * mjxball_lqg_height_gain[row];
+    for (int axis = 0; axis < 2; axis++, memory += 5) {
+        mjxball_real angle = observation[3 + axis] - memory[0], rate = observation[9 + axis] - memory[1];
+        for (int row = 0; row < 5; row++)
+            memory[row] += angle * mjxball_lqg_axis_gain[2 * row] + rate * mjxball_lqg_axis_gain[2 * row + 1];
+    }
+}
+
+static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
+    for (int axis = 0; axis < 2; axis++) {
+        to[axis] = observation[3 + axis] - memory[5 * axis];
+        to[2 + axis] = observation[9 + axis] - memory[5 * axis + 1];
+        mjxball_copy(to + 5 + 3 * axis, memory + 5 * axis + 2, 3);
+    }
+    to[4] = -observation[17] - memory[10];
+    mjxball_copy(to + 11, memory + 11, 7);
+}
+
+/* Two numbers as a vector no longer than `limit`. */
+static inline void mjxball_within(mjxball_real *vector, mjxball_real limit) {
+    mjxball_real square = vector[0] * vector[0] + vector[1] * vector[1] + (mjxball_real)1e-12;
+    if (square <= limit * limit) return;
+    limit /= mjxball_root(square);
+    vector[0] *= limit;
+    vector[1] *= limit;
+}
+
+/* own: the law's command, to which the network's is added. */
+static inline void mjxball_lqg_command(
+    const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *own) {
+    const mjxball_real *context = memory + 13, share = context[0], damping = mjxball_lqg_damping[0];
+    mjxball_real far[2], load[2], room[2], rest[2];
+    mjxball_real rise = mjxball_lqg_rise[0] * observation[14] + mjxball_lqg_rise[1] * observation[17];
+    rise = mjxball_clip(rise, mjxball_lqg_limits[1]) - memory[12];
+    own[2] = mjxball_clip(share * rise - (share - 1) * led[2], mjxball_limit[2]);
+    far[0] = -(mjxball_lqg_tilts[0] * observation[13] + mjxball_lqg_tilts[1] * observation[16]);
+    far[1] = mjxball_lqg_tilts[0] * observation[12] + mjxball_lqg_tilts[1] * observation[15];
+    mjxball_within(far, mjxball_lqg_limits[0]);
+    for (int i = 0; i < 2; i++)
+        load[i] = memory[5 * i + 2] / mjxball_lqg_stiffness[0] + context[1 + i] * (own[2] - led[2]);
+    mjxball_within(load, mjxball_lqg_limits[2]);
+    for (int i = 0; i < 2; i++) {
+        mjxball_real wanted = far[i] - mjxball_lqg_tilts[2] * observation[3 + i];
+        wanted = wanted - mjxball_lqg_tilts[3] * observation[9 + i] - load[i];
+        own[i] = share * wanted - (share - 1) * led[i];
+        rest[i] = observation[3 + i] + damping * observation[9 + i];
+        room[i] = (own[i] - rest[i]) / context[3 + i];
+    }
+    mjxball_within(room, 1);
+    for (int i = 0; i < 2; i++) own[i] = rest[i] + context[3 + i] * room[i];
+}
+
+static inline void mjxball_lqg_next(mjxball_real *memory, const mjxball_real *led, const mjxball_real *own) {
+    const mjxball_real *context = memory + 13;
+    mjxball_real drive[3], before[5];
+    for (int i = 0; i < 3; i++) drive[i] = (own[i] + (context[0] - 1) * led[i]) / context[0];
+    for (int i = 0; i < 2; i++) drive[i] += context[1 + i] * (own[2] - led[2]);
+    for (int i = 0; i < 3; i++) {
+        const int states = i < 2 ? 5 : 3;
+        const float *row = i < 2 ? mjxball_lqg_axis : mjxball_lqg_height;
+        mjxball_real *state = memory + 5 * i;
+        mjxball_copy(before, state, states);
+        for (int k = 0; k < states; k++, row += states + 1) {
+            state[k] = row[states] * drive[i];
+            for (int j = 0; j < states; j++) state[k] += row[j] * before[j];
+        }
+    }
 }
 """
 LAYER_INT8 = """

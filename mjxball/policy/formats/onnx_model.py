@@ -16,7 +16,7 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from mjxball.control import observation as layout
 from mjxball.policy.file import PolicyFile, law_of
-from mjxball.policy.policy import NetworkLaw, Policy
+from mjxball.policy.policy import NetworkLaw, Policy, known_context
 
 Array = Any
 OPSET, IR_VERSION = 17, 8  # of 2022: read by every runtime of the last years
@@ -49,39 +49,67 @@ class Graph:
 
 
 class TracedArray:
-    """An array (N, `size`) of the graph, or (N,) with `size` None. Arithmetic on it appends nodes."""
+    """An array (N, *`shape`) of the graph. Arithmetic on it appends nodes."""
 
     __array_ufunc__ = None  # NumPy constants on the left defer to the reflected operators
     dtype = np.dtype(np.float32)
 
-    def __init__(self, graph: Graph, name: str, size: int | None):
-        self.graph, self.name, self.size = graph, name, size
+    def __init__(self, graph: Graph, name: str, *sizes: int):
+        self.graph, self.name, self.sizes = graph, name, sizes
 
     def __array_namespace__(self, api_version: str | None = None) -> type[Namespace]:
         return Namespace
 
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        """Its sizes behind itself, which stands for N."""
+        return (self, *self.sizes)
+
+    def unary(self, operation: str) -> TracedArray:
+        """`operation` of every element."""
+        return TracedArray(self.graph, self.graph.add(operation, self), *self.sizes)
+
     def binary(self, operation: str, left: Any, right: Any) -> TracedArray:
         """`left` `operation` `right`, one of which is this array."""
-        sizes = [value.size if isinstance(value, TracedArray) else np.shape(value)[-1:] for value in (left, right)]
-        widths = [size if isinstance(size, int) else size[0] if size else None for size in sizes]
-        return TracedArray(self.graph, self.graph.add(operation, left, right), widths[0] or widths[1])
+        sizes = [value.sizes if isinstance(value, TracedArray) else np.shape(value) for value in (left, right)]
+        return TracedArray(self.graph, self.graph.add(operation, left, right), *np.broadcast_shapes(*sizes))
 
     def __getitem__(self, index: Any) -> TracedArray:
-        place = index[-1]
-        if self.size is None or index[0] is not Ellipsis:
-            raise TypeError(f"only the last axis can be indexed, not {index}")
+        first, *places = index
+        if first is not Ellipsis:
+            raise TypeError(f"the flights cannot be indexed: {index}")
+        found = self
+        axis = 1 + len(self.sizes) - sum(place is not None for place in places)
+        for place in places:
+            found, step = found._along(axis, place)
+            axis += step
+        return found
+
+    def _along(self, axis: int, place: Any) -> tuple[TracedArray, int]:
+        """One index of `axis`, which counts N, and how many axes further the next index belongs."""
+        before, after = self.sizes[: axis - 1], self.sizes[axis:]
+        if place is None:
+            name = self.graph.add("Unsqueeze", self, np.array([axis], np.int64))
+            return TracedArray(self.graph, name, *before, 1, *self.sizes[axis - 1 :]), 1
+        size = self.sizes[axis - 1]
         if isinstance(place, slice):
-            start, stop, _ = place.indices(self.size)
+            start, stop, _ = place.indices(size)
             stop = max(start, stop)
-            ends = (np.array([value], np.int64) for value in (start, stop, -1))
-            return TracedArray(self.graph, self.graph.add("Slice", self, *ends), stop - start)
-        return TracedArray(self.graph, self.graph.add("Gather", self, np.array(place, np.int64), axis=-1), None)
+            ends = (np.array([value], np.int64) for value in (start, stop, axis))
+            return TracedArray(self.graph, self.graph.add("Slice", self, *ends), *before, stop - start, *after), 1
+        name = self.graph.add("Gather", self, np.array(place % size, np.int64), axis=axis)
+        return TracedArray(self.graph, name, *before, *after), 0
+
+    def sum(self, axis: int, keepdims: bool) -> TracedArray:
+        """Over the last axis, which stays."""
+        name = self.graph.add("ReduceSum", self, np.array([axis], np.int64), keepdims=int(keepdims))
+        return TracedArray(self.graph, name, *self.sizes[:-1], 1)
 
     def __neg__(self) -> TracedArray:
-        return TracedArray(self.graph, self.graph.add("Neg", self), self.size)
+        return self.unary("Neg")
 
     def __matmul__(self, weight: np.ndarray) -> TracedArray:
-        return TracedArray(self.graph, self.graph.add("MatMul", self, weight), weight.shape[-1])
+        return TracedArray(self.graph, self.graph.add("MatMul", self, weight), *self.sizes[:-1], weight.shape[-1])
 
 
 def _add_operators() -> None:
@@ -101,9 +129,17 @@ class Namespace:
     @staticmethod
     def cos(value: Any) -> Any:
         """Elementwise; of a constant it is one."""
-        if not isinstance(value, TracedArray):
-            return np.cos(value)
-        return TracedArray(value.graph, value.graph.add("Cos", value), value.size)
+        return value.unary("Cos") if isinstance(value, TracedArray) else np.cos(value)
+
+    @staticmethod
+    def sqrt(value: TracedArray) -> TracedArray:
+        """Elementwise."""
+        return value.unary("Sqrt")
+
+    @staticmethod
+    def tanh(value: TracedArray) -> TracedArray:
+        """Elementwise."""
+        return value.unary("Tanh")
 
     @staticmethod
     def asarray(values: Any, dtype: Any = None) -> Any:
@@ -112,13 +148,14 @@ class Namespace:
 
     @staticmethod
     def zeros_like(value: TracedArray) -> TracedArray:
-        """Zeros (N, size)."""
+        """Zeros (N, ...)."""
         return value.binary("Sub", value, value)
 
     @staticmethod
-    def tanh(value: TracedArray) -> TracedArray:
-        """Elementwise."""
-        return TracedArray(value.graph, value.graph.add("Tanh", value), value.size)
+    def broadcast_to(value: np.ndarray, shape: tuple[Any, ...]) -> TracedArray:
+        """A constant (k,) for each of N flights, (N, k)."""
+        rows: TracedArray = shape[0]
+        return Namespace.zeros_like(rows)[..., None] + value
 
     @staticmethod
     def maximum(value: TracedArray, other: Any) -> TracedArray:
@@ -133,18 +170,20 @@ class Namespace:
     @staticmethod
     def concat(values: Sequence[TracedArray], axis: int) -> TracedArray:
         """Join along the last axis; empty parts are left out."""
-        parts = [value for value in values if value.size] or list(values[:1])
-        if len(parts) == 1:
-            return parts[0]
-        name = parts[0].graph.add("Concat", *parts, axis=-1)
-        return TracedArray(parts[0].graph, name, sum(part.size or 0 for part in parts))
+        parts = [value for value in values if value.sizes[-1]] or list(values[:1])
+        return parts[0] if len(parts) == 1 else Namespace._joined(parts, -1)
 
     @staticmethod
     def stack(values: Sequence[TracedArray], axis: int) -> TracedArray:
-        """Join (N,) arrays along a new last axis."""
-        last = np.array([-1], np.int64)
-        parts = [TracedArray(value.graph, value.graph.add("Unsqueeze", value, last), 1) for value in values]
-        return Namespace.concat(parts, axis=-1)
+        """Join along a new `axis`, counted from the end."""
+        places = (slice(None),) * (-1 - axis)
+        return Namespace._joined([value[(..., None, *places)] for value in values], axis)
+
+    @staticmethod
+    def _joined(parts: Sequence[TracedArray], axis: int) -> TracedArray:
+        sizes = list(parts[0].sizes)
+        sizes[axis] = sum(part.sizes[axis] for part in parts)
+        return TracedArray(parts[0].graph, parts[0].graph.add("Concat", *parts, axis=axis), *sizes)
 
 
 def onnx_model(contents: PolicyFile, name: str) -> Any:
@@ -152,12 +191,13 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
 
     Inputs: `observation` (N, 18); with a memory of m numbers also `memory` (N, m) and `start` (N, 1) bool, true at
     the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
-    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m).
+    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m). A policy of format 3
+    is that of the one follower that `team` in its card names, and sees and commands in its mount frame.
     """
     graph, around = Graph(), law_of(contents.card)
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
-    memory = around.start(observation)
+    memory = around.start(observation, known_context(contents.card, name))
     if around.size:
         inputs += [_value("memory", TensorProto.FLOAT, around.size), _value("start", TensorProto.BOOL, 1)]
         start, given = TracedArray(graph, "start", 1), TracedArray(graph, "memory", around.size)
@@ -167,7 +207,7 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
         del results["next_memory"]
     for label, value in results.items():
         graph.nodes.append(helper.make_node("Identity", [value.name], [label], name=label))
-    outputs = [_value(label, TensorProto.FLOAT, value.size) for label, value in results.items()]
+    outputs = [_value(label, TensorProto.FLOAT, *value.sizes) for label, value in results.items()]
     made = helper.make_graph(graph.nodes, "follower", inputs, outputs, graph.constants, doc_string=onnx_model.__doc__)
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="mjxball")
     model.ir_version = IR_VERSION
