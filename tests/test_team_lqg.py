@@ -150,7 +150,7 @@ def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file) -> None:
 def test_unsound_files_are_refused(change, file, tmp_path) -> None:
     contents = silent(TEAM)
     given, said = {
-        "another context": ({"context": ["drones"]}, "another context"),
+        "another context": ({"context": ["mass"]}, "another context"),
         "no numbers": ({"lqg": None}, "needs card field lqg"),
         "a number that is none": ({"lqg": contents.card["lqg"] | {"damping": float("nan")}}, "lqg.damping"),
         "no such team": ({"team": {"drone": 1, "mount_angle": 0.0, "context": [2.0] * 4}}, "team.context must be"),
