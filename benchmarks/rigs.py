@@ -37,11 +37,11 @@ from mjxball.control.followers import Copy, Law
 from mjxball.env import PipelineState
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import Flown, fly, held_out, told_laws
+from mjxball.evaluate.rigs import Flown, fly, told_laws
 from mjxball.policy.policy import NetworkLaw
-from mjxball.sim.rigs import HELD_OUT, RigTable, draw_rigs, rig_config, unpadded
+from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, held_out, rig_config, unpadded
 
-SIZES, RIGS, FLIGHTS = (2, 3, 4, 5, 6), 200, 3
+SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
 LATER, MORE, LENGTH = 1.25, 0.005, 0.17  # the bar: settling, peak [m], of a rig of that length [m]
 TOLD = ("lqg-told", "lqg-slow-told")
 PAIR_LOAD = 0.2  # [kg]
@@ -68,7 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Fly, print, write."""
     parser = cli.make_parser("python benchmarks/rigs.py", __doc__.split("\n\n")[0])
     parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz")
-    parser.add_argument("--rigs", type=int, default=RIGS, metavar="N", help="of each number of drones (default 200)")
+    parser.add_argument(
+        "--rigs", type=int, default=HELD_OUT_RIGS, metavar="N", help="of each number of drones (default 200)"
+    )
     parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), metavar="N", help="numbers of drones")
     parser.add_argument("--beyond", action="store_true", help="rigs just outside one range at a time instead")
     parser.add_argument("--steps", action="store_true", help="a step of the mass or the CG in flight")

@@ -18,14 +18,14 @@ from mjxball.control.team_lqg import nominal_context
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import Flown, fly, held_out, stacked, told_laws
+from mjxball.evaluate.rigs import Flown, fly, stacked, told_laws
 from mjxball.physics.newton_euler import make_engine
 from mjxball.physics.step import make_control_step
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
 from mjxball.policy.policy import NetworkLaw
-from mjxball.sim.rigs import TRAINING, draw_rigs, loop_damping, outside, rig_config, unpadded, whole
+from mjxball.sim.rigs import TRAINING, draw_rigs, held_out, loop_damping, outside, rig_config, unpadded, whole
 from mjxball.sim.rollout import load_of, start_of
 from mjxball.sim.scenario import Scenario
 

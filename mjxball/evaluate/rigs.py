@@ -15,7 +15,7 @@ from mjxball.config import Config
 from mjxball.control.followers import Law, PrivilegedInfo
 from mjxball.env import PipelineState, State, TransportEnv
 from mjxball.physics.motion import object_mass
-from mjxball.sim.rigs import HELD_OUT, RigTable, draw_rigs, rig_config, unpadded
+from mjxball.sim.rigs import RigTable, rig_config
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -39,11 +39,6 @@ class Flown(NamedTuple):
     def peak(self, period: float) -> Float[np.ndarray, "R K"]:
         """Largest error after 20 s [m]; inf of a flight that failed."""
         return np.where(self.failed, np.inf, self.error[..., round(STEADY_AFTER / period) :].max(axis=-1))
-
-
-def held_out(config: Config, size: int, count: int) -> RigTable:
-    """`count` rigs of `size` drones that no training draws, without padding."""
-    return unpadded(draw_rigs(config, size, count, HELD_OUT).rigs, size)
 
 
 def fly(

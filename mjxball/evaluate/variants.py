@@ -12,6 +12,7 @@ import numpy as np
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.plant.teams import ring_config
+from mjxball.sim.rigs import held_out, rig_config
 from mjxball.sim.scenario import Scenario
 
 
@@ -25,6 +26,7 @@ class Variant:
     waveform: Callable[[int], tuple[tuple[float, ...], ...]] | None = None  # seed -> times, offsets, offsets across
     team: str = ""  # preset whose plant it flies; empty: the command's
     drones: int = 0  # of a ring of that many; 0: the preset's plant
+    rig: int | None = None  # number of a held-out rig of so many drones, in place of a ring
     known: Mapping[str, Any] = field(default_factory=dict)  # of a team, settings that its followers are made for
     scatter: float = 0.0  # of a team, every drone's numbers are drawn within this share of those that followers know
 
@@ -33,7 +35,9 @@ class Variant:
         if not self.team:
             return base
         found = configs.preset(self.team)
-        if self.drones:
+        if self.rig is not None:
+            found = rig_config(found, held_out(found, self.drones), self.rig)
+        elif self.drones:
             found = ring_config(found, self.drones)
         for path, value in self.known.items():
             found = configs.replace(found, path, value)

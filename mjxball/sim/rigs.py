@@ -7,6 +7,7 @@ to a drone of 3 kg; factors of a draw come on top. Needs NumPy alone.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ YAW_RATIO = 0.4  # of the yaw loop to that of pitch
 # Wrong beliefs and uneven thrusts are drawn back by three tenths, at most 8 times, while they leave the CG less than a
 # tenth of the rig's length; a rig whose CG can go less far than a fiftieth is drawn anew.
 TRAINING, HELD_OUT = 1, 2  # seeds
+HELD_OUT_RIGS = 200  # of each number of drones
 DRAWN_BACK, WANTED_REACH, LEAST_REACH = 8, 0.1, 0.02
 
 
@@ -92,6 +94,12 @@ def training_rigs(config: Config) -> RigTable:
         return np.asarray(part, np.float32).reshape(*shape, *part.shape[1:])
 
     return RigTable(_each(folded, table.numbers), *(folded(part) for part in table[1:]))
+
+
+@functools.lru_cache(maxsize=16)
+def held_out(config: Config, size: int, count: int = HELD_OUT_RIGS) -> RigTable:
+    """`count` rigs of `size` drones that no training draws, without padding; another `count` draws others."""
+    return unpadded(draw_rigs(config, size, count, HELD_OUT).rigs, size)
 
 
 def joined(tables: list[RigTable]) -> RigTable:
