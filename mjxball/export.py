@@ -128,6 +128,9 @@ def export(
         from mjxball.fly.app.generate import check_place, write_app
 
         check_place(out)
+        drones = 2 if plant is None else plant_setup(plant).plant.count
+        if drones != 2:
+            raise InputError(f"an app is for pairs of Crazyflies, and {plant} has {drones} drones")
         write_app(policy(), source.stem, out, int8)
         return
     if int8 and out.suffix not in ROUNDED:
