@@ -76,7 +76,7 @@ def limited(remembering: Trained) -> PolicyFile:
     params=[
         *("trained", "direct", "remembering", "limited", "estimating"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
-        *("team pair", "team team3"),
+        *("team pair", "team team3", "universal pair"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:

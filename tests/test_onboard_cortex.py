@@ -29,7 +29,7 @@ INTERFACE = Path(__file__).parent / "firmware" / "interface.h"
 
 @pytest.mark.slow
 @needs_gcc
-@pytest.mark.parametrize("name", ["flight", "flight --int8", "stand"])
+@pytest.mark.parametrize("name", ["flight", "flight --int8", "stand", "universal"])
 def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
     policy, *flags = name.split()
     assert call(export, [shipped_policy(policy), tmp_path / "app", "--crazyflie", *flags]) == 0
@@ -52,7 +52,7 @@ def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsy
 @needs_arm
 @pytest.mark.parametrize("int8", [False, True])
 def test_a_cortex_m4_computes_the_same_bits(int8: bool, tmp_path: Path):
-    for name in ("balance", "flight", "team"):
+    for name in ("balance", "flight", "team", "universal"):
         found = benchmark.compare(benchmark.policy_of(shipped_policy(name)), tmp_path, int8, 500)
         assert found["identical"], name
         if not int8:

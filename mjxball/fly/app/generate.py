@@ -50,8 +50,8 @@ def ident_of(policy: PolicyFile, int8: bool) -> int:
 def check_policy(policy: PolicyFile, name: str) -> Config:
     """The configuration of a policy that can fly on board. Raises InputError for another plant or rate.
 
-    A follower of a team, which lifts one drone more than the other at will, must not lift more than the pair's rotors
-    can hold level.
+    A follower of a team, which lifts one drone more than the other at will, must not lift more than the rotors can hold
+    level by what it is told of them.
     """
     plant = policy.card["plant"]
     drones = plant.get("drones", ())
