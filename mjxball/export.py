@@ -21,7 +21,7 @@ from mjxball.config import Config
 from mjxball.control.motors import firmware
 from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
-from mjxball.policy.file import CONTEXT, PolicyFile, law_of, load_file, save_file, write_whole
+from mjxball.policy.file import CONTEXT, COUNT, PolicyFile, law_of, load_file, save_file, write_whole
 from mjxball.policy.policy import context_of
 
 
@@ -101,6 +101,7 @@ def _write_header(out: Path, policy: PolicyFile, int8: bool = False) -> None:
     write_whole(out, c_header(policy, out.stem, int8).encode("ascii"))
 
 
+CRAZYFLIES = Path("crazyflie")  # the plant of apps of a policy that is told the number of drones alone
 Writer = Callable[[Path, PolicyFile], None]
 WRITERS: dict[str, Writer] = {".npz": save_file, ".onnx": _write_onnx, ".h": _write_header}
 ROUNDED: dict[str, Writer] = {".npz": _save_rounded, ".h": functools.partial(_write_header, int8=True)}  # with --int8
@@ -118,6 +119,7 @@ def export(
 
     `crazyflie`: to the new directory `out`, as apps for both drones. `int8`: weights of 8 bits in an app or a header,
     floats rounded to them in a policy file. `plant`, `drone`: see `in_team`; a policy file need not be told them.
+    A policy that is told the number of drones alone flies in a pair by default, apps on `crazyflie`.
     """
 
     def policy() -> PolicyFile:
@@ -128,6 +130,12 @@ def export(
         from mjxball.fly.app.generate import check_place, write_app
 
         check_place(out)
+        card = contents_of(source).card
+        if plant is None and card.get("context") == list(COUNT) and "team" not in card:
+            plant = CRAZYFLIES
+        drones = 2 if plant is None else plant_setup(plant).plant.count
+        if drones != 2:
+            raise InputError(f"an app is for pairs of Crazyflies, and {plant} has {drones} drones")
         write_app(policy(), source.stem, out, int8)
         return
     if int8 and out.suffix not in ROUNDED:

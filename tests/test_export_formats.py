@@ -76,7 +76,7 @@ def limited(remembering: Trained) -> PolicyFile:
     params=[
         *("trained", "direct", "remembering", "limited", "estimating"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
-        *("team pair", "team team3"),
+        *("team pair", "team team3", "universal pair"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
@@ -233,6 +233,10 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
         ("team.npz", "a.onnx --plant team4 --drone 0", "--drone must be a follower of --plant: 1, 2, 3"),
         ("team.npz", "a.onnx --drone 1", "has to be told its team: --plant NAME"),
         ("team.npz", "a.onnx --plant stand", "free flight with attitude loops of 10 rad/s"),
+        ("team.npz", "apps --crazyflie", "has to be told its team: --plant NAME"),
+        ("team.npz", "apps --crazyflie --plant team4", "an app is for pairs of Crazyflies, and team4 has 4 drones"),
+        ("team.npz", "apps --crazyflie --plant pair", "is for another plant than a pair of Crazyflies"),
+        ("team.npz", "apps --crazyflie --plant crazyflie", "may lift 4 m/s2 more than the leader"),
         ("team.npz", "a.npz --plant nothing", "plant file nothing cannot be read"),
     ],
 )

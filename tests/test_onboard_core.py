@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from typing import Any
 
@@ -16,10 +17,11 @@ from mjxball.fly.app.protocol import CAUSES, Phase
 from mjxball.fly.card import Controller
 from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.policy import Policy
+from mjxball.sim.laws import Laws
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["flight", "stand"])
+@pytest.mark.parametrize("name", ["flight", "stand", "team"])
 def test_the_apps_command_what_the_laptop_would(name: str):
     """Leader and follower over 5 s of motion: float32 on board, float64 laws on the laptop."""
     policy = policy_of(name)
@@ -52,6 +54,20 @@ def test_the_apps_command_what_the_laptop_would(name: str):
     assert worst.max() < 1e-4
     assert spread[5] > 0.05
     assert spread[2] > 0.05
+
+
+def test_the_laptop_turns_into_mount_frames_as_teams_do():
+    """A pair along y, whose follower's frame is turned by a right angle, beside the same rig as a team."""
+    policy = policy_of("team")
+    controller, random = Controller(Policy(policy, "team")), np.random.default_rng(1)
+    config = controller.config
+    laws = Laws(dataclasses.replace(config, plant=dataclasses.replace(config.plant, cg_axis="xy")))
+    alone, goal = Policy(policy, "team"), np.array([0.0, 0.0, 0.4])
+    for _ in range(5):
+        place, velocity, rates, euler = random.normal(scale=0.02, size=(4, 3))
+        pair = ObjectState(place, velocity, rotations.quaternion_from_euler(euler), rates)
+        wanted = laws.in_body_axes(np.asarray(alone(laws.observe(pair, goal)), float))
+        np.testing.assert_allclose(controller.step(pair, goal).follower, wanted, rtol=0, atol=1e-6)
 
 
 REFUSED: tuple[tuple[str, Any], ...] = (

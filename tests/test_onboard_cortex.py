@@ -29,7 +29,7 @@ INTERFACE = Path(__file__).parent / "firmware" / "interface.h"
 
 @pytest.mark.slow
 @needs_gcc
-@pytest.mark.parametrize("name", ["flight", "flight --int8", "stand"])
+@pytest.mark.parametrize("name", ["flight", "flight --int8", "stand", "universal"])
 def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
     policy, *flags = name.split()
     assert call(export, [shipped_policy(policy), tmp_path / "app", "--crazyflie", *flags]) == 0
@@ -52,7 +52,7 @@ def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsy
 @needs_arm
 @pytest.mark.parametrize("int8", [False, True])
 def test_a_cortex_m4_computes_the_same_bits(int8: bool, tmp_path: Path):
-    for name in ("balance", "flight", "team"):
+    for name in ("balance", "flight", "team", "universal"):
         found = benchmark.compare(benchmark.policy_of(shipped_policy(name)), tmp_path, int8, 500)
         assert found["identical"], name
         if not int8:
@@ -94,10 +94,11 @@ int main(void) {
 
 @pytest.mark.slow
 @needs_arm
-def test_a_cortex_m4_flies_the_same_bits(tmp_path: Path):
+@pytest.mark.parametrize("name", ["flight", "team"])
+def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
     """Both apps over take-off, motion of the pair, landing and a fence that is left, whose inputs were recorded."""
-    policy = policy_of("flight")
-    bench, random = Bench(cores_of(), Rig.of_card(policy.card)), np.random.default_rng(5)
+    policy = policy_of(name)
+    bench, random = Bench(cores_of(name), Rig.of_card(policy.card)), np.random.default_rng(5)
     records: list[list[bytes]] = [[], []]
     place, euler, seen = np.zeros(3), np.zeros(3), set()
     for step in range(900):
@@ -113,7 +114,7 @@ def test_a_cortex_m4_flies_the_same_bits(tmp_path: Path):
             records[number].append(state + beats[number] + np.array([bench.now, order], np.uint32).tobytes())
         seen |= set(bench.phases)
     assert seen >= {Phase.SPIN, Phase.RAMP, Phase.FLY, Phase.LAND, Phase.DESCEND}
-    for path, text in generate.files_of(policy, "flight", False).items():
+    for path, text in generate.files_of(policy, name, False).items():
         if path in ("src/core.c", "src/core.h", "src/policy.h", "src/rig.h"):
             (tmp_path / Path(path).name).write_text(text)
     for number in range(2):

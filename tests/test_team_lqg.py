@@ -145,7 +145,16 @@ def test_what_a_policy_is_not_told_or_not_made_for_is_refused(file) -> None:
 
 
 @rows(
-    "change", ["another context", "no numbers", "a number that is none", "no damping", "no such team", "a pair of one"]
+    "change",
+    [
+        "another context",
+        "no numbers",
+        "a number that is none",
+        "no damping",
+        "no such team",
+        "strings",
+        "a pair of one",
+    ],
 )
 def test_unsound_files_are_refused(change, file, tmp_path) -> None:
     contents = silent(TEAM)
@@ -154,6 +163,7 @@ def test_unsound_files_are_refused(change, file, tmp_path) -> None:
         "no numbers": ({"lqg": None}, "needs card field lqg"),
         "a number that is none": ({"lqg": contents.card["lqg"] | {"damping": float("nan")}}, "lqg.damping"),
         "no such team": ({"team": {"drone": 1, "mount_angle": 0.0, "context": [2.0] * 4}}, "team.context must be"),
+        "strings": ({"team": {"drone": 1, "mount_angle": 0.0, "context": ["2.0"] * 5}}, "team.context must be"),
         "a pair of one": ({"team": {"drone": 1, "mount_angle": 0.0, "context": [1.0] * 5}}, "must be above 1"),
         "no damping": ({"lqg": contents.card["lqg"] | {"damping": 0.0}}, "must be positive"),
     }[change]

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjxball import config as configs
 from mjxball.config import Config
-from mjxball.control import crazyflie, motors
+from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
@@ -38,6 +38,11 @@ def config_of(card: Mapping[str, Any]) -> Config:
     data["command"] |= {"tilt_limit": tilt, "vertical_limit": vertical}
     data["timing"] |= {"control_period": card["control_period"]}
     return configs.validate(configs.from_record(data))
+
+
+def mount_angle(card: Mapping[str, Any]) -> float:
+    """Angle about body z by which the axes are turned in which the policy sees and commands [rad], see `team`."""
+    return float(card.get("team", {}).get("mount_angle", 0.0))
 
 
 def is_crazyflie(config: Config) -> bool:
@@ -153,7 +158,7 @@ class Controller:
         config = config_of(policy.card)
         self.policy, self.config, self.period = policy, config, policy.control_period
         self.handover = Handover(policy)
-        self._loop = Laws(config)
+        self._loop, self._angle = Laws(config), mount_angle(policy.card)
         self.reset()
 
     def reset(self) -> None:
@@ -170,6 +175,7 @@ class Controller:
         """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
         seen = self._loop.observe(state, goal)
         led = self._loop.leader_command(state, goal, self._integral)
-        followed = self._loop.follower_command(self.handover(seen), self._integral)
+        answer = self.handover(rotations.turned_about_z(seen, -self._angle))
+        followed = self._loop.follower_command(rotations.turned_about_z(answer, self._angle), self._integral)
         self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=followed)
         return Commands(led, followed, seen)

@@ -305,11 +305,12 @@ def _check_team(team: Any, name: str) -> None:
 
 
 def _check_numbers(name: str, field: str, value: Any, shape: tuple[int, ...]) -> None:
+    """Raise PolicyFileError unless `value` of a card is numbers of `shape`, none of them a string or out of bounds."""
     try:
-        array = np.array(value, np.float64)
-    except (TypeError, ValueError):
-        array = np.full(1, np.nan)
-    if array.shape != shape or not (np.abs(array) <= MAX_NUMBER).all():
+        array = np.array(value)
+    except ValueError:
+        array = np.array("ragged")
+    if array.shape != shape or array.dtype.kind not in "iuf" or not (np.abs(array) <= MAX_NUMBER).all():
         raise PolicyFileError(f"{name}: card field {field} must be finite numbers of shape {shape}")
 
 

@@ -164,6 +164,17 @@ static void observe(const seen *one, const float *goal, float *to) {
         to[15 + i] = -one->velocity[i];
     }
 }
+
+#ifdef MJXBALL_MOUNT_ANGLE
+/* Every three of `count` numbers as a vector, turned about z by an angle of this cosine and sine. */
+static void turn(float *vectors, int count, float c, float s) {
+    for (int k = 0; k + 1 < count; k += 3) {
+        float x = vectors[k], y = vectors[k + 1];
+        vectors[k] = c * x - s * y;
+        vectors[k + 1] = s * x + c * y;
+    }
+}
+#endif
 #endif
 
 /* Laws, as in sim/laws.py. */
@@ -218,11 +229,17 @@ static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
     {
         float observation[18], more[3], integrated[3];
         observe(one, goal, observation);
+#ifdef MJXBALL_MOUNT_ANGLE
+        turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
+#endif
         if (!app->copying) {
             mjxball_follow(&app->follower, observation, app->action, command);
             good = finite(command, 3);
         }
         if (app->copying || !good) mjxball_copy_law(observation, command);
+#ifdef MJXBALL_MOUNT_ANGLE
+        turn(command, 3, mjxball_rig.mount_frame[0], mjxball_rig.mount_frame[1]);
+#endif
         if (mjxball_rig.shares) {
             for (int i = 0; i < 3; i++) integrated[i] = mjxball_rig.ki[i] * integral[i];
             command_of(integrated, more);

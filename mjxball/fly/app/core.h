@@ -68,6 +68,9 @@ typedef struct {
     uint32_t key;          /* of all but weights: both drones and an upload must agree */
     int period;            /* of the law [ms] */
     float mount[2][3];     /* of leader and follower as trained [m] */
+#ifdef MJXBALL_MOUNT_ANGLE
+    float mount_frame[2];  /* cosine and sine of the angle about body z by which the policy's axes are turned */
+#endif
     float carried[2];      /* mass that each believes it lifts [kg] */
     float kp[3], kd[3], ki[3], band[3], lead, tilt_gain, washout; /* the leader's law, see sim/laws.py */
     int axis;              /* 0 roll, 1 pitch: what the load turns */

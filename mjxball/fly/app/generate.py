@@ -48,17 +48,28 @@ def ident_of(policy: PolicyFile, int8: bool) -> int:
 
 
 def check_policy(policy: PolicyFile, name: str) -> Config:
-    """The configuration of a policy that can fly on board. Raises InputError for another plant or rate."""
+    """The configuration of a policy that can fly on board. Raises InputError for another plant or rate.
+
+    A follower of a team, which lifts one drone more than the other at will, must not lift more than the rotors can hold
+    level by what it is told of them.
+    """
     plant = policy.card["plant"]
     drones = plant.get("drones", ())
     if policy.card.get("firmware") is None or (drones and len(drones) != 2):
-        raise InputError(f"{name} was trained for another plant than a pair of Crazyflies, such as that of flight")
-    if abs(policy.card.get("team", {}).get("mount_angle", 0.0)) > 1e-6:
-        raise InputError(f"{name} sees and commands in its mount frame; an app keeps body axes: pairs along x alone")
+        raise InputError(f"{name} is for another plant than a pair of Crazyflies, such as that of flight")
     period = 1000 * float(policy.card["control_period"])
     if abs(period - round(period)) > 1e-6 or not PERIODS[0] <= round(period) <= PERIODS[1]:
         wanted = f"whole milliseconds from {PERIODS[0]} to {PERIODS[1]}"
         raise InputError(f"{name} has a control period of {period:g} ms; an app keeps {wanted}")
+    if team := policy.card.get("team"):
+        share, roll, pitch, *room = team["context"]
+        wanted = min(share * policy.card["lqg"]["limits"][1], policy.card["command_limits"][1])  # [m/s2]
+        held = min(room) / max(math.hypot(roll, pitch), 1e-9)
+        if wanted > held:
+            raise InputError(
+                f"{name} may lift {wanted:.2g} m/s2 more than the leader, and the rotors of this pair hold {held:.2g}: "
+                "train with a smaller --command.vertical_limit"
+            )
     return card.config_of(policy.card)
 
 
@@ -69,12 +80,14 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
     bounds = card.limits_of(config, goal)
     variants = card.variants(config)
     axis = 0 if plant.cg_axis == "y" else 1
+    angle = card.mount_angle(policy.card)
     first = next(iter(variants[0]))
     fields: dict[str, Any] = {
         "ident": f"{ident_of(policy, int8)}u",
         "key": f"{key_of(policy)}u",
         "period": round(1000 * config.timing.control_period),
         "mount": [rig.leader_mount, rig.follower_mount],
+        **({"mount_frame": [math.cos(angle), math.sin(angle)]} if "team" in policy.card else {}),
         "carried": [own[first].map.carried_mass for own in variants],
         "kp": law.kp,
         "kd": law.kd,
