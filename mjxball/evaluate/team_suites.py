@@ -37,7 +37,7 @@ def _ring(drones: int, omega: float = 1.0, share: float = 0.3, **more: Any) -> S
 
 
 def _on_rig(size: int, number: int) -> Variant:
-    """A held-out rig whose load, of unknown mass, goes round at 70 % of where it can be trimmed, with noise and delay."""
+    """A held-out rig whose load goes round at 70 % of where it can be trimmed, its mass unknown; noise and delay."""
     rigs = held_out(configs.preset("universal"), size)
     scenario = Scenario(
         omega=1.0,
