@@ -34,10 +34,9 @@ from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.lqg import SlowToldLqg, ToldLqg
 from mjxball.config import Config, preset, replace
 from mjxball.control.followers import Copy, Law
-from mjxball.env import PipelineState
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import Flown, fly, told_laws
+from mjxball.evaluate.rigs import Flown, cg_jumps, fly, mass_changes, told_laws
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, held_out, rig_config, unpadded
 
@@ -221,18 +220,7 @@ def steps(config: Config, options: Any) -> dict[str, Any]:
     return {"rows": rows}
 
 
-def _mass_changes(world: PipelineState) -> PipelineState:
-    """The change of the object's mass that was drawn happens now."""
-    load = world.load
-    return world._replace(load=load._replace(mass_change_time=0.0 * load.mass_change_time))
-
-
-def _cg_jumps(world: PipelineState) -> PipelineState:
-    """The CG is where it would be half a period later, from one moment to the next."""
-    return world._replace(load=world.load._replace(cg_phase=world.load.cg_phase + math.pi))
-
-
-CHANGES = {"mass": _mass_changes, "CG": _cg_jumps}
+CHANGES = {"mass": mass_changes, "CG": cg_jumps}
 
 
 def _draw(curves: dict[Any, list[np.ndarray]], period: float, path: Path) -> None:

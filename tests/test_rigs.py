@@ -18,7 +18,7 @@ from mjxball.control.team_lqg import nominal_context
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import Flown, fly, stacked, told_laws
+from mjxball.evaluate.rigs import Flown, cg_jumps, fly, mass_changes, stacked, told_laws
 from mjxball.physics.newton_euler import make_engine
 from mjxball.physics.step import make_control_step
 from mjxball.plant import plant_parameters
@@ -140,6 +140,19 @@ class TestUniversal:
             found = fly(UNIVERSAL, rigs, law, flights=2, seconds=12.0)
             assert not found.failed.any()
             assert np.median(found.error[..., 300:].max(axis=-1)) < 0.1
+
+    def test_a_step_in_flight_is_felt_from_then_on(self) -> None:
+        rigs = held_out(UNIVERSAL, 2).rows(slice(0, 3))
+        law = NetworkLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
+        quiet = {"noise": (0.0, 0.0), "delay": (0.0, 0.0), "estimator_drift": (0.0, 0.0)}
+        still = dataclasses.replace(UNIVERSAL, scenario=dataclasses.replace(UNIVERSAL.scenario, **quiet))
+        same, mass, cg = (
+            fly(still, rigs, law, 2, 4.0, 0, (2.0, change)).error
+            for change in (lambda world: world, mass_changes, cg_jumps)
+        )
+        for changed in (mass, cg):
+            np.testing.assert_allclose(changed[..., :101], same[..., :101], atol=1e-6)
+            assert (np.abs(changed - same)[..., 101:].max(axis=-1) > 1e-3).mean() > 0.3  # where a change can be held
 
     def test_a_rig_outside_is_flown_with_a_warning(self, capsys: pytest.CaptureFixture[str]) -> None:
         load_policy(POLICY, with_plant(UNIVERSAL, "team4"))

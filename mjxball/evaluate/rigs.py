@@ -101,6 +101,17 @@ def fly(
     return Flown(np.asarray(error), np.asarray(failed))
 
 
+def mass_changes(world: PipelineState) -> PipelineState:
+    """The change of the object's mass that was drawn (`rigs.mass_step`) happens now."""
+    load = world.load
+    return world._replace(load=load._replace(mass_change_time=jnp.zeros_like(load.mass_change_time)))
+
+
+def cg_jumps(world: PipelineState) -> PipelineState:
+    """The CG is where it would be half a period later, from one moment to the next."""
+    return world._replace(load=world.load._replace(cg_phase=world.load.cg_phase + jnp.pi))
+
+
 def told_laws(config: Config, rigs: RigTable, make: Callable[[Config], Law]) -> list[Law]:
     """`make` of every rig's own configuration."""
     return [make(rig_config(config, rigs, row)) for row in range(rigs.total)]
