@@ -26,7 +26,7 @@ from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import TRAINING, draw_rigs, held_out, loop_damping, outside, rig_config, unpadded, whole
-from mjxball.sim.rollout import load_of, start_of
+from mjxball.sim.rollout import load_of, simulate, start_of
 from mjxball.sim.scenario import Scenario
 
 UNIVERSAL = preset("universal")
@@ -166,6 +166,18 @@ class TestUniversal:
     def test_it_flies_no_stand(self) -> None:
         with pytest.raises(InputError, match="made for free flight, not for a stand"):
             load_policy(POLICY, replace(preset("paper"), "plant.stand", "pivot"))
+
+    def test_a_pair_along_y_is_one_in_the_plane(self) -> None:
+        drones = tuple(dataclasses.replace(d, mount=(0.0, d.mount[0], 0.0)) for d in preset("paper").plant.drones)
+        plant = dataclasses.replace(preset("paper").plant, drones=drones, cg_axis="y")
+        with pytest.raises(InputError, match=r"plant\\.cg_axis xy"):
+            load_policy(POLICY, dataclasses.replace(preset("paper"), plant=plant))
+        flown = []
+        for turned in (preset("paper").plant, dataclasses.replace(plant, cg_axis="xy")):
+            config = dataclasses.replace(preset("paper"), plant=dataclasses.replace(turned, object_size=(0.34,) * 3))
+            flight = simulate(config, load_policy(POLICY, config), Scenario(amplitude=0.0, seconds=4.0), "newton-euler")
+            flown.append(np.linalg.norm(flight.error[-1]))
+        assert max(flown) < 0.03
 
     def test_another_context_is_refused(self, tmp_path: object) -> None:
         contents = load_file(POLICY)

@@ -27,6 +27,10 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     if told_nothing(policy):
         if config.plant.stand != "free":
             raise InputError(f"{path} was made for free flight, not for a stand")
+        if config.plant.cg_axis == "y":
+            raise InputError(
+                f"{path} sees and commands along its mount, which plant.cg_axis xy does for a pair along y"
+            )
         for text in outside(config, trained_rigs(policy)):
             print(f"warning: {path} was not trained for this rig: {text}", file=sys.stderr)  # noqa: T201
         return policy
