@@ -49,7 +49,7 @@ def test_every_variant_is_sound_for_every_seed() -> None:
         assert len({variant.label for variant in suite.variants}) == len(suite.variants)
         for variant in suite.variants:
             for seed in range(2):
-                check_scenario(variant.config(variant.home(CONFIG), seed), variant.seeded(seed))
+                check_scenario(variant.config(variant.nominal(CONFIG), seed), variant.seeded(seed))
 
 
 def test_seeds_are_reproducible_and_differ() -> None:
@@ -123,9 +123,9 @@ def test_verdict_counts_wins_and_compares_peaks(scores) -> None:
         mine = [with_peaks(s, "mine", peak) for s in scores if s.follower == "copy"]
         found = verdict([*scores, *mine])
         row = next(row for row in found["rows"] if row["follower"] == "mine")
-        assert row["cells"][0]["text"] == won
+        assert [cell["text"] for cell in row["cells"][:2]] == ["6", won]
         assert row["cells"][-1]["text"] == duel
-        assert len(found["heads"]) == len(row["cells"]) == 6
+        assert len(found["heads"]) == len(row["cells"]) == 7
         assert compare([*scores, *mine], "mine", "adaptive") == (6 - 6 * (peak > 1), 6 * (peak > 1))
 
 
@@ -191,8 +191,8 @@ def test_report_opens_in_a_browser(browser, report: Path, width: int) -> None:
     assert tab.locator("nav").bounding_box()["y"] == pytest.approx(0, abs=1)  # it stays in view
     tab.evaluate("window.scrollTo({top: 0, behavior: 'instant'})")
     for section in ("delay", "start-errors"):
-        assert tab.locator(f"h2#{section} ~ svg").count() >= 1
-        box = tab.locator(f"h2#{section} ~ svg").first.bounding_box()
+        assert tab.locator(f"h2#{section} ~ .scroll > svg").count() >= 1
+        box = tab.locator(f"h2#{section} ~ .scroll > svg").first.bounding_box()
         assert box["width"] > 0.8 * (min(width, 1100) - 32)
         assert box["height"] > 80
     tab.close()
@@ -231,7 +231,7 @@ def test_the_frozen_levels_are_flights_of_the_pair() -> None:
     levels = [level for suite in read_levels() for level in suite.variants]
     assert len(levels) == 80
     for level in levels:
-        assert level.home(CONFIG) is CONFIG
+        assert level.nominal(CONFIG) is CONFIG
         for seed in range(FLIGHTS):
             config = level.config(CONFIG, seed)
             check_scenario(config, level.seeded(seed))

@@ -55,12 +55,27 @@ def test_each_metric_and_suite_is_counted_by_hand(cell: Result) -> None:
         made(cell, "c", "fast", [{"x_peak": 0.02, "overshoot": 0.2}], suite="two"),
     ]
     found = {row["follower"]: [cell["text"] for cell in row["cells"]] for row in verdict(scores)["rows"]}
-    # Peak, RMSE (equal in b and c: both win), settling (equal in a), overshoot, failed flights.
-    assert found == {"slow": ["2", "2", "1", "3", "0"], "fast": ["1", "3", "3", "0", "0"]}
+    # Variants, peak, RMSE (equal in b and c: both win), settling (equal in a), overshoot, failed flights.
+    assert found == {"slow": ["3", "2", "2", "1", "3", "0"], "fast": ["3", "1", "3", "3", "0", "0"]}
     table = wins_by_suite(scores)
     assert table["names"] == ["slow", "fast"]
     suites = {row["suite"]: (row["total"], [cell["text"] for cell in row["cells"]]) for row in table["rows"]}
     assert suites == {"one": (2, ["2", "0"]), "two": (1, ["0", "1"])}
+
+
+def test_suites_flown_by_different_followers_are_compared_where_both_flew(cell: Result) -> None:
+    scores = [
+        made(cell, "a", "pair", [{"x_peak": 0.01}], suite="pairs"),
+        made(cell, "a", "adaptive", [{"x_peak": 0.02}], suite="pairs"),
+        made(cell, "b", "team", [{"x_peak": 0.01}], suite="teams"),
+        made(cell, "b", "adaptive", [{"x_peak": 0.02}], suite="teams"),
+    ]
+    found = {row["follower"]: [cell["text"] for cell in row["cells"]] for row in verdict(scores)["rows"]}
+    assert {name: (row[0], row[1], row[-1]) for name, row in found.items()} == {
+        "pair": ("1", "1", "1 : 0"),
+        "team": ("1", "1", "1 : 0"),
+        "adaptive": ("2", "0", "–"),
+    }
 
 
 def test_failures_and_the_oracle_win_nothing(cell: Result) -> None:

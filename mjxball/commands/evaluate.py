@@ -178,21 +178,21 @@ def _benchmark(
     def progress(text: str) -> None:
         print(f"{time.monotonic() - started:6.1f} s  {text}", file=sys.stderr)  # noqa: T201
 
-    def crew(home: config.Config) -> list[Follower]:
+    def team_followers(known: config.Config) -> list[Follower]:
         """Whoever flies this team: baselines, and policies that were made for such."""
         found: list[Follower] = []
         for name in dict.fromkeys(group.named if group.asked else [*SUITE_BASELINES, "lqg-known-failures"]):
             with contextlib.suppress(InputError):
-                found.append(make_baseline(name, home))
+                found.append(make_baseline(name, known))
         for path in (*group.paths, *team):
             with contextlib.suppress(InputError):
-                found.append(load_policy(path, home))
+                found.append(load_policy(path, known))
         return found
 
-    scores = run_benchmark(group.setup, followers, suites, num_seeds, options.physics, progress, crew)
+    scores = run_benchmark(group.setup, followers, suites, num_seeds, options.physics, progress, team_followers)
     if not scores:
         raise InputError("none of these followers flies the teams of these suites")
-    plant = suites[0].variants[0].home(group.setup).plant
+    plant = suites[0].variants[0].nominal(group.setup).plant
     print(text_table(scores))  # noqa: T201
     if options.json:
         options.json.write_text(json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")

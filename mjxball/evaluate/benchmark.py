@@ -102,25 +102,25 @@ def run_benchmark(
     num_seeds: int,
     physics: str,
     progress: Callable[[str], None] = lambda text: None,
-    crew: Callable[[Config], Sequence[Follower]] | None = None,
+    team_followers: Callable[[Config], Sequence[Follower]] = lambda config: [],
 ) -> list[Score]:
     """Fly everything. The followers are designed for `base` and do not know what a variant changes.
 
-    `crew`: those that are made for the home of a variant with a team of its own.
+    `team_followers`: those that are designed for the configuration of a variant with a team of its own.
     """
     scores: list[Score] = []
-    crews: dict[str, Sequence[Follower]] = {}
+    of_teams: dict[str, Sequence[Follower]] = {}
     for number, suite in enumerate(suites):
         progress(f"{number + 1}/{len(suites)} {suite.name}: {len(suite.variants)} variants x {num_seeds} seeds")
-        homes: dict[str, tuple[Config, list[Variant]]] = {}
+        groups: dict[str, tuple[Config, list[Variant]]] = {}
         for variant in suite.variants:
-            home = variant.home(base)
-            homes.setdefault(configs.config_hash(home), (home, []))[1].append(variant)
-        for key, (home, variants) in homes.items():
+            known = variant.nominal(base)
+            groups.setdefault(configs.config_hash(known), (known, []))[1].append(variant)
+        for key, (known, variants) in groups.items():
             own = followers
             if variants[0].team:
-                crews[key] = own = crews.get(key) or (crew(home) if crew else [])
-            flown = dict(_fly(home, own, replace(suite, variants=tuple(variants)), num_seeds, physics))
+                of_teams[key] = own = of_teams.get(key) or team_followers(known)
+            flown = dict(_fly(known, own, replace(suite, variants=tuple(variants)), num_seeds, physics))
             for variant in variants:
                 for index, follower in enumerate(own):
                     results = [flown[variant.label, seed][index] for seed in range(num_seeds)]

@@ -93,12 +93,13 @@ def verdict(scores: Sequence[Score]) -> dict[str, Any]:
     failed = {name: sum(score.failures for score in scores if score.follower == name) for name in names}
     rows = []
     for name in names:
-        cells = [_count(count[name], max(count.values())) for count in counts.values()]
+        cells = [{"text": str(sum(score.follower == name for score in scores)), "style": ""}]
+        cells += [_count(count[name], max(count.values())) for count in counts.values()]
         cells.append({"text": str(failed[name]), "style": "" if failed[name] else "zero"})
         cells += [_comparison(scores, name, rival) for rival in rivals]
         rows.append({"follower": name, "cells": cells})
-    heads = [f"smallest {label}, of {len(by_variant(scores))}" for label in COUNTED.values()]
-    return {"heads": [*heads, "failed flights", *(f"peak vs. {rival}" for rival in rivals)], "rows": rows}
+    heads = ["variants flown", *(f"smallest {label}" for label in COUNTED.values()), "failed flights"]
+    return {"heads": [*heads, *(f"peak vs. {rival}" for rival in rivals)], "rows": rows}
 
 
 def wins_by_suite(scores: Sequence[Score]) -> dict[str, Any]:
@@ -116,12 +117,13 @@ def wins_by_suite(scores: Sequence[Score]) -> dict[str, Any]:
 def compare(scores: Sequence[Score], follower: str, rival: str) -> tuple[int, int]:
     """Variants in which the steady-state peak of `follower` is (smaller, larger) than that of `rival`.
 
-    A follower that failed in any seed of a variant counts as infinitely bad there.
+    A follower that failed in any seed of a variant counts as infinitely bad there; variants that one of the two did
+    not fly count for neither.
     """
     smaller = larger = 0
     for group in by_variant(scores).values():
         peaks = {s.follower: math.inf if s.failures else s.summary("peak").median for s in group}
-        mine, other = peaks[follower], peaks[rival]
+        mine, other = peaks.get(follower, math.nan), peaks.get(rival, math.nan)
         smaller, larger = smaller + (mine < other), larger + (mine > other)  # NaN is neither
     return smaller, larger
 
@@ -132,7 +134,8 @@ def lead_picture(plant: Plant, scores: Sequence[Score], policies: Sequence[str])
     (None, reason) if MuJoCo cannot render.
     """
     first = next(iter(by_variant(scores).values()))
-    count = wins(scores)
+    there = [score.follower for score in first]
+    count = {name: number for name, number in wins(scores).items() if name in there}
     classical = [name for name in count if name in LAWS and name not in ("copy", "stay", "random")]
     trained = [name for name in count if name in policies]
     best = [max(names, key=lambda name: count[name]) for names in (trained, classical) if names]

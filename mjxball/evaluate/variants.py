@@ -30,7 +30,7 @@ class Variant:
     known: Mapping[str, Any] = field(default_factory=dict)  # of a team, settings that its followers are made for
     scatter: float = 0.0  # of a team, every drone's numbers are drawn within this share of those that followers know
 
-    def home(self, base: Config) -> Config:
+    def nominal(self, base: Config) -> Config:
         """What its followers are made for: `base`, or a team of its own."""
         if not self.team:
             return base
@@ -44,7 +44,7 @@ class Variant:
         return configs.validate(found)
 
     def config(self, base: Config, seed: int) -> Config:
-        """The configuration of this variant for one seed; `base` is its `home`."""
+        """The configuration of this variant for one seed; `base` is its `nominal` one."""
         for path, value in self.changes.items():
             base = configs.replace(base, path, value)
         if self.waveform:

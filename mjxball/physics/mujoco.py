@@ -117,13 +117,8 @@ class MujocoWorld:
 
     def drive(self, acceleration: Array) -> Float[np.ndarray, " n"]:
         """Give the ball `acceleration` along its slides by the force that it takes; see `roll` for the result."""
-        model, data, slides = self.model, self.data, self._slides
-        unit = np.eye(model.nv)[slides]
-        free, response = np.zeros((1, model.nv)), np.zeros_like(unit)
-        pushed = data.qfrc_applied + self._external() - data.qfrc_bias
-        mujoco.mj_solveM(model, data, free, pushed[None])
-        mujoco.mj_solveM(model, data, response, unit)
-        return self.roll(np.linalg.solve(response[:, slides], np.atleast_1d(acceleration) - free[0, slides]))
+        pushed = self.data.qfrc_applied + self._external() - self.data.qfrc_bias
+        return self.roll(slide_force(self.model, self.data, self._slides, acceleration, pushed))
 
     def roll(self, force: Array) -> Float[np.ndarray, " n"]:
         """Accelerations: O in the world, angular in body axes, ball (one or two); with `force` on the slides [N]."""
@@ -170,6 +165,17 @@ class MujocoWorld:
             force, torque = self.data.xfrc_applied[body, :3], self.data.xfrc_applied[body, 3:]
             mujoco.mj_applyFT(self.model, self.data, force, torque, self.data.xipos[body], body, total)
         return total
+
+
+def slide_force(
+    model: mujoco.MjModel, data: mujoco.MjData, slides: slice, acceleration: Array, pushed: Float[np.ndarray, " nv"]
+) -> Float[np.ndarray, " n"]:
+    """Force [N] on the joints `slides` that gives them `acceleration` [m/s2], beside the generalized forces `pushed`."""
+    unit = np.eye(model.nv)[slides]
+    free, response = np.zeros((1, model.nv)), np.zeros_like(unit)
+    mujoco.mj_solveM(model, data, free, pushed[None])
+    mujoco.mj_solveM(model, data, response, unit)
+    return np.linalg.solve(response[:, slides], np.atleast_1d(acceleration) - free[0, slides])
 
 
 def flown_contact_wrenches(

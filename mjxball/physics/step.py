@@ -68,7 +68,7 @@ def make_control_step(
 
     def physics_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         loops, target = autopilot(state, commands, load)
-        keep, mean = _rotor_shares(shared(numbers.rotor_lag, state.rotor_force), load.rotor_lag_scale, h)
+        keep, mean = rotor_shares(shared(numbers.rotor_lag, state.rotor_force), load.rotor_lag_scale, h)
         if load.thrust_scale is not None:
             target = target * load.thrust_scale[..., None]
         if load.thrust_fade is not None:
@@ -94,7 +94,7 @@ def make_control_step(
     return control_step
 
 
-def _rotor_shares(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any, Any]:
+def rotor_shares(lag: Array | float, scale: Scalar | None, h: float) -> tuple[Any, Any]:
     """Shares of the old rotor force that are left after a step of `h` [s] and, in the mean, during it; `lag` [s]."""
     if scale is None and isinstance(lag, float):
         keep = math.exp(-h / lag)

@@ -23,6 +23,8 @@ from mjxball.fly.twin.onboard import TICK, Onboard, Power
 from mjxball.fly.twin.physics import RUNNING, Modes, PairState
 from mjxball.physics import motion
 from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.mujoco import slide_force
+from mjxball.physics.step import rotor_shares
 
 STEP = 0.001  # [s] of MuJoCo, the sensors and the motors
 LEG = 0.03  # [m] from a drone's centre down to what it stands on
@@ -101,11 +103,7 @@ class CoupledPair:
         load = self.conditions
         mass, amplitude, speed, zero = map(np.float64, (load.object_mass, load.cg_amplitude, load.cg_speed, 0.0))
         self._load = Load(mass, mass, amplitude, speed, zero, np.zeros(0), np.zeros(0))
-        self._unit = np.zeros((1, self.model.nv))
-        self._unit[0, self._slide] = 1.0
-        lag = plant.rotor_lag * self.conditions.rotor_lag
-        self._keep = math.exp(-STEP / lag)
-        self._mean = lag / STEP * (1 - self._keep)
+        self._keep, self._mean = rotor_shares(plant.rotor_lag * self.conditions.rotor_lag, None, STEP)
         self.onboard = Onboard(kind, surroundings, with_stock_gains(config.autopilot), self._new_power())
         self.start()
 
@@ -233,11 +231,9 @@ class CoupledPair:
         assert self._prescribed is not None
         data.qfrc_applied[self._slide] = 0.0
         mujoco.mj_fwdActuation(model, data)
-        free, response = np.zeros((1, model.nv)), np.zeros((1, model.nv))
-        mujoco.mj_solveM(model, data, free, (data.qfrc_actuator - data.qfrc_bias)[None])
-        mujoco.mj_solveM(model, data, response, self._unit)
         wanted = self._prescribed(np.float64(self._flown), self._load).acceleration / self._share
-        return float((wanted - free[0, self._slide]) / response[0, self._slide])
+        slides = slice(self._slide, self._slide + 1)
+        return float(slide_force(model, data, slides, wanted, data.qfrc_actuator - data.qfrc_bias)[0])
 
     def _place_ball(self) -> None:
         """Put a prescribed ball where it is to be, so that no error adds up; a rolling one at its start."""
