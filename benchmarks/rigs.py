@@ -1,10 +1,10 @@
 """One follower on 1000 rigs that no training drew, beside laws that are told each rig.
 
     python benchmarks/rigs.py policies/universal.npz --json benchmarks/results/rigs.json
-    python benchmarks/rigs.py policies/universal.npz --steps --figure docs/images/rigs_steps.png
+    python benchmarks/rigs.py policies/universal.npz --steps --figure docs/rigs-steps.png
 
 Rigs of 2 to 6 drones in equal numbers, three random flights of 30 s each, the same for everybody; noise, drift and
-delay as in training (`config.rigs` and `scenario` of the preset `universal`). `lqg-told` and `lqg-slow-told` know the
+delay as in training (settings of the preset `universal`). `lqg-known-rig` and `lqg-slow-known-rig` know the
 rig: masses, inertia, mounts, loops, rotors, what each drone gives of its thrust; they estimate the load's torque alone.
 The better of both is the reference of a rig, by the median of its flights, in settling and in peak apart. A rig is met
 where the policy's median settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over
@@ -31,18 +31,18 @@ import numpy as np
 
 from mjxball import cli
 from mjxball.baselines.adaptive import Adaptive
-from mjxball.baselines.lqg import SlowToldLqg, ToldLqg
+from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
 from mjxball.config import Config, preset, replace
 from mjxball.control.followers import Copy, Law
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import Flown, cg_jumps, fly, mass_changes, told_laws
+from mjxball.evaluate.rigs import Flown, cg_jumps, fly, mass_changes, rig_laws
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, held_out, rig_config, unpadded
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
 LATER, MORE, LENGTH = 1.25, 0.005, 0.17  # the bar: settling, peak [m], of a rig of that length [m]
-TOLD = ("lqg-told", "lqg-slow-told")
+KNOWING = ("lqg-known-rig", "lqg-slow-known-rig")
 PAIR_LOAD = 0.2  # [kg]
 STEP, BACK, AFTER = 15.0, 1.5, 5.0  # [s] when the load changes, within which it is balanced again, what is flown then
 BEYOND = {
@@ -89,12 +89,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def followers(paths: Sequence[Path]) -> list[Made]:
-    """(name, what makes its law for rigs of one size), the two told ones first."""
+    """(name, what makes its law for rigs of one size), the two LQGs that know each rig first."""
     return [
-        ("lqg-told", lambda config, rigs: told_laws(config, rigs, ToldLqg)),
-        ("lqg-slow-told", lambda config, rigs: told_laws(config, rigs, SlowToldLqg)),
+        ("lqg-known-rig", lambda config, rigs: rig_laws(config, rigs, KnownRigLqg)),
+        ("lqg-slow-known-rig", lambda config, rigs: rig_laws(config, rigs, SlowKnownRigLqg)),
         ("copy", lambda config, rigs: Copy(config)),
-        ("adaptive-mass", lambda config, rigs: told_laws(config, rigs, _adaptive)),
+        ("adaptive-mass", lambda config, rigs: rig_laws(config, rigs, _adaptive)),
         *((path.stem, functools.partial(_network, path)) for path in paths),
     ]
 
@@ -139,7 +139,7 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
 
 
 def beyond(config: Config, options: Any) -> dict[str, Any]:
-    """The told LQGs and the policies outside one range at a time."""
+    """The LQGs that know the rig and the policies outside one range at a time."""
     rows = []
     for path, ends in BEYOND.items():
         outside = replace(config, path, ends)
@@ -164,15 +164,16 @@ def _row(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) -> d
         **{f"settling_{q}": _quantile(settling, q) for q in (50, 90)},
         **{f"peak_{q}": _quantile(peak, q) for q in (50, 90)},
     }
-    if not set(TOLD) <= flown.keys() or name in TOLD:
+    if not set(KNOWING) <= flown.keys() or name in KNOWING:
         return row
-    told = [flown[one] for one in TOLD]
+    knowing = [flown[one] for one in KNOWING]
     best, smallest = (
-        np.min([np.median(getattr(one, part)(period), axis=1) for one in told], axis=0) for part in ("settling", "peak")
+        np.min([np.median(getattr(one, part)(period), axis=1) for one in knowing], axis=0)
+        for part in ("settling", "peak")
     )
     soon = (settling <= LATER * best) | np.isinf(best)
     small = (peak <= smallest + MORE * np.maximum(rigs.length / LENGTH, 1.0)) | np.isinf(smallest)
-    alone = flown[name].failed & ~np.all([one.failed for one in told], axis=0)
+    alone = flown[name].failed & ~np.all([one.failed for one in knowing], axis=0)
     return {
         **row,
         "crashed_alone": float(alone.mean()),
@@ -224,7 +225,7 @@ CHANGES = {"mass": mass_changes, "CG": cg_jumps}
 
 
 def _draw(curves: dict[Any, list[np.ndarray]], period: float, path: Path) -> None:
-    """Error against time since the step: median and 10 to 90 %, for the told LQGs and the policies."""
+    """Error against time since the step: median and 10 to 90 %, for these LQGs and the policies."""
     from mjxball.plotting import pyplot
 
     figure, axes = pyplot().subplots(1, len(CHANGES), figsize=(9, 3.6), sharey=True, layout="constrained")

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from tables import rows
 
-from mjxball.baselines.lqg import SlowToldLqg
+from mjxball.baselines.lqg import SlowKnownRigLqg
 from mjxball.config import preset, replace, validate, with_plant
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.team_lqg import nominal_context
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import Flown, cg_jumps, fly, mass_changes, stacked, told_laws
+from mjxball.evaluate.rigs import Flown, cg_jumps, fly, mass_changes, rig_laws, stacked
 from mjxball.physics.newton_euler import make_engine
 from mjxball.physics.step import make_control_step
 from mjxball.plant import plant_parameters
@@ -79,9 +79,9 @@ def test_followers_can_hold_every_load_as_far_as_it_goes() -> None:
                 assert largest_margin(plant, mass, place, believed, thrust=thrust).margin > margin - 1e-6
 
 
-def test_told_laws_fly_together_as_each_alone() -> None:
+def test_rig_laws_fly_together_as_each_alone() -> None:
     rigs = held_out(UNIVERSAL, 3, 3)
-    laws = told_laws(UNIVERSAL, rigs, SlowToldLqg)
+    laws = rig_laws(UNIVERSAL, rigs, SlowKnownRigLqg)
     numbers, rebuild = stacked(laws)
     random = np.random.default_rng(0)
     observation = 0.1 * random.standard_normal((2, 18))

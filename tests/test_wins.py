@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+from pathlib import Path
 
 import pytest
 
 from mjxball.baselines import make_baseline
-from mjxball.config import preset
+from mjxball.config import Plant, preset
+from mjxball.evaluate import report
 from mjxball.evaluate.benchmark import Score, winners, wins
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.report import verdict, wins_by_suite
 from mjxball.evaluate.results import Result, fly_scenarios
+from mjxball.evaluate.variants import Suite, Variant
 from mjxball.sim.scenario import Scenario
 
 GOOD = Metrics(
@@ -63,7 +67,9 @@ def test_each_metric_and_suite_is_counted_by_hand(cell: Result) -> None:
     assert suites == {"one": (2, ["2", "0"]), "two": (1, ["0", "1"])}
 
 
-def test_suites_flown_by_different_followers_are_compared_where_both_flew(cell: Result) -> None:
+def test_suites_flown_by_different_followers_are_compared_where_both_flew(
+    cell: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scores = [
         made(cell, "a", "pair", [{"x_peak": 0.01}], suite="pairs"),
         made(cell, "a", "adaptive", [{"x_peak": 0.02}], suite="pairs"),
@@ -76,6 +82,11 @@ def test_suites_flown_by_different_followers_are_compared_where_both_flew(cell: 
         "team": ("1", "1", "1 : 0"),
         "adaptive": ("2", "0", "–"),
     }
+    monkeypatch.setattr(report, "film", lambda *_: (None, "not drawn in this test"))
+    variants = {"pairs": (Variant("a", Scenario()),), "teams": (Variant("b", Scenario()),)}
+    suites = [Suite(name, name, "case", members) for name, members in variants.items()]
+    report.write_report(tmp_path, Plant(), scores, suites, [], "", {})
+    assert {row["follower"] for row in json.loads((tmp_path / "scores.json").read_text())["scores"]} == set(found)
 
 
 def test_failures_and_the_oracle_win_nothing(cell: Result) -> None:

@@ -236,14 +236,14 @@ class KnownFailuresLqg(Lqg):
         return None if privileged.thrust is None else self._model.of_flight(privileged.thrust, axes=1)
 
 
-class ToldLqg(KnownFailuresLqg):
-    """`lqg` that is told everything of its rig but where the CG is: `config` is the rig's, the true mass included.
+class KnownRigLqg(KnownFailuresLqg):
+    """`lqg` that knows everything of its rig but where the CG is: `config` is the rig's, the true mass included.
 
     The load's torque is expected to wander in proportion to the assembly's inertia, so that one tuning serves rigs of
     all sizes, and no command asks rotors for more torque than they have.
     """
 
-    name = "lqg-told"
+    name = "lqg-known-rig"
 
     def __init__(self, config: Config):
         super().__init__(config)
@@ -266,10 +266,10 @@ class ToldLqg(KnownFailuresLqg):
         return xp.clip(xp.concat([tilts, followed[..., 2:]], axis=-1), -limits, limits)
 
 
-class SlowToldLqg(ToldLqg):
+class SlowKnownRigLqg(KnownRigLqg):
     """The same with the tuning of `lqg-slow`."""
 
-    name = "lqg-slow-told"
+    name = "lqg-slow-known-rig"
     tuning = SLOW
 
 

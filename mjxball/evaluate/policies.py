@@ -24,7 +24,7 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     if abs(policy.control_period - period) > 1e-9:
         raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
     made_for = configs.from_record({"plant": policy.card["plant"]}).plant
-    if told_nothing(policy):
+    if flies_any_rig(policy):
         if config.plant.stand != "free":
             raise InputError(f"{path} was made for free flight, not for a stand")
         if config.plant.cg_axis == "y":
@@ -48,7 +48,7 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
     return policy
 
 
-def told_nothing(policy: Policy) -> bool:
+def flies_any_rig(policy: Policy) -> bool:
     """Whether `policy` flies any rig, of which it is told the number of drones alone."""
     return policy.card.get("context") == list(COUNT)
 

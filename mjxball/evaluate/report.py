@@ -109,7 +109,8 @@ def wins_by_suite(scores: Sequence[Score]) -> dict[str, Any]:
     for suite in dict.fromkeys(score.suite for score in scores):
         mine = [score for score in scores if score.suite == suite]
         count = wins(mine)
-        cells = [_count(count[name], max(count.values())) for name in names]
+        best = max(count.values())
+        cells = [_count(count[name], best) if name in count else {"text": "–", "style": "zero"} for name in names]
         rows.append({"suite": suite, "total": len(by_variant(mine)), "cells": cells})
     return {"names": names, "rows": rows}
 

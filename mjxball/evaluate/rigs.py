@@ -1,4 +1,4 @@
-"""Followers on random rigs: many rigs at once, each with its own numbers, and laws that are told them."""
+"""Followers on random rigs: many rigs at once, each with its own numbers, and laws that know them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def fly(
             world = state.pipeline_state
             error = jnp.linalg.norm(world.goal - world.loop.plant.position)
             far = far | (error > config.scenario.termination_distance) | world.loop.diverged
-            memory, command = law.step(memory, state.obs[..., :18], _told(world, size))
+            memory, command = law.step(memory, state.obs[..., :18], _known(world, size))
             return (env.step_with_command(state, command), memory, far), error
 
         start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool))
@@ -112,7 +112,7 @@ def cg_jumps(world: PipelineState) -> PipelineState:
     return world._replace(load=world.load._replace(cg_phase=world.load.cg_phase + jnp.pi))
 
 
-def told_laws(config: Config, rigs: RigTable, make: Callable[[Config], Law]) -> list[Law]:
+def rig_laws(config: Config, rigs: RigTable, make: Callable[[Config], Law]) -> list[Law]:
     """`make` of every rig's own configuration."""
     return [make(rig_config(config, rigs, row)) for row in range(rigs.total)]
 
@@ -133,7 +133,7 @@ def stacked(laws: Sequence[Law]) -> tuple[list[Any], Callable[[list[Any]], Law]]
     return numbers, rebuild
 
 
-def _told(world: PipelineState, size: int) -> PrivilegedInfo:
+def _known(world: PipelineState, size: int) -> PrivilegedInfo:
     """What a classical follower may know of its world; nothing of where the CG is."""
     load: Any = world.load
     mass = object_mass(world.loop.plant.time, load)
@@ -142,7 +142,7 @@ def _told(world: PipelineState, size: int) -> PrivilegedInfo:
         thrust = thrust * (1.0 - load.thrust_fade * world.loop.plant.time)
     total = world.rig.drone_mass.sum() + world.rig.carrier_mass + mass
     zero = jnp.zeros(2)
-    told = PrivilegedInfo(load.believed_mass, zero, zero, total, thrust)
+    known = PrivilegedInfo(load.believed_mass, zero, zero, total, thrust)
     if size == 2:
-        return told
-    return jax.tree.map(lambda part: jnp.broadcast_to(part, (size - 1, *part.shape)), told)
+        return known
+    return jax.tree.map(lambda part: jnp.broadcast_to(part, (size - 1, *part.shape)), known)

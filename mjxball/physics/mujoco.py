@@ -170,7 +170,7 @@ class MujocoWorld:
 def slide_force(
     model: mujoco.MjModel, data: mujoco.MjData, slides: slice, acceleration: Array, pushed: Float[np.ndarray, " nv"]
 ) -> Float[np.ndarray, " n"]:
-    """Force [N] on the joints `slides` that gives them `acceleration` [m/s2], beside the generalized forces `pushed`."""
+    """Force [N] on the joints `slides` that gives them `acceleration` [m/s2] beside the generalized forces `pushed`."""
     unit = np.eye(model.nv)[slides]
     free, response = np.zeros((1, model.nv)), np.zeros_like(unit)
     mujoco.mj_solveM(model, data, free, pushed[None])
