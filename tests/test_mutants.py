@@ -21,7 +21,8 @@ def test_every_fault_can_be_made() -> None:
     for one in table:
         text = (REPOSITORY / one.file).read_text()
         changed = one.applied(text)  # ValueError unless the old text occurs exactly once
-        assert ast.dump(ast.parse(changed)) != ast.dump(ast.parse(text)), one
+        assert changed != text, one
+        assert not one.file.endswith(".py") or ast.dump(ast.parse(changed)) != ast.dump(ast.parse(text)), one
         assert one.tests
         for test in one.tests:
             path, *inside = test.split("::")
