@@ -3,7 +3,7 @@
 A physics step is the whole plant: both attitude loops, rotor lag, accelerations and the integrator. Every figure
 is the median of several timed calls after one that is not counted; compile time is the first call's extra.
 
-    python benchmarks/physics.py --worlds 1024 65536 --json physics.json
+    python benchmarks/physics.py --num-envs 1024 65536 --json physics.json
 """
 
 from __future__ import annotations
@@ -117,7 +117,15 @@ def time_mj_step(config: configs.Config, steps: int = 20_000) -> dict[str, float
 def main() -> None:
     """Print the table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--worlds", type=int, nargs="+", default=[256, 1024, 8192, 65536, 1048576])
+    parser.add_argument(
+        "--num-envs",
+        "--worlds",
+        dest="worlds",
+        metavar="N",
+        type=int,
+        nargs="+",
+        default=[256, 1024, 8192, 65536, 1048576],
+    )
     parser.add_argument("--engines", nargs="+", choices=[*ENGINES, "mujoco"], default=[*ENGINES, "mujoco"])
     parser.add_argument("--loops", nargs="+", choices=LOOPS, default=list(LOOPS))
     parser.add_argument("--work", type=float, default=2e7, help="physics steps in a timed call, at most")

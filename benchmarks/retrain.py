@@ -38,7 +38,7 @@ from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.rig.load import LoadWatch
 from mjxball.rig.retrain import FlightReplay, situation
-from mjxball.train.polish import MOST_STEPS, Polished, Polisher
+from mjxball.train.fine_tune import MOST_STEPS, FineTuned, FineTuner
 
 ROOT = Path(__file__).parents[1]
 POLICY = shipped_policy("flight")
@@ -55,9 +55,9 @@ def read_load(text: str) -> AddedLoad:
 
 
 def fly(
-    load: AddedLoad, seconds: float, polisher: Polisher | None, most: int = 0, begin: float = math.inf
+    load: AddedLoad, seconds: float, tuner: FineTuner | None, most: int = 0, begin: float = math.inf
 ) -> dict[str, Any]:
-    """One flight in virtual time, polished in `most` steps; figures from `begin` [s], or from a new policy on."""
+    """One flight in virtual time, fine-tuned in `most` steps; figures from `begin` [s], or from a new policy on."""
     contents = load_file(POLICY)
     world = VirtualTwin(
         Policy(contents, "flown"), FlightSettings(seconds=seconds), surroundings=Surroundings(load=load)
@@ -73,7 +73,7 @@ def fly(
 
     world.flight.succession._successor = successor
     while world.tick():
-        if "found" in row or polisher is None:
+        if "found" in row or tuner is None:
             continue
         for record in world.log.records[read:]:
             one = decode(record) if record["kind"] == "state" else record
@@ -86,8 +86,8 @@ def fly(
         found = watch.find()
         if found is not None:
             begin = world.now + TAKES
-            made: Polished = polisher.polish(*situation(found, watch, replay, world.config), 600.0, most)
-            new = None if made.contents is None else Policy(made.contents, "polished")
+            made: FineTuned = tuner.fine_tune(*situation(found, watch, replay, world.config), 600.0, most)
+            new = None if made.contents is None else Policy(made.contents, "fine-tuned")
             row = {
                 "found": True,
                 "mass": 1e3 * found.mass,
@@ -140,16 +140,16 @@ def rehearse(load: AddedLoad, seconds: float, retrains: bool) -> dict[str, Any]:
     row["p99"], row["largest"] = (
         float(re.search(rf"{name} ([\d.]+) ms", done.stdout)[1]) for name in ("p99", "largest")
     )  # type: ignore[index]
-    row["late_while_polishing"] = lateness(records, times)
-    handed = times.get("polished", times.get("kept"))
+    row["late_while_fine_tuning"] = lateness(records, times)
+    handed = times.get("fine-tuned", times.get("kept"))
     row["seconds"] = handed - times["identified"] if handed and "identified" in times else None
-    row["steps"] = next((one["numbers"]["steps"] for one in said if one["what"] in ("polished", "kept")), None)
+    row["steps"] = next((one["numbers"]["steps"] for one in said if one["what"] in ("fine-tuned", "kept")), None)
     return {**row, "flown": end["flown"], "ended": end["cause"] or "as planned"}
 
 
 def lateness(records: list[Any], times: dict[str, float]) -> float | None:
     """Largest lateness of a tick [ms] between the identification and what came of it."""
-    end = times.get("polished", times.get("kept"))
+    end = times.get("fine-tuned", times.get("kept"))
     if end is None or "identified" not in times:
         return None
     ticks = [one["late"] for one in records if one["kind"] == "tick" and times["identified"] <= one["t"] <= end]
@@ -166,8 +166,8 @@ def main() -> None:
     options = parser.parse_args()
     enable_compilation_cache()
     contents = load_file(POLICY)
-    polisher = Polisher(config_of(contents.card), contents)
-    polisher.compile()
+    tuner = FineTuner(config_of(contents.card), contents)
+    tuner.compile()
     clock = []
     for _ in range(options.clock):
         for retrains in (False, True):
@@ -180,7 +180,7 @@ def main() -> None:
     print("load g:mm   found g, mg m (true)      cost            retrain   rms  along height   peak   tilt  ended")
     for text in options.loads:
         load = read_load(text)
-        new = fly(load, options.seconds, polisher, most)
+        new = fly(load, options.seconds, tuner, most)
         old = fly(load, options.seconds, None, begin=new["begin"])
         moment = 1e6 * load.mass * load.offset
         rows.append({"load": text, "true_moment": moment, "with": new, "without": old})

@@ -120,7 +120,7 @@ def main() -> None:
         "--physics", default="mujoco", help="that the follower is evaluated on: mujoco, newton-euler or mjx"
     )
     parser.add_argument("--steps", type=int, default=192_000)
-    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--num-envs", "--worlds", dest="worlds", metavar="N", type=int, default=64)
     parser.add_argument("--updates", type=int, default=6, help="gradient updates after each step of all worlds")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=5, help="worlds that each follower is evaluated in")

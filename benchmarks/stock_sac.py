@@ -1,6 +1,6 @@
 """Train a follower with Brax's own `sac.train` on the environment of a preset, and export it as a policy file.
 
-`python benchmarks/stock_sac.py OUT.npz [--seed N] [--steps N] [--worlds N] ... [--physics mjx|newton-euler]`
+`python benchmarks/stock_sac.py OUT.npz [--seed N] [--steps N] [--num-envs N] ... [--physics mjx|newton-euler]`
 
 The other side of `benchmarks/training.py`. Brax 0.14.2 calls `jax.device_put_replicated`, which JAX has removed; it is
 supplied here. Brax's own evaluations are left out, which makes it faster. Besides OUT.npz, written at the end, there is
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--snapshots", type=int, default=1, help="policies exported on the way, the last one included")
     parser.add_argument("--steps", type=int, default=768_000)
-    parser.add_argument("--worlds", type=int, default=128)
+    parser.add_argument("--num-envs", "--worlds", dest="worlds", metavar="N", type=int, default=128)
     parser.add_argument("--updates", type=int, default=4)
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--replay", type=int, default=768_000)

@@ -48,7 +48,7 @@ def test_refusals(capsys: pytest.CaptureFixture[str]) -> None:
 
 READY = 'say(what="ready")\n'
 IDENTIFIED = 'say(what="identified", text="a load")\n'
-POLISHED = 'say(what="polished", policy=sys.argv[1])\n'
+FINE_TUNED = 'say(what="fine-tuned", policy=sys.argv[1])\n'
 WAIT = "sys.stdin.read()\n"
 HEAD = """
 import json, os, sys, time
@@ -82,11 +82,11 @@ def heard(one: Retrainer, count: int) -> list[str]:
 
 
 def test_progress_is_shown_until_it_is_ready(started: Callable[..., Retrainer]) -> None:
-    one = started('say(text="1 of 2")\nsay(text="2 of 2")\n' + READY + IDENTIFIED + POLISHED + WAIT)
+    one = started('say(text="1 of 2")\nsay(text="2 of 2")\n' + READY + IDENTIFIED + FINE_TUNED + WAIT)
     shown: list[str] = []
     one.wait(shown.append)
     assert shown == ["1 of 2", "2 of 2"]
-    assert heard(one, 2) == ["identified", "polished"]
+    assert heard(one, 2) == ["identified", "fine-tuned"]
     end = time.monotonic() + 20
     policy = one.take()
     while policy is None and time.monotonic() < end:
@@ -113,10 +113,10 @@ def test_without_it_no_flight_begins(started: Callable[..., Retrainer], lines: s
 GARBAGE = r"""
 os.write(1, b"\xff\xfe{]\n")
 os.write(1, b"x" * 200000 + b"\n")
-say(what="polished", policy=5)
-say(what="polished")
-say(what=["polished"], policy=None)
-say(what="polished", policy="/no/such/policy.npz")
+say(what="fine-tuned", policy=5)
+say(what="fine-tuned")
+say(what=["fine-tuned"], policy=None)
+say(what="fine-tuned", policy="/no/such/policy.npz")
 print("[1, 2", flush=True)
 """
 # What the process does once it is ready, what it hands over, and what the runner makes of it in the end.
@@ -125,10 +125,10 @@ WRONG: dict[str, tuple[str, str, str]] = {
     "dead after it identified": (IDENTIFIED, "sound", "ended"),
     "killed": (IDENTIFIED + "os.kill(os.getpid(), 9)\n", "sound", "ended"),
     "garbage": (GARBAGE, "sound", "ended"),
-    "nothing was identified": (POLISHED + WAIT, "sound", "too late"),
-    "of another rig": (IDENTIFIED + POLISHED + WAIT, "other", "another"),
-    "cut short": (IDENTIFIED + POLISHED + WAIT, "cut", "damaged"),
-    "not finite": (IDENTIFIED + POLISHED + WAIT, "nan", "not finite"),
+    "nothing was identified": (FINE_TUNED + WAIT, "sound", "too late"),
+    "of another rig": (IDENTIFIED + FINE_TUNED + WAIT, "other", "another"),
+    "cut short": (IDENTIFIED + FINE_TUNED + WAIT, "cut", "damaged"),
+    "not finite": (IDENTIFIED + FINE_TUNED + WAIT, "nan", "not finite"),
 }
 
 
@@ -163,9 +163,9 @@ def test_a_policy_that_comes_late_is_not_taken(
     started: Callable[..., Retrainer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(retrain, "LATE", 0.2)
-    one = started(READY + IDENTIFIED + "time.sleep(0.5)\n" + POLISHED + WAIT)
+    one = started(READY + IDENTIFIED + "time.sleep(0.5)\n" + FINE_TUNED + WAIT)
     one.wait(lambda text: None)
-    assert heard(one, 3) == ["identified", "polished", "failed"]
+    assert heard(one, 3) == ["identified", "fine-tuned", "failed"]
     assert one.take() is None
 
 
@@ -220,7 +220,7 @@ def test_a_card_says_what_it_was_retrained_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.alone
-def test_a_rehearsal_finds_its_load_and_polishes(tmp_path: Path) -> None:
+def test_a_rehearsal_finds_its_load_and_fine_tunes(tmp_path: Path) -> None:
     """From end to end by the clock: runner, twin, and the process with JAX that reads the growing log."""
     pytest.importorskip("cflib")
     log = tmp_path / "flight.jsonl"
@@ -246,8 +246,8 @@ def test_a_rehearsal_finds_its_load_and_polishes(tmp_path: Path) -> None:
     found = said["identified"]["numbers"]
     assert found["mass"] == pytest.approx(0.006, abs=5e-4)
     assert found["moment"] == pytest.approx(-0.006 * 0.04, abs=1e-4)
-    assert said.keys() & {"kept", "polished"}
-    assert ("taken" in said) == ("polished" in said)
+    assert said.keys() & {"kept", "fine-tuned"}
+    assert ("taken" in said) == ("fine-tuned" in said)
     end = next(record for record in records if record["kind"] == "end")
     assert end["flown"].keys() == {"first policy", *["second policy"] * ("taken" in said)}
     assert all(figures["error_rms"] < 0.1 for figures in end["flown"].values())

@@ -196,7 +196,7 @@ KINDS: dict[str, Kind] = {
     ),
     "retrain": record(
         "a retraining process, or what it hands over, in a rehearsal with --retrain",
-        what=need(TEXT, "`ready`, `identified`, `polished`, `kept`, `taken`, `returned`, `failed`"),
+        what=need(TEXT, "`ready`, `identified`, `fine-tuned`, `kept`, `taken`, `returned`, `failed`"),
         text=may(TEXT, "in words"),
         numbers=may(JSON, "by name"),
     ),

@@ -100,13 +100,13 @@ class Retrainer:
 
     def _heard(self, message: dict[str, Any]) -> None:
         what = message.get("what")
-        if what not in ("identified", "kept", "polished"):
+        if what not in ("identified", "kept", "fine-tuned"):
             return
         self._tell(what, str(message.get("text", "")), message.get("numbers"))
         if what == "identified":
             self._identified = time.monotonic()
         self._concluded = self._concluded or what == "kept"
-        if what != "polished":
+        if what != "fine-tuned":
             return
         policy = Policy.load(Path(str(message.get("policy"))))
         odd = difference(self._flown, policy)

@@ -1,8 +1,8 @@
 """`python -m mjxball.rig.retrain`: retrains a policy for a load that is put on in flight; started by mjxball.fly.
 
-It reads the running flight's log, finds the load (`rig.load`), polishes the policy for it from where the flight is
-(`train.polish`), and prints lines of JSON: {"text"} while it compiles, {"what": "ready"}, then "identified", and
-"polished" with the path of a policy file, or "kept" if nothing better was found. It ends when standard input does.
+It reads the running flight's log, finds the load (`rig.load`), fine-tunes the policy for it from where the flight is
+(`train.fine_tune`), and prints lines of JSON: {"text"} while it compiles, {"what": "ready"}, then "identified", and
+"fine-tuned" with the path of a policy file, or "kept" if nothing better was found. It ends when standard input does.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from mjxball.sim.laws import BodyState, Laws
 NICE = 15
 POLL = 0.02  # [s] between two looks at the log
 LOOK = 0.5  # [s] of flight between two looks for a load
-SECONDS = 4.0  # [s] in which a policy is to be polished
+SECONDS = 4.0  # [s] in which a policy is to be fine-tuned
 GUIDED_NAMES = tuple(state.value for state in GUIDED)
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Compile, watch, identify, polish; return the exit code."""
+    """Compile, watch, identify, fine-tune; return the exit code."""
     parser = make_parser("python -m mjxball.rig.retrain", "Retrain a policy in flight; started by mjxball.fly.")
     parser.add_argument("policy", type=Path, metavar="POLICY.npz")
     parser.add_argument("log", type=Path, metavar="LOG", help="of the flight, may be yet to come")
     parser.add_argument("out", type=Path, metavar="OUT.npz", help="to be written")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="in which a policy is to be polished")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="in which a policy is to be fine-tuned")
     options = parser.parse_args(arguments)
     threading.Thread(target=_end_with_input, daemon=True).start()
     os.nice(NICE)
@@ -64,33 +64,33 @@ def retrain(options: argparse.Namespace) -> int:
     _say(text="retraining: loading JAX")
     try:
         from mjxball.cache import enable_compilation_cache
-        from mjxball.train.polish import Polisher
+        from mjxball.train.fine_tune import FineTuner
     except ModuleNotFoundError as error:
         raise InputError(f"{error.name} is not installed; pip install 'mjxball[train]'") from None
     enable_compilation_cache()
-    polisher = Polisher(config, flown)
-    polisher.compile(lambda text: _say(text=f"retraining: {text}"))
+    tuner = FineTuner(config, flown)
+    tuner.compile(lambda text: _say(text=f"retraining: {text}"))
     watch, replay = LoadWatch(config), FlightReplay(Policy(flown, "flown"))
     _say(what="ready")
     load = find(options.log, watch, replay)
     _say(what="identified", text=describe(load), numbers=load._asdict())
     known, place = situation(load, watch, replay, config)
-    polished = polisher.polish(known, place, options.seconds)
-    numbers = {name: getattr(polished, name) for name in ("before", "after", "steps", "seconds")}
-    text = f"{polished.steps} gradient steps in {polished.seconds:.1f} s, cost {polished.before:.3f} to "
-    text += f"{polished.after:.3f}"
-    if polished.contents is None:
+    tuned = tuner.fine_tune(known, place, options.seconds)
+    numbers = {name: getattr(tuned, name) for name in ("before", "after", "steps", "seconds")}
+    text = f"{tuned.steps} gradient steps in {tuned.seconds:.1f} s, cost {tuned.before:.3f} to "
+    text += f"{tuned.after:.3f}"
+    if tuned.contents is None:
         _say(what="kept", text=f"{text}: hardly better, the policy stays", numbers=numbers)
     else:
-        save_file(options.out, with_origin(polished.contents, load, numbers))
-        _say(what="polished", text=text, numbers=numbers, policy=str(options.out))
+        save_file(options.out, with_origin(tuned.contents, load, numbers))
+        _say(what="fine-tuned", text=text, numbers=numbers, policy=str(options.out))
     while True:  # until standard input ends
         time.sleep(1.0)
 
 
 def situation(load: IdentifiedLoad, watch: LoadWatch, replay: FlightReplay, config: Config) -> Any:
-    """(`KnownLoad`, `FlightState`) of `train.polish`: the object with the `load`, and where the flight is."""
-    from mjxball.train.polish import FlightState, KnownLoad
+    """(`KnownLoad`, `FlightState`) of `train.fine_tune`: the object with the `load`, and where the flight is."""
+    from mjxball.train.fine_tune import FlightState, KnownLoad
 
     place, mass = replay.place, config.plant.object_mass + load.mass
     assert place is not None  # a load is found in flight only

@@ -1,8 +1,8 @@
-"""A flown policy polished for a load that was identified in flight: gradients through the Crazyflies' closed form.
+"""A flown policy fine-tuned for a load that was identified in flight: gradients through the Crazyflies' closed form.
 
 The worlds begin where the flight is, integrals and observation history included, and are flown ahead by the old weights
 to where new ones could take over. From there `gradient.horizon` control steps after the other are flown and
-differentiated. Everything is compiled beforehand (`Polisher.compile`); load and flight are arguments of the programs.
+differentiated. Everything is compiled beforehand (`FineTuner.compile`); load and flight are arguments of the programs.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class FlightState(NamedTuple):
     history: Any  # (m,) the policy's, see `control.follower_law.FollowerLaw`
 
 
-class Polished(NamedTuple):
+class FineTuned(NamedTuple):
     """What came out."""
 
     contents: PolicyFile | None  # None: not finite, or hardly better than what it came from
@@ -140,7 +140,7 @@ class LoadedEnv(TransportEnv):
         return state.replace(pipeline_state=moved, obs=self._input(observation, moved))
 
 
-def polishing_config(flown: Config, gradient: dict[str, Any]) -> Config:
+def fine_tuning_config(flown: Config, gradient: dict[str, Any]) -> Config:
     """`flown`, a policy's own configuration, for flights of one load near hover."""
     return dataclasses.replace(
         flown,
@@ -152,12 +152,12 @@ def polishing_config(flown: Config, gradient: dict[str, Any]) -> Config:
     )
 
 
-class Polisher:
-    """Programs that polish one flown policy. `compile` takes half a minute, `polish` the seconds that it is given."""
+class FineTuner:
+    """Programs that fine-tune one flown policy. `compile` takes half a minute, `fine_tune` as long as it is given."""
 
     def __init__(self, config: Config, flown: PolicyFile, settings: dict[str, Any] | None = None):
         hidden = tuple(bias.shape[0] for bias in flown.biases[:-1])
-        self.config = polishing_config(config, {**SETTINGS, "policy_layers": hidden, **(settings or {})})
+        self.config = fine_tuning_config(config, {**SETTINGS, "policy_layers": hidden, **(settings or {})})
         self._flown, self._worlds = flown, self.config.gradient.num_envs
         self._programs: dict[str, Any] = {}
         self._comparing = 0.0  # [s] that it takes to compare
@@ -183,10 +183,10 @@ class Polisher:
                 self._programs[waiting[done]] = done.result()
                 progress(f"{count} of {len(waiting)} programs compiled")
         for _ in range(2):  # so that nothing is made for the first time in flight, and the comparison's time is known
-            self.polish(load, flight, 0.0)
+            self.fine_tune(load, flight, 0.0)
 
-    def polish(self, load: KnownLoad, flight: FlightState, seconds: float, most: int = MOST_STEPS) -> Polished:
-        """Polish for `load` from `flight` on, within `seconds` [s] by the clock or little more, in `most` steps."""
+    def fine_tune(self, load: KnownLoad, flight: FlightState, seconds: float, most: int = MOST_STEPS) -> FineTuned:
+        """Fine-tune for `load` from `flight` on, within `seconds` [s] by the clock or little more, in `most` steps."""
         begun = time.monotonic()
         load, flight = _single(load), _single(flight)
         key, own = jax.random.split(jax.random.PRNGKey(0))
@@ -210,7 +210,7 @@ class Polisher:
         best = int(np.nanargmin(costs)) if np.isfinite(costs[0]) else 0
         better = costs[best] <= WORTH * costs[0]
         contents = self._contents(state._replace(layers=candidates[best])) if better else None
-        return Polished(contents, float(costs[0]), float(costs[best]), SHARES[best], count, time.monotonic() - begun)
+        return FineTuned(contents, float(costs[0]), float(costs[best]), SHARES[best], count, time.monotonic() - begun)
 
     def _environments(self, load: KnownLoad, flight: FlightState, count: int | None = None) -> Environments:
         return Environments(LoadedEnv(self.config, load, flight), count or self._worlds)

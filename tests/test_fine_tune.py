@@ -1,4 +1,4 @@
-"""Polishing a flown policy by gradients through the Crazyflies' cascade."""
+"""Fine-tuning a flown policy by gradients through the Crazyflies' cascade."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from mjxball.control import crazyflie
 from mjxball.fly.card import config_of
 from mjxball.policy import Policy, load_file, shipped_policy
-from mjxball.train.polish import FlightState, KnownLoad, LoadedEnv, Polisher, nominal_load, resting
+from mjxball.train.fine_tune import FineTuner, FlightState, KnownLoad, LoadedEnv, nominal_load, resting
 
 
 def test_rounding_passes_a_gradient_and_rounds_all_the_same() -> None:
@@ -37,14 +37,14 @@ def test_rounding_passes_a_gradient_and_rounds_all_the_same() -> None:
 
 
 @pytest.fixture(scope="module")
-def uncompiled() -> Polisher:
+def uncompiled() -> FineTuner:
     """Of the shipped policy."""
     contents = load_file(shipped_policy("flight"))
-    return Polisher(config_of(contents.card), contents, {"num_envs": 8, "horizon": 50})
+    return FineTuner(config_of(contents.card), contents, {"num_envs": 8, "horizon": 50})
 
 
 @pytest.fixture(scope="module")
-def polisher(uncompiled: Polisher) -> Polisher:
+def tuner(uncompiled: FineTuner) -> FineTuner:
     """The same, compiled once for this file."""
     said: list[str] = []
     uncompiled.compile(said.append)
@@ -52,7 +52,7 @@ def polisher(uncompiled: Polisher) -> Polisher:
     return uncompiled
 
 
-def test_worlds_begin_at_the_flight_with_the_known_load(uncompiled: Polisher) -> None:
+def test_worlds_begin_at_the_flight_with_the_known_load(uncompiled: FineTuner) -> None:
     config, tilted = uncompiled.config, np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0], np.float32)
     load = KnownLoad(0.0215, -0.0112, 0.009, 0.7, 0.3, 3.84, 1.0)
     flight = resting(config)._replace(position=np.array([1.0, -2.0, 0.5], np.float32), quaternion=tilted)
@@ -71,7 +71,7 @@ def test_worlds_begin_at_the_flight_with_the_known_load(uncompiled: Polisher) ->
     assert (world.load.battery, world.load.uncompensated) == (pytest.approx(3.84), 1)
 
 
-def test_it_starts_from_the_flown_policy(uncompiled: Polisher) -> None:
+def test_it_starts_from_the_flown_policy(uncompiled: FineTuner) -> None:
     flown = load_file(shipped_policy("flight"))
     again = uncompiled._contents(uncompiled._start)
     draw = np.random.default_rng(1).normal(size=(50, 18)) * 0.05
@@ -81,22 +81,22 @@ def test_it_starts_from_the_flown_policy(uncompiled: Polisher) -> None:
 
 
 @pytest.mark.slow
-def test_polishing_lowers_the_cost_and_ends_in_time(polisher: Polisher) -> None:
+def test_fine_tuneing_lowers_the_cost_and_ends_in_time(tuner: FineTuner) -> None:
     load = KnownLoad(0.0215, -0.0112, 0.009, 0.7, 0.3, 3.84, 0.0)
-    flight = resting(polisher.config)
+    flight = resting(tuner.config)
     flight = flight._replace(integral=np.array([0, 0, 0.2, 0, 0, 0, 0], np.float32))
-    polished = polisher.polish(load, flight, 60.0)
-    assert polished.steps > 1
-    assert polished.contents is not None
-    assert polished.after < 0.9 * polished.before
-    Policy(polished.contents, "polished")
-    nothing = polisher.polish(load, flight, 0.0)  # no time: the old weights are as good as they are
+    tuned = tuner.fine_tune(load, flight, 60.0)
+    assert tuned.steps > 1
+    assert tuned.contents is not None
+    assert tuned.after < 0.9 * tuned.before
+    Policy(tuned.contents, "fine-tuned")
+    nothing = tuner.fine_tune(load, flight, 0.0)  # no time: the old weights are as good as they are
     assert (nothing.steps, nothing.contents) == (0, None)
 
 
 @pytest.mark.slow
-def test_what_is_not_finite_or_no_better_is_kept_back(polisher: Polisher) -> None:
-    flight, load = resting(polisher.config), nominal_load(polisher.config)
+def test_what_is_not_finite_or_no_better_is_kept_back(tuner: FineTuner) -> None:
+    flight, load = resting(tuner.config), nominal_load(tuner.config)
     lost = FlightState(*(np.full_like(part, np.nan) for part in flight))
-    polished = polisher.polish(load, lost, 5.0)
-    assert polished.contents is None
+    tuned = tuner.fine_tune(load, lost, 5.0)
+    assert tuned.contents is None
