@@ -149,7 +149,8 @@ def lead_picture(plant: Plant, scores: Sequence[Score], policies: Sequence[str])
         return None, f"No picture: {why}."
     names = ", ".join(flights)
     what = f"{shown[0].suite}, {shown[0].variant}, seed 0"
-    return picture, f"{names} with the same load ({what}); green: the goal, yellow: the CG, ×{LEAD_SPEED:g}."
+    alike = " with the same load" if len(flights) > 1 else ""
+    return picture, f"{names}{alike} ({what}); green: the goal, yellow: the CG, ×{LEAD_SPEED:g}."
 
 
 def _suite(suite: Suite, scores: Sequence[Score]) -> Row:
