@@ -1,6 +1,10 @@
 """mjxball: two quadrotors carry one object whose centre of gravity moves."""
 
+import os
 from typing import TYPE_CHECKING, Any
+
+# XLA writes two lines of 2 kB to stderr for each CPU program that it loads from its cache. What goes wrong is raised.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 __version__ = "0.1.0"
 __all__ = ["Policy", "Scenario", "Trajectory", "__version__", "simulate"]
@@ -10,7 +14,7 @@ if TYPE_CHECKING:
     from mjxball.sim.rollout import Trajectory, simulate
     from mjxball.sim.scenario import Scenario
 
-_HOMES = {
+_MODULES = {
     "Policy": "mjxball.policy",
     "Scenario": "mjxball.sim.scenario",
     "Trajectory": "mjxball.sim.rollout",
@@ -22,6 +26,6 @@ def __getattr__(name: str) -> Any:
     """Import public names on first use, so that the base install needs nothing but NumPy."""
     import importlib
 
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'mjxball' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
+    return getattr(importlib.import_module(_MODULES[name]), name)

@@ -25,7 +25,17 @@ from mjxball.plant import plant_parameters
 from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
 from mjxball.policy.policy import NetworkLaw
-from mjxball.sim.rigs import TRAINING, draw_rigs, held_out, loop_damping, outside, rig_config, unpadded, whole
+from mjxball.sim.rigs import (
+    TRAINING,
+    draw_rigs,
+    held_out,
+    loop_damping,
+    outside,
+    rig_config,
+    trimmed_reach,
+    unpadded,
+    whole,
+)
 from mjxball.sim.rollout import load_of, simulate, start_of
 from mjxball.sim.scenario import Scenario
 
@@ -56,6 +66,9 @@ def test_draws_are_seeded_within_their_ranges_and_never_those_of_training() -> N
     assert not np.isin(held_out(UNIVERSAL, 3, 40).reach, drawn.rigs.reach).any()
     for row in range(40):
         assert not outside(rig_config(UNIVERSAL, drawn.rigs, row), UNIVERSAL)
+    for axis in (0, 1):
+        found = loop_damping(drawn.rigs.frequency[:, axis], drawn.rigs.damping, drawn.rigs.numbers.rotor_lag[:, 0])
+        assert found.min() >= UNIVERSAL.rigs.least_damping
 
 
 def test_damping_is_that_of_the_roots() -> None:
@@ -77,6 +90,16 @@ def test_followers_can_hold_every_load_as_far_as_it_goes() -> None:
                 place = tuple(0.999 * rigs.reach[row] * np.array([np.cos(angle), np.sin(angle)]))
                 mass, believed = float(rigs.object_mass[row]), float(rigs.believed_mass[row])
                 assert largest_margin(plant, mass, place, believed, thrust=thrust).margin > margin - 1e-6
+
+
+def test_a_wrong_belief_takes_from_what_tilt_commands_hold() -> None:
+    rigs = held_out(UNIVERSAL, 3, 8)
+    numbers, load, full = whole(rigs.numbers, 9.81), rigs.object_mass, np.ones_like(rigs.thrust)
+    right, less, more = (trimmed_reach(numbers, load, k * load, full, 0.15, 0.01, 6.0) for k in (1.0, 0.9, 1.1))
+    held = 0.85 * 0.01 * 2 * numbers.gains.kp[:, :2].min(axis=1)  # by two followers, of limits of 0.01 rad
+    np.testing.assert_allclose(right, held / (9.81 * load), rtol=1e-12)
+    assert (less < right).all()
+    assert (more < right).all()
 
 
 def test_rig_laws_fly_together_as_each_alone() -> None:

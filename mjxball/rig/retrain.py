@@ -60,7 +60,6 @@ def retrain(options: argparse.Namespace) -> int:
     flown = load_file(options.policy)
     config = config_of(flown.card)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA warns of every program that its cache gives
     _say(text="retraining: loading JAX")
     try:
         from mjxball.cache import enable_compilation_cache
