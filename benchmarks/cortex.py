@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 HOST = ("gcc",)
 ARM = ("arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16")
-STRICT = ("-std=c11", "-Wall", "-Wextra", "-Werror", "-O2", "-ffp-contract=off", "-fno-math-errno")  # as the apps
+STRICT = ("-std=c11", "-Wall", "-Wextra", "-Werror", "-ffp-contract=off", "-fno-math-errno")
 QEMU = ("qemu-system-arm", "-M", "netduinoplus2", "-nographic", "-semihosting-config", "enable=on,target=native")
 CLOCK = 168e6  # [Hz]
 TOOLS = ("gcc", "arm-none-eabi-gcc", "qemu-system-arm")
@@ -99,12 +99,15 @@ def run(command: Sequence[str], place: Path, limit: float = 600.0) -> str:
 
 
 def build(place: Path, main: str, flags: Sequence[str] = ()) -> None:
-    """Compile `main`, which uses file_open and so on, for both machines, into `host` and `arm.elf` in `place`."""
+    """Compile `main`, which uses file_open and so on, for both machines, into `host` and `arm.elf` in `place`.
+
+    `flags` are the apps', with their level of optimization; the host's is that of the twin.
+    """
     (place / "main.c").write_text(main)
     (place / "board.c").write_text(BOARD)
     (place / "computer.c").write_text(COMPUTER)
     (place / "layout.ld").write_text(LAYOUT)
-    run([*HOST, *STRICT, *flags, "main.c", "computer.c", "-o", "host"], place)
+    run([*HOST, *STRICT, *flags, "-O2", "main.c", "computer.c", "-o", "host"], place)
     link = ["-nostartfiles", "-T", "layout.ld", "-Wl,-Map=arm.map", "-Wl,--gc-sections"]
     split = ["-ffunction-sections", "-fdata-sections"]
     run([*ARM, *STRICT, *split, "-fno-builtin", *flags, "main.c", "board.c", *link, "-o", "arm.elf"], place)

@@ -21,7 +21,7 @@ import numpy as np
 import cortex
 from mjxball.errors import InputError
 from mjxball.export import in_team
-from mjxball.fly.app.generate import rig_header, sources
+from mjxball.fly.app.generate import options, rig_header, sources
 from mjxball.fly.card import config_of
 from mjxball.policy import Policy, PolicyFile
 from mjxball.policy.file import law_of, load_file, shipped_policies
@@ -84,7 +84,7 @@ def flown(policy: PolicyFile, steps: int) -> tuple[np.ndarray, np.ndarray]:
 def compare(policy: PolicyFile, place: Path, int8: bool, steps: int) -> dict[str, Any]:
     """Both machines and NumPy on `steps` observations."""
     (place / "policy.h").write_text(c_header(policy, "follower", int8))
-    cortex.build(place, MAIN)
+    cortex.build(place, MAIN, options(int8))
     records, actions = flown(policy, steps)
     host, arm = cortex.on_both(place, records.tobytes())
     found = np.frombuffer(arm, np.float32).reshape(steps, -1)[:, :3]
@@ -108,7 +108,7 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> dict[str, Any]:
         return row
     for name in ("core.c", "core.h"):
         (place / name).write_text((sources() / name).read_text())
-    flags = ["-DMJXBALL_FOLLOWER=1"]
+    flags = [*options(int8), "-DMJXBALL_FOLLOWER=1"]
     stack = cortex.stack(place, flags, "core.c", "mjxball_tick")
     return {**row, "flash": cortex.sizes(place, flags, "core.c"), "stack": stack}
 

@@ -25,23 +25,32 @@ needs_arm = pytest.mark.skipif(bool(cortex.missing()), reason=f"not installed: {
 
 
 INTERFACE = Path(__file__).parent / "firmware" / "interface.h"
+STRICT = ("-std=c11", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion")
+FIRMWARE = (  # its Kbuild's, release 2026.08: gcc's dialect has functions of its own such as finite
+    *("-std=gnu11", "-Os", "-Wall", "-Wmissing-braces", "-Wdouble-promotion", "-Werror", "-Werror=implicit-int"),
+    *("-fno-strict-aliasing", "-ffunction-sections", "-fdata-sections", "-fno-strict-overflow", "-fno-math-errno"),
+    *("-Wno-pointer-sign", "-Wno-unused-but-set-variable", "-Wno-unused-const-variable"),
+)
 
 
 @pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("name", ["flight", "flight --int8", "stand", "universal"])
 def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
-    policy, *flags = name.split()
-    assert call(export, [shipped_policy(policy), tmp_path / "app", "--crazyflie", *flags]) == 0
+    policy, *more = name.split()
+    assert call(export, [shipped_policy(policy), tmp_path / "app", "--crazyflie", *more]) == 0
     glue = (tmp_path / "app/src/glue.c").read_text()
     (tmp_path / "include").mkdir()
     for header in set(re.findall(r'#include "(\w+\.h)"', glue)) - {"core.h"}:
         (tmp_path / "include" / header).write_text(f'#include "{INTERFACE}"\n')
-    strict = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion", "-I", str(tmp_path / "include"), "-c"]
+    include = ["-I", str(tmp_path / "include"), "-c"]
     compilers = [["gcc"], *([[*cortex.ARM]] if not cortex.missing() else [])]
-    for compiler, (number, role) in itertools.product(compilers, enumerate(generate.ROLES)):
+    for compiler, flags, (number, role) in itertools.product(compilers, (STRICT, FIRMWARE), enumerate(generate.ROLES)):
+        kbuild = (tmp_path / "app" / role / "src/Kbuild").read_text()
         for source in ("core", "glue"):
-            options = [*compiler, *strict, f"-DMJXBALL_FOLLOWER={number}", f"src/{source}.c", "-o", "out.o"]
+            own = re.search(rf"^CFLAGS_{source}.o := (.*)$", kbuild, re.M)[1].split()
+            assert f"-DMJXBALL_FOLLOWER={number}" in own
+            options = [*compiler, *flags, *include, *own, f"src/{source}.c", "-o", "out.o"]
             done = subprocess.run(options, cwd=tmp_path / "app" / role, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
     words = int(re.search(r"STACKSIZE=(\d+)", (tmp_path / "app/follower/app-config").read_text())[1])
@@ -118,7 +127,7 @@ def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
         if path in ("src/core.c", "src/core.h", "src/policy.h", "src/rig.h"):
             (tmp_path / Path(path).name).write_text(text)
     for number in range(2):
-        cortex.build(tmp_path, REPLAY, [f"-DMJXBALL_FOLLOWER={number}"])
+        cortex.build(tmp_path, REPLAY, [*generate.options(False), f"-DMJXBALL_FOLLOWER={number}"])
         host, arm = cortex.on_both(tmp_path, b"".join(records[number]))
         assert len(host) == 900 * (13 * 4 + protocol.BEAT_SIZE)
         assert host == arm

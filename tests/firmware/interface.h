@@ -77,7 +77,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     const state_t *state, const stabilizerStep_t stabilizerStep);
 void appMain(void);
 
-#define APPCHANNEL_MTU 31
+#define APPCHANNEL_MTU 30
 int appchannelSendDataPacket(void *data, size_t length);
 size_t appchannelReceiveDataPacket(void *buffer, size_t max_length, int timeout_ms);
 

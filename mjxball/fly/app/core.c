@@ -49,7 +49,7 @@ static float clip(float value, float low, float high) {
 }
 
 /* NaN and infinity less themselves are not 0. */
-static bool finite(const float *values, int count) {
+static bool all_finite(const float *values, int count) {
     for (int k = 0; k < count; k++)
         if (!(values[k] - values[k] == 0)) return false;
     return true;
@@ -234,7 +234,7 @@ static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
 #endif
         if (!app->copying) {
             mjxball_follow(&app->follower, observation, app->action, command);
-            good = finite(command, 3);
+            good = all_finite(command, 3);
         }
         if (app->copying || !good) mjxball_copy_law(observation, command);
 #ifdef MJXBALL_MOUNT_ANGLE
@@ -325,7 +325,7 @@ static bool mount_is_set(const mjxball_parameters *set) {
 static bool state_is_good(const mjxball_state *state, uint32_t now) {
     const float *q = state->quaternion;
     float size = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-    return finite(state->position, 3) && finite(state->velocity, 3) && finite(state->rates, 3) && size > 0.9f
+    return all_finite(state->position, 3) && all_finite(state->velocity, 3) && all_finite(state->rates, 3) && size > 0.9f
         && size < 1.1f && now - state->time <= STATE_AGE;
 }
 
@@ -483,7 +483,7 @@ static void fly(mjxball_app *app, const seen *one, const mjxball_map *map, mjxba
         app->copying = 1;
         if (app->phase == MJXBALL_FLY) enter(app, MJXBALL_LAND, app->late > 10 ? MJXBALL_LATE : MJXBALL_BAD_COMMAND, map);
     }
-    if (!finite(app->command, 3)) {
+    if (!all_finite(app->command, 3)) {
         app->trusted = 0;
         enter(app, MJXBALL_DESCEND, MJXBALL_BAD_STATE, map);
         descend(app, false, out);
@@ -582,7 +582,7 @@ void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now)
     copy(&beat.key, data + 4, 4);
     copy(beat.integral, data + 8, 16);
     copy(beat.velocity, data + 24, 12);
-    if (!finite(beat.integral, 4) || !finite(beat.velocity, 3)) return;
+    if (!all_finite(beat.integral, 4) || !all_finite(beat.velocity, 3)) return;
     app->peer = beat;
     app->peer_time = now ? now : 1;
 }
