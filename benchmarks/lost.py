@@ -1,6 +1,6 @@
 """Teams that lose a follower in flight: how many flights the rotors that are left can trim, and who holds these.
 
-    python benchmarks/lost.py [POLICY.npz ...] --json benchmarks/results/lost.json
+    python benchmarks/lost.py policies/team.npz policies/lost.npz --json benchmarks/results/lost.json
 
 Random flights of `team6`: mass, elliptic CG path, goal, which follower's rotors stop and when. A flight counts where
 `mjxball.plant.trim` finds 15 % margin at every point of the path with that drone lost, the leader on its hover law. It
@@ -28,18 +28,19 @@ from mjxball import cli
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset, replace, with_plant
 from mjxball.control.followers import Follower
+from mjxball.evaluate.batch import Batch, Course
 from mjxball.evaluate.policies import load_policy
 from mjxball.plant.trim import largest_margin
-from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import CgPath, Scenario
 
-FLIGHTS, SECONDS, BATCH = 200, 40.0, 50
+FLIGHTS, SECONDS = 200, 40.0
 MASSES, AMPLITUDES, SPEEDS, TIMES = (0.05, 0.4), (0.0, 0.3), (0.1, 3.1), (5.0, 15.0)  # [kg] for each drone, [m], ...
 POINTS = 24  # of a path
-CLASSICAL = ("copy", "adaptive", "adaptive-mass", "lqg", "lqg-known-failures")
+CLASSICAL = ("copy", "adaptive", "adaptive-mass", "lqg", "lqg-offset-free", "lqg-known-failures")
+LIFTED = preset("lost").follower.load_by_lift  # share of the load's torque that `lqg-offset-free` lifts apart here
 VERTICAL_LIMIT, USUAL_LIMIT = 12.0, 6.0  # of commands [m/s2]
 HELD, LAST = 0.05, 10.0  # [m] in the last seconds
-COMES_DOWN = 2.0  # [s] after the loss in which team4's descent is measured
+COMES_DOWN = 5.0  # [s] after the loss in which team4's descent is measured
 ENGINE = "newton-euler"
 
 
@@ -47,10 +48,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Fly, print, write."""
     parser = cli.make_parser("python benchmarks/lost.py", __doc__.split("\n\n")[0])
     parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz")
+    parser.add_argument("--followers", nargs="*", default=CLASSICAL, metavar="NAME", help="baselines (default all)")
+    parser.add_argument("--flights", type=int, default=FLIGHTS)
+    parser.add_argument("--seed", type=int, default=0, help="of the flights")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     six, four = (with_plant(preset("paper"), name) for name in ("team6", "team4"))
-    drawn = flights(six)
+    drawn = flights(six, options.flights, options.seed)
     margins = [margin(six, scenario) for scenario in drawn]
     least = six.scenario.trim_margin
     feasible = [scenario for scenario, left in zip(drawn, margins, strict=True) if left >= least]
@@ -61,23 +65,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     }
     print(f"team6: {len(drawn)} flights, {shares['with margin']:.1%} trimmed with a margin of {least:g}", end="")
     print(f" ({shares['without']:.1%} with none)")
-    held = table(six, feasible, options.policies)
+    held = table(six, feasible, options.followers, options.policies)
     unlimited = dataclasses.replace(four.plant, rotor_force_max=math.inf)
     best = [largest_margin(unlimited, four.plant.object_mass, (0.0, 0.0), lost=(k,)).margin for k in (1, 2, 3)]
     shown = ", ".join(f"{left:.3f}" for left in best)
     print(f"team4: largest margin with the CG at O and rotors of any size, follower 1, 2, 3 lost: {shown}")
-    down = descents(replace(four, "command.vertical_limit", VERTICAL_LIMIT), options.policies)
+    down = descents(replace(four, "command.vertical_limit", VERTICAL_LIMIT), options.followers, options.policies)
     if options.json:
         found = {"margin": least, "team6": {**shares, "held": held}, "team4": {"margins": best, "descents": down}}
         options.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
     return 0
 
 
-def flights(config: Config) -> list[Scenario]:
+def flights(config: Config, count: int = FLIGHTS, seed: int = 0) -> list[Scenario]:
     """Random ones."""
-    random, drones = np.random.default_rng(0), config.plant.count
+    random, drones = np.random.default_rng(seed), config.plant.count
     drawn = []
-    for _ in range(FLIGHTS):
+    for _ in range(count):
         path = CgPath(random.uniform(0, 2 * math.pi), random.uniform(0, 1), 1.0, math.pi / 2)
         goal = random.uniform(-1, 1, 3)
         drawn.append(
@@ -106,19 +110,24 @@ def margin(config: Config, scenario: Scenario) -> float:
     return min(largest_margin(config.plant, scenario.mass, place, lost=(lost,)).margin for place in places)
 
 
-def followers_of(config: Config, policies: Sequence[Path]) -> list[Follower]:
-    """Classical ones and policies."""
-    return [*(make_baseline(name, config) for name in CLASSICAL), *(load_policy(path, config) for path in policies)]
+def flying(config: Config, names: Sequence[str], policies: Sequence[Path]) -> list[tuple[Config, Follower]]:
+    """Classical followers and policies, each with the configuration that it flies with."""
+    apart = replace(replace(config, "follower.base", "lqg"), "follower.load_by_lift", LIFTED)
+    setups = [apart if name == "lqg-offset-free" else config for name in names]
+    made = [(setup, make_baseline(name, setup)) for name, setup in zip(names, setups, strict=True)]
+    return [*made, *((config, load_policy(path, config)) for path in policies)]
 
 
-def table(config: Config, feasible: list[Scenario], policies: Sequence[Path]) -> list[dict[str, Any]]:
+def table(
+    config: Config, feasible: list[Scenario], names: Sequence[str], policies: Sequence[Path]
+) -> list[dict[str, Any]]:
     """What every follower holds, with the loss and without."""
     whole = [dataclasses.replace(scenario, lost=()) for scenario in feasible]
+    strong, usual = (replace(config, "command.vertical_limit", limit) for limit in (VERTICAL_LIMIT, USUAL_LIMIT))
+    known = [name for name in names if name == "lqg-known-failures"]
     rows = []
     print(f"{'follower':>16}{'limit':>8}{'failed':>10}{'held':>10}{'no loss':>10}{'peak m':>10}{'tilt deg':>10}")
-    strong, usual = (replace(config, "command.vertical_limit", limit) for limit in (VERTICAL_LIMIT, USUAL_LIMIT))
-    flying = [(strong, follower) for follower in followers_of(strong, policies)]
-    for setup, follower in [*flying, (usual, make_baseline("lqg-known-failures", usual))]:
+    for setup, follower in [*flying(strong, names, policies), *flying(usual, known, ())]:
         lost, free = (flown(setup, follower, scenarios) for scenarios in (feasible, whole))
         row = {
             "follower": follower.name,
@@ -140,38 +149,36 @@ def table(config: Config, feasible: list[Scenario], policies: Sequence[Path]) ->
 
 def flown(config: Config, follower: Follower, scenarios: list[Scenario]) -> dict[str, np.ndarray]:
     """Of every flight: whether it failed and was held, largest |e_o| [m] and tilt [deg] from the loss on."""
-    parts = [_part(config, follower, scenarios[at : at + BATCH]) for at in range(0, len(scenarios), BATCH)]
-    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-
-
-def _part(config: Config, follower: Follower, scenarios: list[Scenario]) -> dict[str, np.ndarray]:
-    flight = simulate_batch(config, [(follower, scenarios)], ENGINE)
+    flight = Batch(config, follower, ENGINE).course(scenarios)
     distance = np.linalg.norm(flight.error, axis=-1)
     lost = np.array([scenario.lost[0][1] if scenario.lost else 0.0 for scenario in scenarios])
     after = flight.time[:, None] >= lost
-    failed = flight.diverged | (distance.max(axis=0) > config.scenario.termination_distance)
+    failed = flight.diverged | ~(distance.max(axis=0) <= config.scenario.termination_distance)
     end = distance[flight.time >= SECONDS - LAST].max(axis=0)
-    tilt = np.degrees(np.hypot(flight.euler[..., 0], flight.euler[..., 1]))
-    peak, most = (np.where(after, value, 0.0).max(axis=0) for value in (distance, tilt))
+    peak, most = (np.where(after, value, 0.0).max(axis=0) for value in (distance, _tilt(flight)))
     return {"failed": failed, "held": ~failed & (end < HELD), "peak": peak, "tilt": most}
 
 
-def descents(config: Config, policies: Sequence[Path]) -> list[dict[str, Any]]:
-    """How fast and how tilted four drones are within 2 s of the loss of each follower."""
+def descents(config: Config, names: Sequence[str], policies: Sequence[Path]) -> list[dict[str, Any]]:
+    """How fast and how tilted four drones are within `COMES_DOWN` of the loss of each follower."""
     mass, when = config.plant.object_mass, 5.0
     scenarios = [
         Scenario(amplitude=0.0, mass=mass, goal=(0.0, 0.0, 0.0), seconds=when + COMES_DOWN, lost=((number, when),))
         for number in config.plant.followers
     ]
     rows = []
-    for follower in followers_of(config, policies):
-        flight = simulate_batch(config, [(follower, scenarios)], ENGINE)
-        speed = np.maximum(-flight.velocity[..., 2], 0.0).max(axis=0)
-        tilt = np.degrees(np.hypot(flight.euler[..., 0], flight.euler[..., 1]).max(axis=0))
+    for setup, follower in flying(config, names, policies):
+        flight = Batch(setup, follower, ENGINE).course(scenarios)
+        speed, tilt = np.maximum(-flight.velocity[..., 2], 0.0).max(axis=0), _tilt(flight).max(axis=0)
         rows.append({"follower": follower.name, "descent": speed.tolist(), "tilt": tilt.tolist()})
         shown = "  ".join(f"{v:.2g} m/s {t:.3g} deg" for v, t in zip(speed, tilt, strict=True))
         print(f"{follower.name:>16}  {shown}")
     return rows
+
+
+def _tilt(flight: Course) -> np.ndarray:
+    """Angle between body z and the vertical [deg]."""
+    return np.degrees(np.arccos(np.cos(flight.euler[..., 0]) * np.cos(flight.euler[..., 1])))
 
 
 def _median(values: np.ndarray) -> float | None:

@@ -22,7 +22,7 @@ from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, total_wrench
 from mjxball.physics.step import make_accelerations, start_state
 from mjxball.plant import plant_parameters
-from mjxball.plant.teams import Factors, padded, ring, ring_config, table, varied
+from mjxball.plant.teams import Factors, amplitudes_with_loss, padded, ring, ring_config, table, varied
 from mjxball.plant.trim import largest_amplitude, safe_radius
 from mjxball.sim.randomization import ResetDistribution
 from mjxball.train import program as programs
@@ -166,8 +166,19 @@ class TestWorlds:
         drawn = jax.jit(jax.vmap(ResetDistribution(config).draw, in_axes=(0, None, 0)))
         load, _, _, rig = drawn(jax.random.split(jax.random.key(0), 400), 1.0, jnp.arange(400))
         stops = np.isfinite(np.asarray(load.stop_time))
-        assert 0.4 < stops.any(axis=1).mean() < 0.6
+        six = np.asarray(rig.flies).sum(axis=1) == 6
+        assert 0.35 < stops[six].any(axis=1).mean() < 0.65
+        assert not stops[~six].any()  # what is left of smaller teams cannot be trimmed
         assert stops.sum(axis=1).max() == 1
+        masses, table = amplitudes_with_loss(config)
+        lost = stops.any(axis=1) & six
+        held = [
+            np.interp(mass, masses, row)
+            for mass, row in zip(load.object_mass[lost], table[-1][stops[lost].argmax(axis=1)], strict=True)
+        ]
+        assert (
+            np.asarray(load.cg_amplitude)[lost] <= np.array(held) * np.asarray(rig.proportion)[lost] * (1 + 1e-4)
+        ).all()
         assert not stops[:, 0].any()  # never the leader
         assert not (stops & (np.asarray(rig.flies) == 0)).any()
         assert stops[:, 5].any()

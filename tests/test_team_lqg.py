@@ -16,6 +16,8 @@ from mjxball.algorithms.base import PolicyNetwork
 from mjxball.baselines import make_baseline
 from mjxball.baselines.team_lqg import team_lqg
 from mjxball.config import Config, preset
+from mjxball.control import rotations
+from mjxball.control.observation import mount_angles
 from mjxball.control.team_lqg import team_context
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
@@ -28,8 +30,8 @@ from mjxball.policy.export import policy_file
 from mjxball.policy.file import save_file
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.follower import follower_law
-from mjxball.sim.rollout import simulate
-from mjxball.sim.scenario import Scenario
+from mjxball.sim.rollout import simulate, simulate_batch
+from mjxball.sim.scenario import CIRCLE, Scenario
 
 TEAM = preset("team")
 ENGINE = "newton-euler"
@@ -206,3 +208,55 @@ def test_every_range_of_a_rig_acts(moved) -> None:
     base = moved()
     for name in (*FACTORS, "rotor_lag", "thrust", "inertia"):
         assert np.abs(moved(name) - base).max() > 1e-5, name
+
+
+def lifting(config: Config) -> Config:
+    return configs.replace(config, "follower.load_by_lift", 0.9)
+
+
+@rows("count", [4, 5, 6])
+def test_lifts_apart_give_the_torque_and_no_lift(count: int) -> None:
+    """By the wrenches of thrusts at their mounts, which `plant.trim` writes down for itself."""
+    config = lifting(ring(count))
+    law, plant = team_lqg(config), config.plant
+    numbers = plant_parameters(plant, config.attitude)
+    known = team_context(numbers, plant, np.float64(plant.object_mass))
+    held = np.array([0.03, -0.02])  # what all drones would command, body axes
+    angles = mount_angles(plant)
+    seen = rotations.turned_about_z(np.broadcast_to([*held, 0.0], (count - 1, 3)), -angles)[:, :2]
+    memory = np.concatenate([np.zeros((count - 1, 13)), known], axis=-1)
+    lifts = law._apart(np.zeros((count - 1, 3)), seen, memory)[:, 2]
+    thrust = lifts * (numbers.known_mass[0] + numbers.share[0] * plant.object_mass)
+    x, y, _ = numbers.mounts[1:].T
+    torque = np.array([(y * thrust).sum(), -(x * thrust).sum()])
+    np.testing.assert_allclose(torque, -count * numbers.gains.kp[:2] * held, rtol=1e-9)
+    assert abs(thrust.sum()) < 1e-9
+
+
+def test_a_follower_that_is_lost_is_made_up_for() -> None:
+    """Six drones with a load on a circle lose each follower in turn; tilting alone ends far away."""
+    config = configs.replace(ring(6), "command.vertical_limit", 12.0)
+    flights = [
+        Scenario(omega=1.0, amplitude=0.1, mass=0.6, path=CIRCLE, goal=(0.0, 0.0, 0.0), seconds=12.0, lost=((k, 3.0),))
+        for k in config.plant.followers
+    ]
+    apart, tilting = (
+        simulate_batch(c, [(make_baseline("lqg-offset-free", c), flights)], ENGINE) for c in (lifting(config), config)
+    )
+    distance = np.linalg.norm(apart.error, axis=-1)
+    assert distance.max() < 0.3
+    assert distance[-50:].max() < 0.05
+    assert (np.linalg.norm(tilting.error[-1], axis=-1) > 2.5).all()
+
+
+def test_lifting_apart_takes_four_drones(tmp_path) -> None:
+    with pytest.raises(InputError, match=r"follower.load_by_lift needs teams of at least 4 drones, not 3"):
+        team_lqg(lifting(ring(3)))
+    path = tmp_path / "apart.npz"
+    save_file(path, silent(lifting(ring(6))))
+    with pytest.raises(InputError, match="apart needs a team of at least 4 drones, not 3"):
+        load_policy(path, ring(3))
+    contents = silent(lifting(ring(6)))
+    odd = dataclasses.replace(contents, card={**contents.card, "lqg": {**contents.card["lqg"], "lifting": 1.5}})
+    with pytest.raises(PolicyFileError, match=r"lqg.lifting must be a share from 0 to 1"):
+        save_file(path, odd)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from mjxball.baselines.lqg import (
 from mjxball.baselines.offset_free import LIFT_WALK, NAME, OffsetFree
 from mjxball.config import Config
 from mjxball.control.followers import copy_gains
-from mjxball.control.team_lqg import TeamLqg, team_context
+from mjxball.control.team_lqg import LEAST_LIFTING, TeamLqg, team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 
@@ -30,9 +30,25 @@ LOAD_TIME, RATE_TIME, LIFT_TIME = 3.0, 0.3, 5.0
 ANGLE_NOISE = 5e-3  # deviation of a measurement [rad]
 
 
-def team_lqg(config: Config, tuning: Tuning = TUNING) -> TeamLqg:
+class Forgetting(NamedTuple):
+    """How fast estimates change."""
+
+    lift_walk: float = LIFT_WALK  # intensity of the white noise that drives the lift error [(m/s2)2/s]
+    lift_time: float = LIFT_TIME  # [s] in which it is forgotten
+
+
+# Of teams that are to outlive a lost follower: what it gave is to be found at once.
+QUICK = Tuning(position=0.1, velocity=0.4, torque_walk=80.0, tilt_limit=0.3)
+QUICK_LIFT = Forgetting(lift_walk=0.3, lift_time=10.0)
+
+
+def team_lqg(config: Config) -> TeamLqg:
     """The law for teams like that of `config`; InputError unless it flies freely with ideal loops that are alike."""
-    model = ideal_model(config, NAME)
+    model, lifting = ideal_model(config, NAME), config.follower.load_by_lift
+    tuning, forgetting = (QUICK, QUICK_LIFT) if lifting else (TUNING, Forgetting())
+    smallest = min(config.scenario.team_sizes, default=config.plant.count)
+    if lifting and smallest < LEAST_LIFTING:
+        raise InputError(f"follower.load_by_lift needs teams of at least {LEAST_LIFTING} drones, not {smallest}")
     roll, pitch, _ = config.attitude.natural_frequency
     if roll != pitch:
         raise InputError(f"follower {NAME!r} needs attitude loops alike about roll and pitch in a team")
@@ -45,9 +61,9 @@ def team_lqg(config: Config, tuning: Tuning = TUNING) -> TeamLqg:
     *axis, axis_gain = steady_filter(a, b, model.period, {3: tuning.torque_walk}, {0: ANGLE_NOISE, 1: RATE_NOISE})
     a, b = np.zeros((3, 3)), np.zeros((3, 1))
     a[0, 1] = a[0, 2] = 1.0
-    a[2, 2] = -1.0 / LIFT_TIME
+    a[2, 2] = -1.0 / forgetting.lift_time
     a[1, 1], b[1] = -1.0 / model.lag, 1.0 / model.lag
-    *height, height_gain = steady_filter(a, b, model.period, {2: LIFT_WALK}, {0: CLIMB_NOISE})
+    *height, height_gain = steady_filter(a, b, model.period, {2: forgetting.lift_walk}, {0: CLIMB_NOISE})
     gains = feedback(model, tuning)
     return TeamLqg(
         axis=np.hstack(axis),
@@ -59,6 +75,7 @@ def team_lqg(config: Config, tuning: Tuning = TUNING) -> TeamLqg:
         limits=np.array([tuning.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
         stiffness=stiffness,
         damping=damping / stiffness,
+        lifting=lifting,
     )
 
 

@@ -186,6 +186,21 @@ def _team() -> Config:
     )
 
 
+def _lost() -> Config:
+    """Six drones of which one may be lost; the followers hold most of the load by lifting apart."""
+    team = _team()
+    return replace(
+        team,
+        preset="lost",
+        command=replace(team.command, vertical_limit=12.0),
+        follower=replace(team.follower, load_by_lift=0.9, action_scale_vertical=4.0),
+        scenario=replace(team.scenario, team_sizes=(), object_mass=(0.3, 2.4), lost_follower_probability=0.6),
+        sac=replace(team.sac, num_envs=560, replay_size=560_000),
+        ppo=Ppo(num_envs=560),
+        gradient=replace(team.gradient, num_envs=65, windows_per_episode=6, until_termination=True),
+    )
+
+
 def _universal() -> Config:
     """One follower for teams of any drones and loads, which is told nothing of its rig."""
     large = _transport_large()
@@ -262,7 +277,7 @@ PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
         made.preset: made
         for made in (
             *(_transport(), _paper(), _transport_large(), _robust(), _balance()),
-            *(_team(), _plate(), _universal(), stand(), flight()),
+            *(_team(), _lost(), _plate(), _universal(), stand(), flight()),
         )
     }
 )

@@ -16,6 +16,7 @@ from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_f
 from mjxball.plant import PlantParameters
 
 Array = Any
+LEAST_LIFTING = 4  # drones of a team that lifts apart: with three, two followers lift without the leader
 UNKNOWN_ROOM = 0.15  # [rad] that the rotors of a rig which nobody knows can follow
 ANGLE_STATES, HEIGHT_STATES, CONTEXT = 5, 3, 5
 STATES = 2 * ANGLE_STATES + HEIGHT_STATES
@@ -40,6 +41,7 @@ class TeamLqg(NamedTuple):
     limits: Array  # (3,) of the error's part in a tilt [rad], of that in the height [m/s2], against the load [rad]
     stiffness: float  # natural frequency of the closed attitude loops, squared [1/s2]
     damping: float  # Kd over Kp of the attitude loops [s]
+    lifting: float = 0.0  # share of the load's torque that followers hold by lifting apart, the rest by tilting
 
     @property
     def size(self) -> int:
@@ -87,22 +89,42 @@ class TeamLqg(NamedTuple):
 
         `leader`: the arguments of `copy_command` after the observation.
         """
-        return self._plan(memory, observation, leader)[0] + added
+        own, held = self._plan(memory, observation, leader)[:2]
+        return (own if held is None else self._apart(own, held, memory)) + added
 
     def next(self, memory: Array, observation: Array, command: Array, leader: tuple[Any, ...]) -> Array:
         """Memory of the next step, after `observation` was answered; `command` is not read."""
         xp, dtype = observation.__array_namespace__(), observation.dtype
-        own, turning, rising = self._plan(memory, observation, leader)
+        own, held, turning, rising = self._plan(memory, observation, leader)
         led, share = copy_command(observation, *leader), memory[..., STATES : STATES + 1]
         mean = (own + (share - 1.0) * led) / share
         drive = mean[..., :2] + memory[..., STATES + 1 : STATES + 3] * (own - led)[..., 2:]
+        drive = drive if held is None else drive - held
         axis, height = (xp.asarray(part, dtype=dtype).T for part in (self.axis, self.height))
         angles = [xp.concat([turning[..., k, :], drive[..., k : k + 1]], axis=-1) @ axis for k in (0, 1)]
         climbing = xp.concat([rising, mean[..., 2:]], axis=-1) @ height
         return xp.concat([*angles, climbing, memory[..., STATES:]], axis=-1)
 
-    def _plan(self, memory: Array, observation: Array, leader: tuple[Any, ...]) -> tuple[Array, Array, Array]:
-        """(the law's own command, only its vertical part clipped, estimates)."""
+    def _apart(self, own: Array, held: Array, memory: Array) -> Array:
+        """`own` command (..., 3) and what this follower lifts more to hold `held` (..., 2), a command of all drones.
+
+        On a ring of N drones lifts in proportion to their places give a torque with the least effort; F = N - 1
+        followers without the leader, whose lifts are to sum to 0, have to give (N - 1) / (N - 3) about its axis.
+        """
+        xp = own.__array_namespace__()
+        share, lever = memory[..., STATES : STATES + 1], memory[..., STATES + 1 : STATES + 3]
+        length = xp.sqrt((lever * lever).sum(axis=-1, keepdims=True) + 1e-12)
+        count = share / (share - 1.0)
+        led = lever / length
+        along = (led * held).sum(axis=-1, keepdims=True)
+        torque = held[..., 1:] + led[..., 1:] * along * (2.0 / (count - 3.0))
+        lifts = (torque - along / (count - 3.0)) * 2.0 / (count * length)
+        return xp.concat([own[..., :2], own[..., 2:] - lifts], axis=-1)
+
+    def _plan(
+        self, memory: Array, observation: Array, leader: tuple[Any, ...]
+    ) -> tuple[Array, Array | None, Array, Array]:
+        """(the law's own command, only its vertical part clipped; what of the load is lifted apart; estimates)."""
         xp = observation.__array_namespace__()
         turning, rising = self.estimate(memory, observation)
         led, share = copy_command(observation, *leader), memory[..., STATES]
@@ -117,11 +139,15 @@ class TeamLqg(NamedTuple):
         far = _within(xp, xp.stack([-far[..., 1], far[..., 0]], axis=-1), tilt_limit)
         wanted = far - k_angle * observation[..., 3:5] - k_rate * observation[..., 9:11]
         load = turning[..., 2] / self.stiffness + lever * (vertical - led[..., 2])[..., None]
-        wanted = wanted - _within(xp, load, load_limit)
+        load, held = _within(xp, load, load_limit), None
+        if self.lifting > 0:
+            held = float(self.lifting) * load
+            load = load - held
+        wanted = wanted - load
         own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
         rest = observation[..., 3:5] + self.damping * observation[..., 9:11]
         own = rest + most * _within(xp, (own - rest) / most, 1.0)
-        return xp.concat([own, vertical[..., None]], axis=-1), turning, rising
+        return xp.concat([own, vertical[..., None]], axis=-1), held, turning, rising
 
 
 def team_context(parameters: PlantParameters, plant: Plant, object_mass: Array) -> Array:

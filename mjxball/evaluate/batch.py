@@ -1,4 +1,4 @@
-"""Any number of flights as one compiled program that keeps only their metrics: for batches no memory would hold."""
+"""Any number of flights as one compiled program: only their metrics, for batches no memory would hold, or `Course`s."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
 from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
-from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_control_step
+from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_cg_offset, make_control_step
 from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim import rollout
@@ -27,7 +27,7 @@ from mjxball.sim.disturbances import Sample, SensorModel, followers_axis, record
 from mjxball.sim.scenario import Scenario, check_scenario
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 
 class Carry(NamedTuple):
@@ -48,8 +48,19 @@ class Inputs(NamedTuple):
     sample: Sample  # of the measurement at its end
 
 
+class Course(NamedTuple):
+    """What `n` flights did, row by row from the start, in float32."""
+
+    time: Float[np.ndarray, " rows"]  # [s]
+    error: Float[np.ndarray, "rows n 3"]  # goal less place of O [m]
+    velocity: Float[np.ndarray, "rows n 3"]  # of O [m/s]
+    euler: Float[np.ndarray, "rows n 3"]  # [rad]
+    cg_offset: Float[np.ndarray, "rows n ..."]  # [m]
+    diverged: Bool[np.ndarray, " n"]
+
+
 class Batch:
-    """One follower and one configuration, for `n` flights of one length. `fly` compiles at its first call."""
+    """One follower and one configuration, for `n` flights of one length. Each method compiles at its first call."""
 
     def __init__(self, config: Config, follower: Follower, physics: str = "newton-euler"):
         if physics not in TRAINING_ENGINES:
@@ -60,11 +71,23 @@ class Batch:
         step = make_control_step(config, make(config.plant, config.attitude), jax_repeat)
         self._physics = jax.vmap(step)
         self._privileged = rollout.make_privileged_info(config)
+        self._offset = make_cg_offset(config)
         self._shares = np.float32(not isinstance(follower, Baseline))
         self._compiled: dict[Any, Any] = {}
 
     def fly(self, scenarios: Sequence[Scenario]) -> list[Metrics]:
         """Metrics of every flight, computed in float32."""
+        return metrics.results(self._run(scenarios, False)[0])
+
+    def course(self, scenarios: Sequence[Scenario]) -> Course:
+        """Every step of every flight."""
+        rows = self._run(scenarios, True)[1]
+        error, velocity, euler, offset, diverged = (np.asarray(part) for part in rows)
+        time = np.arange(len(error)) * self._config.timing.control_period
+        return Course(time, error, velocity, euler, offset, diverged[-1])
+
+    def _run(self, scenarios: Sequence[Scenario], keeps: bool) -> Any:
+        """(metrics, rows of `Course` or None)."""
         for scenario in scenarios:
             check_scenario(self._config, scenario)
         if len({scenario.seconds for scenario in scenarios}) != 1:
@@ -85,32 +108,43 @@ class Batch:
             np.arange(count + 1, dtype=np.int32), (goals[:-1], goals[1:]), force, later._replace(force=None)
         )
         with jax.default_matmul_precision("highest"):
-            running = self._program(sensors, delays)(start, load, goals[0], samples.at(0), inputs)
-        return metrics.results(running)
+            return self._program(sensors, delays, keeps)(start, load, goals[0], samples.at(0), inputs)
 
-    def _program(self, sensors: SensorModel, delays: np.ndarray) -> Any:
+    def _program(self, sensors: SensorModel, delays: np.ndarray, keeps: bool) -> Any:
         """The compiled flight; delays, biases and resolutions are constants in it, everything else is given to it."""
         bias = None if sensors.relay_bias is None else sensors.relay_bias.tobytes()
-        key = (delays.tobytes(), bias, np.asarray(sensors.quantized).tobytes())
+        key = (delays.tobytes(), bias, np.asarray(sensors.quantized).tobytes(), keeps)
         if key not in self._compiled:
             loop = ClosedLoop(self._config, self._physics, sensors)
-            self._compiled[key] = jax.jit(lambda *parts: self._all(loop, delays, *parts))
+            self._compiled[key] = jax.jit(lambda *parts: self._all(loop, delays, keeps, *parts))
         return self._compiled[key]
 
     def _all(
         self,
         loop: ClosedLoop,
         delays: Int[Array, " n"],
+        keeps: bool,
         start: PlantState,
         load: Load,
         goal: Float[Array, "n 3"],
         first: Sample,
         inputs: Inputs,
-    ) -> metrics.RunningMetrics:
+    ) -> tuple[metrics.RunningMetrics, Any]:
         state, observation = loop.start(start, goal, first, delays)
         running = metrics.begin(start.position, goal, start.rotor_force, self._config.plant.leader)
         carry = Carry(state, observation, self._law.start(observation), running)
-        return jax.lax.scan(lambda c, i: (self._step(loop, load, c, i), None), carry, inputs)[0].running
+
+        def step(carry: Carry, inputs: Inputs) -> tuple[Carry, Any]:
+            return self._step(loop, load, carry, inputs), self._seen(carry, load, inputs) if keeps else None
+
+        last, rows = jax.lax.scan(step, carry, inputs)
+        return last.running, rows
+
+    def _seen(self, carry: Carry, load: Load, inputs: Inputs) -> tuple[Array, ...]:
+        plant = carry.loop.plant
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
+        offset = self._offset(plant, load)
+        return inputs.goals[0] - plant.position, plant.velocity, euler, offset, carry.loop.diverged
 
     def _step(self, loop: ClosedLoop, load: Load, carry: Carry, inputs: Inputs) -> Carry:
         config, state, observation = self._config, carry.loop, carry.observation

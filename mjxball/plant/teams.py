@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from typing import Any, NamedTuple
 
@@ -12,6 +13,7 @@ from mjxball.config import Attitude, Config, Plant
 from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, plant_parameters, rigid_inertia
 
 Array = Any
+LOSS_MASSES, LOSS_DIRECTIONS = 6, 8
 
 
 class Factors(NamedTuple):
@@ -90,6 +92,33 @@ def table(config: Config) -> PlantParameters:
         **{name: np.stack([getattr(one, name) for one in found]) for name in found[0]._fields if name != "gains"},
         gains=gains,
     )
+
+
+def amplitudes_with_loss(config: Config) -> tuple[np.ndarray, np.ndarray]:
+    """(masses (M,) [kg] of `scenario.object_mass`, CG amplitudes (S, N, M) [m]) that are trimmed after a loss.
+
+    In every direction with `scenario.trim_margin`, by the linear program of `plant.trim`, the leader on its hover law;
+    of each of `scenario.team_sizes`, or of the plant alone, when that drone is lost, over the ring's radius in
+    proportion to the plant's. Negative: none, as for the leader. Needs SciPy.
+    """
+    from mjxball.plant.trim import largest_amplitude
+
+    scenario, most = config.scenario, config.plant.count
+    masses = np.linspace(*scenario.object_mass, LOSS_MASSES)
+    angles = math.pi * np.arange(LOSS_DIRECTIONS) / LOSS_DIRECTIONS
+    ways = [(math.cos(angle), math.sin(angle)) for angle in angles]
+    if len(config.plant.directions) == 1:
+        ways = [tuple(np.eye(2)[config.plant.directions[0]])]
+    found = np.full((len(scenario.team_sizes or (most,)), most, LOSS_MASSES), -1.0)
+    for row, count in enumerate(scenario.team_sizes or (most,)):
+        plant = ring(config.plant, count) if scenario.team_sizes else config.plant
+        wide = plant.object_size[0] / config.plant.object_size[0]
+        for number, (column, mass) in itertools.product(plant.followers, enumerate(masses)):
+            held = [
+                largest_amplitude(plant, mass * count / most, scenario.trim_margin, way, lost=(number,)) for way in ways
+            ]
+            found[row, number, column] = max(min(held) / wide, -1.0)
+    return masses, found
 
 
 def varied(parameters: PlantParameters, factors: Factors, attitude: Attitude, object_mass: Array) -> PlantParameters:

@@ -87,6 +87,7 @@ TEAM_LQG_SHAPES: dict[str, tuple[int, ...]] = {
     "stiffness": (),
     "damping": (),
 }
+LATER_LQG_SHAPES: dict[str, tuple[int, ...]] = {"lifting": ()}  # of teams, absent from the first files
 
 
 def law_of(card: dict[str, Any]) -> FollowerLaw:
@@ -109,7 +110,7 @@ def _lqg_of(card: dict[str, Any]) -> OffsetFreeLqg | TeamLqg | None:
     if lqg is None:
         return None
     if card["format_version"] == 3:
-        return TeamLqg._make(np.array(lqg[name]) for name in TEAM_LQG_SHAPES)
+        return TeamLqg(**{name: np.array(value) for name, value in lqg.items()})
     return OffsetFreeLqg._make(np.array(lqg[name]) for name in LQG_SHAPES)
 
 
@@ -274,6 +275,8 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
     """Raise PolicyFileError unless format 2 has the numbers of an offset-free LQG and format 1 has none."""
     lqg, in_team = card.get("lqg"), card["format_version"] == 3
     shapes = TEAM_LQG_SHAPES if in_team else LQG_SHAPES
+    if in_team and isinstance(lqg, dict):
+        shapes = shapes | {field: shape for field, shape in LATER_LQG_SHAPES.items() if field in lqg}
     if card["format_version"] == 1:
         if lqg is not None:
             raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 and 3, not 1")
@@ -291,6 +294,8 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
         _check_team(card["team"], name)
     if min(np.min(lqg[field]) for field in positive) <= 0:
         raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
+    if not 0 <= lqg.get("lifting", 0) <= 1:
+        raise PolicyFileError(f"{name}: card field lqg.lifting must be a share from 0 to 1")
 
 
 def _check_team(team: Any, name: str) -> None:

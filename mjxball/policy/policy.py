@@ -12,7 +12,7 @@ import numpy as np
 from mjxball.config import Attitude, Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.team_lqg import nominal_context, team_context
+from mjxball.control.team_lqg import LEAST_LIFTING, nominal_context, team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import COUNT, PolicyFile, law_of, load_file
@@ -38,6 +38,8 @@ def context_of(name: str, card: dict[str, Any], plant: Plant | None, attitude: A
             f"policy {name} was made for free flight with attitude loops of {made_for:g} rad/s, "
             f"not {found[0]:g} and {found[1]:g} on a stand that is {plant.stand}"
         )
+    if float(card["lqg"].get("lifting", 0)) > 0 and plant.count < LEAST_LIFTING:
+        raise InputError(f"policy {name} needs a team of at least {LEAST_LIFTING} drones, not {plant.count}")
     return np.asarray(team_context(plant_parameters(plant, attitude), plant, np.float64(plant.object_mass)))
 
 

@@ -73,6 +73,7 @@ class ResetDistribution:
         self._motor = motors.MOTORS[config.autopilot.drone or "2.1"]
         self._lever = 2 * min(map(abs, constants.mounts[:, plant.directions[0]]))
         self._levels = config.follower.residual_on_pid and config.leader.tilt_integral_gain > 0
+        self._held_with_loss = teams.amplitudes_with_loss(config) if scenario.lost_follower_probability > 0 else None
         self._drones = constants.own_inertia.sum(axis=0)
         self._object = constants.object_inertia_per_mass
 
@@ -185,14 +186,16 @@ class ResetDistribution:
         return jnp.minimum(*limits)
 
     def _commanded_radius(self, numbers: PlantParameters, object_mass: Scalar) -> Scalar:
-        """Distance of the CG from O that the followers' tilt commands hold by torque alone, `trim_margin` left [m].
+        """Distance of the CG from O that the followers' tilt commands hold, with their share, `trim_margin` left [m].
 
         Small teams are light about the axis through their drones, and their attitude gains with it.
         """
         margin, tilt = self.config.scenario.trim_margin, self.config.follower.action_scale_tilt
         flying = (jnp.asarray(numbers.drone_mass) > 0).sum() - 1
         gain = jnp.min(jnp.asarray(numbers.gains.kp)[..., :2], axis=-1)
-        return (1 - margin) * flying * gain * tilt / (numbers.gravity * object_mass)
+        held = (1 - margin) * flying * gain * tilt / (numbers.gravity * object_mass)
+        by_lift = self.config.follower.load_by_lift
+        return held / (1 - by_lift) if by_lift < 1 else jnp.full_like(held, jnp.inf)
 
     def _varied(self, load: Load, key: Array) -> Load:
         """`load` with rotors and inertia of its own."""
@@ -263,14 +266,25 @@ class ResetDistribution:
         return load._replace(cg_amplitude=jnp.minimum(load.cg_amplitude * proportion, limit / longest), cg_shape=shape)
 
     def _losing(self, load: Load, key: Array, rig: Rig | None) -> Load:
-        """`load` in whose flight perhaps the rotors of one follower stop."""
+        """`load` in whose flight perhaps the rotors of one follower stop, its CG within what the others can trim.
+
+        None stops where no place of the CG can be trimmed then, unless `trim_margin` is negative; there the CG stays.
+        """
         followers, scenario = np.array(self.config.plant.followers), self.config.scenario
+        masses, table = self._held_with_loss  # type: ignore[misc]
         lost, which, when = jax.random.uniform(key, (3,))
         there = len(followers) if rig is None else rig.flies[followers].sum()
         chosen = jnp.asarray(followers)[jnp.floor(which * there).astype(jnp.int32)]
+        size = 0 if rig is None or self._table is None else jnp.argmin(jnp.abs(self._sizes - rig.flies.sum()))
+        share, wide = (1.0, 1.0) if rig is None else (rig.share, rig.proportion)
+        held = jnp.interp(load.object_mass / share, masses, jnp.asarray(table)[size, chosen]) * wide
+        happens = (lost < scenario.lost_follower_probability) & ((held > 0) | (scenario.trim_margin < 0))
         low, high = LOSS_TIME
-        stops = (jnp.arange(self.config.plant.count) == chosen) & (lost < scenario.lost_follower_probability)
-        return load._replace(stop_time=jnp.where(stops, low + (high - low) * when, jnp.inf))
+        stops = (jnp.arange(self.config.plant.count) == chosen) & happens
+        return load._replace(
+            stop_time=jnp.where(stops, low + (high - low) * when, jnp.inf),
+            cg_amplitude=jnp.where(happens, jnp.clip(held, 0.0, load.cg_amplitude), load.cg_amplitude),
+        )
 
     def _direction(self, rng: Array, stream: int) -> Float[Array, "2"]:
         """Any direction in the plane."""

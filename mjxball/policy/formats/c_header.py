@@ -34,6 +34,18 @@ LQG_TEXTS = {  # helpers, law
 }
 
 
+def _lifts(lqg: Any) -> bool:
+    return isinstance(lqg, TeamLqg) and lqg.lifting > 0
+
+
+def _lqg_text(lqg: Any) -> str:
+    """The law's text."""
+    text = LQG_TEXTS[type(lqg)][1]
+    for plain, lifting in c_texts.LIFTS_APART.items() if _lifts(lqg) else ():
+        text = text.replace(plain, lifting)
+    return text
+
+
 @dataclass(frozen=True)
 class Footprint:
     """What a header costs on board [bytes]; code comes on top, about 1 KiB with -Os."""
@@ -50,6 +62,7 @@ def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     widest = max(len(bias) for bias in biases)
     lqg = law_of(policy.card).lqg
     constants = 2 * ACTION_SIZE + (0 if lqg is None else sum(np.size(value) for value in lqg))
+    constants -= isinstance(lqg, TeamLqg) and not _lifts(lqg)
     constants += CONTEXT if isinstance(lqg, TeamLqg) else 0
     state, stack = FLOAT * (size - OBSERVATION_SIZE) + 4, FLOAT * (size + 2 * widest)
     if int8:
@@ -77,6 +90,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
         arrays += [
             _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
             for name, value in law.lqg._asdict().items()
+            if name != "lifting" or _lifts(law.lqg)
         ]
     if context is not None:
         arrays += [_array("lqg_context", context)]
@@ -107,7 +121,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
         memory_size=law.size,
         memory_field=f"    mjxball_real memory[{law.size}];\n" if law.size else "",
         helpers=helpers,
-        lqg=LQG_TEXTS[type(law.lqg)][1],
+        lqg=_lqg_text(law.lqg),
         team="" if context is None else _team(card["team"]),
         mount_angle="" if context is None else f"#define MJXBALL_MOUNT_ANGLE {_number(card['team']['mount_angle'])}\n",
         memory_pointer="    mjxball_real *memory = follower->memory;\n" if law.size else "",
@@ -331,11 +345,13 @@ def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
     """Lines that make the command of `action`, which is added to a law unless it is direct."""
     added = "mjxball_action_scale[i] * action[i]"
     if isinstance(law.lqg, TeamLqg):
+        lifts = _lifts(law.lqg)
+        apart = " + (i == 2 ? own[3] : 0)" if lifts else ""
         return "\n".join(
             [
-                "    mjxball_real own[3];",
+                f"    mjxball_real own[{6 if lifts else 3}];",
                 f"    mjxball_lqg_command(memory + {law.history.size}, observation, led, own);",
-                f"    for (i = 0; i < 3; i++) command[i] = mjxball_clip(own[i] + {added}, mjxball_limit[i]);",
+                f"    for (i = 0; i < 3; i++) command[i] = mjxball_clip(own[i]{apart} + {added}, mjxball_limit[i]);",
             ]
         )
     if law.lqg is not None:

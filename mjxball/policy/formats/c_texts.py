@@ -266,6 +266,30 @@ static inline void mjxball_lqg_next(mjxball_real *memory, const mjxball_real *le
     }
 }
 """
+# For laws that lift apart: what stands first in TEAM_LQG is replaced by what stands second.
+LIFTS_APART = {
+    "/* own: the law's command, to": """
+/* What a follower lifts more to hold its share of `load`, which is taken off: apart[0], the share behind it. */
+static inline void mjxball_lqg_apart(const mjxball_real *context, mjxball_real *load, mjxball_real *apart) {
+    mjxball_real square = context[1] * context[1] + context[2] * context[2] + (mjxball_real)1e-12;
+    mjxball_real length = mjxball_root(square), count = context[0] / (context[0] - 1), along = 0;
+    for (int i = 0; i < 2; i++) {
+        apart[1 + i] = mjxball_lqg_lifting[0] * load[i];
+        load[i] -= apart[1 + i];
+        along += context[1 + i] / length * apart[1 + i];
+    }
+    along /= count - 3;
+    apart[0] = -(apart[2] + context[2] / length * along * 2 - along) * 2 / (count * length);
+}
+
+/* own: the law's command, and behind it what `mjxball_lqg_apart` says, to""",
+    "    mjxball_within(load, mjxball_lqg_limits[2]);\n": """    mjxball_within(load, mjxball_lqg_limits[2]);
+    mjxball_lqg_apart(context, load, own + 3);
+""",
+    "context[1 + i] * (own[2] - led[2]);\n    for (int i = 0; i < 3; i++) {": (
+        "context[1 + i] * (own[2] - led[2]) - own[4 + i];\n    for (int i = 0; i < 3; i++) {"
+    ),
+}
 LAYER_INT8 = """
 /* The nearest whole number of a value within 16 bits. */
 static inline int16_t mjxball_whole(mjxball_real value) {
