@@ -2,7 +2,7 @@
 
     python benchmarks/teams.py policies/team.npz --followers copy adaptive lqg --json benchmarks/results/teams.json
     python benchmarks/teams.py policies/team.npz --random --json benchmarks/results/teams_random.json
-    python benchmarks/teams.py --plate policies/plate.npz --json benchmarks/results/plate.json
+    python benchmarks/teams.py --plate --followers copy adaptive lqg --json benchmarks/results/plate.json
 
 Teams: N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A
 case counts where `mjxball.plant.trim` finds 15 % margin in every direction and the followers' tilt commands reach it.
@@ -40,7 +40,6 @@ from mjxball.plant import plant_parameters
 from mjxball.plant.teams import ring_config
 from mjxball.plant.trim import largest_amplitude
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import CIRCLE, CgPath, Scenario
 
 SIZES, SPEEDS, AMPLITUDES, MASSES = (2, 3, 4, 5, 6), (0.31, 1.0, 2.0, 3.1), (0.15, 0.3, 0.6), (0.5, 1.0, 1.5)
@@ -201,7 +200,7 @@ def plate(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
         )
     rows: list[dict[str, Any]] = [{"follower": "friction alone, level", "off_the_rim": alone}]
     for follower in _followers(config, paths, named):
-        flown = simulate_batch(config, [(follower, cells)], ENGINE)
+        flown = Batch(config, follower, ENGINE).course(cells)
         distance = np.hypot(flown.cg_offset[..., 0], flown.cg_offset[..., 1]).max(axis=0)
         error = np.linalg.norm(flown.error[flown.time >= 20], axis=-1).max(axis=0)
         far = np.linalg.norm(flown.error, axis=-1).max(axis=0) > config.scenario.termination_distance

@@ -110,7 +110,8 @@ def _lqg_of(card: dict[str, Any]) -> OffsetFreeLqg | TeamLqg | None:
     if lqg is None:
         return None
     if card["format_version"] == 3:
-        return TeamLqg(**{name: np.array(value) for name, value in lqg.items()})
+        numbers: dict[str, Any] = {name: np.array(value) for name, value in lqg.items()}
+        return TeamLqg(**numbers)
     return OffsetFreeLqg._make(np.array(lqg[name]) for name in LQG_SHAPES)
 
 
