@@ -229,8 +229,8 @@ def test_lifts_apart_give_the_torque_and_no_lift(count: int) -> None:
     thrust = lifts * (numbers.known_mass[0] + numbers.share[0] * plant.object_mass)
     x, y, _ = numbers.mounts[1:].T
     torque = np.array([(y * thrust).sum(), -(x * thrust).sum()])
-    np.testing.assert_allclose(torque, -count * numbers.gains.kp[:2] * held, rtol=1e-9)
-    assert abs(thrust.sum()) < 1e-9
+    np.testing.assert_allclose(torque, -count * numbers.gains.kp[:2] * held, rtol=1e-7)  # a root keeps 1e-12 of it
+    assert abs(thrust.sum()) < 1e-7
 
 
 def test_a_follower_that_is_lost_is_made_up_for() -> None:
