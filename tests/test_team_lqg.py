@@ -17,7 +17,8 @@ from mjxball.baselines import make_baseline
 from mjxball.baselines.team_lqg import team_lqg
 from mjxball.config import Config, preset
 from mjxball.control import rotations
-from mjxball.control.observation import mount_angles
+from mjxball.control.followers import copy_gains
+from mjxball.control.observation import copy_command, mount_angles
 from mjxball.control.team_lqg import team_context
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
@@ -55,7 +56,40 @@ def test_what_a_follower_knows_of_a_ring(count: int) -> None:
     if count % 2 == 0:  # the follower across from the leader has it straight ahead: a pure pitch, nose up to the leader
         np.testing.assert_allclose(known[count // 2 - 1, 1:3], [0.0, torque / count / numbers.gains.kp[1]], atol=1e-12)
     room = 2 * numbers.arm[0] * 9.81 * lifted / 4  # all hover below half of their range
-    np.testing.assert_allclose(known[:, 4], room / numbers.gains.kp[1], rtol=1e-9)
+    np.testing.assert_allclose(known[:, 3:], np.tile(room / numbers.gains.kp[:2], (count - 1, 1)), rtol=1e-9)
+
+
+def test_turning_a_team_changes_nothing_that_its_followers_know() -> None:
+    config, known = ring(4), []
+    for angle in (0.0, 0.7):
+        c, s = math.cos(angle), math.sin(angle)
+        drones = tuple(
+            dataclasses.replace(
+                one, mount=(c * one.mount[0] - s * one.mount[1], s * one.mount[0] + c * one.mount[1], 0.0)
+            )
+            for one in config.plant.drones
+        )
+        plant = dataclasses.replace(config.plant, drones=drones)
+        known.append(team_context(plant_parameters(plant, config.attitude), plant, np.float64(plant.object_mass)))
+    np.testing.assert_allclose(known[1], known[0], rtol=1e-9, atol=1e-12)
+
+
+def test_what_enters_the_filter_is_the_mean_of_all_commands() -> None:
+    """It lifts as the height's feedback asks, and tilts against what lifting more than the leader turns."""
+    config = ring(4)
+    law, leader = team_lqg(config), copy_gains(config)
+    observation = 0.05 * np.random.default_rng(0).standard_normal(18)
+    led, tilts = copy_command(observation, *leader), []
+    for lever in (np.zeros(2), np.array([0.01, -0.02])):
+        memory = law.start(observation, np.array([4 / 3, *lever, 9.0, 9.0]))
+        own = law.command(np.zeros(3), memory, observation, leader)
+        mean, (turning, rising) = (led + 3 * own) / 4, law.estimate(memory, observation)
+        assert mean[2] == pytest.approx(law.rise @ (observation[14], observation[17]) - rising[2], rel=1e-9)
+        tilts.append(mean[:2] + lever * (own - led)[2])  # with what the lift turns
+        states = [np.append(turning[k], tilts[-1][k]) for k in (0, 1)]
+        expected = [*(law.axis @ state for state in states), law.height @ np.append(rising, mean[2])]
+        np.testing.assert_allclose(law.next(memory, observation, own, leader)[:13], np.concatenate(expected), rtol=1e-9)
+    np.testing.assert_allclose(tilts[1], tilts[0], rtol=1e-9)
 
 
 def test_worlds_of_training_know_what_a_flight_knows() -> None:
