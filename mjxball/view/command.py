@@ -22,7 +22,7 @@ def parser() -> Parser:
     result = make_parser("python -m mjxball.view", about)
     result.add_argument(
         "source",
-        metavar="RUN_OR_LOG",
+        metavar="POLICY|RUN|LOG",
         help="recorded flight (.npz), flight log (.jsonl), or what to fly: a run directory, policy or baseline",
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
