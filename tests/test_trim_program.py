@@ -18,7 +18,7 @@ from mjxball.control.mixer import torque_per_force
 from mjxball.errors import InputError
 from mjxball.physics.engine import total_wrench
 from mjxball.plant import plant_parameters
-from mjxball.plant.trim import Trim, largest_amplitude, largest_margin
+from mjxball.plant.trim import Trim, largest_amplitude, largest_margin, safe_radius
 
 PAPER = Plant()
 TEAMS = {name: with_plant(preset("paper"), name).plant for name in ("team3", "team4", "team6")}
@@ -63,6 +63,14 @@ def test_of_a_pair_it_is_the_closed_form(plant: Plant) -> None:
         expected += torque * min(least - room, 0.0) / (mass * plant.gravity)
         assert found == pytest.approx(expected, rel=EXACT, abs=EXACT)
     assert upper > 60  # of 135
+
+
+def test_of_a_pair_the_safe_radius_is_the_largest_amplitude() -> None:
+    """Light loads leave rotors nearest to 0, heavy ones nearest to their most."""
+    numbers = plant_parameters(PAPER, Attitude())
+    for mass in (0.1, 0.2, 0.4, 0.6):
+        found = float(safe_radius(numbers, PAPER.leader, np.array(mass), 0.15))
+        assert found == pytest.approx(largest_amplitude(PAPER, mass, 0.15), rel=EXACT)
 
 
 @rows("plant, mass", [(PAPER, 0.4), *((plant, 0.15 * plant.count) for plant in TEAMS.values())])
