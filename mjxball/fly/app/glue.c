@@ -3,6 +3,7 @@
  * The stabilizer's loop only hands the state over and goes on with the firmware's own PID; law and network run in the
  * app's task, whose priority is below, and send setpoints to the commander as a radio would.
  */
+#include <stdatomic.h>
 #include <stdbool.h>
 #include <stdint.h>
 #include <string.h>
@@ -41,10 +42,22 @@ static mjxball_weights uploaded;
 #define MEMORY ((uint8_t *)0)
 #endif
 
-/* What tasks of higher priority write; who reads takes it again if it changed meanwhile. */
+/* What tasks of higher priority write, and how often they did. */
 static volatile uint32_t stateCount, beatCount;
 static mjxball_state newest;
 static uint8_t beat[MJXBALL_BEAT_SIZE];
+
+/* Copies it, again if it was written meanwhile, and tells of which `count` it is. */
+static uint32_t take(void *to, const void *from, size_t size, const volatile uint32_t *count) {
+    uint32_t before;
+    do {
+        before = *count;
+        atomic_signal_fence(memory_order_seq_cst);
+        memcpy(to, from, size);
+        atomic_signal_fence(memory_order_seq_cst);
+    } while (before != *count);
+    return before;
+}
 
 void controllerOutOfTreeInit(void) {
     controllerPidInit();
@@ -71,6 +84,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     newest.rates[1] = radians * sensors->gyro.y;
     newest.rates[2] = radians * sensors->gyro.z;
     newest.time = T2M(xTaskGetTickCount());
+    atomic_signal_fence(memory_order_seq_cst);
     stateCount++;
     controllerPid(control, setpoint, sensors, state, stabilizerStep);
 }
@@ -78,6 +92,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
 static void heard(P2PPacket *packet) {
     if (packet->size != MJXBALL_BEAT_SIZE) return;
     memcpy(beat, packet->data, MJXBALL_BEAT_SIZE);
+    atomic_signal_fence(memory_order_seq_cst);
     beatCount++;
 }
 
@@ -109,10 +124,7 @@ static void receive(uint32_t now) {
         if (answer) appchannelSendDataPacket(reply, (size_t)answer);
     }
     if (beats == beatCount) return;
-    do {
-        beats = beatCount;
-        memcpy(word, beat, sizeof word);
-    } while (beats != beatCount);
+    beats = take(word, beat, sizeof word, &beatCount);
     mjxball_hear(&core, word, sizeof word, now);
 }
 
@@ -135,17 +147,14 @@ void appMain(void) {
     p2pRegisterCB(heard);
     for (uint32_t tick = 0;; tick++) {
         uint64_t begun;
-        uint32_t now, count;
+        uint32_t now;
         mjxball_state state;
         mjxball_setpoint wanted;
         vTaskDelayUntil(&wake, M2T(mjxball_period()));
         begun = usecTimestamp();
         now = T2M(xTaskGetTickCount());
         receive(now);
-        do {
-            count = stateCount;
-            memcpy(&state, &newest, sizeof state);
-        } while (count != stateCount);
+        take(&state, &newest, sizeof state, &stateCount);
         for (int i = 0; i < 3; i++) state.variance[i] = logGetFloat(variances[i]);
         state.voltage = logGetFloat(voltage);
         state.can_fly = supervisorCanFly();
