@@ -6,14 +6,46 @@ import contextlib
 import importlib
 import io
 import sys
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, NamedTuple
 
 
+FOR_MESHES = ("trimesh", "scipy.spatial")  # what MJX imports for meshes alone: that takes as long as JAX
+
+
 def quietly(name: str) -> Any:
-    """The module `name`, imported without what it prints: MJX, also behind Brax, says that NVIDIA Warp is absent."""
+    """The module `name`, imported without what it prints: MJX, also behind Brax, says that NVIDIA Warp is absent.
+
+    Those `FOR_MESHES` are imported when MJX calls them.
+    """
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        return importlib.import_module(name)
+        with contextlib.ExitStack() as stack:
+            for later in FOR_MESHES:
+                stack.enter_context(_postponed(later))
+            return importlib.import_module(name)
+
+
+@contextlib.contextmanager
+def _postponed(name: str) -> Iterator[None]:
+    """Who imports the module `name` in here gets one whose functions and classes import it when they are called."""
+
+    def find(attribute: str) -> Any:
+        if attribute.startswith("__"):
+            raise AttributeError(attribute)
+        return lambda *arguments, **named: getattr(importlib.import_module(name), attribute)(*arguments, **named)
+
+    if name in sys.modules:
+        yield
+        return
+    stand_in = ModuleType(name)
+    stand_in.__dict__["__getattr__"] = find  # PEP 562
+    sys.modules[name] = stand_in
+    try:
+        yield
+    finally:
+        if sys.modules.get(name) is stand_in:
+            del sys.modules[name]
 
 
 def import_mjx() -> ModuleType:

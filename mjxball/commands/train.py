@@ -151,9 +151,13 @@ def _run(
 
 def _wake_devices() -> None:
     """Start the accelerator's runtime (2 s of waiting on a GPU) beside the imports that follow."""
-    import jax
+    import jax  # here: two threads must not both import it
 
-    threading.Thread(target=lambda: jax.numpy.zeros(1).block_until_ready(), daemon=True).start()
+    threading.Thread(target=_first_kernel, args=(jax.numpy,), daemon=True).start()
+
+
+def _first_kernel(xp: Any) -> None:
+    xp.zeros(1).block_until_ready()
 
 
 def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:

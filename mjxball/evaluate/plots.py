@@ -170,14 +170,14 @@ def draw_flights(results: Sequence[Result], title: str, path: Path) -> None:
     """Draw all followers of one scenario over time: position and distance, CG offset (y dotted), all commands."""
     plt = pyplot()
     # Fixed margins: to fit them takes Matplotlib as long as to draw.
-    margins = {"left": 0.1, "right": 0.985, "top": 0.96, "bottom": 0.035, "hspace": 0.1}
+    margins = {"left": 0.115, "right": 0.985, "top": 0.96, "bottom": 0.035, "hspace": 0.1}
     figure, axes = plt.subplots(len(PANELS), 1, sharex=True, figsize=(9, 14.5), gridspec_kw=margins)
     for axis, panel in zip(axes, PANELS, strict=True):
         _draw_panel(axis, results, *panel)
     axes[0].legend(loc="lower right", ncol=3, fontsize="small")
     axes[5].legend(loc="upper right", ncol=4, fontsize="small")
     axes[-1].set_xlabel("time [s]")
-    figure.align_ylabels(axes)
+    axes[-1].xaxis.set_label_coords(0.5, -0.22)
     figure.suptitle(title, y=0.985)
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -214,6 +214,7 @@ def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | No
     if high - low < LEAST_SPAN:  # rounding errors must not look like motion
         axis.set_ylim((low + high - LEAST_SPAN) / 2, (low + high + LEAST_SPAN) / 2)
     axis.set_ylabel(label, fontsize="small")
+    axis.yaxis.set_label_coords(-0.09, 0.5)  # to find a place for the labels takes as long as all else that is drawn
     axis.grid(alpha=0.25)
     axis.margins(x=0)
 
