@@ -5,8 +5,8 @@
 Each algorithm trains once with an empty cache (cold), then `--runs` times with it (warm). The trainer itself runs
 unchanged: it is started through this file, which notes when imports and functions of the list below begin and end, in
 which thread, and JAX's own reports of tracing, lowering, compiling and reading the cache. Seconds count from before the
-process starts; `cpu` is the thread's own time, which other work on the machine does not lengthen. The policy is there at
-`policy`; what follows is evaluation and figures. Before, each algorithm runs once for a moment, uncounted: a machine
+process starts; `cpu` is the thread's own time, which other work on the machine does not lengthen. The policy is there
+at `policy`; what follows is evaluation and figures. Before, each algorithm runs once for a moment, uncounted: a machine
 reads libraries from its disk only once.
 """
 
@@ -28,17 +28,42 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-IMPORTS = ("jax", "brax.training.networks", "brax.envs.base", "mujoco.mjx", "mujoco", "flax", "optax", "scipy.linalg",
-           "orbax.checkpoint", "matplotlib.pyplot", "tensorboardX", "mjxball.train.run", "mjxball.commands.train")  # fmt: skip
+IMPORTS = (
+    "jax",
+    "brax.training.networks",
+    "brax.envs.base",
+    "mujoco.mjx",
+    "mujoco",
+    "flax",
+    "optax",
+    "scipy.linalg",
+    "orbax.checkpoint",
+    "matplotlib.pyplot",
+    "tensorboardX",
+    "mjxball.train.run",
+    "mjxball.commands.train",
+)
 FUNCTIONS = {
-    "mjxball.commands.train": ("parser", "_new_run", "_run", "_first_kernel", "_prepare_evaluation", "draw_training",
-                               "_evaluate"),
+    "mjxball.commands.train": (
+        "parser",
+        "_new_run",
+        "_run",
+        "_first_kernel",
+        "_prepare_evaluation",
+        "draw_training",
+        "_evaluate",
+    ),
     "mjxball.train.run": ("Run.__init__", "Run._start", "Run._advance", "Run._evaluated", "Run._save", "Run._export"),
-    "mjxball.train.population": ("Population.__init__", "Population.template", "Population.compile", "Population.start",
-                                 "Population.metric_names"),
+    "mjxball.train.population": (
+        "Population.__init__",
+        "Population.template",
+        "Population.compile",
+        "Population.start",
+        "Population.metric_names",
+    ),
     "mjxball.train.compilation": ("TracedProgram.__init__", "TracedProgram.lower", "_read", "_write"),
     "mjxball.train.checkpoint": ("Checkpoints.__init__", "Checkpoints.save"),
-}  # fmt: skip
+}
 VARIABLE = "MJXBALL_TIMELINE"
 SHORT = {
     "sac": "--sac.total_steps 25600 --sac.replay_size 25600",

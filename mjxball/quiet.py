@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any, NamedTuple
 
-
 FOR_MESHES = ("trimesh", "scipy.spatial")  # what MJX imports for meshes alone: that takes as long as JAX
 
 
@@ -19,11 +18,12 @@ def quietly(name: str) -> Any:
 
     Those `FOR_MESHES` are imported when MJX calls them.
     """
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        with contextlib.ExitStack() as stack:
-            for later in FOR_MESHES:
-                stack.enter_context(_postponed(later))
-            return importlib.import_module(name)
+    with contextlib.ExitStack() as around:
+        around.enter_context(contextlib.redirect_stdout(io.StringIO()))
+        around.enter_context(contextlib.redirect_stderr(io.StringIO()))
+        for later in FOR_MESHES:
+            around.enter_context(_postponed(later))
+        return importlib.import_module(name)
 
 
 @contextlib.contextmanager
@@ -33,7 +33,11 @@ def _postponed(name: str) -> Iterator[None]:
     def find(attribute: str) -> Any:
         if attribute.startswith("__"):
             raise AttributeError(attribute)
-        return lambda *arguments, **named: getattr(importlib.import_module(name), attribute)(*arguments, **named)
+
+        def call(*arguments: Any, **named: Any) -> Any:
+            return getattr(importlib.import_module(name), attribute)(*arguments, **named)
+
+        return call
 
     if name in sys.modules:
         yield

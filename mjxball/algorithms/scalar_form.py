@@ -78,7 +78,7 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     if name == "scan" and _repeats(equation):
         return _scan(parameters["jaxpr"], parameters["length"], inputs)
     avals, shape = [variable.aval for variable in (*equation.invars, *equation.outvars)], equation.outvars[0].aval.shape
-    alike = all(aval.shape in ((), shape) for aval in avals)  # a change of type may turn one number into several
+    alike = all(_spreads(aval.shape, shape) for aval in avals)  # a change of type may turn one number into several
     rewritten = (name in ELEMENTWISE and alike) or name in REDUCTIONS or name in REARRANGED
     keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals)
     if keys or not rewritten or max(aval.size for aval in avals) > LARGEST:
@@ -96,6 +96,13 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     for index in np.ndindex(shape):
         outputs[index] = _compute(equation, [part[index] for part in spread])
     return [outputs]
+
+
+def _spreads(own: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Whether an operand of shape `own` is spread over `shape` as NumPy does it, without further axes."""
+    return own == () or (
+        len(own) == len(shape) and all(one in (1, other) for one, other in zip(own, shape, strict=True))
+    )
 
 
 def _repeats(scan: Any) -> bool:
