@@ -65,11 +65,6 @@ FUNCTIONS = {
     "mjxball.train.checkpoint": ("Checkpoints.__init__", "Checkpoints.save"),
 }
 VARIABLE = "MJXBALL_TIMELINE"
-SHORT = {
-    "sac": "--sac.total_steps 25600 --sac.replay_size 25600",
-    "ppo": "--ppo.total_steps 40960",
-    "gradient": "--gradient.gradient_steps 1",
-}
 
 
 class Recorder:
@@ -215,12 +210,15 @@ def show(title: str, found: dict[str, Any], least: float) -> None:
 
 def main() -> None:
     """Measure, print, write."""
+    from algorithms import ON_GPU, SHORT
     from training import NO_CACHE, versions
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--algorithms", nargs="+", choices=tuple(SHORT), default=["sac", "gradient"])
     parser.add_argument("--runs", type=int, default=1, help="with a warm cache")
+    parser.add_argument("--gpu", action="store_true", help="the settings of one GPU, see benchmarks/algorithms.py")
     parser.add_argument("--flags", default="", help="further flags of train.py")
+    parser.add_argument("--again", action="store_true", help="the libraries were read just now: none runs uncounted")
     parser.add_argument("--least", type=float, default=0.05, metavar="S", help="shortest span in the table")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
@@ -228,8 +226,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         for algorithm in options.algorithms:
-            chosen = ["--algorithm", algorithm, "--seed", "0", *shlex.split(options.flags)]
-            run([*chosen, *shlex.split(SHORT[algorithm])], NO_CACHE, place)
+            chosen = ["--algorithm", algorithm, "--seed", "0", *shlex.split(ON_GPU[algorithm] if options.gpu else "")]
+            chosen += shlex.split(options.flags)
+            if not options.again:
+                run([*chosen, *shlex.split(SHORT[algorithm])], NO_CACHE, place)
             for number in range(1 + options.runs):
                 row = run(chosen, place / f"cache-{algorithm}", place)
                 title = f"{algorithm}, {'warm' if number else 'cold'}"

@@ -132,12 +132,50 @@ def _scan(body: Any, length: int, inputs: list[Value]) -> list[Value]:
             rest = rest[aval.size :]
         return found
 
-    @jax.checkpoint
-    def step(flat: list[Any]) -> list[Any]:
-        return numbers(_evaluate(body.jaxpr, body.consts, [*fixed, *values(flat)]))
+    # What stays the same: the traced numbers among it are differentiated, too.
+    same = [_parts(value) for value in fixed]
+    traced = [one for part in same for one in part.ravel() if not _known(one)]
 
-    flat = numbers(inputs[count:])
-    return values(jax.lax.scan(lambda carry, _: (step(carry), None), flat, length=length)[0])
+    def step(traced: list[Any], flat: list[Any]) -> list[Any]:
+        rest = iter(traced)
+        filled = [np.empty(part.shape, object) for part in same]
+        for part, own in zip(filled, same, strict=True):
+            for index in np.ndindex(own.shape):
+                part[index] = own[index] if _known(own[index]) else next(rest)
+        return numbers(_evaluate(body.jaxpr, body.consts, [*filled, *values(flat)]))
+
+    return values(_repeated(step, length)(traced, numbers(inputs[count:])))
+
+
+def _repeated(step: Callable[[list[Any], list[Any]], list[Any]], length: int) -> Callable[..., list[Any]]:
+    """`f(same, value)`: `length` times value = step(same, value).
+
+    Its gradient is written out, since to let JAX find that of a loop of `jax.checkpoint` takes a second longer.
+    """
+
+    @jax.custom_vjp
+    def repeat(same: list[Any], value: list[Any]) -> list[Any]:
+        return jax.lax.scan(lambda value, _: (step(same, value), None), value, length=length)[0]
+
+    def forward(same: list[Any], value: list[Any]) -> tuple[list[Any], Any]:
+        last, every = jax.lax.scan(lambda value, _: (step(same, value), value), value, length=length)
+        return last, (same, every)
+
+    def backward(kept: Any, slope: list[Any]) -> tuple[list[Any], list[Any]]:
+        same, every = kept
+
+        def back(carry: tuple[list[Any], list[Any]], value: list[Any]) -> tuple[Any, None]:
+            slope, total = carry
+            _, pull = jax.vjp(step, same, value)
+            more, slope = pull(slope)
+            return (slope, [a + b for a, b in zip(total, more, strict=True)]), None
+
+        nothing = [jnp.zeros_like(one) for one in same]
+        (slope, total), _ = jax.lax.scan(back, (slope, nothing), every, reverse=True)
+        return total, slope
+
+    repeat.defvjp(forward, backward)
+    return repeat
 
 
 def _parts(value: Value) -> Parts:

@@ -55,21 +55,21 @@ class Ppo:
     num_envs: int = setting(512, "environments that are stepped at once", low=1)
     unroll_length: int = setting(20, "steps in a row whose advantages are estimated together", low=1)
     unrolls: int = setting(1, "such rows of every environment between two updates", low=1)
-    epochs: int = setting(4, "passes over these steps in an update", low=1)
+    epochs: int = setting(8, "passes over these steps in an update", low=1)
     minibatches: int = setting(8, "parts of the unrolls that each pass is cut into", low=1)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     activation: Literal["relu", "swish"] = setting(
         "relu", "units of the policy; policy files hold relu alone, swish is for `mjxball.train.train`"
     )
     value_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the state value", low=1)
-    learning_rate: float = setting(1e-3, "Adam's rate at the start", above=0)
+    learning_rate: float = setting(2e-3, "Adam's rate at the start", above=0)
     learning_rate_final_ratio: float = setting(
-        0.05, "rate at the end of the run over the rate at its start", above=0, high=1
+        0.02, "rate at the end of the run over the rate at its start", above=0, high=1
     )
     discount: float = setting(0.97, "gamma", low=0, high=0.99999)
     gae_lambda: float = setting(0.95, "lambda of the generalised advantage estimate", low=0, high=1)
     clipping: float = setting(0.2, "largest change of an action's probability that is rewarded", above=0)
-    entropy_cost: float = setting(1e-3, "weight of the policy's entropy", low=0)
+    entropy_cost: float = setting(0.0, "weight of the policy's entropy", low=0)
     reward_scale: float = setting(0.02, "factor on the reward: the value's loss shares the gradient's norm", above=0)
     max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
