@@ -21,7 +21,7 @@ import numpy as np
 import cortex
 from mjxball.errors import InputError
 from mjxball.export import in_team
-from mjxball.fly.app.generate import options, rig_header, sources
+from mjxball.fly.app.generate import CORE, options, rig_header, sources
 from mjxball.fly.card import config_of
 from mjxball.policy import Policy, PolicyFile
 from mjxball.policy.file import law_of, load_file, shipped_policies
@@ -106,7 +106,7 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> dict[str, Any]:
         (place / "rig.h").write_text(rig_header(policy, config_of(policy.card), int8))
     except InputError:  # a team: its follower's network alone
         return row
-    for name in ("core.c", "core.h"):
+    for name in CORE:
         (place / name).write_text((sources() / name).read_text())
     flags = [*options(int8), "-DMJXBALL_FOLLOWER=1"]
     stack = cortex.stack(place, flags, "core.c", "mjxball_tick")

@@ -23,7 +23,8 @@ from mjxball.fly.telemetry import Rig
 from mjxball.policy.file import PolicyFile
 from mjxball.policy.formats.c_header import c_header, float_bytes, footprint, weight_bytes
 
-SOURCES = ("core.h", "core.c", "glue.c")
+CORE = ("core.h", "core.c", "laws.h", "packets.h")  # no firmware types
+SOURCES = (*CORE, "glue.c")
 ROLES = ("leader", "follower")
 PERIODS = (5, 20)  # [ms] of laws that an app may keep
 STACK = 2400  # [bytes] of the app's task beside the network's arrays
@@ -117,7 +118,7 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
     lines = ",\n".join(f"    .{name} = {_literal(value)}" for name, value in fields.items())
     causes = ",\n".join(f'    "{text}"' for text in CAUSES)
     return (
-        f"/* See core.h. */\nstatic const mjxball_rig_numbers mjxball_rig = {{\n{lines},\n}};\n\n"
+        f"/* See core.h. */\n#pragma once\nstatic const mjxball_rig_numbers mjxball_rig = {{\n{lines},\n}};\n\n"
         f"static const char *const mjxball_texts[MJXBALL_CAUSES] = {{\n{causes},\n}};\n"
     )
 
@@ -208,7 +209,8 @@ Made by `python -m mjxball.export POLICY DIR --crazyflie` (configuration {hash},
 constants, a law every {period} ms, number {ident}).
 
 `leader/` and `follower/` are out-of-tree apps for the Crazyflie firmware 2026.08; `src/` is what both share: `core.c`
-is the flight (plain C, no firmware types), `glue.c` the firmware's interface, `policy.h` and `rig.h` the policy.
+with `laws.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's interface, `policy.h`
+and `rig.h` the policy.
 
     cd leader && make CRAZYFLIE_BASE=... cf2_defconfig && make CRAZYFLIE_BASE=... && make CRAZYFLIE_BASE=... cload
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from mjxball.errors import InputError
-from mjxball.fly.app.generate import ROLES, files_of
+from mjxball.fly.app.generate import CORE, ROLES, files_of
 from mjxball.fly.app.protocol import BEAT_SIZE, REPLY_SIZE, Phase
 from mjxball.policy.file import PolicyFile
 
@@ -85,7 +85,7 @@ def compile_pair(policy: PolicyFile, name: str, int8: bool = False) -> tuple[Lib
     if shutil.which("gcc") is None:
         raise InputError("the twin runs the app's C, which needs gcc: install it, or leave --onboard out")
     with tempfile.TemporaryDirectory() as place:
-        for path in ("core.h", "core.c", "policy.h", "rig.h"):
+        for path in (*CORE, "policy.h", "rig.h"):
             (Path(place) / path).write_text(files[f"src/{path}"], encoding="utf-8")
         (Path(place) / "host.c").write_text(ACCESS, encoding="utf-8")
         libraries = []

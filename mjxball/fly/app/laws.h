@@ -1,0 +1,236 @@
+/* The laws of one drone: what it sees of the pair, the leader's PID, the follower's network. Part of core.c. */
+#ifndef MJXBALL_LAWS_H
+#define MJXBALL_LAWS_H
+
+#include "core.h"
+
+#include "rig.h"
+
+#define MAX_LIFT_DIFFERENCE 1.5f
+
+/* Numbers. */
+
+static float clip(float value, float low, float high) {
+    return value < low ? low : value > high ? high : value;
+}
+
+/* NaN and infinity less themselves are not 0. */
+static bool all_finite(const float *values, int count) {
+    for (int k = 0; k < count; k++)
+        if (!(values[k] - values[k] == 0)) return false;
+    return true;
+}
+
+static float root(float x) {
+    return x > 0 ? __builtin_sqrtf(x) : 0;
+}
+
+/* Odd Taylor sum within tan(pi / 8), where it is exact to float. */
+static float arctan(float x) {
+    float size = x < 0 ? -x : x, base = 0, square, value = 0;
+    if (size > 2.4142135f) {
+        base = 1.5707963f;
+        size = -1 / size;
+    } else if (size > 0.41421356f) {
+        base = 0.78539816f;
+        size = (size - 1) / (size + 1);
+    }
+    square = size * size;
+    for (int k = 17; k > 0; k -= 2) value = 1 / (float)k - square * value;
+    value = base + size * value;
+    return x < 0 ? -value : value;
+}
+
+static float arctan2(float y, float x) {
+    if (x > 0) return arctan(y / x);
+    if (x < 0) return arctan(y / x) + (y < 0 ? -3.1415927f : 3.1415927f);
+    return y > 0 ? 1.5707963f : y < 0 ? -1.5707963f : 0;
+}
+
+static float cosine(float x) {
+    float square = x * x, value = 1;
+    for (int k = 12; k > 0; k -= 2) value = 1 - square * value / (float)(k * (k - 1));
+    return value;
+}
+
+static void rotation(const float *q, float matrix[3][3]) {
+    float w = q[0], x = q[1], y = q[2], z = q[3];
+    matrix[0][0] = 1 - 2 * (y * y + z * z);
+    matrix[0][1] = 2 * (x * y - w * z);
+    matrix[0][2] = 2 * (x * z + w * y);
+    matrix[1][0] = 2 * (x * y + w * z);
+    matrix[1][1] = 1 - 2 * (x * x + z * z);
+    matrix[1][2] = 2 * (y * z - w * x);
+    matrix[2][0] = 2 * (x * z - w * y);
+    matrix[2][1] = 2 * (y * z + w * x);
+    matrix[2][2] = 1 - 2 * (x * x + y * y);
+}
+
+static void rotate(const float matrix[3][3], const float *vector, float *to) {
+    for (int i = 0; i < 3; i++)
+        to[i] = matrix[i][0] * vector[0] + matrix[i][1] * vector[1] + matrix[i][2] * vector[2];
+}
+
+static void cross(const float *a, const float *b, float *to) {
+    to[0] = a[1] * b[2] - a[2] * b[1];
+    to[1] = a[2] * b[0] - a[0] * b[2];
+    to[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* The pair as this drone sees it. */
+
+typedef struct {
+    float position[3], velocity[3], euler[3], rates[3], matrix[3][3]; /* of O */
+    float level; /* cosine of the drone's tilt */
+} seen;
+
+/* p_O = p - R r. On a stand nothing is believed of what is locked. */
+static void look(const mjxball_parameters *set, const mjxball_state *state, seen *to) {
+    float arm[3], swing[3], sweep[3];
+    rotation(state->quaternion, to->matrix);
+    rotate(to->matrix, set->mount, arm);
+    cross(state->rates, set->mount, swing);
+    rotate(to->matrix, swing, sweep);
+    to->level = to->matrix[2][2];
+    for (int i = 0; i < 3; i++) {
+        to->position[i] = state->position[i] - arm[i];
+        to->velocity[i] = state->velocity[i] - sweep[i];
+        to->rates[i] = state->rates[i];
+    }
+    to->euler[0] = arctan2(to->matrix[2][1], root(1 - to->matrix[2][1] * to->matrix[2][1]));
+    to->euler[1] = arctan2(-to->matrix[2][0], to->matrix[2][2]);
+    to->euler[2] = arctan2(-to->matrix[0][1], to->matrix[1][1]);
+    if (mjxball_rig.stand) {
+        float c = root(1 - to->matrix[2][1] * to->matrix[2][1]), s = to->matrix[2][1];
+        const float roll[3][3] = {{1, 0, 0}, {0, c, -s}, {0, s, c}};
+        for (int i = 0; i < 9; i++) to->matrix[i / 3][i % 3] = roll[i / 3][i % 3];
+        for (int i = 0; i < 2; i++) to->position[i] = to->velocity[i] = to->euler[i + 1] = to->rates[i + 1] = 0;
+    }
+}
+
+/* A place and its motion relative to O, as the laws see them: 0 along what a stand locks. */
+static void arm_of(const seen *one, const float *mount, float *arm, float *sweep) {
+    float swing[3];
+    rotate(one->matrix, mount, arm);
+    cross(one->rates, mount, swing);
+    rotate(one->matrix, swing, sweep);
+    if (mjxball_rig.stand) arm[0] = arm[1] = sweep[0] = sweep[1] = 0;
+}
+
+#if MJXBALL_FOLLOWER
+static void observe(const seen *one, const float *goal, float *to) {
+    float arm[3], sweep[3];
+    arm_of(one, mjxball_rig.mount[1], arm, sweep);
+    for (int i = 0; i < 3; i++) {
+        to[i] = one->position[i] + arm[i];
+        to[3 + i] = one->euler[i];
+        to[6 + i] = one->velocity[i] + sweep[i];
+        to[9 + i] = one->rates[i];
+        to[12 + i] = goal[i] - one->position[i];
+        to[15 + i] = -one->velocity[i];
+    }
+}
+
+#ifdef MJXBALL_MOUNT_ANGLE
+/* Every three of `count` numbers as a vector, turned about z by an angle of this cosine and sine. */
+static void turn(float *vectors, int count, float c, float s) {
+    for (int k = 0; k + 1 < count; k += 3) {
+        float x = vectors[k], y = vectors[k + 1];
+        vectors[k] = c * x - s * y;
+        vectors[k + 1] = s * x + c * y;
+    }
+}
+#endif
+#endif
+
+/* Laws, as in sim/laws.py. */
+
+static void clip_command(float *command) {
+    for (int i = 0; i < 3; i++) command[i] = clip(command[i], -mjxball_limit[i], mjxball_limit[i]);
+}
+
+static void command_of(const float *acceleration, float *command) {
+    command[0] = -acceleration[1] / (float)MJXBALL_GRAVITY;
+    command[1] = acceleration[0] / (float)MJXBALL_GRAVITY;
+    command[2] = acceleration[2];
+    clip_command(command);
+}
+
+static void leader_error(const seen *one, const float *goal, float *error, float *rate) {
+    float arm[3], sweep[3];
+    arm_of(one, mjxball_rig.mount[0], arm, sweep);
+    for (int i = 0; i < 3; i++) {
+        error[i] = goal[i] - one->position[i];
+        rate[i] = -one->velocity[i];
+        if (mjxball_rig.own_error) {
+            error[i] += mjxball_rig.stand && i < 2 ? 0 : mjxball_rig.mount[0][i] - arm[i];
+            rate[i] -= sweep[i];
+        }
+    }
+}
+
+static void pid(const float *error, const float *rate, const float *integral, float *command) {
+    float wanted[3];
+    for (int i = 0; i < 3; i++)
+        wanted[i] = mjxball_rig.kp[i] * error[i] + mjxball_rig.kd[i] * rate[i] + mjxball_rig.ki[i] * integral[i];
+    command_of(wanted, command);
+}
+
+/* What this drone lifts more than the other one to turn the stick. */
+static float lift(const float *integral) {
+    float side = MJXBALL_FOLLOWER ? -mjxball_rig.lift_sign : mjxball_rig.lift_sign;
+    return side * mjxball_rig.tilt_gain * integral[3];
+}
+
+/* One period of this drone's law toward `goal`: `app->command`. False if the network's was not finite. */
+static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
+    const float period = (float)mjxball_rig.period / 1000;
+    float error[3], rate[3], base[3], *command = app->command, *integral = app->integral;
+    bool good = true;
+    leader_error(one, goal, error, rate);
+    if (MJXBALL_FOLLOWER)
+        for (int i = 0; i < 4; i++) integral[i] = app->peer.integral[i];
+    pid(error, rate, integral, base);
+#if MJXBALL_FOLLOWER
+    {
+        float observation[18], more[3], integrated[3];
+        observe(one, goal, observation);
+#ifdef MJXBALL_MOUNT_ANGLE
+        turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
+#endif
+        if (!app->copying) {
+            mjxball_follow(&app->follower, observation, app->action, command);
+            good = all_finite(command, 3);
+        }
+        if (app->copying || !good) mjxball_copy_law(observation, command);
+#ifdef MJXBALL_MOUNT_ANGLE
+        turn(command, 3, mjxball_rig.mount_frame[0], mjxball_rig.mount_frame[1]);
+#endif
+        if (mjxball_rig.shares) {
+            for (int i = 0; i < 3; i++) integrated[i] = mjxball_rig.ki[i] * integral[i];
+            command_of(integrated, more);
+            for (int i = 0; i < 3; i++) command[i] += more[i] - integral[4 + i];
+            command[2] += lift(integral);
+            clip_command(command);
+            base[2] += lift(integral);
+            if (mjxball_rig.washout > 0)
+                for (int i = 0; i < 3; i++) integral[4 + i] += period / mjxball_rig.washout * (command[i] - base[i]);
+        }
+    }
+#else
+    for (int i = 0; i < 3; i++) command[i] = base[i];
+    if (mjxball_rig.shares) {
+        float most = mjxball_rig.tilt_gain > 0 ? MAX_LIFT_DIFFERENCE / mjxball_rig.tilt_gain : 0;
+        command[2] += lift(integral);
+        clip_command(command);
+        integral[3] = clip(integral[3] + period * (base[mjxball_rig.axis] - one->euler[mjxball_rig.axis]), -most, most);
+    }
+    for (int i = 0; i < 3; i++) {
+        float ahead = error[i] + mjxball_rig.lead * rate[i];
+        integral[i] += period * clip(ahead, -mjxball_rig.band[i], mjxball_rig.band[i]);
+    }
+#endif
+    return good;
+}
+
+#endif
