@@ -58,21 +58,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--followers", nargs="+", default=["copy"], metavar="NAME", help="baselines (default copy)")
     parser.add_argument("--plate", action="store_true", help="the free ball instead of the paths")
     parser.add_argument("--random", action="store_true", help=f"{RANDOM:,} random flights instead of the paths")
+    parser.add_argument(
+        "--sizes", nargs="+", type=int, choices=SIZES, default=SIZES, help="numbers of drones (default all)"
+    )
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
     if options.plate and options.random:
         raise InputError("--plate and --random are two benchmarks; run one after the other")
-    fly = plate if options.plate else random_flights if options.random else teams
-    rows = fly(options.policies, options.followers)
+    if tuple(options.sizes) != SIZES and (options.plate or options.random):
+        raise InputError("--sizes is for the paths; drop it, or --plate or --random")
+    flown = options.policies, options.followers
+    rows = (
+        plate(*flown) if options.plate else random_flights(*flown) if options.random else teams(*flown, options.sizes)
+    )
     if options.json:
         options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     return 0
 
 
-def teams(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
+def teams(paths: Sequence[Path], named: Sequence[str], sizes: Sequence[int]) -> list[dict[str, Any]]:
     """Medians and worst cases for every number of drones and every follower, and shares of cases at the bar."""
     rows, base = [], preset("team")
-    for count in SIZES:
+    for count in sizes:
         config = ring_config(base, count)
         radius, nominal = config.plant.object_size[0] / 2, config.plant.object_mass
         cells = [
