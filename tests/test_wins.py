@@ -75,15 +75,16 @@ def test_suites_flown_by_different_followers_are_compared_where_both_flew(
         made(cell, "a", "adaptive", [{"x_peak": 0.02}], suite="pairs"),
         made(cell, "b", "team", [{"x_peak": 0.01}], suite="teams"),
         made(cell, "b", "adaptive", [{"x_peak": 0.02}], suite="teams"),
+        made(cell, "c", "adaptive", [{"x_peak": 0.02}], suite="teams"),
     ]
     found = {row["follower"]: [cell["text"] for cell in row["cells"]] for row in verdict(scores)["rows"]}
     assert {name: (row[0], row[1], row[-1]) for name, row in found.items()} == {
         "pair": ("1", "1", "1 : 0"),
         "team": ("1", "1", "1 : 0"),
-        "adaptive": ("2", "0", "–"),
+        "adaptive": ("3", "1", "–"),
     }
     monkeypatch.setattr(report, "film", lambda *_: (None, "not drawn in this test"))
-    variants = {"pairs": (Variant("a", Scenario()),), "teams": (Variant("b", Scenario()),)}
+    variants = {"pairs": (Variant("a", Scenario()),), "teams": (Variant("b", Scenario()), Variant("c", Scenario()))}
     suites = [Suite(name, name, "case", members) for name, members in variants.items()]
     report.write_report(tmp_path, Plant(), scores, suites, [], "", {})
     assert {row["follower"] for row in json.loads((tmp_path / "scores.json").read_text())["scores"]} == set(found)

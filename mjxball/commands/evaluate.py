@@ -22,7 +22,7 @@ from mjxball.evaluate import paper_figures
 from mjxball.evaluate.benchmark import run_benchmark, scores_of, text_table
 from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant, load_policy, native_config
-from mjxball.evaluate.report import write_page, write_report
+from mjxball.evaluate.report import MADE, write_page, write_report
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
 from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
 from mjxball.evaluate.stand_figure import stand_config
@@ -262,7 +262,7 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     for figure in figures:
         (options.out / f"figure-{figure.name}.svg").write_text(figure.svg, encoding="utf-8")
     page = options.out / "figures.html"
-    links = [(figure.name, figure.title) for figure in figures]
+    links = [*((figure.name, figure.title) for figure in figures), MADE]
     context = {"title": "The paper's figures from our flights", "figures": figures, "links": links}
     command = shlex.join(["python", "eval.py", *arguments])
     write_page("figures.html", page, context, policies, command, versions())

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.evaluate.benchmark import Score
+from mjxball.evaluate.benchmark import Score, Summary
 from mjxball.evaluate.results import RESULTS, Result, scenario_stem, scenario_title, to_json
 from mjxball.plotting import pyplot
 from mjxball.sim.rollout import Trajectory
@@ -36,6 +36,7 @@ POLICY_COLOURS = ("#1b6ca8", "#6f4a8e", "#00798c", "#c2571a", "#7a9e1f")
 CYCLE = ("#1b6ca8", "#d1495b", "#2e933c", "#edae49", "#6f4a8e", "#00798c", "#8d6a4f", "#444444")  # in PNG files
 LEAST_SPAN = 0.01  # of an axis [m], [deg], [m/s2]
 LEAST_ERROR = 0.1  # of the axis of distances [mm]
+LEAST_PEAK = 1e-4  # of the axis of peaks [m]
 PANELS = (
     ("position", 0, "x [m]"),
     ("position", 1, "y [m]"),
@@ -73,12 +74,14 @@ def variant_curves(scores: Sequence[Score], axis: str) -> str:
             if name in NOT_DRAWN:
                 continue
             mine = {score.variant: score.summary(metric) for score in scores if score.follower == name}
-            rows = np.array([[mine[k].median, mine[k].low, mine[k].high] for k in variants])
+            flown = [mine.get(variant, Summary(math.nan, math.nan, math.nan)) for variant in variants]
+            rows = np.array([[one.median, one.low, one.high] for one in flown])
             rows[~np.isfinite(rows)] = np.nan
             panel.plot(range(len(variants)), rows[:, 0], marker="o", markersize=3, color=shade[name], label=name)
             panel.fill_between(range(len(variants)), rows[:, 1], rows[:, 2], color=shade[name], alpha=0.15, linewidth=0)
         if metric == "peak" and any(np.isfinite(line.get_ydata()).any() for line in panel.lines):
             panel.set_yscale("log")
+            panel.set_ylim(bottom=max(panel.get_ylim()[0], LEAST_PEAK))
         panel.set_ylabel(label)
         panel.set_xticks(range(len(variants)), variants, fontsize=8, rotation=15 if max(map(len, variants)) > 9 else 0)
         panel.set_xlabel(axis)

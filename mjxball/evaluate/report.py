@@ -27,6 +27,8 @@ RIVALS = ("adaptive", "lqg", "lqg-slow")  # that followers are compared with one
 CARD_HIDES = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
 LEAD_START, LEAD_SECONDS, LEAD_SPEED = 15.0, 20.0, 3.0  # of the lead picture: steady state, where flights are long
 
+MADE = ("made", "How it was made")  # anchor and heading of the section at the end of every page
+
 Row = dict[str, Any]
 
 
@@ -55,7 +57,7 @@ def write_report(
         "suites": [_suite(suite, [score for score in scores if score.suite == suite.name]) for suite in suites],
         "followers": list(dict.fromkeys(score.follower for score in scores)),
         "rows": _rows(scores),
-        "links": [("verdict", "Verdict"), *((s.name, s.name) for s in suites), ("all-scores", "All scores")],
+        "links": [("verdict", "Verdict"), ("all-scores", "All scores"), MADE, *((s.name, s.name) for s in suites)],
     }
     write_page("report.html", out / "report.html", context, policies, command, versions)
     records = {"command": command, "scores": [score.record() for score in scores]}
