@@ -18,7 +18,7 @@ from conftest import Trained
 from mjxball.cli import plant_setup
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import shipped_policy
+from mjxball.policy.file import save_file, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 
@@ -76,17 +76,24 @@ def limited(remembering: Trained) -> PolicyFile:
     params=[
         *("trained", "direct", "remembering", "limited", "estimating"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
-        *("team pair", "team team3", "universal pair"),
+        *("team pair", "team team3", "universal pair", "lifting team6"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
     name, _, plant = request.param.partition(" ")
     if plant:
-        return in_team(load_file(shipped_policy(name)), name, Path(plant), None if plant == "pair" else 2)
+        policy = lifting() if name == "lifting" else load_file(shipped_policy(name))
+        return in_team(policy, name, Path(plant), None if plant == "pair" else 2)
     if name in ("balance", "transport", "robust", "flight", "stand", "paper"):
         return load_file(shipped_policy(name))
     made = request.getfixturevalue(request.param)
     return made.contents if isinstance(made, Trained) else made
+
+
+def lifting() -> PolicyFile:
+    """`team` with a law that holds most of the load by lifting apart."""
+    team = load_file(shipped_policy("team"))
+    return dataclasses.replace(team, card={**team.card, "lqg": {**team.card["lqg"], "lifting": 0.9}})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,11 +244,14 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
         ("team.npz", "apps --crazyflie --plant team4", "an app is for pairs of Crazyflies, and team4 has 4 drones"),
         ("team.npz", "apps --crazyflie --plant pair", "is for another plant than a pair of Crazyflies"),
         ("team.npz", "apps --crazyflie --plant crazyflie", "may lift 4 m/s2 more than the leader"),
+        ("lifting.npz", "a.h --plant team3 --drone 1", "needs a team of at least 4 drones, not 3"),
+        ("lifting.npz", "apps --crazyflie --plant crazyflie", "needs a team of at least 4 drones, not 2"),
         ("team.npz", "a.npz --plant nothing", "plant file nothing cannot be read"),
     ],
 )
 def test_refusals(source: str, out: str, message: str, saved: Path, monkeypatch, capsys):
     shutil.copy(shipped_policy("team"), saved.parent / "team.npz")
+    save_file(saved.parent / "lifting.npz", lifting())
     (saved.parent / "taken.h").write_text("mine")
     arrays, card = load_arrays(saved)
     del card["history"]
