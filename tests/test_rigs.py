@@ -156,14 +156,15 @@ class TestUniversal:
         assert card["context"] == ["drones"]
         np.testing.assert_allclose(nominal_context(np.array(4.0)), [4 / 3, 0, 0, 0.15, 0.15])
 
-    def test_it_fails_on_no_rig_that_it_has_never_seen(self) -> None:
-        for size in (2, 5):
-            rigs = held_out(UNIVERSAL, size, 4)
-            law = NetworkLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
-            found = fly(UNIVERSAL, rigs, law, flights=2, seconds=12.0)
-            assert not found.failed.any()
-            assert np.median(found.error[..., 300:].max(axis=-1)) < 0.1
+    @pytest.mark.parametrize("size", [pytest.param(2, marks=pytest.mark.slow), 5])
+    def test_it_fails_on_no_rig_that_it_has_never_seen(self, size: int) -> None:
+        rigs = held_out(UNIVERSAL, size, 4)
+        law = NetworkLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
+        found = fly(UNIVERSAL, rigs, law, flights=2, seconds=12.0)
+        assert not found.failed.any()
+        assert np.median(found.error[..., 300:].max(axis=-1)) < 0.1
 
+    @pytest.mark.slow
     def test_a_step_in_flight_is_felt_from_then_on(self) -> None:
         rigs = held_out(UNIVERSAL, 2).rows(slice(0, 3))
         law = NetworkLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
