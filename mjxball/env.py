@@ -192,10 +192,10 @@ class TransportEnv:
         command: Float[Array, "... 3"],
         action: Float[Array, "... 3"],
         diverged: Bool[Array, ""],
-        shares: float,
+        on_pid: float,
         physics: ControlStep | None = None,
     ) -> State:
-        """The next state at the followers' `command`; `shares`: see `ClosedLoop.step`."""
+        """The next state at the followers' `command`; `on_pid`: see `ClosedLoop.step`."""
         world: PipelineState = state.pipeline_state
         observation = self._observed(state)
         load = world.load
@@ -204,7 +204,7 @@ class TransportEnv:
         disturbances, sample = self._disturbances.step(world.disturbances)
         before, goals = world.loop._replace(diverged=diverged), (world.goal, world.goal)
         own = self._loop_of(world.rig)
-        loop, after, commands = own.step(before, observation, command, load, goals, sample, shares, physics)
+        loop, after, commands = own.step(before, observation, command, load, goals, sample, on_pid, physics)
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,

@@ -72,7 +72,7 @@ class Batch:
         self._physics = jax.vmap(step)
         self._privileged = rollout.make_privileged_info(config)
         self._offset = make_cg_offset(config)
-        self._shares = np.float32(not isinstance(follower, Baseline))
+        self._on_pid = np.float32(not isinstance(follower, Baseline))
         self._compiled: dict[Any, Any] = {}
 
     def fly(self, scenarios: Sequence[Scenario]) -> list[Metrics]:
@@ -151,7 +151,7 @@ class Batch:
         plant, goals = state.plant, inputs.goals
         follower, answer = self._law.step(carry.follower, observation, self._privileged(plant, load))
         acting = load._replace(external_force=inputs.force)
-        moved, after, commands = loop.step(state, observation, answer, acting, goals, inputs.sample, self._shares)
+        moved, after, commands = loop.step(state, observation, answer, acting, goals, inputs.sample, self._on_pid)
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         time = inputs.number * jnp.float32(config.timing.control_period)
         flown = (time, plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)

@@ -73,23 +73,23 @@ class ClosedLoop(Laws):
         load: Load,
         goals: tuple[Vector, Vector],
         sample: Sample,
-        shares: Scalar | float = 1.0,
+        on_pid: Scalar | float = 1.0,
         physics: ControlStep | None = None,
     ) -> tuple[LoopState, Observation, Commands]:
         """One control period: (state, observation at its end, commands).
 
         `follower`: what the followers' law answers to `observation`, in their mount frames. `goals`: of O at the
         period's beginning and at its end [m]. `load` with the external force that acts in it, `sample` of the
-        measurement at its end. `shares` (...): 1 for a network whose residual is on the PID law, 0
+        measurement at its end. `on_pid` (...): 1 for a network whose residual is on the PID law, 0
         for a law of its own. `physics` in place of the loop's own.
         """
-        commands = self.commands(state, observation, follower, goals[0], shares)
+        commands = self.commands(state, observation, follower, goals[0], on_pid)
         plant = (physics or self._physics)(state.plant, self.stack(*commands), load)
         diverged = state.diverged | has_diverged(plant)
         plant = state.plant.each(lambda old, new: _where(diverged, old, new), plant)
         measured = self._leader_sees(state, observation, goals[0])
-        shares = np.asarray(shares)[..., None]
-        integral = self.integrate(state.integral, measured, goals[0], self._period, shares, commands.follower)
+        on_pid = np.asarray(on_pid)[..., None]
+        integral = self.integrate(state.integral, measured, goals[0], self._period, on_pid, commands.follower)
         sensors, observation = self._sensors.step(state.sensors, self.observe(plant, goals[1]), sample)
         return LoopState(plant, integral, sensors, diverged), observation, commands
 
@@ -99,16 +99,16 @@ class ClosedLoop(Laws):
         observation: Observation,
         follower: FollowerCommand,
         goal: Vector,
-        shares: Scalar | float = 1.0,
+        on_pid: Scalar | float = 1.0,
     ) -> Commands:
         """All commands at `observation`; arguments as of `step`."""
         leader_command = self.leader_command(self._leader_sees(state, observation, goal), goal, state.integral)
         follower = self.in_body_axes(follower)
-        if not self._shares:
+        if not self._on_pid:
             return Commands(leader_command, follower)
-        xp, shares = leader_command.__array_namespace__(), np.asarray(shares)
+        xp, on_pid = leader_command.__array_namespace__(), np.asarray(on_pid)
         return Commands(
-            leader_command, xp.where(shares[..., None] > 0, self.follower_command(follower, state.integral), follower)
+            leader_command, xp.where(on_pid[..., None] > 0, self.follower_command(follower, state.integral), follower)
         )
 
     def _leader_sees(self, state: LoopState, observation: Observation, goal: Vector) -> Body:

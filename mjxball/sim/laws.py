@@ -77,7 +77,7 @@ class Laws:
     def __init__(self, config: Config, parameters: PlantParameters | None = None):
         self._law, self._gravity = config.leader, config.plant.gravity
         self._limits = config.command.tilt_limit, config.command.vertical_limit
-        self._shares = config.follower.residual_on_pid
+        self._on_pid = config.follower.residual_on_pid
         self._tilt_integral_gain = config.leader.tilt_integral_gain
         self._washout = config.follower.washout_time
         self._axis = 0 if config.plant.cg_axis == "y" else 1  # roll or pitch, which the load turns
@@ -172,7 +172,7 @@ class Laws:
         """The integral before a flight that begins at `position`."""
         xp = position.__array_namespace__()
         still = xp.zeros_like(position)
-        return xp.concat([still, still[..., :1], still], axis=-1) if self._shares else still
+        return xp.concat([still, still[..., :1], still], axis=-1) if self._on_pid else still
 
     def integrate(
         self,
@@ -180,13 +180,13 @@ class Laws:
         state: Body,
         goal: Vector,
         period: float,
-        shares: Float[Array, "... 1"] | None = None,
+        on_pid: Float[Array, "... 1"] | None = None,
         follower_command: Vector | None = None,
     ) -> Integral:
         """`integral` one `period` [s] on, in which its error was that at `state`.
 
-        `shares`, if given: 1 where the follower shares it, 0 where it flies a law of its own. `follower_command`: the
-        command that a network's follower flew, in body axes.
+        `on_pid`, if given: 1 where the follower flies on it too, 0 where it flies a law of its own.
+        `follower_command`: what a network's follower flew, in body axes.
         """
         xp = goal.__array_namespace__()
         band = xp.asarray(self._law.integral_error_limit, dtype=goal.dtype)
@@ -194,7 +194,7 @@ class Laws:
         lead = self._law.integral_lead_time
         error = error + lead * rate if lead else error
         own = integral[..., :3] + period * xp.clip(error, -band, band)
-        if not self._shares:
+        if not self._on_pid:
             return own
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         axis = slice(self._axis, self._axis + 1)
@@ -206,18 +206,18 @@ class Laws:
             # What was added is what was flown above the base, which is the leader's law, and what was taken off.
             base = self._with_lift_difference(self._pid_command(state, goal, integral), integral, -self._lift_sign)
             average = average + period / self._washout * (follower_command - base)
-        if shares is not None:
-            level, average = level * shares, average * shares
+        if on_pid is not None:
+            level, average = level * on_pid, average * on_pid
         return xp.concat([own, level, average], axis=-1)
 
     def leader_command(self, state: Body, goal: Vector, integral: Integral) -> Vector:
         """The leader's command at `state`; `integral` of its error so far, see `Laws`."""
         wanted = self._pid_command(state, goal, integral)
-        return wanted if not self._shares else self._clip(self._with_lift_difference(wanted, integral, self._lift_sign))
+        return wanted if not self._on_pid else self._clip(self._with_lift_difference(wanted, integral, self._lift_sign))
 
     def follower_command(self, command: Vector, integral: Integral) -> Vector:
         """A network's `command` in body axes, which holds the PD law, with its share of the integrals if it has one."""
-        if not self._shares:
+        if not self._on_pid:
             return command
         xp, law = command.__array_namespace__(), self._law
         ki = xp.asarray(law.ki, dtype=command.dtype)

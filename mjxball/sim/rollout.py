@@ -144,7 +144,7 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
     All scenarios must last equally long. Each follower is called once per control step for its own part.
     """
     scenarios, act = _together(config, flights)
-    return _record(config, scenarios, act, physics, shares_of(flights))
+    return _record(config, scenarios, act, physics, on_pid_of(flights))
 
 
 def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
@@ -172,19 +172,19 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     return scenarios, act
 
 
-def shares_of(flights: Flights) -> Float[np.ndarray, " n"]:
+def on_pid_of(flights: Flights) -> Float[np.ndarray, " n"]:
     """1.0 for every flight whose follower's base is the leader's whole PID law: a policy, not a baseline."""
     return np.array([0.0 if isinstance(follower, Baseline) else 1.0 for follower, part in flights for _ in part])
 
 
 def fly(
-    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, shares: Float[np.ndarray, " n"] | None = None
+    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, on_pid: Float[np.ndarray, " n"] | None = None
 ) -> Iterator[Tick]:
     """Every control step of all scenarios at once, the start first; `act` is the followers' laws.
 
-    `shares` as from `shares_of`; None: all of them policies.
+    `on_pid` as from `on_pid_of`; None: all of them policies.
     """
-    shares = np.ones(len(scenarios)) if shares is None else shares
+    on_pid = np.ones(len(scenarios)) if on_pid is None else on_pid
     cg_offset, privileged, period = make_cg_offset(config), make_privileged_info(config), config.timing.control_period
     count = round(scenarios[0].seconds / period)
     load, target = load_of(scenarios, config.plant.count), targets(scenarios, count + 1, period)
@@ -198,7 +198,7 @@ def fly(
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         answer = act(observation, privileged(plant, load))
         acting = load._replace(external_force=samples.at(number).force)
-        after = loop.step(state, observation, answer, acting, goals, samples.at(number + 1), shares)
+        after = loop.step(state, observation, answer, acting, goals, samples.at(number + 1), on_pid)
         # The time is exact, so that a mass change falls on the same row for every engine.
         flown = (plant.position, goals[0], euler, plant.rotor_force, *after[2], state.diverged)
         yield Tick(number * period, *flown, plant, observation, cg_offset(plant, load))
@@ -206,9 +206,9 @@ def fly(
 
 
 def _record(
-    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, shares: Float[np.ndarray, " n"]
+    config: Config, scenarios: Sequence[Scenario], act: Act, physics: str, on_pid: Float[np.ndarray, " n"]
 ) -> Trajectory:
-    ticks = list(fly(config, scenarios, act, physics, shares))
+    ticks = list(fly(config, scenarios, act, physics, on_pid))
     grid = np.array([tick.time for tick in ticks])
     load, count = load_of(scenarios, config.plant.count), len(ticks)
     force = record([s.disturbance for s in scenarios], count, config.timing.control_period).force
