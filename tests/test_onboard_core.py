@@ -142,6 +142,33 @@ def test_one_abort_lands_both():
     assert "the laptop is not heard" in (bench.cause(0), bench.cause(1))
 
 
+@needs_gcc
+def test_another_pair_on_the_channel_is_not_obeyed():
+    """In flight a leader of another policy is not heard; on the ground it is a reason not to start."""
+    rig = Rig.of_card(policy_of("flight").card)
+
+    def heard(bench: Bench, phase: Phase, order: Phase, ours: bool) -> App:
+        """The follower after a beat of the leader's in this phase."""
+        beat, follower = bytearray(bench.apps[0].send()), bench.apps[1]
+        beat[2] = phase
+        beat[4] ^= 0 if ours else 1  # of the key
+        follower.hear(bytes(beat), bench.now)
+        follower.laptop(protocol.order(order).data, bench.now)
+        follower.tick(bench.state(AT_REST, rig.mounts[1]), bench.now)
+        return follower
+
+    for ours, phase in ((False, Phase.FLY), (True, Phase.DESCEND)):
+        bench = Bench(cores_of(), rig)
+        bench.take_off()
+        assert heard(bench, Phase.DESCEND, Phase.FLY, ours).phase is phase
+    for ours, refusal in ((False, "the other drone flies another policy"), (True, "good")):
+        bench = Bench(cores_of(), rig)
+        bench.tick(Phase.IDLE)
+        follower = heard(bench, Phase.IDLE, Phase.SPIN, ours)
+        assert CAUSES[int(follower.logged()["refusal"])] == refusal
+        assert follower.phase is (Phase.SPIN if ours else Phase.IDLE)
+
+
 def test_names_are_those_of_the_c_files():
     header, glue = ((generate.sources() / name).read_text() for name in ("core.h", "glue.c"))
     causes = re.search(r"\{([^{}]*) +MJXBALL_CAUSES,\s*\} mjxball_cause;", header)

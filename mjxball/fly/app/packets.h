@@ -29,6 +29,7 @@ void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now)
     beat.phase = data[2];
     beat.trusted = data[3];
     copy(&beat.key, data + 4, 4);
+    if (app->phase != MJXBALL_IDLE && beat.key != mjxball_rig.key) return; /* of another pair */
     copy(beat.integral, data + 8, 16);
     copy(beat.velocity, data + 24, 12);
     if (!all_finite(beat.integral, 4) || !all_finite(beat.velocity, 3)) return;
