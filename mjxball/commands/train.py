@@ -177,8 +177,9 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
-    if settings.ppo.activation != "relu":
-        raise InputError(f"--ppo.activation {settings.ppo.activation}: policy files hold relu; see mjxball.train.train")
+    for section in ALGORITHMS:
+        if (units := getattr(getattr(settings, section), "activation", "relu")) != "relu":
+            raise InputError(f"--{section}.activation {units}: policy files hold relu; see mjxball.train.train")
     out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)
     members = 1 if options.num_seeds is None else options.num_seeds
