@@ -1,4 +1,4 @@
-"""Export a follower: `python -m mjxball.export RUN_DIR OUT`, of a run's newest checkpoint or of a policy file.
+"""Export a follower: `python -m mjxball.export POLICY|RUN OUT`, of a run's newest checkpoint or of a policy file.
 
 OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header); see docs/policy-file.md. With --crazyflie it is a
 new directory of apps for both drones; see docs/onboard.md.
@@ -150,7 +150,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.export`."""
     about, formats = __doc__.split("\n\n")
     parser = make_parser("python -m mjxball.export", about, epilog=formats)
-    parser.add_argument("source", metavar="RUN_DIR", type=Path, help="run directory of train.py, or a policy file .npz")
+    parser.add_argument("source", metavar="POLICY|RUN", type=Path, help="policy file or run directory of train.py")
     parser.add_argument("out", metavar="OUT", type=Path, help="file to write, .npz, .onnx or .h; must not exist")
     parser.add_argument("--crazyflie", action="store_true", help="OUT is a directory: apps for a pair of Crazyflies")
     parser.add_argument("--int8", action="store_true", help="weights of 8 bits; .npz: rounded to them")
