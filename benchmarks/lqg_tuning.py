@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from cells import feasible
-from mjxball.baselines.lqg import SLOW, Lqg, Tuning
+from mjxball.baselines.lqg import Lqg
+from mjxball.baselines.lqg_design import SLOW, Tuning
 from mjxball.config import preset
 from mjxball.control.followers import Baseline
 from rivals import fly

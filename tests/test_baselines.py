@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjxball.baselines import LAWS, lqg, make_baseline, make_law
+from mjxball.baselines import LAWS, lqg, lqg_design, make_baseline, make_law
 from mjxball.baselines.assembly_model import ideal_model
 from mjxball.config import preset, replace
 from mjxball.errors import InputError
@@ -88,13 +88,13 @@ def test_feedback_is_that_of_the_hamiltonians_stable_subspace(law: type[lqg.Lqg]
     values, vectors = np.linalg.eig(np.block([[a, -b @ b.T / r], [-q, -a.T]]))
     stable = vectors[:, values.real < 0]
     cost = np.real(stable[4:] @ np.linalg.inv(stable[:4]))
-    np.testing.assert_allclose(lqg.feedback(plant, law.tuning).pitch, (b.T @ cost / r)[0], rtol=1e-9)
+    np.testing.assert_allclose(lqg_design.feedback(plant, law.tuning).pitch, (b.T @ cost / r)[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("walk", [9.0, 0.003])
 def test_filter_is_the_fixed_point_of_the_kalman_recursion(walk: float) -> None:
     plant = ideal_model(preset("paper"), "lqg")
-    found = lqg.kalman(plant, 1, walk)
+    found = lqg_design.kalman(plant, 1, walk)
     noise, measured, covariance = np.zeros((5, 5)), np.eye(2, 5), np.eye(5)
     noise[3, 3] = walk * plant.period
     for _ in range(3000):
@@ -116,7 +116,7 @@ def test_sampled_model_is_the_integrated_one() -> None:
         k3 = a @ (end + step / 2 * k2) + b @ u
         k4 = a @ (end + step * k3) + b @ u
         end = end + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    transition, drive = lqg.discretise(a, b, 0.02)
+    transition, drive = lqg_design.discretise(a, b, 0.02)
     np.testing.assert_allclose(transition @ x + drive @ u, end, rtol=1e-11)
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
-from mjxball.baselines.lqg import discretise
+from mjxball.baselines.lqg_design import discretise
 from mjxball.config import Config, ball_limit
 from mjxball.control.constants import drone_loop, thrust_slopes
 from mjxball.control.followers import PrivilegedInfo

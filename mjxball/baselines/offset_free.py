@@ -7,16 +7,8 @@ from typing import Any
 import numpy as np
 
 from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
-from mjxball.baselines.lqg import (
-    CLIMB_NOISE,
-    CORRECTION_LIMIT,
-    RATE_NOISE,
-    THETA_NOISE,
-    VERTICAL_LIMIT,
-    Tuning,
-    feedback,
-    steady_filter,
-)
+from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
+from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, THETA_NOISE, Tuning, feedback, steady_filter
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.leader import clip_command

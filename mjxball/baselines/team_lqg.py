@@ -7,15 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.baselines.assembly_model import ideal_model
-from mjxball.baselines.lqg import (
-    CLIMB_NOISE,
-    CORRECTION_LIMIT,
-    RATE_NOISE,
-    VERTICAL_LIMIT,
-    Tuning,
-    feedback,
-    steady_filter,
-)
+from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
+from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, Tuning, feedback, steady_filter
 from mjxball.baselines.offset_free import LIFT_WALK, NAME, OffsetFree
 from mjxball.config import Config
 from mjxball.control.followers import copy_gains
