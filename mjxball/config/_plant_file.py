@@ -45,8 +45,8 @@ def read_plant(source: Path | str) -> PlantFile:
     if preset is not None and not isinstance(preset, str):
         raise InputError(f"plant file {path}: preset must be the name of one, not {preset!r}")
     settings = dict(_flat(values))
-    for name in settings:
-        if name.partition(".")[0] not in PLANT_PARTS or "." not in name:
+    for name in (*settings, *values):  # tables without settings are in `values` alone
+        if name.partition(".")[0] not in PLANT_PARTS or (name in PLANT_PARTS and name in settings):
             raise InputError(f"plant file {path} may set {', '.join(PLANT_PARTS)}, not {name}")
     if DRONES in settings:
         whole = {f"plant.{name}": value for name, value, _ in leaves(Plant()) if not name.startswith("drones.")}
@@ -97,6 +97,8 @@ def with_plant(config: Config, source: Path | str) -> Config:
         if DRONES in settings:
             _check_inertias(changed.plant)
         return changed
+    except OverflowError:  # a whole number with hundreds of digits
+        raise InputError(f"plant file {source} holds a number that is not finite") from None
     except InputError as error:
         text = str(error)
         raise InputError(text if text.startswith("plant file") else f"plant file {source}: {text}") from None
