@@ -28,6 +28,7 @@ from mjxball import cli
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset, replace, with_plant
 from mjxball.control.followers import Follower
+from mjxball.errors import InputError
 from mjxball.evaluate.batch import Batch, Course
 from mjxball.evaluate.policies import load_policy
 from mjxball.plant.trim import largest_margin
@@ -53,11 +54,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the flights")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(arguments)
+    if options.flights < 1:
+        raise InputError(f"--flights must be at least 1, not {options.flights}")
     six, four = (with_plant(preset("paper"), name) for name in ("team6", "team4"))
     drawn = flights(six, options.flights, options.seed)
     margins = [margin(six, scenario) for scenario in drawn]
     least = six.scenario.trim_margin
     feasible = [scenario for scenario, left in zip(drawn, margins, strict=True) if left >= least]
+    if not feasible:
+        raise InputError(f"none of {len(drawn)} flights can be trimmed; draw more")
     shares = {
         "flights": len(drawn),
         "with margin": len(feasible) / len(drawn),

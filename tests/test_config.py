@@ -30,7 +30,7 @@ def another(value: Any) -> Any:
     if isinstance(value, bool):
         return not value
     if isinstance(value, tuple):
-        return (another(value[0]), *value[1:]) if value else (1.0,)
+        return (another(value[0]), *value[1:]) if value else (3,)
     return value + 1 if isinstance(value, (int, float)) else f"{value}!"
 
 
@@ -157,6 +157,11 @@ class TestOverride:
     @rows(("text", "value"), [("true", True), ("False", False), ("1", True), ("0", False)])
     def test_switches(self, text, value):
         assert configs.override(Config(), "sac.alpha_fixed", text).sac.alpha_fixed is value
+
+    def test_numbers_of_drones_are_whole(self):
+        assert str(configs.override(Config(), "scenario.team_sizes", "2,4").scenario.team_sizes) == "(2, 4)"
+        with pytest.raises(InputError, match="whole numbers"):
+            configs.override(Config(), "scenario.team_sizes", "2.5")
 
     def test_layers_may_have_any_number(self):
         assert configs.override(Config(), "sac.policy_layers", "32,16,8").sac.policy_layers == (32, 16, 8)

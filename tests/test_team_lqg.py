@@ -285,7 +285,11 @@ def test_a_follower_that_is_lost_is_made_up_for() -> None:
 
 def test_lifting_apart_takes_four_drones(tmp_path) -> None:
     with pytest.raises(InputError, match=r"follower.load_by_lift needs teams of at least 4 drones, not 3"):
-        team_lqg(lifting(ring(3)))
+        configs.validate(lifting(ring(3)))
+    with pytest.raises(InputError, match=r"follower.load_by_lift needs teams of at least 4 drones, not 2"):
+        configs.validate(configs.override(configs.preset("lost"), "scenario.team_sizes", "2,6"))
+    with pytest.raises(InputError, match=r"follower.load_by_lift is of teams with follower.base lqg"):
+        configs.validate(configs.override(configs.preset("transport"), "follower.load_by_lift", "0.5"))
     path = tmp_path / "apart.npz"
     save_file(path, silent(lifting(ring(6))))
     with pytest.raises(InputError, match="apart needs a team of at least 4 drones, not 3"):

@@ -12,7 +12,7 @@ from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, Tuning, feedba
 from mjxball.baselines.offset_free import LIFT_WALK, NAME, OffsetFree
 from mjxball.config import Config
 from mjxball.control.followers import copy_gains
-from mjxball.control.team_lqg import LEAST_LIFTING, TeamLqg, team_context
+from mjxball.control.team_lqg import TeamLqg, team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 
@@ -39,9 +39,6 @@ def team_lqg(config: Config) -> TeamLqg:
     """The law for teams like that of `config`; InputError unless it flies freely with ideal loops that are alike."""
     model, lifting = ideal_model(config, NAME), config.follower.load_by_lift
     tuning, forgetting = (QUICK, QUICK_LIFT) if lifting else (TUNING, Forgetting())
-    smallest = min(config.scenario.team_sizes, default=config.plant.count)
-    if lifting and smallest < LEAST_LIFTING:
-        raise InputError(f"follower.load_by_lift needs teams of at least {LEAST_LIFTING} drones, not {smallest}")
     roll, pitch, _ = config.attitude.natural_frequency
     if roll != pitch:
         raise InputError(f"follower {NAME!r} needs attitude loops alike about roll and pitch in a team")

@@ -29,7 +29,7 @@ from mjxball.evaluate.stand_figure import stand_config
 from mjxball.evaluate.suites import find_suites, list_suites
 from mjxball.evaluate.variants import Suite
 from mjxball.physics.step import ENGINES
-from mjxball.policy import Policy, PolicyFileError
+from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policies
 from mjxball.sim.scenario import Scenario
 from mjxball.train.run_directory import versions
@@ -286,16 +286,16 @@ def _load(
     """
     policies = []
     for path in paths:
+        setup, policy = setup_of(path), Policy.load(path)
+        policy.join(setup.plant, setup.attitude)  # nothing forces a law into a team that it is not for
         try:
-            policies.append(load_policy(path, setup_of(path), compare_laws=options.wn_pitch is None))
-        except PolicyFileError:
-            raise
+            policy = load_policy(path, setup, compare_laws=options.wn_pitch is None)
         except InputError as error:
             if not options.force:
                 raise InputError(f"{error}; --force flies it all the same") from None
             print(f"warning: FORCED: {error}", file=sys.stderr)  # noqa: T201
-            policies.append(Policy.load(path))
-            policies[-1].name += " (FORCED)"
+            policy.name += " (FORCED)"
+        policies.append(policy)
     stems = [policy.name for policy in policies]
     for policy, path in zip(policies, paths, strict=True):
         if stems.count(policy.name) > 1:

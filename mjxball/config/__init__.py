@@ -5,7 +5,7 @@ Importing it needs the standard library only.
 
 from mjxball.config._leaf import Range
 from mjxball.config._learning import Gradient, Ppo, Sac
-from mjxball.config._plant import Drone, Plant
+from mjxball.config._plant import LEAST_LIFTING, Drone, Plant
 from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
 from mjxball.config._presets import PRESETS, preset
 from mjxball.config._renamed import CONSTANT, RENAMED, current_name, old_names, with_current_names
@@ -38,6 +38,7 @@ from mjxball.config._validate import ball_limit, cg_limit, validate
 
 __all__ = [
     "CONSTANT",
+    "LEAST_LIFTING",
     "PLANTS",
     "PLANT_PARTS",
     "PRESETS",

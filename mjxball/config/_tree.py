@@ -52,9 +52,10 @@ def override(config: Config, path: str, text: str) -> Config:
 
     Raises InputError for an unknown path or a text that does not parse to the leaf's type.
     """
-    for known, value, _ in leaves(config):
+    for known, value, item in leaves(config):
         if known == current_name(path):
-            return replace(config, known, _parse(path, text, value))
+            whole = "int" in str(item.type)
+            return replace(config, known, _parse(path, text, value, int if whole else float))
     raise InputError(f"--{path} is not a setting; run with --help for the list")
 
 
@@ -84,16 +85,18 @@ def apply_overrides(config: Config, values: Mapping[str, Any]) -> Config:
     return config
 
 
-def _parse(path: str, text: str, example: Any) -> Any:
+def _parse(path: str, text: str, example: Any, kind: type) -> Any:
+    """`text` as a value like `example`, of a tuple's parts as `kind`."""
     try:
         if isinstance(example, bool):
             return {"true": True, "false": False, "1": True, "0": False}[text.lower()]
         if isinstance(example, tuple):
-            kind = type(example[0]) if example else float
+            kind = type(example[0]) if example else kind
             return tuple(kind(part) for part in text.split(",")) if text else ()
         return type(example)(text)
     except (ValueError, KeyError):
-        wanted = {bool: "true or false", int: "a whole number", float: "a number", tuple: "comma-separated numbers"}
+        several = f"comma-separated {'whole ' if kind is int else ''}numbers"
+        wanted = {bool: "true or false", int: "a whole number", float: "a number", tuple: several}
         raise InputError(f"--{path} takes {wanted[type(example)]}, not {text!r}") from None
 
 

@@ -16,7 +16,6 @@ from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_f
 from mjxball.plant import PlantParameters
 
 Array = Any
-LEAST_LIFTING = 4  # drones of a team that lifts apart: with three, two followers lift without the leader
 UNKNOWN_ROOM = 0.15  # [rad] that the rotors of a rig which nobody knows can follow
 ANGLE_STATES, HEIGHT_STATES, CONTEXT = 5, 3, 5
 STATES = 2 * ANGLE_STATES + HEIGHT_STATES

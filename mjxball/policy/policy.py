@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.config import Attitude, Plant
+from mjxball.config import LEAST_LIFTING, Attitude, Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.team_lqg import LEAST_LIFTING, nominal_context, team_context
+from mjxball.control.team_lqg import nominal_context, team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import COUNT, PolicyFile, law_of, load_file
