@@ -66,6 +66,13 @@ class Flight {
     return { low, high };
   }
 
+  // Some of the places where the object is, or should be.
+  places() {
+    const every = Math.ceil(this.rows / 200), found = [];
+    for (let row = 0; row < this.rows; row += every) found.push(this.at('position', row), this.at('target', row));
+    return found;
+  }
+
   rowAt(time) {
     let low = 0, high = this.rows - 1;
     while (low < high) {

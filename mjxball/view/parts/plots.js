@@ -1,13 +1,13 @@
 // Time plots: lines over time with a cursor; click or drag to seek.
 const LEFT = 46, RIGHT = 8, TOP = 6, BOTTOM = 18;
 
-// About `count` round numbers between low and high.
+// About `count` round numbers between low and high, two at least.
 function ticks(low, high, count) {
   const raw = (high - low) / count, power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].map((k) => k * power).find((k) => k >= raw * 0.999);
   const found = [];
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push(k * step);
-  return found;
+  return found.length > 1 || count > 10 ? found : ticks(low, high, 2 * count);
 }
 
 const short = (value) => String(+value.toPrecision(3)).replace('-', '−');

@@ -32,7 +32,9 @@ class Scene {
     const { low, high } = this.flight.bounds(), { camera } = this, zoomed = camera.distance / camera.home.distance;
     this.middle = times(0.5, add(low, high));
     this.floor = Math.min(low[2] - 0.25, -0.25);
-    Object.assign(camera.home, { target: this.middle, distance: 0.95 * length(sub(high, low)) + 0.85 });
+    const places = this.flight.places().map((place) => sub(place, this.middle));
+    const rig = Math.max(...this.flight.plant.drones.map(({ mount, arm }) => length(mount) + 1.6 * arm));
+    Object.assign(camera.home, { target: this.middle, distance: camera.whole(places, rig) });
     Object.assign(camera, { target: this.middle, distance: zoomed * camera.home.distance });
   }
 

@@ -12,6 +12,12 @@ function rotate([w, x, y, z], v) {
   return add(add(v, times(w, t)), cross(axis, t));
 }
 
+// Unit vectors of a view: towards the eye, to the right, up.
+function axes({ azimuth, elevation }) {
+  const ce = Math.cos(elevation), se = Math.sin(elevation), ca = Math.cos(azimuth), sa = Math.sin(azimuth);
+  return { back: [ce * ca, ce * sa, se], right: [-sa, ca, 0], up: [-se * ca, -se * sa, ce] };
+}
+
 class Camera {
   constructor(target, distance) {
     this.home = { target, distance, azimuth: -1.15, elevation: 0.24 };
@@ -27,13 +33,16 @@ class Camera {
 
   zoom(factor) { this.distance = Math.max(0.3, Math.min(40, this.distance * factor)); }
 
+  // Distance from which all `points`, given from the target, and what lies flat within `around` of each are seen at home.
+  whole(points, around) {
+    const { back, right, up } = axes(this.home);
+    return Math.max(...points.map((p) => dot(p, back)
+      + Math.max(2.6 * (Math.abs(dot(p, right)) + around), 3.4 * (Math.abs(dot(p, up)) + 0.4 * around))));
+  }
+
   // Call once for each picture of `width` x `height` pixels.
   aim(width, height) {
-    const ce = Math.cos(this.elevation), se = Math.sin(this.elevation);
-    const ca = Math.cos(this.azimuth), sa = Math.sin(this.azimuth);
-    this.back = [ce * ca, ce * sa, se];
-    this.right = [-sa, ca, 0];
-    this.up = [-se * ca, -se * sa, ce];
+    Object.assign(this, axes(this));
     this.place = add(this.target, times(this.distance, this.back));
     this.focal = 1.25 * Math.min(width, 1.3 * height);
     this.centre = [width / 2, height / 2];
