@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mjxball.baselines import make_baseline
-from mjxball.config import Plant, preset
+from mjxball.config import Plant, preset, with_plant
 from mjxball.evaluate import report
 from mjxball.evaluate.benchmark import Score, winners, wins
 from mjxball.evaluate.metrics import Metrics
@@ -88,6 +88,12 @@ def test_suites_flown_by_different_followers_are_compared_where_both_flew(
     suites = [Suite(name, name, "case", members) for name, members in variants.items()]
     report.write_report(tmp_path, Plant(), scores, suites, [], "", {})
     assert {row["follower"] for row in json.loads((tmp_path / "scores.json").read_text())["scores"]} == set(found)
+    assert "Reference scenario: CG ±5 cm" in " ".join((tmp_path / "report.html").read_text().split())
+    team = with_plant(preset("paper"), "team4").plant
+    report.write_report(tmp_path, team, scores, suites, [], "", {})
+    told = (tmp_path / "report.html").read_text()
+    assert "Reference scenario" not in told
+    assert "the pair" not in told
 
 
 def test_failures_and_the_oracle_win_nothing(cell: Result) -> None:

@@ -49,6 +49,7 @@ def write_report(
         "title": "Benchmark of followers",
         "picture": base64.b64encode(picture).decode() if picture else "",
         "caption": caption,
+        "pair": plant.count == 2,
         "num_seeds": max(len(score.metrics) for score in scores),
         "variants": len(by_variant(scores)),
         "verdict": verdict(scores),
