@@ -35,8 +35,8 @@ from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
 from mjxball.config import Config, preset, replace
 from mjxball.control.followers import Copy, Law
 from mjxball.errors import InputError
-from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import Flown, cg_jumps, fly, mass_changes, rig_laws
+from mjxball.evaluate.policies import flies_any_rig, load_policy
+from mjxball.evaluate.rigs import AnyRigLaw, Flown, cg_jumps, fly, mass_changes, rig_laws
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, held_out, rig_config, unpadded
 
@@ -100,7 +100,8 @@ def followers(paths: Sequence[Path]) -> list[Made]:
 
 
 def _network(path: Path, config: Config, rigs: RigTable) -> Law:
-    return NetworkLaw(load_policy(path, rig_config(config, rigs, 0)))
+    policy = load_policy(path, rig_config(config, rigs, 0))
+    return AnyRigLaw(policy) if flies_any_rig(policy) else NetworkLaw(policy)
 
 
 def _adaptive(config: Config) -> Law:

@@ -29,8 +29,8 @@ from mjxball.control import rotations
 from mjxball.control.observation import mount_angles
 from mjxball.env import TransportEnv
 from mjxball.evaluate.policies import load_policy
+from mjxball.evaluate.rigs import AnyRigLaw
 from mjxball.physics.motion import make_prescribed
-from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import RigTable, held_out, rig_config, whole
 
 SIZES, RIGS, FLIGHTS, TIMES, RIDGE = (2, 3, 4), 100, 2, (0.5, 1.0, 2.0, 8.0), 1e-2
@@ -69,10 +69,10 @@ def _explained(memory: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _memories(config: Config, rigs: RigTable, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(memory (R, K, T, m) of the first follower, truths (R, K, T, t)) at `TIMES`."""
+    """(what the first follower's network sees of its memory (R, K, T, s), truths (R, K, T, t)) at `TIMES`."""
     size = int(rigs.size[0])
     alone = rig_config(config, rigs, 0)
-    law = NetworkLaw(load_policy(path, alone))
+    every = AnyRigLaw(load_policy(path, alone))
     own = dataclasses.replace(alone, attitude=config.attitude, rigs=dataclasses.replace(config.rigs, number=1))
     env, cg = TransportEnv(own, "newton-euler"), make_prescribed(own)
     ends = np.array([round(time / env.dt) for time in TIMES])
@@ -84,9 +84,11 @@ def _memories(config: Config, rigs: RigTable, path: Path) -> tuple[np.ndarray, n
         state = env.reset(key, 1.0, None, rig)
         numbers = whole(rig.numbers, own.plant.gravity)
         angle = first(jnp.asarray(mount_angles(own.plant, numbers.mounts)))
+        law = every.on(rig, own.plant)
 
         def step(carry: Any, _: None) -> Any:
             state, memory = carry
+            seen = every.shown(state.obs[..., :18], memory)
             memory, command = law.step(memory, state.obs[..., :18], None)
             state = env.step_with_command(state, command)
             world = state.pipeline_state
@@ -104,7 +106,7 @@ def _memories(config: Config, rigs: RigTable, path: Path) -> tuple[np.ndarray, n
                 delay[None],
                 jnp.log(rig.frequency[1])[None],
             ]
-            return (state, memory), (first(memory), jnp.concatenate(known))
+            return (state, memory), (first(seen), jnp.concatenate(known))
 
         start = state, law.start(state.obs[..., :18])
         return jax.tree.map(lambda part: part[ends - 1], jax.lax.scan(step, start, None, length=int(ends[-1]))[1])

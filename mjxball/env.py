@@ -13,7 +13,8 @@ from mjxball import rewards
 from mjxball.config import Config, ball_limit
 from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
-from mjxball.control.team_lqg import nominal_context, team_context
+from mjxball.control.multi_model_lqg import team_geometry
+from mjxball.control.team_lqg import team_context
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
 from mjxball.physics.motion import object_mass
@@ -107,7 +108,7 @@ class TransportEnv:
     @property
     def policy_input_size(self) -> int:
         """How many numbers of the observation the follower sees and remembers; only critics are told the rest."""
-        return layout.OBSERVATION_SIZE + self._law.size
+        return layout.OBSERVATION_SIZE + self._law.shown
 
     @property
     def input_mask(self) -> list[float]:
@@ -279,7 +280,7 @@ class TransportEnv:
             return None
         plant = self.config.plant
         if rig is not None and rig.drawn is not None:
-            return nominal_context(rig.drawn.size)
+            return team_geometry(plant, rig.drawn.numbers.mounts, rig.drawn.size)
         mass = jnp.float32(plant.object_mass) * (1.0 if rig is None else rig.share)
         numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
         return team_context(jax.tree.map(jnp.float32, numbers), plant, mass)

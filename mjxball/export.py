@@ -21,8 +21,8 @@ from mjxball.config import Config
 from mjxball.control.motors import firmware
 from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
-from mjxball.policy.file import CONTEXT, COUNT, PolicyFile, law_of, load_file, save_file, write_whole
-from mjxball.policy.policy import context_of
+from mjxball.policy.file import PolicyFile, law_of, load_file, save_file, write_whole
+from mjxball.policy.policy import context_of, not_told
 
 
 def policy_of_run(run: Path) -> PolicyFile:
@@ -62,14 +62,16 @@ def in_team(policy: PolicyFile, name: str, plant: Path | None, drone: int | None
     if drone not in (followers if len(followers) > 1 else (None, *followers)):
         raise InputError(f"--drone must be a follower of --plant: {', '.join(map(str, followers))}")
     place = 0 if drone is None else followers.index(drone)
-    if config is None:  # InputError, unless any pair will do
-        context, angles, about = context_of(name, policy.card, None, None), np.zeros(1), {}
-    else:
-        context = context_of(name, policy.card, config.plant, config.attitude)
-        angles, about = np.ravel(mount_frames(config.plant)), _card_of(config, policy.card)
-    told = context.reshape(-1, len(CONTEXT))[place].tolist()
-    team = {"drone": followers[place], "mount_angle": float(angles[place]), "context": told}
-    return replace(policy, card={**policy.card, **about, "team": team})
+    if config is None:
+        raise not_told(name)
+    context = context_of(name, policy.card, config.plant, config.attitude)
+    told = context.reshape(-1, context.shape[-1])[place].tolist()
+    team = {
+        "drone": followers[place],
+        "mount_angle": float(np.ravel(mount_frames(config.plant))[place]),
+        "context": told,
+    }
+    return replace(policy, card={**policy.card, **_card_of(config, policy.card), "team": team})
 
 
 def _card_of(config: Config, card: dict[str, Any]) -> dict[str, Any]:
@@ -101,7 +103,7 @@ def _write_header(out: Path, policy: PolicyFile, int8: bool = False) -> None:
     write_whole(out, c_header(policy, out.stem, int8).encode("ascii"))
 
 
-CRAZYFLIES = Path("crazyflie")  # the plant of apps of a policy that is told the number of drones alone
+CRAZYFLIES = Path("crazyflie")  # the plant of apps of a policy for any rig
 Writer = Callable[[Path, PolicyFile], None]
 WRITERS: dict[str, Writer] = {".npz": save_file, ".onnx": _write_onnx, ".h": _write_header}
 ROUNDED: dict[str, Writer] = {".npz": _save_rounded, ".h": functools.partial(_write_header, int8=True)}  # with --int8
@@ -119,7 +121,7 @@ def export(
 
     `crazyflie`: to the new directory `out`, as apps for both drones. `int8`: weights of 8 bits in an app or a header,
     floats rounded to them in a policy file. `plant`, `drone`: see `in_team`; a policy file need not be told them.
-    A policy that is told the number of drones alone flies in a pair by default, apps on `crazyflie`.
+    Apps of a policy for any rig are for the plant `crazyflie` by default.
     """
 
     def policy() -> PolicyFile:
@@ -131,7 +133,7 @@ def export(
 
         check_place(out)
         card = contents_of(source).card
-        if plant is None and card.get("context") == list(COUNT) and "team" not in card:
+        if plant is None and card["format_version"] == 4 and "team" not in card:
             plant = CRAZYFLIES
         drones = 2 if plant is None else plant_setup(plant).plant.count
         if drones != 2:

@@ -18,7 +18,7 @@ from conftest import Trained
 from mjxball.cli import plant_setup
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import save_file, shipped_policy
+from mjxball.policy.file import law_of, save_file, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 
@@ -58,6 +58,9 @@ int main(void) {
 """
 
 
+ROUNDED = 5e-5  # of what is large in a memory: angular accelerations, scores of models
+
+
 @pytest.fixture(scope="module")
 def direct(trained: Trained) -> PolicyFile:
     """A follower that commands directly, with other gains and limits."""
@@ -76,7 +79,7 @@ def limited(remembering: Trained) -> PolicyFile:
     params=[
         *("trained", "direct", "remembering", "limited", "estimating"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
-        *("team pair", "team team3", "universal pair", "lifting team6"),
+        *("team pair", "team team3", "universal pair", "universal team3", "lifting team6"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
@@ -112,7 +115,7 @@ def flown(contents: PolicyFile, dtype: Any) -> Flight:
     """NumPy inference on observations that change as smoothly as a flight's."""
     policy, random = Policy(contents, "follower", dtype), np.random.default_rng(3)
     walk = np.cumsum(random.normal(scale=0.03, size=(STEPS, 18)), axis=0) + random.normal(scale=0.3, size=18)
-    size = len(contents.observation_mean) - 18
+    size = law_of(contents.card).size
     rows: dict[str, list[Any]] = {field.name: [] for field in dataclasses.fields(Flight)}
     for number, seen in enumerate(walk.astype(np.float32)):
         start = number % (STEPS // 2) == 0
@@ -143,7 +146,7 @@ def test_onnx_computes_what_numpy_computes(contents: PolicyFile):
     scale = float(contents.action_scale.max())
     np.testing.assert_allclose(answer["command"], flight.command, rtol=0, atol=1e-6 + scale * ONNX_TOLERANCE)
     if flight.memory.shape[1]:
-        np.testing.assert_allclose(answer["next_memory"], flight.next_memory, rtol=0, atol=1e-6 + ONNX_TOLERANCE)
+        np.testing.assert_allclose(answer["next_memory"], flight.next_memory, rtol=ROUNDED, atol=1e-6 + ONNX_TOLERANCE)
     assert np.abs(flight.action).max() > 0.05
 
 
@@ -185,7 +188,7 @@ def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_pat
     np.testing.assert_allclose(answer[:, :3], flight.action, rtol=0, atol=TOLERANCE)
     scale = float(contents.action_scale.max())
     np.testing.assert_allclose(answer[:, 3:6], flight.command, rtol=0, atol=1e-6 + scale * TOLERANCE)
-    np.testing.assert_allclose(answer[:, 6:], flight.next_memory, rtol=0, atol=1e-6 + TOLERANCE)
+    np.testing.assert_allclose(answer[:, 6:], flight.next_memory, rtol=ROUNDED, atol=1e-6 + TOLERANCE)
     if real == "float":
         assert int(done.stderr) == footprint(contents).state
 

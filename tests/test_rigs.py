@@ -1,4 +1,4 @@
-"""Random rigs: what is drawn is sound, padded and told alike, and the follower for any rig is told nothing of them."""
+"""Random rigs: what is drawn is sound and padded, and the follower for any rig is told where drones are mounted."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from tables import rows
 from mjxball.baselines.lqg import SlowKnownRigLqg
 from mjxball.config import preset, replace, validate, with_plant
 from mjxball.control.followers import PrivilegedInfo
-from mjxball.control.team_lqg import nominal_context
+from mjxball.control.multi_model_lqg import team_geometry
+from mjxball.control.team_lqg import team_context
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import Flown, cg_jumps, fly, mass_changes, rig_laws, stacked
+from mjxball.evaluate.rigs import AnyRigLaw, Flown, cg_jumps, fly, mass_changes, rig_laws, stacked
 from mjxball.physics.newton_euler import make_engine
 from mjxball.physics.step import make_control_step
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
-from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import (
     TRAINING,
     draw_rigs,
@@ -151,15 +151,31 @@ def test_thrust_falls_as_the_battery_empties() -> None:
 
 
 class TestUniversal:
-    def test_it_is_told_the_number_of_drones_alone(self) -> None:
-        card = load_file(POLICY).card
-        assert card["context"] == ["drones"]
-        np.testing.assert_allclose(nominal_context(np.array(4.0)), [4 / 3, 0, 0, 0.15, 0.15])
+    def test_what_it_makes_of_mounts_is_that_of_a_middling_rig(self) -> None:
+        """Against what a law that is told the whole rig is told: medians of the rigs, their spread and direction."""
+        for size in (2, 3, 4, 6):
+            levers, rooms, turned = [], [], []
+            rigs = held_out(UNIVERSAL, size, 40)
+            for row in range(40):
+                config = rig_config(UNIVERSAL, rigs, row)
+                plant, numbers = config.plant, plant_parameters(config.plant, config.attitude)
+                told = np.reshape(team_context(numbers, plant, np.float64(plant.object_mass)), (size - 1, 5))
+                guessed = np.reshape(team_geometry(plant, rigs.numbers.mounts[row], np.float64(size)), (size - 1, 4))
+                np.testing.assert_allclose(guessed[:, 0], told[:, 0])
+                stiffness = np.square(config.attitude.natural_frequency[:2])
+                levers.append(np.hypot(*(told[:, 1:3] * stiffness).T) / np.hypot(*guessed[:, 1:3].T))
+                rooms.append(told[:, 4] * stiffness[1] / guessed[:, 3])
+                turned.append(np.arctan2(told[:, 1], told[:, 2]) - np.arctan2(guessed[:, 1], guessed[:, 2]))
+            assert np.median(levers) == pytest.approx(1.0, abs=0.15)
+            assert np.median(rooms) == pytest.approx(1.0, abs=0.25)
+            assert np.quantile(np.abs(np.log(levers)), 0.9) < 0.5
+            # The loops of roll are up to a quarter faster or slower than those of pitch.
+            assert np.abs((np.array(turned) + np.pi) % (2 * np.pi) - np.pi).max() < 0.3
 
     @pytest.mark.parametrize("size", [pytest.param(2, marks=pytest.mark.slow), 5])
     def test_it_fails_on_no_rig_that_it_has_never_seen(self, size: int) -> None:
         rigs = held_out(UNIVERSAL, size, 4)
-        law = NetworkLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
+        law = AnyRigLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
         found = fly(UNIVERSAL, rigs, law, flights=2, seconds=12.0)
         assert not found.failed.any()
         assert np.median(found.error[..., 300:].max(axis=-1)) < 0.1
@@ -167,7 +183,7 @@ class TestUniversal:
     @pytest.mark.slow
     def test_a_step_in_flight_is_felt_from_then_on(self) -> None:
         rigs = held_out(UNIVERSAL, 2).rows(slice(0, 3))
-        law = NetworkLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
+        law = AnyRigLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
         quiet = {"noise": (0.0, 0.0), "delay": (0.0, 0.0), "estimator_drift": (0.0, 0.0)}
         still = dataclasses.replace(UNIVERSAL, scenario=dataclasses.replace(UNIVERSAL.scenario, **quiet))
         same, mass, cg = (

@@ -101,7 +101,16 @@ def kalman(model: AssemblyModel, axis: int, torque_walk: float) -> Filter:
 def steady_filter(
     a: np.ndarray, b: np.ndarray, period: float, walks: Mapping[int, float], noise: Mapping[int, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(A (n, n), B (n, m), K (n, k)) of the steady-state Kalman filter of x' = a x + b u, sampled every `period` [s].
+    """(A, B, K) of `innovation_filter`."""
+    return innovation_filter(a, b, period, walks, noise)[:3]
+
+
+def innovation_filter(
+    a: np.ndarray, b: np.ndarray, period: float, walks: Mapping[int, float], noise: Mapping[int, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(A (n, n), B (n, m), K (n, k), covariance (k, k) of what is measured less what is predicted).
+
+    Of the steady-state Kalman filter of x' = a x + b u, sampled every `period` [s].
 
     `walks`: intensity of the white noise that drives a state, by its number. `noise`: deviation of the measurement of
     a state, by its number; K has a column for each.
@@ -112,8 +121,8 @@ def steady_filter(
         process_noise[state, state] = intensity * period
     measured, measurement_noise = np.eye(len(a))[list(noise)], np.diag([value**2 for value in noise.values()])
     predicted = solve_discrete_are(transition.T, measured.T, process_noise, measurement_noise)
-    gain = predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + measurement_noise)
-    return transition, drive, gain
+    innovation = measured @ predicted @ measured.T + measurement_noise
+    return transition, drive, predicted @ measured.T @ np.linalg.inv(innovation), innovation
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mjxball.control import leader
+from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.control.observation import ObservationHistory, copy_command, scale_action
 from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
@@ -28,24 +29,29 @@ class FollowerLaw(NamedTuple):
     kd: Array  # (3,)
     gravity: float  # [m/s2]
     residual: bool = True  # whether the action is added to a law: `lqg`, or the leader's PD law if that is None
-    lqg: OffsetFreeLqg | TeamLqg | None = None
+    lqg: OffsetFreeLqg | TeamLqg | MultiModelLqg | None = None
 
     @property
     def size(self) -> int:
-        """Length m of the memory, and what `network_input` is longer than an observation."""
+        """Length m of the memory."""
         return self.history.size + (0 if self.lqg is None else self.lqg.size)
+
+    @property
+    def shown(self) -> int:
+        """How many numbers s `network_input` has behind an observation."""
+        return self.history.size + (0 if self.lqg is None else self.lqg.shown)
 
     def mask(self, ignore_position: bool) -> list[float]:
         """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
-        return self.history.mask(ignore_position) + [1.0] * (self.size - self.history.size)
+        return self.history.mask(ignore_position) + [1.0] * (self.shown - self.history.size)
 
     @property
     def needs_context(self) -> bool:
-        """Whether a follower has to be told its team, see `team_lqg.team_context`."""
-        return isinstance(self.lqg, TeamLqg)
+        """Whether a follower has to be told its team: `team_lqg.team_context`, `multi_model_lqg.ring_context`."""
+        return isinstance(self.lqg, TeamLqg | MultiModelLqg)
 
     def start(self, observation: Array, context: Array | None = None) -> Array:
-        """Memory (..., m) before the first `observation` (..., 18); `context` (..., 5) if `needs_context`."""
+        """Memory (..., m) before the first `observation` (..., 18); `context` (..., c) if `needs_context`."""
         remembered = self.history.start(observation)
         if self.lqg is None:
             return remembered
@@ -53,7 +59,7 @@ class FollowerLaw(NamedTuple):
         return observation.__array_namespace__().concat([remembered, self.lqg.start(observation, **known)], axis=-1)
 
     def network_input(self, observation: Array, memory: Array) -> Array:
-        """Input of the network (..., 18 + m)."""
+        """Input of the network (..., 18 + s)."""
         seen = self.history.network_input(observation, memory[..., : self.history.size])
         if self.lqg is None:
             return seen

@@ -39,6 +39,11 @@ class OffsetFreeLqg(NamedTuple):
         """Numbers in the memory."""
         return STATES + DRIVES
 
+    @property
+    def shown(self) -> int:
+        """How many numbers `features` has."""
+        return self.size
+
     def start(self, observation: Array) -> Array:
         """Memory (..., 10), state and drives, before the first `observation` (..., 18)."""
         xp = observation.__array_namespace__()

@@ -16,7 +16,6 @@ from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_f
 from mjxball.plant import PlantParameters
 
 Array = Any
-UNKNOWN_ROOM = 0.15  # [rad] that the rotors of a rig which nobody knows can follow
 ANGLE_STATES, HEIGHT_STATES, CONTEXT = 5, 3, 5
 STATES = 2 * ANGLE_STATES + HEIGHT_STATES
 
@@ -47,6 +46,11 @@ class TeamLqg(NamedTuple):
         """Numbers in the memory: the state as it is predicted, and the context."""
         return STATES + CONTEXT
 
+    @property
+    def shown(self) -> int:
+        """How many numbers `features` has."""
+        return self.size
+
     def start(self, observation: Array, context: Array) -> Array:
         """Memory (..., 18) before the first `observation` (..., 18) of followers with `context` (..., 5).
 
@@ -55,7 +59,7 @@ class TeamLqg(NamedTuple):
         loop asks for no torque, before its rotors cannot follow [rad].
         """
         xp = observation.__array_namespace__()
-        roll, pitch, roll_rate, pitch_rate, climb = _measured(observation)
+        roll, pitch, roll_rate, pitch_rate, climb = measured(observation)
         zero = xp.zeros_like(roll)
         state = [roll, roll_rate, zero, zero, zero, pitch, pitch_rate, zero, zero, zero, climb, zero, zero]
         known = xp.broadcast_to(xp.asarray(context, dtype=observation.dtype), (*roll.shape, CONTEXT))
@@ -65,21 +69,21 @@ class TeamLqg(NamedTuple):
         """State about roll and pitch (..., 2, 5) and of the height (..., 3) at `observation`."""
         xp = observation.__array_namespace__()
         gain, rising = (xp.asarray(part, dtype=observation.dtype) for part in (self.axis_gain, self.height_gain))
-        parts, measured = [], _measured(observation)
+        parts, found = [], measured(observation)
         for number in (0, 1):
             predicted = memory[..., number * ANGLE_STATES : (number + 1) * ANGLE_STATES]
-            left = xp.stack([measured[number] - predicted[..., 0], measured[2 + number] - predicted[..., 1]], axis=-1)
+            left = xp.stack([found[number] - predicted[..., 0], found[2 + number] - predicted[..., 1]], axis=-1)
             parts.append(predicted + left @ gain.T)
         predicted = memory[..., 2 * ANGLE_STATES : STATES]
         turning = xp.stack(parts, axis=-2)
-        return turning, predicted + (measured[4] - predicted[..., 0])[..., None] * rising
+        return turning, predicted + (found[4] - predicted[..., 0])[..., None] * rising
 
     def features(self, memory: Array, observation: Array) -> Array:
         """(..., 18) for a network: the measured less its estimate (5), the other estimates (8), the context (5)."""
         xp = observation.__array_namespace__()
         turning, rising = self.estimate(memory, observation)
         expected = [turning[..., 0, 0], turning[..., 1, 0], turning[..., 0, 1], turning[..., 1, 1], rising[..., 0]]
-        left = [a - b for a, b in zip(_measured(observation), expected, strict=True)]
+        left = [a - b for a, b in zip(measured(observation), expected, strict=True)]
         estimated = [turning[..., 0, 2:], turning[..., 1, 2:], rising[..., 1:], memory[..., STATES:]]
         return xp.concat([xp.stack(left, axis=-1), *estimated], axis=-1)
 
@@ -135,17 +139,17 @@ class TeamLqg(NamedTuple):
         vertical = xp.clip(share * rise - (share - 1.0) * led[..., 2], -leader[-1], leader[-1])
         k_error, k_velocity, k_angle, k_rate = (float(gain) for gain in self.tilt)
         far = k_error * error + k_velocity * rate
-        far = _within(xp, xp.stack([-far[..., 1], far[..., 0]], axis=-1), tilt_limit)
+        far = within(xp, xp.stack([-far[..., 1], far[..., 0]], axis=-1), tilt_limit)
         wanted = far - k_angle * observation[..., 3:5] - k_rate * observation[..., 9:11]
         load = turning[..., 2] / self.stiffness + lever * (vertical - led[..., 2])[..., None]
-        load, held = _within(xp, load, load_limit), None
+        load, held = within(xp, load, load_limit), None
         if self.lifting > 0:
             held = float(self.lifting) * load
             load = load - held
         wanted = wanted - load
         own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
         rest = observation[..., 3:5] + self.damping * observation[..., 9:11]
-        own = rest + most * _within(xp, (own - rest) / most, 1.0)
+        own = rest + most * within(xp, (own - rest) / most, 1.0)
         return xp.concat([own, vertical[..., None]], axis=-1), held, turning, rising
 
 
@@ -175,18 +179,11 @@ def team_context(parameters: PlantParameters, plant: Plant, object_mass: Array) 
     return xp.concat([share[..., None], turned, xp.maximum(xp.stack(most, axis=-1), 1e-3)], axis=-1)
 
 
-def nominal_context(count: Array) -> Array:
-    """As `team_context` (..., 5) where nobody knows more of a team than how many drones it has, `count` (...)."""
-    xp = count.__array_namespace__()
-    one = xp.ones_like(count)
-    return xp.stack([count / (count - 1), 0.0 * one, 0.0 * one, UNKNOWN_ROOM * one, UNKNOWN_ROOM * one], axis=-1)
-
-
-def _measured(observation: Array) -> list[Array]:
+def measured(observation: Array) -> list[Array]:
     """Roll, pitch, their rates, climb."""
     return [*(observation[..., k] for k in (3, 4, 9, 10)), -observation[..., ERROR_RATE.stop - 1]]
 
 
-def _within(xp: Any, vector: Array, limit: float) -> Array:
+def within(xp: Any, vector: Array, limit: float) -> Array:
     """`vector` (..., 2) no longer than `limit`, in every mount frame alike."""
     return vector * (limit / xp.maximum(xp.sqrt((vector * vector).sum(axis=-1, keepdims=True) + 1e-12), limit))

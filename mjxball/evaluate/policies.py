@@ -12,7 +12,6 @@ from mjxball.config import Config, with_current_names
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
-from mjxball.policy.file import COUNT
 from mjxball.sim.rigs import outside
 
 
@@ -49,8 +48,8 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
 
 
 def flies_any_rig(policy: Policy) -> bool:
-    """Whether `policy` flies any rig, of which it is told the number of drones alone."""
-    return policy.card.get("context") == list(COUNT)
+    """Whether `policy` flies any rig, of which it is told where the drones are mounted alone."""
+    return bool(policy.card["format_version"] == 4)
 
 
 def trained_rigs(policy: Policy) -> Config:

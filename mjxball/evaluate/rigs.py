@@ -11,10 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxball.config import Config
+from mjxball.config import Config, Plant
 from mjxball.control.followers import Law, PrivilegedInfo
+from mjxball.control.multi_model_lqg import team_geometry
 from mjxball.env import PipelineState, State, TransportEnv
 from mjxball.physics.motion import object_mass
+from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import RigTable, rig_config
 
 if TYPE_CHECKING:
@@ -87,6 +89,8 @@ def fly(
             memory, command = law.step(memory, state.obs[..., :18], _known(world, size))
             return (env.step_with_command(state, command), memory, far), error
 
+        if isinstance(law, AnyRigLaw):
+            law = law.on(rig, own.plant)
         start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool))
         (_, _, far), error = jax.lax.scan(step, start, jnp.arange(steps + 1))
         return error, far
@@ -99,6 +103,20 @@ def fly(
     with jax.default_matmul_precision("highest"):
         error, failed = jax.jit(jax.vmap(rig_flights))(*single, keys)
     return Flown(np.asarray(error), np.asarray(failed))
+
+
+class AnyRigLaw(NetworkLaw):
+    """A policy for any rig, which is told every rig's geometry."""
+
+    def on(self, rig: RigTable, plant: Plant) -> AnyRigLaw:
+        """The law of the followers of `rig`, drones like those of `plant`."""
+        found = copy.copy(self)
+        found._context = team_geometry(plant, rig.numbers.mounts, rig.size)
+        return found
+
+    def shown(self, observation: Any, memory: Any) -> Any:
+        """What the network sees of its `memory` (..., s)."""
+        return self._law.network_input(observation, memory)[..., observation.shape[-1] :]
 
 
 def mass_changes(world: PipelineState) -> PipelineState:

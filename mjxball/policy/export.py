@@ -14,8 +14,9 @@ from mjxball import __version__
 from mjxball.config import Config, config_hash, to_dict
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.motors import firmware
+from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.control.observation import ACTION, OBSERVATION, commanded
-from mjxball.policy.file import CONTEXT, COUNT, PolicyFile, write_whole
+from mjxball.policy.file import CONTEXTS, PolicyFile, write_whole
 
 
 def policy_file(
@@ -31,8 +32,11 @@ def policy_file(
     size = len(mask)  # behind it stands what only the critics saw; the policy's weights for it never moved
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
+    version = 1 if law.lqg is None else 2
+    if law.needs_context:
+        version = 4 if isinstance(law.lqg, MultiModelLqg) else 3
     card = {
-        "format_version": 1 if law.lqg is None else 3 if law.needs_context else 2,
+        "format_version": version,
         "observation": [list(slot) for slot in OBSERVATION],
         "history": follower.history,
         "previous_action": follower.previous_action,
@@ -40,7 +44,7 @@ def policy_file(
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
         **({} if law.lqg is None else {"lqg": {k: np.asarray(v).tolist() for k, v in law.lqg._asdict().items()}}),
-        **({"context": list(COUNT if config.rigs.number else CONTEXT)} if law.needs_context else {}),
+        **({"context": list(CONTEXTS[version])} if law.needs_context else {}),
         "action_reach": action_scale,
         "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
         "leader_kp": list(leader.kp),

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, ObservationHistory
 from mjxball.control.offset_free import DRIVES, MEASURED, STATES, OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
@@ -20,11 +21,13 @@ from mjxball.errors import InputError
 from mjxball.policy.container import PolicyFileError, read_arrays
 
 # 2: with the numbers of an offset-free LQG of a pair, card field `lqg`; 3: of a team, and what a follower has to know
-# of its team before a flight, card field `context`.
-FORMAT_VERSIONS = (1, 2, 3)
-# `control.team_lqg.team_context`.
+# of its team before a flight, card field `context`; 4: of attitude loops that nobody knows.
+FORMAT_VERSIONS = (1, 2, 3, 4)
+# `control.team_lqg.team_context`, `control.multi_model_lqg.ring_context`.
 CONTEXT = ("command_share", "roll_per_lift", "pitch_per_lift", "roll_room", "pitch_room")
-COUNT = ("drones",)  # or this alone, see `control.team_lqg.nominal_context`
+GEOMETRY = ("command_share", "roll_acceleration_per_lift", "pitch_acceleration_per_lift", "rotor_room")
+CONTEXTS = {3: CONTEXT, 4: GEOMETRY}  # by format
+MAX_MODELS = 16
 FOLDER = "policies"  # of those that come with mjxball
 ARCHIVE = "archive"  # in it: earlier ones, which documents name
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
@@ -90,6 +93,24 @@ TEAM_LQG_SHAPES: dict[str, tuple[int, ...]] = {
 LATER_LQG_SHAPES: dict[str, tuple[int, ...]] = {"lifting": ()}  # of teams, absent from the first files
 
 
+MULTI_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # behind an axis of models
+    "axis": (5, 6),
+    "axis_gain": (5, 2),
+    "certainty": (3,),
+    "prior": (),
+    "tilt": (4,),
+    "stiffness": (),
+    "damping": (),
+}
+MULTI_MODEL_COMMON: dict[str, tuple[int, ...]] = {
+    "height": (3, 4),
+    "height_gain": (3,),
+    "rise": (2,),
+    "limits": (3,),
+    "keep": (2,),
+}
+
+
 def law_of(card: dict[str, Any]) -> FollowerLaw:
     """The laws around the network of a policy file; `filters` is absent from the first files."""
     filters = tuple(card.get("filters", ()))
@@ -105,10 +126,12 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
     )
 
 
-def _lqg_of(card: dict[str, Any]) -> OffsetFreeLqg | TeamLqg | None:
+def _lqg_of(card: dict[str, Any]) -> OffsetFreeLqg | TeamLqg | MultiModelLqg | None:
     lqg = card.get("lqg")
     if lqg is None:
         return None
+    if card["format_version"] == 4:
+        return MultiModelLqg(**{name: np.array(lqg[name]) for name in MultiModelLqg._fields})
     if card["format_version"] == 3:
         numbers: dict[str, Any] = {name: np.array(value) for name, value in lqg.items()}
         return TeamLqg(**numbers)
@@ -190,7 +213,7 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
 def check(policy: PolicyFile, name: str) -> None:
     """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
     _check_card(policy.card, name)
-    size = OBSERVATION_SIZE + law_of(policy.card).size
+    size = OBSERVATION_SIZE + law_of(policy.card).shown
     vectors = [
         ("observation_mean", policy.observation_mean, size),
         ("observation_scale", policy.observation_scale, size),
@@ -273,37 +296,44 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
 
 
 def _check_lqg(card: dict[str, Any], name: str) -> None:
-    """Raise PolicyFileError unless format 2 has the numbers of an offset-free LQG and format 1 has none."""
-    lqg, in_team = card.get("lqg"), card["format_version"] == 3
-    shapes = TEAM_LQG_SHAPES if in_team else LQG_SHAPES
-    if in_team and isinstance(lqg, dict):
+    """Raise PolicyFileError unless later formats have the numbers of their LQG and format 1 has none."""
+    lqg, version = card.get("lqg"), card["format_version"]
+    in_team, shapes = version in CONTEXTS, {2: LQG_SHAPES, 3: TEAM_LQG_SHAPES}.get(version, {})
+    if version == 3 and isinstance(lqg, dict):
         shapes = shapes | {field: shape for field, shape in LATER_LQG_SHAPES.items() if field in lqg}
-    if card["format_version"] == 1:
+    if version == 1:
         if lqg is not None:
-            raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 and 3, not 1")
+            raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 to 4, not 1")
         return
-    version, positive = card["format_version"], ("stiffness", "limits", "damping" if in_team else "carried")
+    if version == 4:
+        stiffness = lqg.get("stiffness") if isinstance(lqg, dict) else None
+        models = len(stiffness) if isinstance(stiffness, list) else 0
+        if not 1 <= models <= MAX_MODELS:
+            raise PolicyFileError(f"{name}: card field lqg.stiffness must be 1 to {MAX_MODELS} numbers")
+        every = {field: (models, *shape) for field, shape in MULTI_MODEL_SHAPES.items()}
+        shapes = {**every, **MULTI_MODEL_COMMON}
+    positive = ("stiffness", "limits", "damping" if in_team else "carried")
     if not isinstance(lqg, dict) or lqg.keys() != shapes.keys() or card["action_mode"] != "residual":
         raise PolicyFileError(
             f"{name}: a residual policy of format {version} needs card field lqg: {', '.join(shapes)}"
         )
-    if in_team and card.get("context") not in (list(CONTEXT), list(COUNT)):
-        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(CONTEXT)}")
+    if in_team and card.get("context") != list(CONTEXTS[version]):
+        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(CONTEXTS[version])}")
     for field, shape in shapes.items():
         _check_numbers(name, f"lqg.{field}", lqg[field], shape)
     if in_team and "team" in card:
-        _check_team(card["team"], name)
+        _check_team(card["team"], name, CONTEXTS[version])
     if min(np.min(lqg[field]) for field in positive) <= 0:
         raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
     if not 0 <= lqg.get("lifting", 0) <= 1:
         raise PolicyFileError(f"{name}: card field lqg.lifting must be a share from 0 to 1")
 
 
-def _check_team(team: Any, name: str) -> None:
+def _check_team(team: Any, name: str, context: tuple[str, ...]) -> None:
     """Raise PolicyFileError unless `team` says in which team, and as which of its drones, a policy flies."""
     if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
         raise PolicyFileError(f"{name}: card field team must hold drone, mount_angle and context")
-    for field, shape in (("drone", ()), ("mount_angle", ()), ("context", (len(CONTEXT),))):
+    for field, shape in (("drone", ()), ("mount_angle", ()), ("context", (len(context),))):
         _check_numbers(name, f"team.{field}", team[field], shape)
     share, _, _, *room = team["context"]
     if share <= 1 or min(room) <= 0:

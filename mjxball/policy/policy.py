@@ -12,26 +12,31 @@ import numpy as np
 from mjxball.config import LEAST_LIFTING, Attitude, Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.team_lqg import nominal_context, team_context
+from mjxball.control.multi_model_lqg import MultiModelLqg, team_geometry
+from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
-from mjxball.policy.file import COUNT, PolicyFile, law_of, load_file
+from mjxball.policy.file import PolicyFile, law_of, load_file
 
 Array = Any
 
 
-def context_of(name: str, card: dict[str, Any], plant: Plant | None, attitude: Attitude | None) -> np.ndarray:
-    """What each follower of a team on `plant` is told, (F, 5), or (5,) of one follower; see `team_lqg.team_context`.
+def not_told(name: str) -> InputError:
+    """What to say where nobody has told a policy its team."""
+    return InputError(f"policy {name} has to be told its team: --plant NAME or FILE.toml, such as team4")
 
-    `name` and `card` of a policy of format 3. One that is told the number of drones alone flies in any team, by default
-    in a pair. Raises InputError if the attitude loops are not those that its law is for, or without a plant.
+
+def context_of(name: str, card: dict[str, Any], plant: Plant | None, attitude: Attitude | None) -> np.ndarray:
+    """What each follower of a team on `plant` is told, (F, c), or (c,) of one follower.
+
+    `name` and `card` of a policy of format 3 (`team_lqg.team_context`) or 4 (`multi_model_lqg.team_geometry`, for any
+    team). Raises InputError if the attitude loops are not those that its law is for, or without a plant.
     """
-    if card["context"] == list(COUNT):
-        followers = 1 if plant is None else len(plant.followers)
-        alike = nominal_context(np.array(followers + 1.0))
-        return alike if followers == 1 else np.broadcast_to(alike, (followers, alike.size))
     if plant is None or attitude is None:
-        raise InputError(f"policy {name} has to be told its team: --plant NAME or FILE.toml, such as team4")
+        raise not_told(name)
+    if card["format_version"] == 4:
+        mounts = np.array([drone.mount for drone in plant.drones])
+        return np.asarray(team_geometry(plant, mounts, np.float64(plant.count)))
     made_for, found = float(card["lqg"]["stiffness"]) ** 0.5, attitude.natural_frequency[:2]
     if plant.stand != "free" or max(abs(frequency - made_for) for frequency in found) > 1e-6 * made_for:
         raise InputError(
@@ -44,7 +49,7 @@ def context_of(name: str, card: dict[str, Any], plant: Plant | None, attitude: A
 
 
 def known_context(card: dict[str, Any], name: str) -> np.ndarray | None:
-    """What a policy of format 3 has in its card of the team that it is for, (5,); None for other formats.
+    """What a policy of format 3 or 4 has in its card of the team that it is for, (c,); None for other formats.
 
     Raises InputError if it is told its team by `Policy.join` alone.
     """
@@ -103,7 +108,7 @@ class Policy:
         Raises InputError if the team's attitude loops are not those that its law is for.
         """
         if self._law.needs_context:
-            if not plant.is_team and self.card["context"] != list(COUNT):
+            if not plant.is_team and not isinstance(self._law.lqg, MultiModelLqg):
                 raise InputError(f"policy {self.name} was made for teams, or a load that moves in the plane")
             self._context = context_of(self.name, self.card, plant, attitude).astype(self._dtype)
 

@@ -14,9 +14,12 @@ def follower_law(config: Config) -> FollowerLaw:
     follower, leader = config.follower, config.leader
     lqg: Any = None
     if follower.base == "lqg":
-        from mjxball.baselines import offset_free, team_lqg  # need SciPy
+        from mjxball.baselines import multi_model_lqg, offset_free, team_lqg  # need SciPy
 
-        lqg = team_lqg.team_lqg(config) if config.plant.is_team else offset_free.offset_free_lqg(config)
+        if config.rigs.number:
+            lqg = multi_model_lqg.multi_model_lqg(config)
+        else:
+            lqg = team_lqg.team_lqg(config) if config.plant.is_team else offset_free.offset_free_lqg(config)
     return FollowerLaw(
         history=observation_history(config),
         action_scale=(follower.action_scale_tilt, follower.action_scale_vertical),

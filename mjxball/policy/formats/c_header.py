@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.control import multi_model_lqg, team_lqg
 from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.multi_model_lqg import LEAST_ROOM, MultiModelLqg
 from mjxball.control.observation import (
     ACTION_SIZE,
     ERROR,
@@ -20,7 +22,7 @@ from mjxball.control.observation import (
     OBSERVATION_SIZE,
 )
 from mjxball.control.offset_free import OffsetFreeLqg
-from mjxball.control.team_lqg import CONTEXT, TeamLqg
+from mjxball.control.team_lqg import TeamLqg
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
 from mjxball.policy.policy import known_context
@@ -30,7 +32,8 @@ FLOAT = 4  # bytes
 LQG_TEXTS = {  # helpers, law
     type(None): ("", ""),
     OffsetFreeLqg: (c_texts.COSINE, c_texts.LQG),
-    TeamLqg: (c_texts.ROOT, c_texts.TEAM_LQG),
+    TeamLqg: (c_texts.ROOT + c_texts.WITHIN, c_texts.TEAM_LQG),
+    MultiModelLqg: (c_texts.ROOT + c_texts.WITHIN, c_texts.MULTI_MODEL_LQG),
 }
 
 
@@ -63,8 +66,8 @@ def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     lqg = law_of(policy.card).lqg
     constants = 2 * ACTION_SIZE + (0 if lqg is None else sum(np.size(value) for value in lqg))
     constants -= isinstance(lqg, TeamLqg) and not _lifts(lqg)
-    constants += CONTEXT if isinstance(lqg, TeamLqg) else 0
-    state, stack = FLOAT * (size - OBSERVATION_SIZE) + 4, FLOAT * (size + 2 * widest)
+    constants += {TeamLqg: team_lqg.CONTEXT, MultiModelLqg: multi_model_lqg.CONTEXT}.get(type(lqg), 0)
+    state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
         return Footprint(flash, state + FLOAT, stack + 2 * (max(size, widest) + 7))
@@ -76,8 +79,8 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
     """The header's text. `mjxball_follow` computes what `mjxball.Policy` computes, in float.
 
     With `int8` the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the
-    same layout may be put in place at run time, `mjxball_follower.weights`. A policy of format 3 is that of the one
-    follower that `team` in its card names; InputError without it.
+    same layout may be put in place at run time, `mjxball_follower.weights`. A policy of formats 3 and 4 is that of the
+    one follower that `team` in its card names; InputError without it.
     """
     context = known_context(policy.card, name)
     law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)
@@ -94,6 +97,8 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
         ]
     if context is not None:
         arrays += [_array("lqg_context", context)]
+    if isinstance(law.lqg, MultiModelLqg):
+        arrays += [f"#define MJXBALL_LEAST_ROOM {_number(LEAST_ROOM)}"]
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
     helpers += (c_texts.APPROACH if history.filters else "") + LQG_TEXTS[type(law.lqg)][0]
     layers = _network_int8(sizes) if int8 else _network(sizes)
@@ -190,7 +195,7 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
     if law.lqg is not None:
         lines += [f"        mjxball_lqg_start(memory + {history.size}, observation);"]
     lines += ["        follower->running = 1;", "    }"]
-    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {law.size});"]
+    lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
     for k in range(len(history.filters)):
         place = OBSERVATION_SIZE + older + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
@@ -217,7 +222,9 @@ def _history_update(law: FollowerLaw) -> str:
         lines += [f"    mjxball_approach(memory + {place + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
     if history.previous_action:
         lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
-    if isinstance(law.lqg, TeamLqg):
+    if isinstance(law.lqg, MultiModelLqg):
+        lines += [f"    mjxball_lqg_next(memory + {history.size}, led, own, command);"]
+    elif isinstance(law.lqg, TeamLqg):
         lines += [f"    mjxball_lqg_next(memory + {history.size}, led, own);"]
     elif law.lqg is not None:
         lines += [f"    mjxball_lqg_next(memory + {history.size}, observation, led, command);"]
@@ -344,7 +351,7 @@ def _leader(card: dict[str, Any], to: str) -> list[str]:
 def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
     """Lines that make the command of `action`, which is added to a law unless it is direct."""
     added = "mjxball_action_scale[i] * action[i]"
-    if isinstance(law.lqg, TeamLqg):
+    if law.needs_context:
         lifts = _lifts(law.lqg)
         apart = " + (i == 2 ? own[3] : 0)" if lifts else ""
         return "\n".join(

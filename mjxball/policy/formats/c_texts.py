@@ -183,6 +183,16 @@ static inline mjxball_real mjxball_root(mjxball_real square) {
     return last;
 }
 """
+WITHIN = """
+/* Two numbers as a vector no longer than `limit`. */
+static inline void mjxball_within(mjxball_real *vector, mjxball_real limit) {
+    mjxball_real square = vector[0] * vector[0] + vector[1] * vector[1] + (mjxball_real)1e-12;
+    if (square <= limit * limit) return;
+    limit /= mjxball_root(square);
+    vector[0] *= limit;
+    vector[1] *= limit;
+}
+"""
 TEAM_LQG = """
 /* LQG of one of a team; its memory: the filter's state about roll (5), about pitch (5), of the height (3), and what it
  * is told of its team (5). */
@@ -213,15 +223,6 @@ static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxbal
     }
     to[4] = -observation[17] - memory[10];
     mjxball_copy(to + 11, memory + 11, 7);
-}
-
-/* Two numbers as a vector no longer than `limit`. */
-static inline void mjxball_within(mjxball_real *vector, mjxball_real limit) {
-    mjxball_real square = vector[0] * vector[0] + vector[1] * vector[1] + (mjxball_real)1e-12;
-    if (square <= limit * limit) return;
-    limit /= mjxball_root(square);
-    vector[0] *= limit;
-    vector[1] *= limit;
 }
 
 /* own: the law's command, to which the network's is added. */
@@ -263,6 +264,152 @@ static inline void mjxball_lqg_next(mjxball_real *memory, const mjxball_real *le
             state[k] = row[states] * drive[i];
             for (int j = 0; j < states; j++) state[k] += row[j] * before[j];
         }
+    }
+}
+"""
+MULTI_MODEL_LQG = """
+/* LQG for loops of unknown speed; its memory: the filters' states about roll (5 of each model) and about pitch, of the
+ * height (3), the models' scores about roll and about pitch, the slow part of what is added (2), and what it is told of
+ * its team (4). */
+enum {
+    MJXBALL_MODELS = sizeof mjxball_lqg_stiffness / sizeof *mjxball_lqg_stiffness,
+    MJXBALL_HEIGHT = 10 * MJXBALL_MODELS,
+    MJXBALL_SCORES = MJXBALL_HEIGHT + 3,
+    MJXBALL_SLOW = MJXBALL_SCORES + 2 * MJXBALL_MODELS,
+    MJXBALL_TOLD = MJXBALL_SLOW + 2
+};
+
+static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *observation) {
+    for (int axis = 0; axis < 2; axis++)
+        for (int model = 0; model < MJXBALL_MODELS; model++) {
+            mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
+            state[0] = observation[3 + axis];
+            state[1] = observation[9 + axis];
+        }
+    memory[MJXBALL_HEIGHT] = -observation[17];
+    for (int k = 0; k < 4; k++) memory[MJXBALL_TOLD + k] = mjxball_lqg_context[k];
+}
+
+static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
+    mjxball_real *height = memory + MJXBALL_HEIGHT, off = -observation[17] - height[0];
+    for (int row = 0; row < 3; row++) height[row] += off * mjxball_lqg_height_gain[row];
+    for (int axis = 0; axis < 2; axis++) {
+        mjxball_real *scores = memory + MJXBALL_SCORES + axis * MJXBALL_MODELS, most = 0;
+        for (int model = 0; model < MJXBALL_MODELS; model++) {
+            mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
+            const float *gain = mjxball_lqg_axis_gain + 10 * model, *sure = mjxball_lqg_certainty + 3 * model;
+            mjxball_real angle = observation[3 + axis] - state[0], rate = observation[9 + axis] - state[1];
+            mjxball_real far = angle * (sure[0] * angle + 2 * sure[1] * rate) + sure[2] * rate * rate;
+            for (int row = 0; row < 5; row++) state[row] += angle * gain[2 * row] + rate * gain[2 * row + 1];
+            scores[model] = mjxball_lqg_keep[0] * scores[model] + mjxball_lqg_prior[model] - (mjxball_real)0.5 * far;
+            if (model == 0 || scores[model] > most) most = scores[model];
+        }
+        for (int model = 0; model < MJXBALL_MODELS; model++) scores[model] -= most;
+    }
+}
+
+/* The models' weights about an axis, and their mean of 1 over the loops' stiffness, which is returned. */
+static inline mjxball_real mjxball_lqg_weights(const mjxball_real *memory, int axis, mjxball_real *weights) {
+    const mjxball_real *scores = memory + MJXBALL_SCORES + axis * MJXBALL_MODELS;
+    mjxball_real sum = 0, soft = 0;
+    for (int model = 0; model < MJXBALL_MODELS; model++) sum += weights[model] = mjxball_decay(-scores[model]);
+    for (int model = 0; model < MJXBALL_MODELS; model++) {
+        weights[model] /= sum;
+        soft += weights[model] / mjxball_lqg_stiffness[model];
+    }
+    return soft;
+}
+
+/* Minus the natural logarithm of 0 < x < 1, by Halley. */
+static inline mjxball_real mjxball_depth(mjxball_real x) {
+    mjxball_real depth = 4;
+    for (int k = 0; k < 6; k++) {
+        mjxball_real found = mjxball_decay(depth);
+        depth += 2 * (found - x) / (found + x);
+    }
+    return depth;
+}
+
+static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
+    const mjxball_real *context = memory + MJXBALL_TOLD, *height = memory + MJXBALL_HEIGHT;
+    for (int axis = 0; axis < 2; axis++) {
+        mjxball_real weights[MJXBALL_MODELS], soft = mjxball_lqg_weights(memory, axis, weights), mean[5] = {0};
+        for (int model = 0; model < MJXBALL_MODELS; model++) {
+            const mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
+            mjxball_real softer = weights[model] / mjxball_lqg_stiffness[model];
+            for (int k = 0; k < 5; k++) mean[k] += (k < 2 ? weights[model] : softer) * state[k];
+        }
+        to[axis] = observation[3 + axis] - mean[0];
+        to[2 + axis] = observation[9 + axis] - mean[1];
+        mjxball_copy(to + 5 + 3 * axis, mean + 2, 3);
+        to[13 + axis] = (mjxball_real)0.5 * mjxball_depth(soft);
+        to[15 + axis] = context[1 + axis] * soft;
+        to[17 + axis] = context[3] * soft;
+    }
+    to[4] = -observation[17] - height[0];
+    mjxball_copy(to + 11, height + 1, 2);
+    to[19] = context[0];
+}
+
+/* own: the law's command, to which the network's is added. */
+static inline void mjxball_lqg_command(
+    const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *own) {
+    const mjxball_real *context = memory + MJXBALL_TOLD, share = context[0];
+    mjxball_real far[2], load[2], room[2], rest[2], most[2], gains[2][4] = {{0}};
+    mjxball_real rise = mjxball_lqg_rise[0] * observation[14] + mjxball_lqg_rise[1] * observation[17];
+    rise = mjxball_clip(rise, mjxball_lqg_limits[1]) - memory[MJXBALL_HEIGHT + 2];
+    own[2] = mjxball_clip(share * rise - (share - 1) * led[2], mjxball_limit[2]);
+    for (int i = 0; i < 2; i++) {
+        mjxball_real weights[MJXBALL_MODELS], soft = mjxball_lqg_weights(memory, i, weights), damping = 0;
+        load[i] = context[1 + i] * soft * (own[2] - led[2]);
+        for (int model = 0; model < MJXBALL_MODELS; model++) {
+            const mjxball_real *state = memory + 5 * (i * MJXBALL_MODELS + model);
+            load[i] += weights[model] * state[2] / mjxball_lqg_stiffness[model];
+            damping += weights[model] * mjxball_lqg_damping[model];
+            for (int k = 0; k < 4; k++) gains[i][k] += weights[model] * mjxball_lqg_tilts[4 * model + k];
+        }
+        rest[i] = observation[3 + i] + damping * observation[9 + i];
+        most[i] = context[3] * soft;
+        if (most[i] < MJXBALL_LEAST_ROOM) most[i] = MJXBALL_LEAST_ROOM;
+    }
+    far[0] = -(gains[0][0] * observation[13] + gains[0][1] * observation[16]);
+    far[1] = gains[1][0] * observation[12] + gains[1][1] * observation[15];
+    mjxball_within(far, mjxball_lqg_limits[0]);
+    mjxball_within(load, mjxball_lqg_limits[2]);
+    for (int i = 0; i < 2; i++) {
+        mjxball_real wanted = far[i] - gains[i][2] * observation[3 + i] - gains[i][3] * observation[9 + i] - load[i];
+        own[i] = share * wanted - (share - 1) * led[i];
+        room[i] = (own[i] - rest[i]) / most[i];
+    }
+    mjxball_within(room, 1);
+    for (int i = 0; i < 2; i++) own[i] = rest[i] + most[i] * room[i];
+}
+
+static inline void mjxball_lqg_next(
+    mjxball_real *memory, const mjxball_real *led, const mjxball_real *own, const mjxball_real *command) {
+    const mjxball_real *context = memory + MJXBALL_TOLD, share = context[0];
+    mjxball_real *slow = memory + MJXBALL_SLOW, *height = memory + MJXBALL_HEIGHT, drive, before[5];
+    const float *row = mjxball_lqg_height;
+    for (int axis = 0; axis < 2; axis++) {
+        mjxball_real added = command[axis] - own[axis], mean;
+        slow[axis] = mjxball_lqg_keep[1] * slow[axis] + (1 - mjxball_lqg_keep[1]) * added;
+        mean = (own[axis] + added - slow[axis] + (share - 1) * led[axis]) / share;
+        for (int model = 0; model < MJXBALL_MODELS; model++) {
+            mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
+            const float *turn = mjxball_lqg_axis + 30 * model;
+            drive = mean + context[1 + axis] * (own[2] - led[2]) / mjxball_lqg_stiffness[model];
+            mjxball_copy(before, state, 5);
+            for (int k = 0; k < 5; k++, turn += 6) {
+                state[k] = turn[5] * drive;
+                for (int j = 0; j < 5; j++) state[k] += turn[j] * before[j];
+            }
+        }
+    }
+    drive = (own[2] + (share - 1) * led[2]) / share;
+    mjxball_copy(before, height, 3);
+    for (int k = 0; k < 3; k++, row += 4) {
+        height[k] = row[3] * drive;
+        for (int j = 0; j < 3; j++) height[k] += row[j] * before[j];
     }
 }
 """

@@ -100,10 +100,11 @@ class TracedArray:
         name = self.graph.add("Gather", self, np.array(place % size, np.int64), axis=axis)
         return TracedArray(self.graph, name, *before, *after), 0
 
-    def sum(self, axis: int, keepdims: bool) -> TracedArray:
-        """Over the last axis, which stays."""
+    def sum(self, axis: int, keepdims: bool = False) -> TracedArray:
+        """Over an `axis` counted from the end."""
         name = self.graph.add("ReduceSum", self, np.array([axis], np.int64), keepdims=int(keepdims))
-        return TracedArray(self.graph, name, *self.sizes[:-1], 1)
+        left, kept = len(self.sizes) + axis, [1] if keepdims else []
+        return TracedArray(self.graph, name, *self.sizes[:left], *kept, *self.sizes[left + 1 :])
 
     def __neg__(self) -> TracedArray:
         return self.unary("Neg")
@@ -135,6 +136,22 @@ class Namespace:
     def sqrt(value: TracedArray) -> TracedArray:
         """Elementwise."""
         return value.unary("Sqrt")
+
+    @staticmethod
+    def exp(value: TracedArray) -> TracedArray:
+        """Elementwise."""
+        return value.unary("Exp")
+
+    @staticmethod
+    def log(value: TracedArray) -> TracedArray:
+        """Elementwise."""
+        return value.unary("Log")
+
+    @staticmethod
+    def max(value: TracedArray, axis: int, keepdims: bool) -> TracedArray:
+        """Over the last axis, which stays."""
+        name = value.graph.add("ReduceMax", value, axes=[axis], keepdims=int(keepdims))
+        return TracedArray(value.graph, name, *value.sizes[:-1], 1)
 
     @staticmethod
     def tanh(value: TracedArray) -> TracedArray:
@@ -192,7 +209,7 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
     Inputs: `observation` (N, 18); with a memory of m numbers also `memory` (N, m) and `start` (N, 1) bool, true at
     the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
     roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m). A policy of format 3
-    is that of the one follower that `team` in its card names, and sees and commands in its mount frame.
+    or 4 is that of the one follower that `team` in its card names, and sees and commands in its mount frame.
     """
     graph, around = Graph(), law_of(contents.card)
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)

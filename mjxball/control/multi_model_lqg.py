@@ -1,0 +1,217 @@
+"""Offset-free LQG of one follower of a team whose attitude loops nobody knows: multiple-model adaptive estimation.
+
+One Kalman filter for each of M loop frequencies runs about roll and about pitch; their weights are those of Magill
+(1965), by how well each predicts what is measured, forgotten over some seconds. Feedback gains and estimates are
+weighted means. Everything else is as in `control.team_lqg`. What a follower must be told is its team's geometry:
+`ring_context`. Needs NumPy alone; `baselines.multi_model_lqg` makes the numbers, which stand in the policy file.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from mjxball.config import Plant
+from mjxball.control import rotations
+from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_frames
+from mjxball.control.team_lqg import measured, within
+
+Array = Any
+ANGLE_STATES, HEIGHT_STATES, CONTEXT, FEATURES = 5, 3, 4, 20
+# Medians of random rigs (`sim.rigs`), with tilt torques of a ring of N drones N a m r^2, a = 1 for a pair and 1/2 else:
+# what lifting 1 m/s2 more than the leader turns, times N a r [1]; what rotors hold as a tilt of the loops [m/s2].
+LEVER, ROOM = 1.25, 1.75
+LEAST_ROOM = 0.15  # [rad] that the rotors of a rig can follow at least
+ADDED_TIME = 1.0  # [s] over which the slow part of what the network adds is found
+
+
+class MultiModelLqg(NamedTuple):
+    """Numbers of the law (ours); M models, states and commands as of `TeamLqg`."""
+
+    axis: Array  # (M, 5, 6): A B of each model
+    axis_gain: Array  # (M, 5, 2): K
+    certainty: Array  # (M, 3) inverse covariance of the innovation (angle, rate): its elements 00, 01, 11
+    prior: Array  # (M,) log of the root of its determinant, less the largest
+    tilt: Array  # (M, 4) feedback on (error, velocity, angle, rate) of pitch; that of roll mirrors it
+    stiffness: Array  # (M,) natural frequency of the closed attitude loops, squared [1/s2]
+    damping: Array  # (M,) Kd over Kp of the attitude loops [s]
+    height: Array  # (A B) (3, 4)
+    height_gain: Array  # K (3,)
+    rise: Array  # (2,) feedback on the vertical (error, velocity)
+    limits: Array  # (3,) of the error's part in a tilt [rad], of that in the height [m/s2], against the load [rad]
+    keep: Array  # (2,) share that a step leaves of the models' scores, and of the slow part of what was added
+
+    @property
+    def models(self) -> int:
+        """M."""
+        return len(self.stiffness)
+
+    @property
+    def size(self) -> int:
+        """Numbers in the memory: filters as predicted, height, scores, slow part of added tilts, context."""
+        return 2 * self.models * (ANGLE_STATES + 1) + HEIGHT_STATES + 2 + CONTEXT
+
+    @property
+    def shown(self) -> int:
+        """How many numbers `features` has."""
+        return FEATURES
+
+    def start(self, observation: Array, context: Array) -> Array:
+        """Memory (..., m) before the first `observation` (..., 18) of followers with `context` (..., 4)."""
+        xp = observation.__array_namespace__()
+        roll, pitch, roll_rate, pitch_rate, climb = measured(observation)
+        zero = xp.zeros_like(roll)
+        turning = [
+            xp.stack([angle, rate, zero, zero, zero], axis=-1)
+            for angle, rate in ((roll, roll_rate), (pitch, pitch_rate))
+            for _ in range(self.models)
+        ]
+        rest = xp.stack([climb, *[zero] * (HEIGHT_STATES - 1 + 2 * self.models + 2)], axis=-1)
+        known = xp.broadcast_to(xp.asarray(context, dtype=observation.dtype), (*roll.shape, CONTEXT))
+        return xp.concat([*turning, rest, known], axis=-1)
+
+    def features(self, memory: Array, observation: Array) -> Array:
+        """(..., 20) for a network.
+
+        The measured less its estimate (5), of both axes the load, its rate and the rotors' part as tilts [rad] (6), the
+        other estimates of the height (2), log frequencies (2), what lifting turns and what rotors hold as tilts (4),
+        N / (N - 1).
+        """
+        xp = observation.__array_namespace__()
+        seen = self._estimate(memory, observation)
+        turning, soft = seen.turning, self._each(seen.weights, 1.0 / self.stiffness)
+        middle = (seen.weights[..., None] * turning[..., :2]).sum(axis=-2)
+        inverse = (seen.weights / self._like(self.stiffness, observation))[..., None]
+        loads = (inverse * turning[..., 2:]).sum(axis=-2)
+        expected = [middle[..., 0, 0], middle[..., 1, 0], middle[..., 0, 1], middle[..., 1, 1], seen.rising[..., 0]]
+        left = [a - b for a, b in zip(measured(observation), expected, strict=True)]
+        context = memory[..., -CONTEXT:]
+        speed = -0.5 * xp.log(soft)
+        parts = [xp.stack(left, axis=-1), loads[..., 0, :], loads[..., 1, :], seen.rising[..., 1:], speed]
+        return xp.concat([*parts, context[..., 1:3] * soft, context[..., 3:] * soft, context[..., :1]], axis=-1)
+
+    def command(self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
+        """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it.
+
+        `leader`: the arguments of `copy_command` after the observation.
+        """
+        return self._plan(memory, observation, leader)[0] + added
+
+    def next(self, memory: Array, observation: Array, command: Array, leader: tuple[Any, ...]) -> Array:
+        """Memory of the next step, after `observation` was answered by `command`.
+
+        The drones are taken to be commanded what the law itself says and the fast part of what the network adds: of
+        its slow part each follower would expect another mean, and the difference would drift unseen.
+        """
+        xp, models = observation.__array_namespace__(), self.models
+        own, seen = self._plan(memory, observation, leader)
+        led, context = copy_command(observation, *leader), memory[..., -CONTEXT:]
+        slow, share = memory[..., -CONTEXT - 2 : -CONTEXT], context[..., :1]
+        added = command[..., :2] - own[..., :2]
+        slow = self.keep[1] * slow + (1.0 - self.keep[1]) * added
+        tilts = own[..., :2] + added - slow
+        mean = (xp.concat([tilts, own[..., 2:]], axis=-1) + (share - 1.0) * led) / share
+        lifted = context[..., 1:3] * (own - led)[..., 2:]
+        drive = mean[..., :2, None] + lifted[..., None] / self._like(self.stiffness, observation)
+        axis, height = self._like(self.axis, observation), self._like(self.height, observation)
+        turning = (axis[..., :ANGLE_STATES] * seen.turning[..., None, :]).sum(axis=-1)
+        turning = turning + axis[..., ANGLE_STATES] * drive[..., None]
+        climbing = xp.concat([seen.rising, mean[..., 2:]], axis=-1) @ height.T
+        flat = [turning[..., k, m, :] for k in (0, 1) for m in range(models)]
+        scores = [seen.scores[..., k, :] for k in (0, 1)]
+        return xp.concat([*flat, climbing, *scores, slow, context], axis=-1)
+
+    def _like(self, numbers: Array, observation: Array) -> Array:
+        return observation.__array_namespace__().asarray(numbers, dtype=observation.dtype)
+
+    def _each(self, weights: Array, numbers: Array) -> Array:
+        """Weighted mean (..., 2) of a number (M,) of each model."""
+        return (weights * self._like(numbers, weights)).sum(axis=-1)
+
+    def _estimate(self, memory: Array, observation: Array) -> Estimate:
+        """What is known at `observation`."""
+        xp, models = observation.__array_namespace__(), self.models
+        ends = 2 * models * ANGLE_STATES
+        rows = [memory[..., k * ANGLE_STATES : (k + 1) * ANGLE_STATES] for k in range(2 * models)]
+        predicted = xp.stack([xp.stack(rows[:models], axis=-2), xp.stack(rows[models:], axis=-2)], axis=-3)
+        rising, found = memory[..., ends : ends + HEIGHT_STATES], measured(observation)
+        angle, rate = (xp.stack([found[k], found[k + 1]], axis=-1)[..., None] for k in (0, 2))
+        left = xp.stack([angle - predicted[..., 0], rate - predicted[..., 1]], axis=-1)
+        gain, certainty = self._like(self.axis_gain, observation), self._like(self.certainty, observation)
+        turning = predicted + (gain * left[..., None, :]).sum(axis=-1)
+        first, second = left[..., 0], left[..., 1]
+        distance = (
+            certainty[:, 0] * first * first + 2.0 * certainty[:, 1] * first * second + certainty[:, 2] * second * second
+        )
+        begin = ends + HEIGHT_STATES
+        scores = xp.stack([memory[..., begin + k * models : begin + (k + 1) * models] for k in (0, 1)], axis=-2)
+        scores = self.keep[0] * scores + self._like(self.prior, observation) - 0.5 * distance
+        scores = scores - xp.max(scores, axis=-1, keepdims=True)
+        odds = xp.exp(scores)
+        weights = odds / odds.sum(axis=-1, keepdims=True)
+        climbed = (found[4] - rising[..., 0])[..., None] * self._like(self.height_gain, observation)
+        return Estimate(turning, scores, weights, rising + climbed)
+
+    def _plan(self, memory: Array, observation: Array, leader: tuple[Any, ...]) -> tuple[Array, Estimate]:
+        """(the law's own command, only its vertical part clipped, what is known)."""
+        xp = observation.__array_namespace__()
+        seen, context = self._estimate(memory, observation), memory[..., -CONTEXT:]
+        weights, share = seen.weights, context[..., 0]
+        led, error, rate = copy_command(observation, *leader), observation[..., ERROR], observation[..., ERROR_RATE]
+        tilt_limit, rise_limit, load_limit = (float(limit) for limit in self.limits)
+        k_error, k_velocity = (float(gain) for gain in self.rise)
+        rise = xp.clip(k_error * error[..., 2] + k_velocity * rate[..., 2], -rise_limit, rise_limit)
+        rise = rise - seen.rising[..., 2]
+        vertical = xp.clip(share * rise - (share - 1.0) * led[..., 2], -leader[-1], leader[-1])
+        gains = weights @ self._like(self.tilt, observation)
+        soft, damping = self._each(weights, 1.0 / self.stiffness), self._each(weights, self.damping)
+        far = gains[..., 0] * _crossed(xp, error) + gains[..., 1] * _crossed(xp, rate)
+        angles, rates = observation[..., 3:5], observation[..., 9:11]
+        wanted = within(xp, far, tilt_limit) - gains[..., 2] * angles - gains[..., 3] * rates
+        load = (weights * seen.turning[..., 2] / self._like(self.stiffness, observation)).sum(axis=-1)
+        load = load + context[..., 1:3] * soft * (vertical - led[..., 2])[..., None]
+        wanted = wanted - within(xp, load, load_limit)
+        own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
+        rest, most = angles + damping * rates, xp.maximum(context[..., 3:] * soft, LEAST_ROOM)
+        own = rest + most * within(xp, (own - rest) / most, 1.0)
+        return xp.concat([own, vertical[..., None]], axis=-1), seen
+
+
+class Estimate(NamedTuple):
+    """What filters know at an observation."""
+
+    turning: Array  # (..., 2, M, 5) about roll and pitch
+    scores: Array  # (..., 2, M) log odds of the models
+    weights: Array  # (..., 2, M) that sum to 1
+    rising: Array  # (..., 3) of the height
+
+
+def team_geometry(plant: Plant, mounts: Array, count: Array) -> Array:
+    """`ring_context` of every follower of `count` () drones like those of `plant` at `mounts` (N, 3) [m].
+
+    (F, 4), or (4,) of one follower; drones from `count` on only pad.
+    """
+    xp = mounts.__array_namespace__()
+    angles, lead = mount_frames(plant, mounts), mounts[plant.leader]
+    place = xp.broadcast_to(lead, (*angles.shape, 3))
+    seen = rotations.turned_about_z(place, -angles)
+    return ring_context(xp.astype(xp.broadcast_to(count, angles.shape), mounts.dtype), seen[..., :2])
+
+
+def ring_context(count: Array, leader: Array) -> Array:
+    """What a follower knows of a team of `count` (...) drones whose leader stands at `leader` (..., 2) [m] (..., 4).
+
+    In its mount frame, from O. N / (N - 1); angular accelerations about roll and pitch that lifting 1 m/s2 more than
+    the leader gives [1/m]; torque of the rotors over the inertia [1/s2], the last two as of a middling rig on a ring.
+    """
+    xp = leader.__array_namespace__()
+    x, y = leader[..., 0], leader[..., 1]
+    spread = xp.where(count < 2.5, 1.0, 0.5)
+    lever = LEVER / ((x * x + y * y) * count * spread)
+    room = ROOM * 2.0 * xp.sin(math.pi / count) / (spread * xp.sqrt(x * x + y * y))
+    return xp.stack([count / (count - 1.0), -y * lever, x * lever, room], axis=-1)
+
+
+def _crossed(xp: Any, vector: Array) -> Array:
+    """(-y, x): which roll and pitch push towards `vector` (..., 3)."""
+    return xp.stack([-vector[..., 1], vector[..., 0]], axis=-1)

@@ -1,0 +1,102 @@
+"""Offset-free LQG for loops of unknown speed: one model is the law of teams; several find the speed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxball.baselines.multi_model_lqg import FREQUENCIES, LAG, MultiModelOffsetFree, multi_model_lqg
+from mjxball.baselines.team_lqg import team_lqg
+from mjxball.config import Config, preset
+from mjxball.control.followers import Baseline, copy_gains
+from mjxball.control.multi_model_lqg import team_geometry
+from mjxball.plant.teams import ring_config
+from mjxball.policy.container import PolicyFileError
+from mjxball.policy.file import load_file, save_file, shipped_policy
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import CIRCLE, Scenario
+
+UNIVERSAL, TEAM = preset("universal"), preset("team")
+
+
+def team4(frequency: float) -> Config:
+    """Four drones on a ring with attitude loops of a `frequency` [rad/s]."""
+    ring = ring_config(TEAM, 4)
+    attitude = dataclasses.replace(ring.attitude, natural_frequency=(frequency, frequency, 4.0), damping=0.8)
+    return dataclasses.replace(ring, attitude=attitude)
+
+
+def law_of_geometry(config: Config) -> MultiModelOffsetFree:
+    """The law alone, told where the drones of `config` are mounted."""
+    mounts = np.array([drone.mount for drone in config.plant.drones])
+    return MultiModelOffsetFree(UNIVERSAL, np.asarray(team_geometry(config.plant, mounts, np.float64(4))))
+
+
+def test_one_model_is_the_law_of_teams() -> None:
+    """The same loops, the same rotors, the same levers: the same commands and estimates, also of what is commanded."""
+    frequency, random = 7.0, np.random.default_rng(0)
+    config = dataclasses.replace(team4(frequency), plant=dataclasses.replace(ring_config(TEAM, 4).plant, rotor_lag=LAG))
+    attitude = dataclasses.replace(UNIVERSAL.attitude, natural_frequency=(7.0, 7.0, 4.0), damping=0.8)
+    own = dataclasses.replace(UNIVERSAL, attitude=attitude, plant=dataclasses.replace(UNIVERSAL.plant, rotor_lag=LAG))
+    known, unknown, leader = team_lqg(config), multi_model_lqg(own, (frequency,)), copy_gains(config)
+    lever, room = np.array([0.02, -0.05]), 0.3
+    one = known.start(np.zeros((3, 18)), np.array([4 / 3, *lever, room, room]))
+    other = unknown.start(np.zeros((3, 18)), np.array([4 / 3, *(lever * frequency**2), room * frequency**2]))
+    for _ in range(20):
+        observation = 0.1 * random.standard_normal((3, 18))
+        nothing = np.zeros((3, 3))
+        command = known.command(nothing, one, observation, leader)
+        np.testing.assert_allclose(unknown.command(nothing, other, observation, leader), command, rtol=1e-9, atol=1e-12)
+        one, other = known.next(one, observation, command, leader), unknown.next(other, observation, command, leader)
+        np.testing.assert_allclose(other[:, :13], one[:, :13], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("frequency", [5.0, 10.0, 16.0])
+def test_it_finds_how_fast_the_loops_are(frequency: float) -> None:
+    config = team4(frequency)
+    law = law_of_geometry(config)
+    scenario = Scenario(omega=1.0, amplitude=0.03, path=CIRCLE, seconds=4.0)
+    flown = simulate(config, Baseline(law, config), scenario, "newton-euler")
+    memory = law.start(flown.observation[0])
+    for seen in flown.observation[:-1]:
+        memory, _ = law.step(memory, seen, None)
+    found = np.exp(law._law.features(memory, flown.observation[-1])[:, 13:15])
+    assert np.abs(np.log(found / frequency)).max() < np.log(1.56)  # models are a factor of 1.56 apart
+    assert np.linalg.norm(flown.error[-1]) < 0.25 * np.linalg.norm(flown.error[0])
+
+
+def test_numpy_and_jax_agree_and_models_share_one_weight() -> None:
+    law, random = multi_model_lqg(UNIVERSAL), np.random.default_rng(1)
+    leader = copy_gains(UNIVERSAL)
+    memory = law.start(np.zeros((2, 18)), np.array([1.5, 3.0, -1.0, 30.0]))
+    assert memory.shape == (2, law.size)
+    for _ in range(10):
+        observation = 0.1 * random.standard_normal((2, 18))
+        command = law.command(np.full((2, 3), 0.01), memory, observation, leader)
+        ours = law.next(memory, observation, command, leader), law.features(memory, observation)
+        single = [jnp.asarray(part, jnp.float32) for part in (memory, observation, command)]
+        theirs = law.next(*single, leader), law.features(*single[:2])
+        for mine, other in zip(ours, theirs, strict=True):
+            np.testing.assert_allclose(other, mine, rtol=2e-4, atol=2e-4)
+        memory = ours[0]
+    weights = law._estimate(memory, observation).weights
+    np.testing.assert_allclose(weights.sum(axis=-1), 1.0)
+    assert law.models == len(FREQUENCIES)
+
+
+def test_models_that_do_not_fit_are_refused(tmp_path: object) -> None:
+    contents = load_file(shipped_policy("universal"))
+    for field, numbers in {
+        "stiffness": [20.0, 50.0],
+        "damping": [0.1],
+        "keep": [float("nan"), 0.9],
+        "axis": "none",
+    }.items():
+        card = json.loads(json.dumps(contents.card))
+        card["lqg"][field] = numbers
+        with pytest.raises(PolicyFileError, match=r"card field lqg\."):
+            save_file(f"{tmp_path}/odd.npz", dataclasses.replace(contents, card=card))
