@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ from mjxball.plant.teams import ring_config
 from mjxball.policy import Policy, PolicyFile
 from mjxball.policy.container import PolicyFileError
 from mjxball.policy.export import policy_file
-from mjxball.policy.file import save_file
+from mjxball.policy.file import save_file, shipped_policies
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.follower import follower_law
 from mjxball.sim.rollout import simulate, simulate_batch
@@ -267,13 +268,16 @@ def test_lifts_apart_give_the_torque_and_no_lift(count: int) -> None:
     assert abs(thrust.sum()) < 1e-7
 
 
+def losing(config: Config) -> list[Scenario]:
+    """Six drones with a load on a circle lose each follower in turn."""
+    flight = Scenario(omega=1.0, amplitude=0.1, mass=0.6, path=CIRCLE, goal=(0.0, 0.0, 0.0), seconds=12.0)
+    return [dataclasses.replace(flight, lost=((k, 3.0),)) for k in config.plant.followers]
+
+
 def test_a_follower_that_is_lost_is_made_up_for() -> None:
-    """Six drones with a load on a circle lose each follower in turn; tilting alone ends far away."""
+    """Where tilting alone ends far away."""
     config = configs.replace(ring(6), "command.vertical_limit", 12.0)
-    flights = [
-        Scenario(omega=1.0, amplitude=0.1, mass=0.6, path=CIRCLE, goal=(0.0, 0.0, 0.0), seconds=12.0, lost=((k, 3.0),))
-        for k in config.plant.followers
-    ]
+    flights = losing(config)
     apart, tilting = (
         simulate_batch(c, [(make_baseline("lqg-offset-free", c), flights)], ENGINE) for c in (lifting(config), config)
     )
@@ -281,6 +285,16 @@ def test_a_follower_that_is_lost_is_made_up_for() -> None:
     assert distance.max() < 0.3
     assert distance[-50:].max() < 0.05
     assert (np.linalg.norm(tilting.error[-1], axis=-1) > 2.5).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", [path for path in shipped_policies() if path.stem == "lost"])
+def test_the_shipped_policy_makes_up_for_it(path: Path) -> None:
+    config = preset("lost")
+    flights = simulate_batch(config, [(load_policy(path, config), losing(config))], ENGINE)
+    distance = np.linalg.norm(flights.error, axis=-1)
+    assert distance.max() < 0.3
+    assert distance[-50:].max() < 0.05
 
 
 def test_lifting_apart_takes_four_drones(tmp_path) -> None:
