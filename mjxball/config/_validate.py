@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 import typing
+from collections.abc import Hashable
 from typing import Any, Literal
 
 from mjxball.config._plant import LEAST_LIFTING, Plant
@@ -17,8 +19,9 @@ LARGEST = 1e12  # of any number in a configuration
 MOST_DRONES, FARTHEST = 16, 10.0  # of a plant; of a mount from O [m]
 
 
-def _types_of(owner: Any) -> dict[str, Any]:
-    return typing.get_type_hints(type(owner))
+@functools.cache
+def _types_of(kind: Hashable) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
 
 
 def _check_leaf(path: str, value: Any, item: dataclasses.Field, hint: Any) -> None:
@@ -66,7 +69,7 @@ def validate(config: Config) -> Config:
         owner: Any = config
         for part in path.split(".")[:-1]:
             owner = owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
-        _check_leaf(path, value, item, _types_of(owner)[item.name])
+        _check_leaf(path, value, item, _types_of(type(owner))[item.name])
     _validate_plant(config.plant)
     _validate_team(config)
     _validate_autopilot(config)
