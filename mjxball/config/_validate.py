@@ -7,7 +7,6 @@ import functools
 import itertools
 import math
 import typing
-from collections.abc import Hashable
 from typing import Any, Literal
 
 from mjxball.config._plant import LEAST_LIFTING, Plant
@@ -20,7 +19,7 @@ MOST_DRONES, FARTHEST = 16, 10.0  # of a plant; of a mount from O [m]
 
 
 @functools.cache
-def _types_of(kind: Hashable) -> dict[str, Any]:
+def _types_of(kind: Any) -> dict[str, Any]:
     return typing.get_type_hints(kind)
 
 
@@ -69,7 +68,8 @@ def validate(config: Config) -> Config:
         owner: Any = config
         for part in path.split(".")[:-1]:
             owner = owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
-        _check_leaf(path, value, item, _types_of(type(owner))[item.name])
+        kind: Any = type(owner)  # hashable, which no type checker knows of `type[Any]`
+        _check_leaf(path, value, item, _types_of(kind)[item.name])
     _validate_plant(config.plant)
     _validate_team(config)
     _validate_autopilot(config)
