@@ -100,3 +100,19 @@ def test_models_that_do_not_fit_are_refused(tmp_path: object) -> None:
         card["lqg"][field] = numbers
         with pytest.raises(PolicyFileError, match=r"card field lqg\."):
             save_file(f"{tmp_path}/odd.npz", dataclasses.replace(contents, card=card))
+
+
+def test_what_the_network_adds_enters_but_not_what_it_adds_all_the_time() -> None:
+    law, leader = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL)
+    context, level, added = np.array([4 / 3, 0.0, 0.0, 40.0]), np.zeros(18), np.array([0.1, -0.05, 0.0])
+    start = law.start(level, context)
+    plain, moved = (law.next(start, level, command, leader) for command in (np.zeros(3), added))
+    fast = added[:2] * law.keep[1] / context[0]  # the mean of all drones' commands, less the slow part of one step
+    for axis in (0, 1):
+        found = (moved - plain)[20 * axis : 20 * (axis + 1)].reshape(4, 5)
+        np.testing.assert_allclose(found, law.axis[:, :, 5] * fast[axis], atol=1e-12)
+    memory = start
+    for _ in range(500):
+        memory = law.next(np.concatenate([start[:-6], memory[-6:]]), level, added, leader)
+    np.testing.assert_allclose(memory[-6:-4], added[:2], rtol=1e-3)  # all of it is taken for slow
+    np.testing.assert_allclose(memory[:40], plain[:40], atol=1e-3)

@@ -320,10 +320,10 @@ static inline mjxball_real mjxball_lqg_weights(const mjxball_real *memory, int a
     return soft;
 }
 
-/* Minus the natural logarithm of 0 < x < 1, by Halley. */
+/* Minus the natural logarithm of x, 1 over the stiffness of loops of 4 to 20 rad/s, by Halley. */
 static inline mjxball_real mjxball_depth(mjxball_real x) {
-    mjxball_real depth = 4;
-    for (int k = 0; k < 6; k++) {
+    mjxball_real depth = (mjxball_real)4.4;
+    for (int k = 0; k < 4; k++) {
         mjxball_real found = mjxball_decay(depth);
         depth += 2 * (found - x) / (found + x);
     }
