@@ -178,6 +178,8 @@ def draw_flights(results: Sequence[Result], title: str, path: Path) -> None:
     for axis, panel in zip(axes, PANELS, strict=True):
         _draw_panel(axis, results, *panel)
     axes[0].legend(loc="lower right", ncol=3, fontsize="small")
+    if results[0].flight.cg_offset.ndim > 1:  # in the plane
+        axes[4].legend(loc="lower right", ncol=2, fontsize="small")
     axes[5].legend(loc="upper right", ncol=4, fontsize="small")
     axes[-1].set_xlabel("time [s]")
     axes[-1].xaxis.set_label_coords(0.5, -0.22)
@@ -201,8 +203,10 @@ def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | No
             moved = result.flight.cg_offset
             if number and np.array_equal(moved, results[0].flight.cg_offset):
                 continue
-            for along, style in zip(moved.reshape(len(time), -1).T, CG_STYLES, strict=False):
-                axis.plot(time, along, color="black" if not number else colour, linewidth=1.2, linestyle=style)
+            shade = colour if number else "black"
+            for along, style, name in zip(moved.reshape(len(time), -1).T, CG_STYLES, "xy", strict=False):
+                shown = None if number else f"along {name}"
+                axis.plot(time, along, color=shade, linewidth=1.2, linestyle=style, label=shown)
         else:
             factor = 1.0 if index == 2 else 57.29577951308232
             flight, name = result.flight, None if number else "dashed: leader"
