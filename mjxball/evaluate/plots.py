@@ -204,8 +204,8 @@ def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | No
             if number and np.array_equal(moved, results[0].flight.cg_offset):
                 continue
             shade = colour if number else "black"
-            for along, style, name in zip(moved.reshape(len(time), -1).T, CG_STYLES, "xy", strict=False):
-                shown = None if number else f"along {name}"
+            for along, style, letter in zip(moved.reshape(len(time), -1).T, CG_STYLES, "xy", strict=False):
+                shown = None if number else f"along {letter}"
                 axis.plot(time, along, color=shade, linewidth=1.2, linestyle=style, label=shown)
         else:
             factor = 1.0 if index == 2 else 57.29577951308232
