@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from mjxball.baselines import crazyflie_lqg, lqg, make_baseline, make_law
+from mjxball.baselines import crazyflie_lqg, lqg_design, make_baseline, make_law
 from mjxball.baselines.assembly_model import assembly_model
 from mjxball.baselines.crazyflie_lqg import MEASURED, linear_model
 from mjxball.config import apply_overrides, preset, replace
@@ -86,7 +86,7 @@ def test_model_moves_as_the_simulator(command: tuple[float, float]) -> None:
     scenario = Scenario(mass=0.0175, amplitude=0.0, goal=(0.0, 0.0, 0.0), seconds=1.0)
     state, load, step = start_of(config, [scenario]), load_of([scenario]), make_stepper(config, "newton-euler")
     assert state.rotor_force == pytest.approx(hover_rotor_force(config, load.believed_mass))
-    transition, drive = lqg.discretise(model.a, model.b, config.timing.control_period)
+    transition, drive = lqg_design.discretise(model.a, model.b, config.timing.control_period)
     x = np.zeros(len(model.names))
     for _ in range(30):
         known = dict(zip(model.names, x, strict=True))
