@@ -172,7 +172,8 @@ class TestUniversal:
             # The loops of roll are up to a quarter faster or slower than those of pitch.
             assert np.abs((np.array(turned) + np.pi) % (2 * np.pi) - np.pi).max() < 0.3
 
-    @pytest.mark.parametrize("size", [pytest.param(2, marks=pytest.mark.slow), 5])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("size", [2, 5])
     def test_it_fails_on_no_rig_that_it_has_never_seen(self, size: int) -> None:
         rigs = held_out(UNIVERSAL, size, 4)
         law = AnyRigLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))
@@ -192,7 +193,8 @@ class TestUniversal:
         )
         for changed in (mass, cg):
             np.testing.assert_allclose(changed[..., :101], same[..., :101], atol=1e-6)
-            assert (np.abs(changed - same)[..., 101:].max(axis=-1) > 1e-3).mean() > 0.3  # where a change can be held
+            # Where a change can be held; a hundred times what rounding does.
+            assert (np.abs(changed - same)[..., 101:].max(axis=-1) > 1e-4).mean() > 0.3
 
     def test_a_rig_outside_is_flown_with_a_warning(self, capsys: pytest.CaptureFixture[str]) -> None:
         load_policy(POLICY, with_plant(UNIVERSAL, "team4"))
