@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjxball.baselines.multi_model_lqg import MultiModelOffsetFree
 from mjxball.config import Config, Plant
 from mjxball.control.followers import Law, PrivilegedInfo
 from mjxball.control.multi_model_lqg import team_geometry
@@ -89,7 +90,7 @@ def fly(
             memory, command = law.step(memory, state.obs[..., :18], _known(world, size))
             return (env.step_with_command(state, command), memory, far), error
 
-        if isinstance(law, AnyRigLaw):
+        if isinstance(law, AnyRigLaw | AnyRigBase):
             law = law.on(rig, own.plant)
         start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool))
         (_, _, far), error = jax.lax.scan(step, start, jnp.arange(steps + 1))
@@ -117,6 +118,21 @@ class AnyRigLaw(NetworkLaw):
     def shown(self, observation: Any, memory: Any) -> Any:
         """What the network sees of its `memory` (..., s)."""
         return self._law.network_input(observation, memory)[..., observation.shape[-1] :]
+
+
+class AnyRigBase(MultiModelOffsetFree):
+    """The law that a policy for any rig adds its action to, alone, told every rig's geometry."""
+
+    name = "lqg-multi-model"
+
+    def __init__(self, config: Config):
+        super().__init__(config, None)
+
+    def on(self, rig: RigTable, plant: Plant) -> AnyRigBase:
+        """The law of the followers of `rig`, drones like those of `plant`."""
+        found = copy.copy(self)
+        found._context = team_geometry(plant, rig.numbers.mounts, rig.size)
+        return found
 
 
 def mass_changes(world: PipelineState) -> PipelineState:
