@@ -202,14 +202,14 @@ def _lost() -> Config:
 
 
 def _universal() -> Config:
-    """One follower for teams of any drones and loads, which is told nothing of its rig."""
+    """One follower for teams of any drones and loads, told where they are mounted alone."""
     large = _transport_large()
     team = apply_overrides(large, read_plant("team4").settings)
     return replace(
         team,
         preset="universal",
         plant=replace(team.plant, rotor_lag=0.04),
-        # Of the law that the network is added to: in the middle of what rigs are drawn with.
+        # Of the law that the network is added to the damping counts: in the middle of what rigs are drawn with.
         attitude=Attitude(natural_frequency=(7.0, 7.0, 3.0), damping=0.8, design_object_mass=0.4),
         command=Command(tilt_limit=0.6, vertical_limit=8.0),
         follower=replace(
