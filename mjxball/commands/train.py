@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import functools
 import math
 import os
 import shlex
@@ -149,6 +150,7 @@ def _run(
         return 1
 
 
+@functools.cache
 def _wake_devices() -> None:
     """Start the accelerator's runtime (2 s of waiting on a GPU) beside the imports that follow."""
     import jax  # here: two threads must not both import it
@@ -186,7 +188,9 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
     extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
-    physics = _check_extensions(extensions, settings, options.physics) if extensions else options.physics or "mjx"
+    physics = options.physics or "mjx"
+    if extensions:
+        physics = _check_extensions(extensions, settings, options.physics, bool(options.distributed))
     origin: dict[str, Any] = {
         "command": command,
         "seed": seed,
@@ -221,19 +225,22 @@ def _refuse_settings_of_others(options: argparse.Namespace) -> None:
             )
 
 
-def _check_extensions(names: dict[str, str], settings: config.Config, wanted: str | None) -> str:
+def _check_extensions(names: dict[str, str], settings: config.Config, wanted: str | None, meeting: bool) -> str:
     """The physics engine to train on; refuses what cannot be found or does not fit, before anything is written."""
     from mjxball.train.extensions import Extensions, make_env, resolve
 
     extensions = resolve(Extensions(**names))
     _choose_processor(extensions.algorithm)
+    if not meeting:
+        _wake_devices()
     engines = getattr(extensions.algorithm, "engines", TRAINING_ENGINES)
     physics = wanted or engines[0]
     if physics not in engines:
         raise InputError(
             f"--algorithm {names['algorithm']} cannot train on --physics {physics}; it can on {', '.join(engines)}"
         )
-    make_env(extensions, settings, physics)
+    if not meeting:  # else the processes meet before anything asks for devices, and training makes the same check
+        make_env(extensions, settings, physics)
     missing = [name for name in ("init", "collect", "update", "policy") if not hasattr(extensions.algorithm, name)]
     if extensions.algorithm is not None and missing:
         raise InputError(
