@@ -111,7 +111,7 @@ def draw(files: list[Path], figure: Path) -> None:
 
     plt = pyplot()
     picture, axes = plt.subplots(1, len(files), sharey=True, squeeze=False, layout="constrained")
-    picture.set_size_inches(4.6 * len(files), 3.6)
+    picture.set_size_inches(5.6 * len(files), 3.6)
     for axis, file in zip(axes[0], files, strict=True):
         found = json.loads(file.read_text())
         for name, rows in found["curves"].items():
@@ -120,7 +120,11 @@ def draw(files: list[Path], figure: Path) -> None:
             reached = [k for k, row in enumerate(rows) if row["at_bar"]]
             axis.plot([seconds[k] for k in reached], [cost[k] for k in reached], "o", color=COLOURS[name], markersize=4)
         axis.set(xscale="log", yscale="log", xlabel="seconds since process start", title=found["versions"]["where"])
-        axis.grid(alpha=0.25, which="both")
+        for each, marks in ((axis.xaxis, (5, 10, 20, 30, 50, 100, 200, 400)), (axis.yaxis, (1000, 2000, 4000, 8000))):
+            each.set_major_locator(plt.FixedLocator(marks))
+            each.set_major_formatter("{x:g}")
+            each.set_minor_locator(plt.NullLocator())
+        axis.grid(alpha=0.25)
     axes[0][0].set_ylabel("cost of an episode (minus its return)")
     axes[0][-1].plot([], [], "o", color="black", markersize=4, label="at the bar")
     axes[0][-1].legend(fontsize="small")

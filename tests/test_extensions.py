@@ -13,8 +13,9 @@ from conftest import with_settings
 
 from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.commands.train import main
-from mjxball.config import Config, preset
+from mjxball.config import Config, preset, with_plant
 from mjxball.env import TransportEnv
+from mjxball.errors import InputError
 from mjxball.train import program as programs
 from mjxball.train import train
 from mjxball.train.extensions import Extensions, find, make_env
@@ -103,6 +104,17 @@ def test_a_reward_of_the_users_own_replaces_ours() -> None:
     after = env.step(state, action)
     assert float(after.reward) == pytest.approx(-float(after.metrics["error"]) - 0.25, rel=1e-6)
     assert (env.input_mask, env.observation_size) == (env.env.input_mask, env.env.observation_size)
+
+
+def test_followers_of_a_team_share_a_reward_or_have_their_own() -> None:
+    config = with_plant(preset("lost"), "team6")
+    action = np.zeros((5, 3), np.float32)
+    for reward in (lambda _, action, after: -after.metrics["error"], lambda _, action, after: action[..., 0] - 1.0):
+        env = make_env(Extensions(reward=reward), config, "newton-euler")
+        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+        assert jax.eval_shape(env.step, state, action).reward.shape == (5,)
+    with pytest.raises(InputError, match=r"one number or one for each follower, shape \(5,\), not shape \(5, 3\)"):
+        make_env(Extensions(reward=lambda _, a, after: a), config, "newton-euler")
 
 
 def test_a_run_on_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

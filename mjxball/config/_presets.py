@@ -197,7 +197,7 @@ def _lost() -> Config:
         scenario=replace(team.scenario, team_sizes=(), object_mass=(0.3, 2.4), lost_follower_probability=0.6),
         sac=replace(team.sac, num_envs=560, replay_size=560_000),
         ppo=Ppo(num_envs=560),
-        gradient=replace(team.gradient, num_envs=65, windows_per_episode=6, until_termination=True),
+        gradient=replace(team.gradient, gradient_steps=600, num_envs=65, windows_per_episode=6, until_termination=True),
     )
 
 

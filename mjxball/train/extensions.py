@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
@@ -153,7 +154,8 @@ class Rewarded:
     def step(self, state: Any, action: Any) -> Any:
         """The environment's own, but for the reward."""
         after = self.env.step(state, action)
-        return after.replace(reward=self._reward(state, action, after))
+        reward = self._reward(state, action, after)
+        return after.replace(reward=jnp.broadcast_to(reward, after.reward.shape))
 
 
 def name_of(extension: Any) -> str:
@@ -215,11 +217,12 @@ def _check_reward(env: Any, reward: Any) -> None:
     except (TypeError, ValueError):
         raise InputError(f"{flag} must take (state, action, next state)") from None
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    action = jax.ShapeDtypeStruct((env.action_size,), "float32")
+    action = jax.ShapeDtypeStruct((*state.obs.shape[:-1], env.action_size), "float32")
     found = _traced(flag, "the function", lambda s, a: reward(s, a, env.step(s, a)), state, action)
     shape, kind = getattr(found, "shape", None), str(getattr(found, "dtype", type(found).__name__))
-    if shape != () or not kind.startswith("float"):
-        raise InputError(f"{flag} must return one number, not shape {shape} of {kind}; sum it and use floats")
+    if shape not in ((), state.reward.shape) or not kind.startswith("float"):
+        each = f" or one for each follower, shape {state.reward.shape}" if state.reward.shape else ""
+        raise InputError(f"{flag} must return one number{each}, not shape {shape} of {kind}; sum it and use floats")
 
 
 def _traced(flag: str, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
