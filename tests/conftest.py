@@ -33,10 +33,9 @@ from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
 from mjxball.sim.follower import follower_law
 
-# XLA reads its flags when it first compiles; processes that tests start have those of users unless a test says so.
-with pytest.MonkeyPatch.context() as patched:
-    patched.setenv("XLA_FLAGS", f"{HASTY} {os.environ.get('XLA_FLAGS', '')}")
-    jax.jit(lambda: jnp.zeros(1))()
+# The same as in `command_line.environment`: a cached program is found by the flags that it was compiled with.
+if HASTY not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = f"{HASTY} {os.environ.get('XLA_FLAGS', '')}".strip()
 if cache.VARIABLE not in os.environ:  # one compilation cache a run: of its workers and of the processes they start
     os.environ[cache.VARIABLE] = tempfile.mkdtemp(prefix="mjxball-cache-")
     atexit.register(shutil.rmtree, os.environ[cache.VARIABLE], ignore_errors=True)

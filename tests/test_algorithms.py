@@ -161,7 +161,9 @@ def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_by_gradient_writes_a_policy_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_by_gradient_writes_a_policy_and_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_verdict: None
+) -> None:
     monkeypatch.chdir(tmp_path)
     flags = ["--gradient.gradient_steps", "2", "--gradient.num_envs", "4", "--gradient.horizon", "20"]
     assert main(["--algorithm", "gradient", *flags, "--num-seeds", "2", "--out", "run"]) == 0

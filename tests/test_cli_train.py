@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import (
+    STEPS,
     assert_process_refuses,
     assert_refused,
     call,
@@ -34,8 +35,6 @@ from mjxball import config as configs
 from mjxball.commands.train import main, parser
 from mjxball.policy import Policy
 
-STEPS = 4096
-LONG = 96_000  # several seconds of training, so that Ctrl-C arrives in the middle
 ROW = re.compile(r"^\s*[\d,]+ / [\d,]+ steps")
 COMPILING = re.compile("compiling the training program")
 EVALUATED = {"eval_return", "eval_steady_error", "eval_peak", "eval_tilt_error", "eval_vertical_error"}
@@ -62,7 +61,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short run in a fresh working directory."""
     here = tmp_path_factory.mktemp("finished")
     with contextlib.chdir(here), contextlib.redirect_stdout(io.StringIO()) as said:
-        assert call(main, tiny(out="run", seed=3, sac__total_steps=STEPS)) == 0
+        assert call(main, tiny(out="run", seed=3)) == 0
     assert "run/policy.npz" in said.getvalue()
     assert sorted(path.name for path in here.iterdir()) == ["run"]
     return here / "run"
@@ -156,14 +155,14 @@ def stopped(here: Path, line: re.Pattern[str], number: int, **settings: Any) -> 
 def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that got one Ctrl-C after its first row of progress."""
     here = tmp_path_factory.mktemp("interrupted")
-    assert "run/policy.npz" in stopped(here, ROW, signal.SIGINT, sac__total_steps=LONG)
+    assert "run/policy.npz" in stopped(here, ROW, signal.SIGINT)
     return here / "run"
 
 
 @pytest.mark.slow
 def test_interrupted_run_keeps_policy_and_checkpoint(interrupted: Path) -> None:
     steps = int(rows_of(interrupted)[-1]["steps"])
-    assert steps < LONG
+    assert steps < STEPS
     assert checkpoint_steps(interrupted)[-1] == steps
     assert load_arrays(interrupted / "policy.npz")[1]["training_steps"] == steps
     assert np.isfinite(command_of(interrupted / "policy.npz")).all()
@@ -179,10 +178,13 @@ def test_export_of_an_interrupted_run(interrupted: Path, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_run_quit_while_it_compiled_is_started_anew(finished: Path, tmp_path: Path, short_verdict: None) -> None:
+def test_a_run_quit_while_it_compiled_is_started_anew(
+    finished: Path, tmp_path: Path, short_verdict: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """SIGTERM before the first checkpoint leaves the configuration and an empty table: enough to resume from."""
+    monkeypatch.setenv("MJXBALL_CACHE", "off")  # of the process, which then has seconds to compile
     run_directory = tmp_path / "run"
-    assert "before training began" in stopped(tmp_path, COMPILING, signal.SIGTERM, seed=3, sac__total_steps=STEPS)
+    assert "before training began" in stopped(tmp_path, COMPILING, signal.SIGTERM, seed=3)
     assert {path.name for path in run_directory.iterdir()} == {"config.json", "metrics.csv", "tensorboard"}
     assert call(main, ["--resume", run_directory]) == 0
     np.testing.assert_array_equal(command_of(run_directory / "policy.npz"), command_of(finished / "policy.npz"))
@@ -197,8 +199,8 @@ def test_resume_finishes_an_interrupted_run(interrupted: Path, short_verdict: No
     assert rows[: len(before)] == before
     steps = [int(row["steps"]) for row in rows]
     assert steps == sorted(set(steps))
-    assert steps[-1] == LONG == checkpoint_steps(interrupted)[-1]
-    assert load_arrays(interrupted / "policy.npz")[1]["training_steps"] == LONG
+    assert steps[-1] == STEPS == checkpoint_steps(interrupted)[-1]
+    assert load_arrays(interrupted / "policy.npz")[1]["training_steps"] == STEPS
     assert (interrupted / "eval" / "cells.json").is_file()
     assert (interrupted / "config.json").read_bytes() == recorded
 

@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment, run
-from conftest import too_busy
 from fly_virtual import VirtualTwin
 
 from mjxball.errors import InputError
 from mjxball.fly import retrain
-from mjxball.fly.flight_log import read
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.main import main
 from mjxball.fly.retrain import Retrainer
@@ -217,37 +215,3 @@ def test_a_card_says_what_it_was_retrained_for(tmp_path: Path) -> None:
     contents: PolicyFile = with_origin(load_file(FLIGHT), load, {"steps": 3})
     save_file(tmp_path / "new.npz", contents)
     assert load_file(tmp_path / "new.npz").card["retrained"] == {"mass": 0.004, "offset": 0.05, "steps": 3}
-
-
-@pytest.mark.alone
-def test_a_rehearsal_finds_its_load_and_fine_tunes(tmp_path: Path) -> None:
-    """From end to end by the clock: runner, twin, and the process with JAX that reads the growing log."""
-    pytest.importorskip("cflib")
-    log = tmp_path / "flight.jsonl"
-    command = ["-m", "mjxball.fly", FLIGHT, "--rehearse", "--retrain", "--twin-load", "0.006", "-0.04", "10"]
-    done = subprocess.run(
-        [sys.executable, *map(str, command), "--seconds", "26", "--log", str(log)],
-        cwd=tmp_path,
-        env={**environment(), "PYTHONPATH": str(REPOSITORY)},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=500,
-        check=False,
-    )
-    assert done.returncode in (0, 1), done.stderr
-    records = list(read(log))
-    said = {record["what"]: record for record in records if record["kind"] == "retrain"}
-    events = {event.split(":")[0] for record in records for event in record.get("events", [])}
-    if events & {"DEADLINES", "STALE"} or "failed" in said:
-        too_busy(f"{sorted(events)}, {said.get('failed')}")
-    assert done.returncode == 0, done.stdout
-    assert "retraining: 3 of 3 programs compiled" in done.stdout
-    found = said["identified"]["numbers"]
-    assert found["mass"] == pytest.approx(0.006, abs=5e-4)
-    assert found["moment"] == pytest.approx(-0.006 * 0.04, abs=1e-4)
-    assert said.keys() & {"kept", "fine-tuned"}
-    assert ("taken" in said) == ("fine-tuned" in said)
-    end = next(record for record in records if record["kind"] == "end")
-    assert end["flown"].keys() == {"first policy", *["second policy"] * ("taken" in said)}
-    assert all(figures["error_rms"] < 0.1 for figures in end["flown"].values())

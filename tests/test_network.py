@@ -30,7 +30,7 @@ from mjxball import export
 from mjxball.commands import evaluate, train
 train.standard_scenarios = short_train.one_second
 codes = [
-    train.main({tiny(sac__total_steps=1100, out="run")}),
+    train.main({tiny(out="run")}),
     export.main(["run", "out.npz"]),
     evaluate.main("run/policy.npz --followers copy --seconds 1 --physics mujoco --out report".split()),
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -12,33 +13,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import STEPS, tiny
 from command_line import environment as child_environment
-from command_line import tiny
 
 from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS
 from mjxball.train.run_directory import PACKAGE, SOURCES
 
 REPOSITORY = Path(__file__).parents[1]
-STEPS = 24_000
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A compilation cache of this module's own, so that its runs compile once."""
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, cache: Path) -> Path:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that was never interrupted. Its replay has wrapped around several times."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    launch(["--out", str(out), *tiny(sac__total_steps=STEPS)], cache).wait(timeout=240)
+    launch(["--out", str(out), *tiny()]).wait(timeout=240)
     return out
 
 
-def launch(arguments: list[str], cache: Path) -> subprocess.Popen:
-    environment = {**child_environment(), "MJXBALL_CACHE": str(cache), "PYTHONPATH": str(REPOSITORY)}
+def launch(arguments: list[str]) -> subprocess.Popen:
+    environment = {**child_environment(), "PYTHONPATH": str(REPOSITORY)}
     command = [sys.executable, str(REPOSITORY / "tests" / "short_train.py"), *arguments]
     return subprocess.Popen(
         command, cwd=REPOSITORY, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -56,9 +50,9 @@ def complete(run: Path) -> list[int]:
 
 
 @pytest.mark.slow
-def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: Path, cache: Path) -> None:
+def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: Path) -> None:
     run = tmp_path / "killed"
-    child = launch(["--out", str(run), *tiny(sac__total_steps=STEPS)], cache)
+    child = launch(["--out", str(run), *tiny()])
     deadline = time.monotonic() + 120
     while not complete(run) and child.poll() is None and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -69,7 +63,7 @@ def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: P
     assert kept
     assert kept[-1] < STEPS
     (run / CHECKPOINTS / f"{kept[-1] + 32}.orbax-checkpoint-tmp").mkdir()  # as a write cut short leaves it
-    again = launch(["--resume", str(run)], cache)
+    again = launch(["--resume", str(run)])
     output = again.communicate(timeout=240)[0]
     assert again.returncode == 0, output
     for name, value in arrays(whole).items():
@@ -130,9 +124,9 @@ def test_changed_program_is_refused_with_the_differences(
 
 
 @pytest.mark.slow
-def test_compilation_cache_is_filled(whole: Path, cache: Path) -> None:
+def test_compilation_cache_is_filled(whole: Path) -> None:
     assert whole.is_dir()
-    assert any(path.name.startswith("jit_advance") for path in cache.iterdir())
+    assert any(path.name.startswith("jit_advance") for path in Path(os.environ["MJXBALL_CACHE"]).iterdir())
 
 
 def test_the_source_hash_covers_what_the_training_program_imports() -> None:
