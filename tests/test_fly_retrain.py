@@ -175,7 +175,7 @@ def test_the_flight_is_the_same_whatever_becomes_of_it(
     save_file(flown, trained.contents)
 
     def sent(one: Retrainer | None) -> list[Any]:
-        world = VirtualTwin(FlightSettings(seconds=2.0), contents=trained.contents)
+        world = VirtualTwin(FlightSettings(seconds=1.0), contents=trained.contents)
         world.flight.succession._successor = None if one is None else one.take
         world.run()
         return [record["sent"] for record in world.log.records if record["kind"] == "tick"]

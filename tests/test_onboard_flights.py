@@ -26,10 +26,10 @@ def world(seconds: float = 6.0, **around: Any) -> VirtualTwin:
 def test_radio_delay_does_not_matter_on_board():
     errors = []
     for delay in (0.0, 0.04):
-        twin = world(delay=delay)
+        twin = world(seconds=5.0, delay=delay)
         twin.run()
         assert code_of(twin) == 0
-        flown = [moment for moment in twin.track if moment.state == "fly"][300:]
+        flown = [moment for moment in twin.track if moment.state == "fly"][250:]
         off = np.array([moment.position for moment in flown]) - twin.flight.goal(twin.now)
         errors.append(float(np.sqrt((off**2).sum(axis=1).mean())))
     assert max(errors) < 0.03
@@ -57,12 +57,12 @@ def test_a_low_battery_lands_both():
     """One drone finds its battery low for 5 s, without the laptop's knowledge; a moment does not count."""
     twin = world(seconds=30.0)
     twin.fly_until(Laptop.FLY)
-    twin.fly_for(3.0)
+    twin.fly_for(1.0)
     follower = twin.links[1]
     follower.write_parameters({"mjxb.battery": 4.2})
     twin.fly_for(4.0)
     follower.write_parameters({"mjxb.battery": 3.2})
-    twin.fly_for(2.0)
+    twin.fly_for(1.0)
     assert twin.flight.supervisor.state is Laptop.FLY
     follower.write_parameters({"mjxb.battery": 4.2})
     twin.fly_for(4.5)

@@ -64,17 +64,18 @@ class TestRings:
         """The same commands to three drones, alone and with three that pad: the same accelerations."""
         config = settings(scenario__team_sizes=SIZES, scenario__cg_amplitude=(0.1, 0.1), scenario__start_tilt=0.3)
         env = TransportEnv(config, "newton-euler")
-        world = jax.jit(env.reset)(jax.random.key(1), 1.0, 1).pipeline_state
+        reset = jax.jit(env.reset)
+        world = reset(jax.random.key(1), 1.0, 1).pipeline_state
         own = ring_config(config, 3)
         alone = TransportEnv(own, "newton-euler")
         plant = world.plant._replace(rotor_force=world.plant.rotor_force[:3])
         still = jnp.zeros((2, 3))
         other = world._replace(loop=world.loop._replace(plant=plant), action=still, command=still, rig=())
         action = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (5, 3)), jnp.float32)
-        state = env.reset(jax.random.key(1), 1.0, 1).replace(pipeline_state=world)
+        state = reset(jax.random.key(1), 1.0, 1).replace(pipeline_state=world)
         for _ in range(5):
             state = jax.jit(env.step)(state, action)
-        start = alone.reset(jax.random.key(2))
+        start = jax.jit(alone.reset)(jax.random.key(2))
         seen = alone._loop_of(()).observe(plant, world.goal)
         moved = start.replace(pipeline_state=other, obs=seen)
         for _ in range(5):
@@ -227,7 +228,7 @@ class TestAgents:
         step = jax.jit(environments.step)
         envs, transition = step(environments.begin(states, 1.0), action, jax.random.PRNGKey(1))
         world = jax.tree.map(lambda leaf: leaf[3], states.pipeline_state)
-        one = env.reset(jax.random.PRNGKey(2), 1.0, 3).replace(pipeline_state=world, obs=states.obs[6:])
+        one = jax.jit(env.reset)(jax.random.PRNGKey(2), 1.0, 3).replace(pipeline_state=world, obs=states.obs[6:])
         alone = jax.jit(env.step)(one, action[6:])
         np.testing.assert_allclose(transition.next_observation[6:], alone.obs, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(transition.reward[6:], alone.reward, rtol=1e-4)

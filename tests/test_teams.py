@@ -103,12 +103,14 @@ def test_a_control_step_of_every_world_may_have_another_rig() -> None:
     zero = np.zeros((3, 3))
     vectors = (zero, 0.1 * random.normal(size=(3, 3)), zero, mass, np.zeros((3, 2)))
 
-    def flown(config, parameters, commands, load, *start):
+    def flown(config, parameters, commands, load, *start, repeat=jax.lax.fori_loop):
         engine = newton_euler.make_engine(config.plant, config.attitude, parameters)
         step = make_control_step(config, engine, parameters=parameters)
-        state = start_state(config, *start, parameters)
-        for _ in range(5):
-            state = step(state, commands, load)
+        return repeat(0, 5, lambda _, state: step(state, commands, load), start_state(config, *start, parameters))
+
+    def in_numpy(first, last, step, state):
+        for number in range(first, last):
+            state = step(number, state)
         return state
 
     numbers = [plant_parameters(rig, Attitude()) for rig in rigs]
@@ -116,7 +118,7 @@ def test_a_control_step_of_every_world_may_have_another_rig() -> None:
     together = jitted(lambda: lambda *each: flown(configs[0], *each))(worlds, commands, load, *vectors)
     for number, config in enumerate(configs):
         given = jax.tree.map(lambda leaf: leaf[number], (commands, load, *vectors))  # noqa: B023
-        alone = flown(config, None, *given)
+        alone = flown(config, None, *given, repeat=in_numpy)
         for found, expected in zip(together.each(lambda leaf: leaf[number]), alone, strict=True):  # noqa: B023
             if expected is not None:
                 # 1e-10: rounding, which the attitude loops' feedback does not let grow

@@ -17,14 +17,14 @@ from mjxball.sim.rollout import Trajectory, load_of, simulate, simulate_batch, s
 from mjxball.sim.scenario import Scenario
 
 CASES = {
-    "sine": (paper_with(), Scenario(omega=1.0, seconds=4)),
-    "waveform": (paper_with(motion=SAMPLES), Scenario(seconds=4)),
+    "sine": (paper_with(), Scenario(omega=1.0, seconds=2.5)),
+    "waveform": (paper_with(motion=SAMPLES), Scenario(seconds=2.5)),
     "rolling": (paper_with(motion=ROLLING), Scenario(seconds=4, ball_start=0.03, goal=(0.3, 0.2, 0.1))),
-    "mass": (paper_with(), Scenario(seconds=4, mass_changes=((1.0, 0.2), (2.5, -0.3)), goal=(0.2, 0.2, 0.2))),
-    "light_ball": (paper_with(LIGHT_BALL), Scenario(seconds=4, amplitude=0.08)),
-    "varied": (paper_with(VARIED), Scenario(seconds=4, amplitude=0.08, mass=0.35)),
+    "mass": (paper_with(), Scenario(seconds=2.5, mass_changes=((0.5, 0.2), (1.5, -0.3)), goal=(0.2, 0.2, 0.2))),
+    "light_ball": (paper_with(LIGHT_BALL), Scenario(seconds=2.5, amplitude=0.08)),
+    "varied": (paper_with(VARIED), Scenario(seconds=2.5, amplitude=0.08, mass=0.35)),
     "pivot": (paper_with(PIVOT, ROLLING), Scenario(seconds=3, goal=(0, 0, 0), ball_start=0.01)),
-    "heave": (paper_with(HEAVE), Scenario(seconds=4, goal=(0, 0, 0.2))),
+    "heave": (paper_with(HEAVE), Scenario(seconds=2.5, goal=(0, 0, 0.2))),
 }
 
 
