@@ -75,9 +75,11 @@ def by_the_clock(item: pytest.Item) -> bool:
 # Files that take longest, which begin first, so that no worker is left with one of them at the end.
 LONGEST = (
     *("test_fly_mocap_flight", "test_fly_link", "test_fly_main", "test_fly_watchdog", "test_fly_rehearsal"),
-    *("test_population", "test_rig_rehearsal", "test_distributed", "test_cli_eval", "test_docs", "test_cli_train"),
-    *("test_extensions", "test_resume", "test_figures", "test_engines", "test_program", "test_gym", "test_algorithms"),
+    *("test_fine_tune", "test_rig_rehearsal", "test_population", "test_distributed", "test_cli_eval", "test_docs"),
+    *("test_rig_load", "test_team_env", "test_cli_train", "test_rigs", "test_algorithms", "test_extensions"),
+    *("test_figures", "test_stability", "test_fly_defects", "test_resume", "test_engines", "test_program", "test_gym"),
 )
+COMPILES = ("test_fine_tune",)  # for long, beside what others compute, before its last test goes by the clock
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -97,7 +99,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.slow)
-    clocked = {item.path for item in items if by_the_clock(item)}
+    clocked = {item.path for item in items if by_the_clock(item) and item.path.stem not in COMPILES}
     places = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: (item.path not in clocked, places.get(item.path.stem, len(places))))
 

@@ -102,7 +102,9 @@ def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None
 @pytest.mark.alone
 def test_worlds_of_one_follower_are_split_over_the_processes(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    children = launch([*SMALL, "--sac.total_steps", "2400", "--out", str(run)], tmp_path / "cache")
+    children = launch(
+        [*SMALL, "--algorithm", "sac", "--sac.total_steps", "2400", "--out", str(run)], tmp_path / "cache"
+    )
     outputs = finish(children)
     assert [child.returncode for child in children] == [0, 0], outputs
     assert Policy.load(run / "policy.npz").card["training_steps"] == 2400

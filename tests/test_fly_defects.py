@@ -52,7 +52,7 @@ def test_two_flights_in_a_row_need_no_reboot() -> None:
     for number in range(2):
         if number:
             world.track.clear()
-            world.next_flight()
+            world.next_flight(pause=0.0)  # it was silent for 3 s
         world.run(60.0)
         assert world.flight.supervisor.cause is None
         assert world.flight.lifted

@@ -98,6 +98,17 @@ REFUSALS = [
 ]
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """What is refused for want of an answer is so after a second; a reader that answers may take its time."""
+
+    def expect(reason: str) -> None:
+        if "does not answer" in reason:
+            monkeypatch.setattr("mjxball.fly.main.ready", functools.partial(ready, limits=MocapLimits(answer=1.0)))
+
+    return expect
+
+
 @pytest.mark.parametrize(
     ("flags", "reason"),
     [  # whoever waits for an answer belongs to the second tier
@@ -105,8 +116,16 @@ REFUSALS = [
         for n, row in enumerate(REFUSALS)
     ],
 )
-def test_refusals(flags: list[str], reason: str, deaf: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refusals(
+    flags: list[str],
+    reason: str,
+    deaf: Any,
+    impatient: Callable[[str], None],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     uris, sockets = deaf
+    impatient(reason)
     log = tmp_path / "log.jsonl"
     assert call(main, [TRANSPORT, *uris, *flags, "--log", log]) == 2
     errors = capsys.readouterr().err
@@ -132,8 +151,14 @@ SERVED: list[tuple[str, Callable[[], Poses], dict[str, Any], str]] = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("poses", "server", "reason"), [c[1:] for c in SERVED], ids=[c[0] for c in SERVED])
 def test_what_a_server_sends_is_refused_in_a_sentence(
-    poses: Callable[[], Poses], server: dict[str, Any], reason: str, deaf: Any, capsys: pytest.CaptureFixture[str]
+    poses: Callable[[], Poses],
+    server: dict[str, Any],
+    reason: str,
+    deaf: Any,
+    impatient: Callable[[str], None],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    impatient(reason)
     with VrpnServer(poses, **server) as running:
         flags = ["--mocap", "vrpn", "--mocap-host", running.host, "--bodies", *BODIES]
         assert call(main, [TRANSPORT, *deaf[0], *flags]) == 2

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -46,21 +47,25 @@ def small(transport: Config) -> Config:
     return with_settings(transport, sac=SMALL)
 
 
-def trained(population: Population) -> object:
-    state = population.create(5)
+@pytest.fixture(scope="module")
+def together(small: Config) -> tuple[Population, Any, Any]:
+    """Two members, and what they are after 5 and 20 steps of training."""
+    population = Population(small, "newton-euler", 2)
     advance = jax.jit(population.advance)
-    state, *_ = advance(state, programs.warmup(10))
-    return advance(state, programs.train(20))[0]
+    state, *_ = advance(population.create(5), programs.warmup(10))
+    early, *_ = advance(state, programs.train(5))
+    return population, early, advance(early, programs.train(15))[0]
 
 
 @pytest.mark.slow
-def test_members_are_the_runs_of_their_seeds(small: Config) -> None:
-    population, single = Population(small, "newton-euler", 2), Population(small, "newton-euler")
-    together, advance = trained(population), jax.jit(single.advance)
+def test_members_are_the_runs_of_their_seeds(small: Config, together: tuple[Population, Any, Any]) -> None:
+    population, _, late = together
+    single = Population(small, "newton-euler")
+    advance = jax.jit(single.advance)
     for member in range(2):
         state, *_ = advance(single.create(5 + member), programs.warmup(10))
         alone, *_ = advance(state, programs.train(20))
-        mine = population.member(together, member)
+        mine = population.member(late, member)
         for a, b in zip(
             jax.tree.leaves(mine.algorithm.learner.policy), jax.tree.leaves(alone.algorithm.learner.policy), strict=True
         ):
@@ -155,7 +160,7 @@ def test_population_run_exports_every_member_and_the_best(
 
 
 @pytest.mark.slow
-def test_members_are_spread_over_devices() -> None:
+def test_members_are_spread_over_devices(together: tuple[Population, Any, Any], tmp_path: Path) -> None:
     """Two CPU devices in a process of their own: the same members as on one, up to rounding."""
     code = f"""
 import jax, numpy as np
@@ -172,13 +177,8 @@ state, *_ = compiled.advance(population.start(compiled, 5), population.mode(P.wa
 state, *_ = compiled.advance(state, population.mode(P.train(5)))
 leaves = jax.tree.leaves(state.algorithm.learner.policy)
 assert len(leaves[0].sharding.device_set) == 2
-single = Population(config, "newton-euler", 2, devices=jax.local_devices()[:1])
-assert single.devices == 1
-advance = jax.jit(single.advance)
-alone, *_ = advance(single.create(5), P.warmup(10))
-alone, *_ = advance(alone, P.train(5))
-for a, b in zip(leaves, jax.tree.leaves(alone.algorithm.learner.policy)):
-    np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=1e-5)
+assert Population(config, "newton-euler", 2, devices=jax.local_devices()[:1]).devices == 1
+np.savez({str(tmp_path / "spread.npz")!r}, *map(np.asarray, leaves))
 """
     flags = f"{HASTY} --xla_force_host_platform_device_count=2"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
@@ -192,6 +192,13 @@ for a, b in zip(leaves, jax.tree.leaves(alone.algorithm.learner.policy)):
         timeout=240,
     )
     assert done.returncode == 0, done.stderr
+    population, alone, _ = together
+    assert population.devices == 1
+    with np.load(tmp_path / "spread.npz") as spread:
+        leaves = jax.tree.leaves(alone.algorithm.learner.policy)
+        assert len(spread.files) == len(leaves)
+        for name, expected in zip(spread.files, leaves, strict=True):
+            np.testing.assert_allclose(spread[name], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("spread", [True, False])

@@ -108,14 +108,6 @@ for physics in ("newton-euler", "mujoco"):
 """
 
 
-def passes(body: str) -> None:
-    done = run(["-c", PROGRAM % (CHECKED, body)], REPOSITORY)
+def test_shapes_of_training_steps_and_flights() -> None:
+    done = run(["-c", PROGRAM % (CHECKED, TRAINING + FLIGHTS)], REPOSITORY)
     assert done.stdout.endswith("done\n"), done.stderr[-3000:]
-
-
-def test_shapes_of_a_training_step() -> None:
-    passes(TRAINING)
-
-
-def test_shapes_of_flights() -> None:
-    passes(FLIGHTS)
