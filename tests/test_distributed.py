@@ -63,7 +63,7 @@ def checkpoints(run: Path) -> list[int]:
     return sorted(int(path.name) for path in place.iterdir() if path.name.isdigit()) if place.is_dir() else []
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None:
     """Two members, one on each process."""
     run, cache = tmp_path / "run", tmp_path / "cache"
@@ -99,7 +99,7 @@ def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None
         assert Policy.load(run / "members" / f"seed{seed}.npz").card["training_steps"] >= kept
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_worlds_of_one_follower_are_split_over_the_processes(tmp_path: Path) -> None:
     run = tmp_path / "run"
     children = launch(
@@ -140,7 +140,7 @@ print("traced by", jax.process_index())
 """
 
 
-@pytest.mark.alone
+@pytest.mark.slow
 def test_every_process_can_trace_mjx() -> None:
     """MJX's own choice of a device is the first of all processes, whose arrays no other process may use."""
     with socket.socket() as free:

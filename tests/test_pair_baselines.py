@@ -130,12 +130,11 @@ def sway() -> dict[str, np.ndarray]:
     """Largest |e_y| [m] from 20 s on at SPEEDS, the CG swinging 34 mm, nothing disturbed."""
     common = {"amplitude": 0.034, "mass": 0.0175, "goal": (0.5, 0.5, 0.5), "seconds": 30.0}
     scenarios = [Scenario(omega=speed, **common) for speed in SPEEDS]
-    found = {}
-    for name in ("copy", "adaptive", "oracle", "lqg"):
-        flown = simulate_batch(FLIGHT, [(make_baseline(name, FLIGHT), scenarios)], "newton-euler")
-        assert not flown.diverged.any()
-        found[name] = np.abs(flown.error[flown.time >= 20, :, 1]).max(axis=0)
-    return found
+    names = ("copy", "adaptive", "oracle", "lqg")
+    flown = simulate_batch(FLIGHT, [(make_baseline(name, FLIGHT), scenarios) for name in names], "newton-euler")
+    assert not flown.diverged.any()
+    largest = np.abs(flown.error[flown.time >= 20, :, 1]).max(axis=0)
+    return dict(zip(names, largest.reshape(len(names), len(scenarios)), strict=True))
 
 
 @pytest.mark.parametrize(("name", "most"), [("adaptive", 0.2), ("oracle", 0.15), ("lqg", 0.03)])
