@@ -288,7 +288,7 @@ class Seen:
     """A world whose flight has motion capture at 100 Hz, with what reached each drone's link."""
 
     def __init__(self, spoil: Spoil = lambda elapsed, frame: frame):
-        self.world = VirtualTwin(FlightSettings(seconds=3.0))
+        self.world = VirtualTwin(FlightSettings(seconds=2.0))
         self.mocap = Mocap(MocapSettings("mock", "", BODIES), self.world.rig.span)
         self.heard: list[list[tuple[np.ndarray, np.ndarray]]] = [[], []]
         self._noise, self._spoil, self._begin = np.random.default_rng(0), spoil, 0.0

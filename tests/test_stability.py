@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+import hover_stability
 from hover_stability import delay_margins, linearised_hovers
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
@@ -42,10 +45,10 @@ def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: 
 
 @pytest.mark.slow
 def test_delay_margin_is_where_flights_begin_to_grow(paper: Config) -> None:
-    """LQG, which is told of no delay."""
-    lqg = make_baseline("lqg", paper)
-    (margin,) = delay_margins(paper, law_of(lqg), CASES[:1], longest=2)
-    assert 0 <= margin < 2
+    """LQG, which is told of no delay, bears one control step and not two."""
+    lqg, margin = make_baseline("lqg", paper), 1
+    hovers = [linearised_hovers(paper, law_of(lqg), CASES[:1], delay)[0] for delay in (margin, margin + 1)]
+    assert [hover.stable for hover in hovers] == [True, False]
     still = {"amplitude": 0.0, "goal": (0.0, 0.0, 0.0), "start_position": (0.001, 0.0, 0.0)}
     delays = [0.02 * margin, 0.02 * (margin + 1)]
     scenarios = [Scenario(**still, disturbance=Disturbance(delay=delay)) for delay in delays]
@@ -53,3 +56,21 @@ def test_delay_margin_is_where_flights_begin_to_grow(paper: Config) -> None:
     late = errors[-500:].max(axis=0)
     assert late[0] < 0.0005
     assert late[1] > 0.01
+
+
+def test_the_margin_of_a_case_is_the_last_delay_before_its_first_unstable_one(
+    paper: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of four cases, one of which is never stable, and one stable again later."""
+    stable = [(1, 1, 0, 0), (0, 0, 0, 0), (1, 0, 1, 1), (1, 1, 1, 0)]
+    asked = []
+
+    def hovers(config: Config, law: Any, cases: Any, delay: int) -> list[SimpleNamespace]:
+        asked.append(delay)
+        return [SimpleNamespace(stable=bool(row[delay])) for row in stable[: len(cases)]]
+
+    monkeypatch.setattr(hover_stability, "linearised_hovers", hovers)
+    law = law_of(make_baseline("lqg", paper))
+    assert delay_margins(paper, law, [CASES[0]] * 4, longest=3) == [1, -1, 0, 2]
+    assert delay_margins(paper, law, CASES[:1], longest=3) == [1]
+    assert asked == [0, 1, 2, 3, 0, 1, 2]  # no further than the first delay that nobody bears

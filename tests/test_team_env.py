@@ -320,12 +320,11 @@ def test_every_algorithm_learns_from_all_followers(algorithm: str) -> None:
 @pytest.mark.slow
 def test_padded_worlds_move_alike_on_mjx_and_in_closed_form() -> None:
     """One world of each size, rigs of their own, 20 control steps in float32."""
-    plants = []
-    for engine in ("mjx", "newton-euler"):
-        env, numbers = TransportEnv(preset("team"), engine), jnp.arange(len(SIZES))
-        keys = jax.random.split(jax.random.key(0), len(SIZES))
-        state = jax.jit(jax.vmap(env.reset, in_axes=(0, None, 0)))(keys, 1.0, numbers)
-        step = jax.jit(jax.vmap(env.step))
+    plants, keys = [], jax.random.split(jax.random.key(0), len(SIZES))
+    envs = [TransportEnv(preset("team"), engine) for engine in ("mjx", "newton-euler")]
+    start = jax.jit(jax.vmap(envs[0].reset, in_axes=(0, None, 0)))(keys, 1.0, jnp.arange(len(SIZES)))
+    for env in envs:
+        state, step = start, jax.jit(jax.vmap(env.step))
         for _ in range(20):
             state = step(state, 0.3 * jnp.ones((len(SIZES), 5, 3)))
         plants.append(state.pipeline_state.plant)
