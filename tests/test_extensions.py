@@ -113,6 +113,7 @@ def test_followers_of_a_team_share_a_reward_or_have_their_own() -> None:
         env = make_env(Extensions(reward=reward), config, "newton-euler")
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
         assert jax.eval_shape(env.step, state, action).reward.shape == (5,)
+    assert make_env(Extensions(env=toys.Gentle), config, "newton-euler").observation_size == env.observation_size
     with pytest.raises(InputError, match=r"one number or one for each follower, shape \(5,\), not shape \(5, 3\)"):
         make_env(Extensions(reward=lambda _, a, after: a), config, "newton-euler")
 

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from mjxball.env import TransportEnv
 from mjxball.quiet import import_brax_env
 
 Env, State = import_brax_env()
@@ -30,6 +31,14 @@ class DoubleIntegrator(Env):
         reward = -(position**2) - 0.1 * speed**2 - 10.0 * lost
         obs = jnp.stack([position, speed])
         return state.replace(obs=obs, reward=reward, done=lost, metrics={"distance": jnp.abs(position)})
+
+
+class Gentle(TransportEnv):
+    """Ours, teams included, where a pitch rate costs more."""
+
+    def step(self, state: Any, action: Any) -> Any:
+        after = super().step(state, action)
+        return after.replace(reward=after.reward - after.pipeline_state.plant.rates[..., 1] ** 2)
 
 
 class Brief(Env):

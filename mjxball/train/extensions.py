@@ -193,9 +193,10 @@ def _check_env(env: Any, name: str) -> None:
     if not all(isinstance(size, int) and size > 0 for size in sizes):
         raise InputError(f"{flag}: observation_size and action_size must be whole numbers, not {sizes}; flatten them")
     first = _traced(flag, "reset", env.reset, jax.random.PRNGKey(0))
-    after = _traced(flag, "step", env.step, first, jax.ShapeDtypeStruct((sizes[1],), "float32"))
+    each: tuple[int, ...] = first.reward.shape if is_pair(env) else ()  # followers of a team
+    after = _traced(flag, "step", env.step, first, jax.ShapeDtypeStruct((*each, sizes[1]), "float32"))
     for part, state in (("reset", first), ("step", after)):
-        for field, wanted in (("obs", (sizes[0],)), ("reward", ()), ("done", ())):
+        for field, wanted in (("obs", (*each, sizes[0])), ("reward", each), ("done", ())):
             shape = getattr(getattr(state, field, None), "shape", None)
             if shape != wanted:
                 raise InputError(f"{flag}: {part} must return {field} of shape {wanted}, not {shape}")
