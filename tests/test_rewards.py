@@ -99,4 +99,6 @@ def test_descent_is_upright_and_slow_and_a_tumble_costs_no_more_the_faster_it_is
     assert cost(velocity=[0, 0, 0.8]) < 0.1 < cost(velocity=[0, 0, -0.5])
     assert cost(velocity=[0, 0, -10]) < cost(velocity=[0, 0, -40]) < 15
     assert cost(action=[1, 0, 0]) == pytest.approx(0.02 / 3, rel=0.02)
+    assert cost(error=[0.1, 0, 0]) == pytest.approx(3 * 0.01 / 1.01, rel=0.01)
+    assert cost(error=[0, 0, 20.0]) < 3 < cost(error=[0, 0, 20.0], velocity=[0, 0, -1])
     assert reward(Reward(kind="descent"), STILL) == descent_reward(STILL)
