@@ -300,7 +300,7 @@ def test_the_shipped_policy_makes_up_for_it() -> None:
 
 @pytest.mark.slow
 def test_four_drones_come_down_slowly_and_upright_without_a_neighbour_of_the_leader() -> None:
-    """From the goal, for 12 s after the loss; without the drone opposite the leader they tumble."""
+    """From the goal, for 12 s after the loss, the load resting in the middle."""
     config = preset("descent")
     lost = [Scenario(amplitude=0.0, mass=0.4, seconds=20.0, lost=((number, 8.0),)) for number in (1, 3)]
     flights = simulate_batch(config, [(load_policy(shipped_policy("descent"), config), lost)], ENGINE)
