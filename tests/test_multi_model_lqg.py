@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjxball.baselines.multi_model_lqg import FREQUENCIES, LAG, MultiModelOffsetFree, multi_model_lqg
-from mjxball.baselines.team_lqg import team_lqg
+from mjxball.baselines.multi_model_lqg import MODELS, MultiModelOffsetFree, multi_model_lqg
+from mjxball.baselines.team_lqg import TUNING, team_lqg
 from mjxball.config import Config, preset
 from mjxball.control.followers import Baseline, copy_gains
 from mjxball.control.multi_model_lqg import team_geometry
@@ -38,11 +38,12 @@ def law_of_geometry(config: Config) -> MultiModelOffsetFree:
 
 def test_one_model_is_the_law_of_teams() -> None:
     """The same loops, the same rotors, the same levers: the same commands and estimates, also of what is commanded."""
-    frequency, random = 7.0, np.random.default_rng(0)
-    config = dataclasses.replace(team4(frequency), plant=dataclasses.replace(ring_config(TEAM, 4).plant, rotor_lag=LAG))
+    frequency, lag, random = 7.0, 0.05, np.random.default_rng(0)
+    config = dataclasses.replace(team4(frequency), plant=dataclasses.replace(ring_config(TEAM, 4).plant, rotor_lag=lag))
     attitude = dataclasses.replace(UNIVERSAL.attitude, natural_frequency=(7.0, 7.0, 4.0), damping=0.8)
-    own = dataclasses.replace(UNIVERSAL, attitude=attitude, plant=dataclasses.replace(UNIVERSAL.plant, rotor_lag=LAG))
-    known, unknown, leader = team_lqg(config), multi_model_lqg(own, (frequency,)), copy_gains(config)
+    own = dataclasses.replace(UNIVERSAL, attitude=attitude, plant=dataclasses.replace(UNIVERSAL.plant, rotor_lag=lag))
+    unknown = multi_model_lqg(own, ((frequency, lag),), TUNING.torque_walk)
+    known, leader = team_lqg(config), copy_gains(config)
     lever, room = np.array([0.02, -0.05]), 0.3
     one = known.start(np.zeros((3, 18)), np.array([4 / 3, *lever, room, room]))
     other = unknown.start(np.zeros((3, 18)), np.array([4 / 3, *(lever * frequency**2), room * frequency**2]))
@@ -85,7 +86,7 @@ def test_numpy_and_jax_agree_and_models_share_one_weight() -> None:
         memory = ours[0]
     weights = law._estimate(memory, observation).weights
     np.testing.assert_allclose(weights.sum(axis=-1), 1.0)
-    assert law.models == len(FREQUENCIES)
+    assert law.models == len(MODELS)
 
 
 def test_models_that_do_not_fit_are_refused(tmp_path: object) -> None:
@@ -105,14 +106,14 @@ def test_models_that_do_not_fit_are_refused(tmp_path: object) -> None:
 def test_what_the_network_adds_enters_but_not_what_it_adds_all_the_time() -> None:
     law, leader = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL)
     context, level, added = np.array([4 / 3, 0.0, 0.0, 40.0]), np.zeros(18), np.array([0.1, -0.05, 0.0])
-    start = law.start(level, context)
+    start, count = law.start(level, context), law.models
     plain, moved = (law.next(start, level, command, leader) for command in (np.zeros(3), added))
     fast = added[:2] * law.keep[1] / context[0]  # the mean of all drones' commands, less the slow part of one step
     for axis in (0, 1):
-        found = (moved - plain)[20 * axis : 20 * (axis + 1)].reshape(4, 5)
+        found = (moved - plain)[5 * count * axis : 5 * count * (axis + 1)].reshape(count, 5)
         np.testing.assert_allclose(found, law.axis[:, :, 5] * fast[axis], atol=1e-12)
     memory = start
     for _ in range(500):
         memory = law.next(np.concatenate([start[:-6], memory[-6:]]), level, added, leader)
     np.testing.assert_allclose(memory[-6:-4], added[:2], rtol=1e-3)  # all of it is taken for slow
-    np.testing.assert_allclose(memory[:40], plain[:40], atol=1e-3)
+    np.testing.assert_allclose(memory[: 10 * count], plain[: 10 * count], atol=1e-3)

@@ -1,8 +1,9 @@
-"""The numbers of `control.multi_model_lqg`: offset-free LQGs for attitude loops from slow to fast (ours)."""
+"""The numbers of `control.multi_model_lqg`: offset-free LQGs for loops and rotors from slow to fast (ours)."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,20 +18,27 @@ from mjxball.control.followers import copy_gains
 from mjxball.control.multi_model_lqg import ADDED_TIME, MultiModelLqg
 
 Array = Any
-FREQUENCIES = (4.5, 7.0, 11.0, 17.0)  # of the models' attitude loops [rad/s]
-LAG, LAG_ANGLE = 0.05, 0.35  # rotor lag that a model assumes: 0.05 s, of fast loops 0.35 over the frequency
-SCORE_TIME = 4.0  # [s] in which a model's score is forgotten
+# Natural frequency of the attitude loops [rad/s] and lag of the rotors [s] of each model; loops stay hardly damped
+# behind slower rotors.
+MODELS = (
+    *((4.5, 0.03), (4.5, 0.08), (4.5, 0.15)),
+    *((7.0, 0.025), (7.0, 0.06), (7.0, 0.12)),
+    *((11.0, 0.025), (11.0, 0.07), (17.0, 0.03)),
+)
+TORQUE_WALK = 300.0  # intensity of the white noise that drives the rate of a load's torque over the inertia
+SCORE_TIME = 8.0  # [s] in which a model's score is forgotten
 
 
-def multi_model_lqg(config: Config, frequencies: tuple[float, ...] = FREQUENCIES) -> MultiModelLqg:
+def multi_model_lqg(
+    config: Config, models: Sequence[tuple[float, float]] = MODELS, torque_walk: float = TORQUE_WALK
+) -> MultiModelLqg:
     """The law for teams of ideal loops, damped like those of `config`; InputError unless they fly freely."""
     parts, period, damped = [], config.timing.control_period, config.attitude.damping
-    for frequency in frequencies:
+    for frequency, lag in models:
         attitude = dataclasses.replace(config.attitude, natural_frequency=(frequency, frequency, frequency))
         model = ideal_model(dataclasses.replace(config, attitude=attitude), NAME)
         stiffness, damping = frequency**2, 2 * damped * frequency
-        lag = min(LAG, LAG_ANGLE / frequency)
-        *axis, gain, covariance = angle_filter(stiffness, damping, lag, period, TUNING.torque_walk)
+        *axis, gain, covariance = angle_filter(stiffness, damping, lag, period, torque_walk)
         inverse, tilts = np.linalg.inv(covariance), feedback(model, TUNING).pitch
         prior = -0.5 * np.log(np.linalg.det(covariance))
         certainty = np.array([inverse[0, 0], inverse[0, 1], inverse[1, 1]])

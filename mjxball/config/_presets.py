@@ -258,15 +258,15 @@ def _universal() -> Config:
         ),
         rigs=Rigs(number=512, mass_step=0.3),
         bounds=Bounds(x_peak=0.02, settling_time=4.0, rmse=0.4),
-        reward=replace(large.reward, error_scale=0.016, velocity=10.5, smoothness=0.2, command_change=40.0),
+        reward=replace(large.reward, error=0.25, error_scale=0.004, velocity=10.5, smoothness=0.1, command_change=15.0),
         sac=replace(large.sac, num_envs=528, replay_size=528_000),
         ppo=Ppo(num_envs=528),
         gradient=replace(
             TEAM_GRADIENT,
-            num_envs=2400,  # for a GPU; two cores take a tenth of them
+            num_envs=3600,  # for a GPU; two cores take a fifteenth of them
             horizon=100,
             windows_per_episode=6,
-            gradient_steps=1100,
+            gradient_steps=1500,
             learning_rate=8e-3,
             policy_layers=(40, 32),
             until_termination=True,
