@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import cortex
+from mjxball.control.team_lqg import TeamLqg
 from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.fly.app.generate import CORE, options, rig_header, sources
@@ -114,9 +115,14 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> dict[str, Any]:
 
 
 def policy_of(path: Path) -> PolicyFile:
-    """The policy in `path`, as the follower of a pair if it has to be told."""
+    """The policy in `path`, as the follower of a pair if it has to be told, or of its own team if it flies no pair."""
     policy = load_file(path)
-    return in_team(policy, path.stem, PAIR if law_of(policy.card).needs_context else None)
+    law = law_of(policy.card)
+    if not law.needs_context:
+        return policy
+    if isinstance(law.lqg, TeamLqg) and law.lqg.lifting:
+        return in_team(policy, path.stem, Path(f"team{len(policy.card['plant']['drones'])}"), 2)
+    return in_team(policy, path.stem, PAIR)
 
 
 def measure(path: Path, int8: bool, steps: int) -> dict[str, Any]:

@@ -4,7 +4,8 @@
     python benchmarks/rigs.py policies/universal.npz --steps --figure docs/rigs-steps.png
 
 Rigs of 2 to 6 drones in equal numbers, three random flights of 30 s each, the same for everybody; noise, drift and
-delay as in training (settings of the preset `universal`). `lqg-known-rig` and `lqg-slow-known-rig` know the
+delay as in training (settings of the preset `universal`). The object's mass stays what it is; with --mass-step it
+changes once in a flight, as in training, and the LQGs are told at once. `lqg-known-rig` and `lqg-slow-known-rig` know the
 rig: masses, inertia, mounts, loops, rotors, what each drone gives of its thrust; they estimate the load's torque alone.
 The better of both is the reference of a rig, by the median of its flights, in settling and in peak apart. A rig is met
 where the policy's median settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over
@@ -71,6 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--rigs", type=int, default=HELD_OUT_RIGS, metavar="N", help="of each number of drones (default 200)"
     )
     parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), metavar="N", help="numbers of drones")
+    parser.add_argument("--mass-step", action="store_true", help="a change of the mass in every flight, as in training")
     parser.add_argument("--beyond", action="store_true", help="rigs just outside one range at a time instead")
     parser.add_argument("--steps", action="store_true", help="a step of the mass or the CG in flight")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="error against time since the step")
@@ -81,6 +83,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.beyond and options.steps:
         raise InputError("--beyond and --steps are two benchmarks; run one after the other")
     config = preset("universal")
+    if not options.mass_step:
+        config = replace(config, "rigs.mass_step", 0.0)
     made = steps if options.steps else beyond if options.beyond else compare
     found = made(config, options)
     if options.json:
