@@ -133,7 +133,7 @@ def evaluate(scratch: Path, mutant: Mutant, suite: str, likely_only: bool) -> Ve
     with faulty(scratch, mutant):
         for tier, mark in marks.items():
             narrow = tier == "likely"
-            which = list(mutant.tests) if narrow else ["-n", "2", "--dist", "loadgroup"]
+            which = list(mutant.tests) if narrow else ["-n", "2", "--dist", "loadfile"]
             code = pytest_in_child(scratch, [*which, "-m", mark], output, LIMIT if narrow else TIER_LIMIT)
             if code not in (0, NOTHING_RAN):
                 test = "(time limit)" if code == TIMED_OUT else first_failure(output)

@@ -5,8 +5,9 @@
 
 Rigs of 2 to 6 drones in equal numbers, three random flights of 30 s each, the same for everybody; noise, drift and
 delay as in training (settings of the preset `universal`). The object's mass stays what it is; with --mass-step it
-changes once in a flight, as in training, and the LQGs are told at once. `lqg-known-rig` and `lqg-slow-known-rig` know the
-rig: masses, inertia, mounts, loops, rotors, what each drone gives of its thrust; they estimate the load's torque alone.
+changes once in a flight, as in training, and the LQGs are told at once. `lqg-known-rig` and `lqg-slow-known-rig` know
+the rig: masses, inertia, mounts, loops, rotors, what each drone gives of its thrust; they estimate the load's torque
+alone.
 The better of both is the reference of a rig, by the median of its flights, in settling and in peak apart. A rig is met
 where the policy's median settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over
 0.17 m where that is larger, above the reference's, or where the reference itself has none.

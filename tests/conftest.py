@@ -74,24 +74,24 @@ def by_the_clock(item: pytest.Item) -> bool:
 
 # Files that take longest, which begin first, so that no worker is left with one of them at the end.
 LONGEST = (
-    *("test_fine_tune", "test_fly_link", "test_fly_mocap_flight", "test_fly_main", "test_fly_watchdog"),
-    *("test_fly_rehearsal", "test_rig_rehearsal", "test_population", "test_distributed", "test_cli_eval", "test_docs"),
-    *("test_rig_load", "test_team_env", "test_cli_train", "test_rigs", "test_algorithms", "test_extensions"),
-    *("test_figures", "test_stability", "test_fly_defects", "test_resume", "test_engines", "test_program", "test_gym"),
+    *("test_fly_retrain_flight", "test_fly_link", "test_fly_mocap_flight", "test_fly_main", "test_fly_watchdog"),
+    *("test_fly_rehearsal", "test_rig_rehearsal", "test_fine_tune", "test_population", "test_distributed"),
+    *("test_cli_eval", "test_docs", "test_rig_load", "test_team_env", "test_cli_train", "test_rigs"),
+    *("test_algorithms", "test_extensions", "test_figures", "test_stability", "test_fly_defects", "test_resume"),
+    *("test_engines", "test_program", "test_gym"),
 )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """With `--dist loadgroup`, groups begin in the order of `pytest_collection_modifyitems`."""
+    """With `--dist loadfile`, files begin in the order of `pytest_collection_modifyitems`."""
     config.option.loadscopereorder = False
 
 
-@pytest.hookimpl(wrapper=True)  # before xdist's own, which reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> Iterator[None]:
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The second tier is what is marked `slow`, what goes by the clock (`alone`, `clock`) and what opens a browser.
 
-    What goes by the clock begins first, on all workers together, then the longest files. A file is one group of
-    `--dist loadgroup`, what goes by the clock in it another.
+    Files with what goes by the clock begin first, on all workers together, then those that take longest.
     """
     for item in items:
         if by_the_clock(item):
@@ -99,10 +99,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> Iterator[None]:
             item.add_marker(pytest.mark.slow)
         if "browser" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.slow)
-        item.add_marker(pytest.mark.xdist_group(item.path.stem + ("_clock" if by_the_clock(item) else "")))
+    clocked = {item.path for item in items if by_the_clock(item)}
     places = {name: number for number, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: (not by_the_clock(item), places.get(item.path.stem, len(places))))
-    return (yield)
+    items.sort(key=lambda item: (item.path not in clocked, places.get(item.path.stem, len(places))))
 
 
 @pytest.hookimpl(tryfirst=True)
