@@ -83,6 +83,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise InputError("--figure is of --steps")
     if options.beyond and options.steps:
         raise InputError("--beyond and --steps are two benchmarks; run one after the other")
+    if options.mass_step and options.steps:
+        raise InputError("--steps says itself when the mass changes; leave --mass-step out")
     config = preset("universal")
     if not options.mass_step:
         config = replace(config, "rigs.mass_step", 0.0)
@@ -130,7 +132,7 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
         for name, make in followers(options.policies):
             begun = time.perf_counter()
             flown[name] = fly(config, rigs, make(config, rigs), FLIGHTS)
-            row = {"drones": size, "follower": name, **_row(flown, name, rigs, period)}
+            row = {"drones": size, "follower": name, **row_of(flown, name, rigs, period)}
             rows.append({**row, "seconds": round(time.perf_counter() - begun, 1)})
             whole.setdefault(name, []).append(row)
             print(json.dumps(rows[-1]))
@@ -155,14 +157,14 @@ def beyond(config: Config, options: Any) -> dict[str, Any]:
             for name, make in followers(options.policies):
                 if name not in WORST:
                     flown[name] = fly(outside, rigs, make(outside, rigs), FLIGHTS)
-                    row = _row(flown, name, rigs, config.timing.control_period)
+                    row = row_of(flown, name, rigs, config.timing.control_period)
                     rows.append({"setting": path, "range": ends, "drones": size, "follower": name, **row})
                     print(json.dumps(rows[-1]))
                     sys.stdout.flush()
     return {"rows": rows}
 
 
-def _row(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) -> dict[str, Any]:
+def row_of(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) -> dict[str, Any]:
     """Shares of failed flights, medians over rigs, and the shares of rigs that are met."""
     settling, peak = (np.median(getattr(flown[name], part)(period), axis=1) for part in ("settling", "peak"))
     row = {

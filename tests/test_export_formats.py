@@ -135,13 +135,13 @@ def flown(contents: PolicyFile, dtype: Any) -> Flight:
 
 
 def assert_remembered(found: np.ndarray, flight: Flight, contents: PolicyFile, tolerance: float) -> None:
-    """Memories agree; scores of models, the differences of large numbers, as well as float32 has the largest."""
+    """Memories agree; scores of models, the differences of large numbers, as well as these are rounded."""
     wanted, law = flight.next_memory, law_of(contents.card)
     least = np.full(wanted.shape[1], 1e-6 + tolerance)
     if isinstance(law.lqg, MultiModelLqg):
         last = -CONTEXT - 2
         scores = slice(last - 2 * law.lqg.models, last)
-        least[scores] += np.spacing(np.abs(wanted[:, scores]).max().astype(np.float32))
+        least[scores] += np.spacing(np.abs(wanted[:, scores]).max().astype(found.dtype))
     excess = np.abs(found - wanted) - ROUNDED * np.abs(wanted) - least
     assert (excess <= 0).all(), np.argwhere(~(excess <= 0))
 

@@ -90,7 +90,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_arrays(here / "curved.npz", arrays, {**card, "curve": CURVE})
     flags = [here / "curved.npz", "--figures", "all", standing(here / "rocked.npz"), "--out", here / "out"]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(stand_figure, "STAND_START", dataclasses.replace(stand_figure.STAND_START, seconds=21.0))
+        patched.setattr(stand_figure, "STAND_START", dataclasses.replace(stand_figure.STAND_START, seconds=22.0))
         assert call(main, [*FAST, *flags]) == 0
     return here / "out"
 

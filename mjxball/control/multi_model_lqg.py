@@ -1,9 +1,10 @@
 """Offset-free LQG of one follower of a team whose attitude loops nobody knows: multiple-model adaptive estimation.
 
-One Kalman filter for each of M loop frequencies runs about roll and about pitch; their weights are those of Magill
-(1965), by how well each predicts what is measured, forgotten over some seconds. Feedback gains and estimates are
-weighted means. Everything else is as in `control.team_lqg`. What a follower must be told is its team's geometry:
-`ring_context`. Needs NumPy alone; `baselines.multi_model_lqg` makes the numbers, which stand in the policy file.
+One Kalman filter for each of M pairs of loop frequency and rotor lag runs about roll and about pitch; their weights are
+those of Magill (1965), by how well each predicts what is measured, forgotten over some seconds. Feedback gains and
+estimates are weighted means. Everything else is as in `control.team_lqg`. What a follower must be told is its team's
+geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg` makes the numbers, which stand in the policy
+file.
 """
 
 from __future__ import annotations
