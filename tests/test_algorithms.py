@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 import toys
-from command_line import assert_refused
+from command_line import TRANSPORT, assert_refused
 from conftest import with_settings
 
 from mjxball.algorithms.base import Phase, Shards
 from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.commands.train import main
 from mjxball.config import Config
+from mjxball.policy.file import PolicyFile, load_file, shipped_policy
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, find
 from mjxball.train.program import Environments, Program
@@ -160,6 +161,14 @@ def test_training_goes_on_bit_for_bit(name: str, transport: Config) -> None:
     jax.tree.map(np.testing.assert_array_equal, program.policy(once), program.policy(seen))
 
 
+def layers_of(contents: PolicyFile, seen: np.ndarray) -> list[np.ndarray]:
+    """All weights and biases; those of an input that is not seen are none."""
+    return [contents.weights[0][seen], *contents.weights[1:], *contents.biases]
+
+
+NARROW = ["--gradient.policy_layers", "8"]
+
+
 @pytest.mark.slow
 def test_a_run_by_gradient_writes_a_policy_and_resumes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_verdict: None
@@ -172,6 +181,15 @@ def test_a_run_by_gradient_writes_a_policy_and_resumes(
     header = Path("run/metrics.csv").read_text().splitlines()[0]
     assert "gradient_norm" in header
     assert main(["--resume", "run"]) == 0  # nothing is left to train
+    still = ["--gradient.learning_rate", "1e-9", "--start-from", "run/policy.npz"]
+    assert main(["--algorithm", "gradient", *flags, *still, "--out", "next"]) == 0
+    before, after = (load_file(Path(name, "policy.npz")) for name in ("run", "next"))
+    seen = before.observation_scale > 0
+    for one, other in zip(layers_of(before, seen), layers_of(after, seen), strict=True):
+        np.testing.assert_allclose(other, one, atol=1e-6)
+    np.testing.assert_allclose(after.observation_mean, before.observation_mean, atol=1e-6)
+    np.testing.assert_allclose(after.observation_scale, before.observation_scale, rtol=1e-3)
+    assert after.card["start_from"]["policy"] == "run/policy.npz"
 
 
 @pytest.mark.parametrize(
@@ -183,6 +201,14 @@ def test_a_run_by_gradient_writes_a_policy_and_resumes(
         (["--algorithm", "td3"], "sac, ppo, gradient, package.module:Name"),
         (["--algorithm", "ppo", "--ppo.minibatches", "7"], "ppo.minibatches"),
         (["--algorithm", "ppo", "--ppo.activation", "swish"], "policy files hold relu"),
+        (["--start-from", TRANSPORT], "--start-from needs --algorithm gradient"),
+        (["--algorithm", "gradient", "--start-from", "none.npz"], "none.npz"),
+        (["paper", "--algorithm", "gradient", "--start-from", shipped_policy("universal")], "follower."),
+        (
+            ["universal", "--algorithm", "gradient", *NARROW, "--start-from", shipped_policy("universal")],
+            "--gradient.policy_layers 40,32",
+        ),
+        (["--algorithm", "gradient", "--resume", "run", "--start-from", TRANSPORT], "drop"),
     ],
 )
 def test_what_does_not_fit_is_refused(

@@ -14,6 +14,7 @@ from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
 from mjxball.algorithms.scalar_form import scalar_form
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.policy.file import PolicyFile
 
 Array = Any
 ADAM = optax.scale_by_adam()
@@ -72,6 +73,32 @@ class FirstOrderGradient:
         slope = jax.tree.map(jnp.zeros_like, layers)
         return GradientState(layers, ADAM.init(layers), slope, zero, none, none, zero, jnp.zeros((), jnp.int32))
 
+    def start_from(self, state: GradientState, policy: PolicyFile) -> GradientState:
+        """`state`, but with the network of `policy` and its normalisation, in NumPy.
+
+        What only critics see stands behind what the policy does, and keeps its rows. InputError for other layers.
+        """
+        sizes = (policy.weights[0].shape[0], *(len(bias) for bias in policy.biases))
+        if sizes[1:] != self._sizes[1:] or sizes[0] > self._sizes[0]:
+            layers, own = (",".join(map(str, hidden[1:-1])) for hidden in (sizes, self._sizes))
+            raise InputError(
+                f"the policy to start from has {sizes[0]} inputs and hidden layers {layers}, and the run has "
+                f"{self._sizes[0]} and {own}; say --gradient.policy_layers {layers}"
+            )
+        scale = np.asarray(policy.observation_scale, np.float64)
+        deviation = np.where(scale > 0, np.maximum(1 / np.where(scale > 0, scale, 1.0), LEAST_DEVIATION), 1.0)
+        mean, seen = np.asarray(policy.observation_mean, np.float64), sizes[0]
+        kernels = [np.array(state.layers[f"hidden_{number}"]["kernel"]) for number in range(len(policy.weights))]
+        kernels[0][:seen] = policy.weights[0] * (deviation * scale)[:, None]
+        kernels[1:] = policy.weights[1:]
+        layers = {
+            f"hidden_{number}": {"kernel": np.asarray(kernel, np.float32), "bias": np.asarray(bias, np.float32)}
+            for number, (kernel, bias) in enumerate(zip(kernels, policy.biases, strict=True))
+        }
+        means, squares = np.zeros(self._sizes[0], np.float32), np.ones(self._sizes[0], np.float32)
+        means[:seen], squares[:seen] = mean, mean**2 + deviation**2
+        return state._replace(layers=layers, mean=means, square=squares, seen=np.ones((), np.float32))
+
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
         """One window of all environments and its gradient; the first one gives the observations' statistics."""
         own = self._environments
@@ -79,7 +106,7 @@ class FirstOrderGradient:
         envs = own.restart(envs, keys[0], turn & phase.recording)
         (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(state.layers, state, envs)
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
-        first = (phase.random & phase.recording).astype(jnp.float32)
+        first = (phase.random & phase.recording).astype(jnp.float32) * (1 - state.seen)
         known = GradientState(
             layers=state.layers,
             adam=state.adam,

@@ -37,8 +37,10 @@ from mjxball.train.run_directory import (
     POLICY,
     commit,
     differences,
+    file_hash,
     read_sweep,
     source_hash,
+    start_policy,
     versions,
 )
 
@@ -48,7 +50,8 @@ def parser() -> cli.Parser:
     result = cli.make_parser(
         "train.py",
         usage="%(prog)s [PRESET] [--seed N] [--num-seeds K] [--sweep FILE] [--out DIR] [--resume DIR]\n"
-        "                [--physics ENGINE] [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
+        "                [--start-from POLICY] [--physics ENGINE]\n"
+        "                [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
         "                [--<config path> VALUE ...]",
         description="Train a follower, export it to NumPy and compare it with `copy`.",
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
@@ -62,6 +65,7 @@ def parser() -> cli.Parser:
     result.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
+    result.add_argument("--start-from", type=Path, metavar="POLICY", help="begin with the weights of a policy file")
     result.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
     result.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state), your own")
     result.add_argument(
@@ -202,9 +206,28 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
         "source_hash": source_hash(),
         "versions": versions(),
     }
+    if options.start_from is not None:
+        origin["start_from"] = _start_from(options, settings)
     if extensions:
         origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
     return settings, origin, out
+
+
+def _start_from(options: argparse.Namespace, settings: config.Config) -> dict[str, str]:
+    """Which policy file the run starts from, for `run_directory.start_policy`, which it passes."""
+    if (options.algorithm or "sac") != "gradient" or options.env:
+        raise InputError(
+            "--start-from needs --algorithm gradient and no --env: the others begin with more than a policy"
+        )
+    try:
+        start = {"policy": str(options.start_from), "sha256": file_hash(options.start_from)}
+    except OSError as error:
+        raise InputError(f"{options.start_from}: {error.strerror}") from None
+    sizes = [len(bias) for bias in start_policy(start, settings).biases[:-1]]
+    if sizes != list(settings.gradient.policy_layers):
+        layers = ",".join(map(str, sizes))
+        raise InputError(f"{options.start_from} has hidden layers {layers}; say --gradient.policy_layers {layers}")
+    return start
 
 
 def _digest(names: dict[str, str]) -> str | None:
@@ -312,7 +335,7 @@ def _seed_of(path: Path) -> int:
 
 def _refuse_with_resume(options: argparse.Namespace) -> None:
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    own = ("out", "seed", "num_seeds", "sweep", "physics", "plant", *EXTENSIONS)
+    own = ("out", "seed", "num_seeds", "sweep", "physics", "plant", "start_from", *EXTENSIONS)
     given += [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
     given += [options.preset] if options.preset else []
     if given:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball.algorithms.base import Phase
-from mjxball.algorithms.gradient import LEAST_DEVIATION, FirstOrderGradient, GradientState
+from mjxball.algorithms.gradient import FirstOrderGradient, GradientState
 from mjxball.config import Config
 from mjxball.env import PipelineState, TransportEnv
 from mjxball.policy import PolicyFile
@@ -163,7 +163,8 @@ class FineTuner:
         self._comparing = 0.0  # [s] that it takes to compare
         environments = self._environments(nominal_load(self.config), resting(self.config))
         self._algorithm = FirstOrderGradient(self.config, environments)
-        self._start = self._state_of(flown)
+        blank = jax.tree.map(np.asarray, self._algorithm.init(jax.random.PRNGKey(0)))
+        self._start = jax.tree.map(jnp.asarray, self._algorithm.start_from(blank, flown))
 
     def compile(self, progress: Callable[[str], None] = lambda text: None) -> None:
         """Compile all programs; `progress` is called with a few words after each."""
@@ -214,23 +215,6 @@ class FineTuner:
 
     def _environments(self, load: KnownLoad, flight: FlightState, count: int | None = None) -> Environments:
         return Environments(LoadedEnv(self.config, load, flight), count or self._worlds)
-
-    def _state_of(self, flown: PolicyFile) -> GradientState:
-        """What the algorithm knows if it has the weights of `flown`, whose normalisation goes into the first layer."""
-        scale = np.asarray(flown.observation_scale, np.float64)
-        deviation = np.where(scale > 0, np.maximum(1 / np.where(scale > 0, scale, 1.0), LEAST_DEVIATION), 1.0)
-        mean = np.asarray(flown.observation_mean, np.float64)
-        first = flown.weights[0] * (deviation * scale)[:, None]
-        layers = {
-            f"hidden_{number}": {"kernel": jnp.asarray(weight, jnp.float32), "bias": jnp.asarray(bias, jnp.float32)}
-            for number, (weight, bias) in enumerate(zip((first, *flown.weights[1:]), flown.biases, strict=True))
-        }
-        return self._algorithm.init(jax.random.PRNGKey(0))._replace(
-            layers=layers,
-            mean=jnp.asarray(mean, jnp.float32),
-            square=jnp.asarray(mean**2 + deviation**2, jnp.float32),
-            seen=jnp.ones(()),
-        )
 
     def _contents(self, state: GradientState) -> PolicyFile:
         """The policy file of `state`, with the card of the flown one."""

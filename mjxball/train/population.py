@@ -16,6 +16,8 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from mjxball import config as configs
 from mjxball.algorithms.base import PolicyNetwork, Shards
 from mjxball.config import Config
+from mjxball.policy import PolicyFile
+from mjxball.train import processes
 from mjxball.train.compilation import (
     CPU_OPTIONS,
     GPU_OPTIONS,
@@ -163,6 +165,13 @@ class Population:
     def start(self, executables: Executables, seed: int) -> TrainState:
         """`create(seed)` with a compiled program."""
         return executables.create(*self._starts(seed))
+
+    def start_from(self, state: TrainState, policy: PolicyFile) -> TrainState:
+        """`state` with the network of `policy` in every member; see `FirstOrderGradient.start_from`."""
+        known, algorithm = processes.gather(state.algorithm), self.program.algorithm
+        begun = [algorithm.start_from(self.member(known, number), policy) for number in range(self.members)]
+        known = begun[0] if self._single else jax.tree.map(lambda *leaves: np.stack(leaves), *begun)
+        return state._replace(algorithm=self.place(known, self._whole))
 
     def evaluation_envs(self, executables: Executables) -> Any:
         """Newly reset environments, the same for every member and every evaluation."""

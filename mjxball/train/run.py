@@ -29,7 +29,7 @@ from mjxball.train.extensions import Extensions, is_pair, resolve
 from mjxball.train.population import Population
 from mjxball.train.program import Mode, Statistics, TrainState
 from mjxball.train.progress import Progress, Row, columns
-from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, write_config
+from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, write_config
 
 CHUNKS = 50  # rows of metrics.csv in a run, at most
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
@@ -78,9 +78,12 @@ class Run:
     def __init__(self, config: Config, out: Path, origin: dict[str, Any], resumed: TrainState | None):
         """`resumed` is None for a run that starts.
 
-        `origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name.
+        `origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name. A run that
+        starts takes the network of the policy `origin["start_from"]`, if that is there.
         """
         self.config, self.out = config, out
+        start = origin.get("start_from") if resumed is None else None
+        self._policy = start_policy(start, config) if start else None
         extensions = resolve(Extensions(**(origin.get("extensions") or {})))
         self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"], extensions=extensions)
         self._schedule = self.population.program.schedule
@@ -156,6 +159,8 @@ class Run:
         self._compiled = self.population.compile(creating)
         if creating:
             self.state = self.population.start(self._compiled, self.origin["seed"])
+            if self._policy:
+                self.state = self.population.start_from(self.state, self._policy)
             self._export()
         else:
             self.state = self.population.place_state(self.state)

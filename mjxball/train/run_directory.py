@@ -20,6 +20,7 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.physics.step import TRAINING_ENGINES
+from mjxball.policy.file import PolicyFile, load_file
 
 MAX_BYTES = 16 * 2**20  # JSON and CSV take some ten times their own length in memory
 
@@ -75,6 +76,27 @@ ORIGIN = ("seed", "physics", "seeds", "sweep")  # what it must say beside the co
 
 def _is_whole(value: Any, low: int, high: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+
+
+def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
+    """The policy file `start["policy"]`; InputError unless it has `start["sha256"]` and the follower of `config`."""
+    path = Path(start["policy"])
+    contents = load_file(path)
+    if file_hash(path) != start["sha256"]:
+        raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
+    own, trained = (
+        json.loads(json.dumps(configs.to_dict(config)["follower"])),
+        contents.card.get("config", {}).get("follower", {}),
+    )
+    changed = [f"follower.{name}" for name in own if own[name] != trained.get(name)]
+    if changed:
+        raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")
+    return contents
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def write_config(run: Path, config: Config, origin: dict[str, Any]) -> None:
