@@ -80,10 +80,10 @@ class FirstOrderGradient:
         """
         sizes = (policy.weights[0].shape[0], *(len(bias) for bias in policy.biases))
         if sizes[1:] != self._sizes[1:] or sizes[0] > self._sizes[0]:
-            layers, own = (",".join(map(str, hidden[1:-1])) for hidden in (sizes, self._sizes))
+            theirs, own = (",".join(map(str, hidden[1:-1])) for hidden in (sizes, self._sizes))
             raise InputError(
-                f"the policy to start from has {sizes[0]} inputs and hidden layers {layers}, and the run has "
-                f"{self._sizes[0]} and {own}; say --gradient.policy_layers {layers}"
+                f"the policy to start from has {sizes[0]} inputs and hidden layers {theirs}, and the run has "
+                f"{self._sizes[0]} and {own}; say --gradient.policy_layers {theirs}"
             )
         scale = np.asarray(policy.observation_scale, np.float64)
         deviation = np.where(scale > 0, np.maximum(1 / np.where(scale > 0, scale, 1.0), LEAST_DEVIATION), 1.0)

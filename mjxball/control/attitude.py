@@ -6,6 +6,7 @@ from typing import Any
 
 from mjxball.control import mixer
 from mjxball.plant.parameters import AttitudeGains
+from mjxball.plant.parts import clipped, joined
 
 Array = Any
 
@@ -34,9 +35,9 @@ def rotor_commands(
     kp, kd = (xp.asarray(gain, dtype=euler.dtype) for gain in gains)
     level = xp.cos(euler[..., 0]) * xp.cos(euler[..., 1])
     thrust = carried_mass * (gravity + command[..., 2]) / level
-    desired = xp.stack([command[..., 0], command[..., 1], xp.zeros_like(command[..., 0])], axis=-1)
+    desired = joined([command[..., 0], command[..., 1], xp.zeros_like(command[..., 0])])
     torque = kp * (desired - euler) - kd * rates
     wrench = mixer.turned(xp.concat([thrust[..., None], torque], axis=-1), -yaw)
     rotors = mixer.rotors_from_wrench(wrench, arm, yaw_per_thrust, layout)
     most = rotor_force_max if isinstance(rotor_force_max, float) else rotor_force_max[..., None]
-    return xp.clip(rotors, 0.0, most)
+    return clipped(rotors, 0.0, most)

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Autopilot
+from mjxball.plant.parts import clipped, joined
 
 Array = Any
 PERIOD = 0.002  # [s] of the attitude and rate loops: 500 Hz
@@ -26,6 +27,7 @@ ATTITUDE_LIMITS = (20.0, 20.0, 360.0)  # of the attitude integrals of roll, pitc
 RATE_LIMITS = (33.3, 33.3, 166.7)  # of the rate integrals [deg]
 LARGEST = 32767.0  # of a rate loop's output
 SIGNS = (1.0, -1.0, 1.0)  # ours -> firmware's roll, pitch, yaw
+TO_FIRMWARE = tuple(sign * 180.0 / math.pi for sign in SIGNS)  # likewise, in degrees
 # "pid_attitude.roll_kp" -> (field of `Autopilot`, place in it)
 PARAMETERS: dict[str, tuple[str, int]] = {
     f"{group}.{axis}_{gain}": (f"{axis}{suffix}", place)
@@ -66,7 +68,7 @@ def start_loops(euler: Array, rates: Array) -> Array:
 def to_firmware(angles: Array) -> Array:
     """Ours (..., 3) [rad] or [rad/s] in the firmware's axes and degrees."""
     xp = angles.__array_namespace__()
-    return angles * xp.asarray([sign * 180.0 / math.pi for sign in SIGNS], dtype=angles.dtype)
+    return angles * xp.asarray(TO_FIRMWARE, dtype=angles.dtype)
 
 
 def motor_force(curve: tuple[float, float], command: Array) -> Array:
@@ -91,15 +93,15 @@ def setpoints(autopilot: Autopilot, command: Array, carried_mass: Array, gravity
     """
     xp = command.__array_namespace__()
     limit = math.radians(TILT_LIMIT)
-    roll, pitch = (xp.clip(command[..., i], -limit, limit) for i in (0, 1))
+    roll, pitch = (clipped(command[..., i], -limit, limit) for i in (0, 1))
     vertical = command[..., 2]
     if autopilot.thrust_law == "paper":
         thrust = autopilot.hover_thrust + autopilot.thrust_per_acceleration * vertical
     else:
         force = carried_mass * (gravity + vertical) / (xp.cos(roll) * xp.cos(pitch))
         thrust = motor_command(autopilot.motor_curve, force / 4)
-    thrust = _whole(xp.clip(thrust, THRUST_FLOOR, THRUST_CEILING), xp.round)
-    return xp.stack([xp.rad2deg(roll), -xp.rad2deg(pitch), xp.zeros_like(roll), thrust], axis=-1)
+    thrust = _whole(clipped(thrust, THRUST_FLOOR, THRUST_CEILING), xp.round)
+    return joined([xp.rad2deg(roll), -xp.rad2deg(pitch), xp.zeros_like(roll), thrust])
 
 
 def cascade(
@@ -134,13 +136,14 @@ def cascade(
     rated = asked - turning, turning - old.rates
     kept, output = _pid(inner, RATE_LIMITS, old.rate_integral, *rated, integrals)
     output = output if rate_share is None else rate_share * output
-    output = _whole(xp.clip(output, -LARGEST, LARGEST), xp.trunc)
+    output = _whole(clipped(output, -LARGEST, LARGEST), xp.trunc)
     thrust = setpoint[..., 3]
     on = (thrust >= IDLE)[..., None]
-    motors = mix(xp.minimum(thrust, xp.asarray(float(THRUST_CEILING), dtype=thrust.dtype)), output, compensate)
-    reset = start_loops(euler, rates)
+    motors = mix(xp.minimum(thrust, float(THRUST_CEILING)), output, compensate)
     after = xp.concat([held, kept, attitude, turning, yaw], axis=-1)
-    return xp.where(on, after, reset), xp.where(on, motors, xp.zeros_like(motors))
+    if isinstance(on, np.ndarray) and on.all():
+        return after, motors
+    return xp.where(on, after, start_loops(euler, rates)), xp.where(on, motors, 0.0)
 
 
 def integral_shares(xp: Any, autopilot: Autopilot, dtype: Any, drones: int = 2, leader: int = 0) -> Array:
@@ -168,8 +171,8 @@ def mix(thrust: Array, output: Array, compensate: Callable[[Array], Array] | Non
     )
     if compensate is not None:
         motors = compensate(motors)
-    excess = xp.maximum(xp.max(motors, axis=-1, keepdims=True) - FULL, xp.zeros_like(motors[..., :1]))
-    return xp.clip(motors - excess, 0.0, FULL)
+    excess = xp.maximum(xp.max(motors, axis=-1, keepdims=True) - FULL, 0.0)
+    return clipped(motors - excess, 0.0, FULL)
 
 
 def _pid(
@@ -185,7 +188,7 @@ def _pid(
     kp, ki, kd = (xp.asarray(column, dtype=error.dtype) for column in zip(*gains, strict=True))
     bound = xp.asarray(limits, dtype=error.dtype)
     ki = ki if share is None else ki * share
-    integral = xp.clip(integral + PERIOD * error, -bound, bound)
+    integral = clipped(integral + PERIOD * error, -bound, bound)
     return integral, kp * error + ki * integral - kd / PERIOD * moved
 
 

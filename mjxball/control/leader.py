@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from mjxball.plant import parts
+
 Array = Any
 
 
@@ -18,16 +20,15 @@ def command(acceleration: Array, yaw: Array | float, gravity: float, tilt_limit:
     phi = (ax sin psi - ay cos psi) / g, theta = (ax cos psi + ay sin psi) / g at the desired `yaw`
     (the paper's equations after eq. 5; both drones fly at psi = 0), clipped to the limits.
     """
-    xp = acceleration.__array_namespace__()
-    yaw = xp.asarray(yaw, dtype=acceleration.dtype)
-    ax, ay, az = (acceleration[..., i] for i in range(3))
-    roll = (ax * xp.sin(yaw) - ay * xp.cos(yaw)) / gravity
-    pitch = (ax * xp.cos(yaw) + ay * xp.sin(yaw)) / gravity
-    return clip_command(xp.stack([roll, pitch, az], axis=-1), tilt_limit, vertical_limit)
+    ax, ay, az = parts.split(acceleration)
+    cosine, sine = parts.cosine_and_sine(yaw)
+    roll = parts.minus(parts.times(ax, sine), parts.times(ay, cosine)) / gravity
+    pitch = parts.plus(parts.times(ax, cosine), parts.times(ay, sine)) / gravity
+    return clip_command(parts.joined([roll, pitch, az]), tilt_limit, vertical_limit)
 
 
 def clip_command(value: Array, tilt_limit: float, vertical_limit: float) -> Array:
     """Clip (roll, pitch, vertical acceleration) (..., 3) to +-(tilt_limit, tilt_limit, vertical_limit)."""
     xp = value.__array_namespace__()
     limit = xp.asarray([tilt_limit, tilt_limit, vertical_limit], dtype=value.dtype)
-    return xp.clip(value, -limit, limit)
+    return parts.clipped(value, -limit, limit)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from mjxball.plant.parts import joined
 from mjxball.plant.rotors import lever
 
 Array = Any
@@ -11,13 +12,12 @@ Array = Any
 
 def wrench_from_rotors(force: Array, arm: Array | float, yaw_per_thrust: Array | float, layout: str = "plus") -> Array:
     """(T, tau_x, tau_y, tau_z) (..., 4) [N, N m] of rotor forces F1..F4 (..., 4) [N], about the drone's centre."""
-    xp = force.__array_namespace__()
     f1, f2, f3, f4 = (force[..., i] for i in range(4))
     thrust, side = f1 + f2 + f3 + f4, lever(arm, layout)
     if layout == "plus":
-        return xp.stack([thrust, side * (f2 - f4), side * (f3 - f1), yaw_per_thrust * (f1 - f2 + f3 - f4)], axis=-1)
+        return joined([thrust, side * (f2 - f4), side * (f3 - f1), yaw_per_thrust * (f1 - f2 + f3 - f4)])
     roll, pitch, yaw = f3 + f4 - f1 - f2, f2 + f3 - f1 - f4, f2 + f4 - f1 - f3
-    return xp.stack([thrust, side * roll, side * pitch, yaw_per_thrust * yaw], axis=-1)
+    return joined([thrust, side * roll, side * pitch, yaw_per_thrust * yaw])
 
 
 def turned(wrench: Array, yaw: Array | float) -> Array:
@@ -31,20 +31,19 @@ def turned(wrench: Array, yaw: Array | float) -> Array:
     yaw = xp.asarray(yaw, dtype=wrench.dtype)
     c, s = xp.cos(yaw), xp.sin(yaw)
     thrust, x, y, z = (wrench[..., i] for i in range(4))
-    return xp.stack([thrust, c * x - s * y, s * x + c * y, z], axis=-1)
+    return joined([thrust, c * x - s * y, s * x + c * y, z])
 
 
 def rotors_from_wrench(wrench: Array, arm: Array | float, yaw_per_thrust: Array | float, layout: str = "plus") -> Array:
     """Rotor forces F1..F4 (..., 4) [N] that give `wrench` = (T, tau_x, tau_y, tau_z) (..., 4); the exact inverse."""
-    xp = wrench.__array_namespace__()
     thrust, tx, ty, tz = (wrench[..., i] / 4 for i in range(4))
     side = lever(arm, layout)
     if layout == "plus":
         roll, pitch, yaw = 2 * tx / side, 2 * ty / side, tz / yaw_per_thrust
-        return xp.stack([thrust - pitch + yaw, thrust + roll - yaw, thrust + pitch + yaw, thrust - roll - yaw], axis=-1)
+        return joined([thrust - pitch + yaw, thrust + roll - yaw, thrust + pitch + yaw, thrust - roll - yaw])
     roll, pitch, yaw = tx / side, ty / side, tz / yaw_per_thrust
     rotors = [thrust - roll - pitch - yaw, thrust - roll + pitch + yaw]
-    return xp.stack([*rotors, thrust + roll + pitch - yaw, thrust + roll - pitch + yaw], axis=-1)
+    return joined([*rotors, thrust + roll + pitch - yaw, thrust + roll - pitch + yaw])
 
 
 def torque_per_force(arm: Any, layout: str) -> Any:

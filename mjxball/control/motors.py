@@ -69,7 +69,7 @@ def force(motor: Motor, pwm: Array, supply: Array) -> Array:
     volts = pwm / FULL * supply
     c0, c1, c2, c3 = motor.force_polynomial
     found = c0 + (c1 + (c2 + c3 * volts) * volts) * volts
-    return xp.where(pwm > 0, xp.maximum(found, xp.zeros_like(found)), xp.zeros_like(found))
+    return xp.where(pwm > 0, xp.maximum(found, 0.0), 0.0)
 
 
 def voltage(motor: Motor, wanted: Array) -> Array:
@@ -81,7 +81,7 @@ def voltage(motor: Motor, wanted: Array) -> Array:
     p = c1 / (3 * c3) - centre * centre
     q = -(c0 + c1 * centre + c2 * centre**2 + c3 * centre**3 - wanted) / (2 * c3)
     # Below zero only for forces so small that the firmware stops the motor.
-    root = xp.sqrt(xp.maximum(q * q + p**3, xp.zeros_like(q)))
+    root = xp.sqrt(xp.maximum(q * q + p**3, 0.0))
     return centre + xp.cbrt(q + root) + xp.cbrt(q - root)
 
 
@@ -90,7 +90,7 @@ def compensated(motor: Motor, command: Array, supply: Array) -> Array:
     xp = command.__array_namespace__()
     wanted = command / FULL * motor.max_force
     found = FULL * voltage(motor, wanted) / supply
-    return xp.where((wanted < motor.min_force) | (supply < 2.0), xp.zeros_like(found), found)
+    return xp.where((wanted < motor.min_force) | (supply < 2.0), 0.0, found)
 
 
 def compensates(curve: Curve) -> bool:

@@ -16,6 +16,7 @@ from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_frames
 from mjxball.control.team_lqg import measured, within
+from mjxball.plant.parts import clipped, joined
 
 Array = Any
 ANGLE_STATES, HEIGHT_STATES, CONTEXT, FEATURES = 5, 3, 4, 20
@@ -63,11 +64,11 @@ class MultiModelLqg(NamedTuple):
         roll, pitch, roll_rate, pitch_rate, climb = measured(observation)
         zero = xp.zeros_like(roll)
         turning = [
-            xp.stack([angle, rate, zero, zero, zero], axis=-1)
+            joined([angle, rate, zero, zero, zero])
             for angle, rate in ((roll, roll_rate), (pitch, pitch_rate))
             for _ in range(self.models)
         ]
-        rest = xp.stack([climb, *[zero] * (HEIGHT_STATES - 1 + 2 * self.models + 2)], axis=-1)
+        rest = joined([climb, *[zero] * (HEIGHT_STATES - 1 + 2 * self.models + 2)])
         known = xp.broadcast_to(xp.asarray(context, dtype=observation.dtype), (*roll.shape, CONTEXT))
         return xp.concat([*turning, rest, known], axis=-1)
 
@@ -88,7 +89,7 @@ class MultiModelLqg(NamedTuple):
         left = [a - b for a, b in zip(measured(observation), expected, strict=True)]
         context = memory[..., -CONTEXT:]
         speed = -0.5 * xp.log(soft)
-        parts = [xp.stack(left, axis=-1), loads[..., 0, :], loads[..., 1, :], seen.rising[..., 1:], speed]
+        parts = [joined(left), loads[..., 0, :], loads[..., 1, :], seen.rising[..., 1:], speed]
         return xp.concat([*parts, context[..., 1:3] * soft, context[..., 3:] * soft, context[..., :1]], axis=-1)
 
     def command(self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
@@ -134,10 +135,10 @@ class MultiModelLqg(NamedTuple):
         xp, models = observation.__array_namespace__(), self.models
         ends = 2 * models * ANGLE_STATES
         rows = [memory[..., k * ANGLE_STATES : (k + 1) * ANGLE_STATES] for k in range(2 * models)]
-        predicted = xp.stack([xp.stack(rows[:models], axis=-2), xp.stack(rows[models:], axis=-2)], axis=-3)
+        predicted = xp.stack([joined(rows[:models], axis=-2), joined(rows[models:], axis=-2)], axis=-3)
         rising, found = memory[..., ends : ends + HEIGHT_STATES], measured(observation)
-        angle, rate = (xp.stack([found[k], found[k + 1]], axis=-1)[..., None] for k in (0, 2))
-        left = xp.stack([angle - predicted[..., 0], rate - predicted[..., 1]], axis=-1)
+        angle, rate = (joined([found[k], found[k + 1]])[..., None] for k in (0, 2))
+        left = joined([angle - predicted[..., 0], rate - predicted[..., 1]])
         gain, certainty = self._like(self.axis_gain, observation), self._like(self.certainty, observation)
         turning = predicted + (gain * left[..., None, :]).sum(axis=-1)
         first, second = left[..., 0], left[..., 1]
@@ -145,7 +146,7 @@ class MultiModelLqg(NamedTuple):
             certainty[:, 0] * first * first + 2.0 * certainty[:, 1] * first * second + certainty[:, 2] * second * second
         )
         begin = ends + HEIGHT_STATES
-        scores = xp.stack([memory[..., begin + k * models : begin + (k + 1) * models] for k in (0, 1)], axis=-2)
+        scores = joined([memory[..., begin + k * models : begin + (k + 1) * models] for k in (0, 1)], axis=-2)
         scores = self.keep[0] * scores + self._like(self.prior, observation) - 0.5 * distance
         scores = scores - xp.max(scores, axis=-1, keepdims=True)
         odds = xp.exp(scores)
@@ -161,9 +162,9 @@ class MultiModelLqg(NamedTuple):
         led, error, rate = copy_command(observation, *leader), observation[..., ERROR], observation[..., ERROR_RATE]
         tilt_limit, rise_limit, load_limit = (float(limit) for limit in self.limits)
         k_error, k_velocity = (float(gain) for gain in self.rise)
-        rise = xp.clip(k_error * error[..., 2] + k_velocity * rate[..., 2], -rise_limit, rise_limit)
+        rise = clipped(k_error * error[..., 2] + k_velocity * rate[..., 2], -rise_limit, rise_limit)
         rise = rise - seen.rising[..., 2]
-        vertical = xp.clip(share * rise - (share - 1.0) * led[..., 2], -leader[-1], leader[-1])
+        vertical = clipped(share * rise - (share - 1.0) * led[..., 2], -leader[-1], leader[-1])
         gains = weights @ self._like(self.tilt, observation)
         soft, damping = self._each(weights, 1.0 / self.stiffness), self._each(weights, self.damping)
         far = gains[..., 0] * _crossed(xp, error) + gains[..., 1] * _crossed(xp, rate)
@@ -210,9 +211,9 @@ def ring_context(count: Array, leader: Array) -> Array:
     spread = xp.where(count < 2.5, 1.0, 0.5)
     lever = LEVER / ((x * x + y * y) * count * spread)
     room = ROOM * 2.0 * xp.sin(math.pi / count) / (spread * xp.sqrt(x * x + y * y))
-    return xp.stack([count / (count - 1.0), -y * lever, x * lever, room], axis=-1)
+    return joined([count / (count - 1.0), -y * lever, x * lever, room])
 
 
 def _crossed(xp: Any, vector: Array) -> Array:
     """(-y, x): which roll and pitch push towards `vector` (..., 3)."""
-    return xp.stack([-vector[..., 1], vector[..., 0]], axis=-1)
+    return joined([-vector[..., 1], vector[..., 0]])

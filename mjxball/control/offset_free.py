@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
+from mjxball.plant.parts import clipped, joined
 
 Array = Any
 STATES, DRIVES, MEASURED = 8, 2, 3
@@ -49,14 +50,14 @@ class OffsetFreeLqg(NamedTuple):
         xp = observation.__array_namespace__()
         pitch, rate, climb = _measured(observation)
         zero = xp.zeros_like(pitch)
-        return xp.stack([pitch, rate, zero, zero, zero, climb, zero, zero, zero, zero], axis=-1)
+        return joined([pitch, rate, zero, zero, zero, climb, zero, zero, zero, zero])
 
     def estimate(self, memory: Array, observation: Array) -> Array:
         """The filter's state (..., 8) at `observation`."""
         xp = observation.__array_namespace__()
         predicted = memory @ xp.asarray(self.transition.T, dtype=observation.dtype)
-        expected = xp.stack([predicted[..., 0], predicted[..., 1], predicted[..., 5]], axis=-1)
-        measured = xp.stack(_measured(observation), axis=-1)
+        expected = joined([predicted[..., 0], predicted[..., 1], predicted[..., 5]])
+        measured = joined(_measured(observation))
         return predicted + (measured - expected) @ xp.asarray(self.gain.T, dtype=observation.dtype)
 
     def features(self, memory: Array, observation: Array) -> Array:
@@ -65,7 +66,7 @@ class OffsetFreeLqg(NamedTuple):
         x = self.estimate(memory, observation)
         left = [value - x[..., place] for value, place in zip(_measured(observation), (0, 1, 5), strict=True)]
         found = [x[..., place] for place in (2, 3, 4, 6, 7)]
-        return xp.concat([xp.stack([*left, *found], axis=-1), memory[..., STATES:]], axis=-1)
+        return xp.concat([joined([*left, *found]), memory[..., STATES:]], axis=-1)
 
     def command(self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
         """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it.
@@ -73,24 +74,23 @@ class OffsetFreeLqg(NamedTuple):
         `leader`: the arguments of `copy_command` after the observation. The vertical part is clipped: the pitch part
         takes the torque off that the drones' difference in thrust makes.
         """
-        xp = observation.__array_namespace__()
         x, led = self.estimate(memory, observation), copy_command(observation, *leader)
         error, rate = observation[..., ERROR], observation[..., ERROR_RATE]
         tilt_limit, rise_limit, load_limit = (float(limit) for limit in self.limits)
 
         def tilt(axis: int, along: int) -> Array:
             k_error, k_velocity, k_angle, k_rate = (float(gain) for gain in self.tilt[axis])
-            far = xp.clip(k_error * error[..., along] + k_velocity * rate[..., along], -tilt_limit, tilt_limit)
+            far = clipped(k_error * error[..., along] + k_velocity * rate[..., along], -tilt_limit, tilt_limit)
             return far - k_angle * observation[..., 3 + axis] - k_rate * observation[..., 9 + axis]
 
         k_error, k_velocity = (float(gain) for gain in self.height)
-        rise = xp.clip(k_error * error[..., 2] + k_velocity * rate[..., 2], -rise_limit, rise_limit) - x[..., 7]
-        vertical = xp.clip(2.0 * rise - led[..., 2] + added[..., 2], -leader[-1], leader[-1])
+        rise = clipped(k_error * error[..., 2] + k_velocity * rate[..., 2], -rise_limit, rise_limit) - x[..., 7]
+        vertical = clipped(2.0 * rise - led[..., 2] + added[..., 2], -leader[-1], leader[-1])
         difference = self._difference(led[..., 2], vertical, observation, leader)
-        against = xp.clip((self.half_length * difference - x[..., 2]) / self.stiffness, -load_limit, load_limit)
+        against = clipped((self.half_length * difference - x[..., 2]) / self.stiffness, -load_limit, load_limit)
         roll = 2.0 * tilt(0, 1) - led[..., 0] + added[..., 0]
         pitch = 2.0 * tilt(1, 0) - led[..., 1] + against + added[..., 1]
-        return xp.stack([roll, pitch, vertical], axis=-1)
+        return joined([roll, pitch, vertical])
 
     def next(self, memory: Array, observation: Array, command: Array, leader: tuple[Any, ...]) -> Array:
         """Memory of the next step, after `observation` was answered by `command` (..., 3)."""
@@ -99,7 +99,7 @@ class OffsetFreeLqg(NamedTuple):
         difference = self._difference(led[..., 2], command[..., 2], observation, leader)
         torque = self.stiffness * (led[..., 1] + command[..., 1]) - self.half_length * difference
         lift = 0.5 * (led[..., 2] + command[..., 2])
-        return xp.concat([self.estimate(memory, observation), xp.stack([torque, lift], axis=-1)], axis=-1)
+        return xp.concat([self.estimate(memory, observation), joined([torque, lift])], axis=-1)
 
     def _difference(self, led: Array, vertical: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
         """The leader's thrust less the follower's (...) [N] at vertical commands (...)."""

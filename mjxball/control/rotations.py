@@ -14,14 +14,12 @@ def rotate(matrix: Array, vector: Array) -> Array:
 
     Written out by component, like everything here: XLA then fuses a whole physics step into few kernels.
     """
-    xp = matrix.__array_namespace__()
-    return xp.stack([dot(matrix[..., i, :], vector) for i in range(3)], axis=-1)
+    return parts.joined([dot(matrix[..., i, :], vector) for i in range(3)])
 
 
 def rotate_back(matrix: Array, vector: Array) -> Array:
     """R^T v for `matrix` (..., 3, 3) and `vector` (..., 3) -> (..., 3)."""
-    xp = matrix.__array_namespace__()
-    return xp.stack([dot(matrix[..., :, i], vector) for i in range(3)], axis=-1)
+    return parts.joined([dot(matrix[..., :, i], vector) for i in range(3)])
 
 
 def turned_about_z(vectors: Array, angle: Array) -> Array:
@@ -31,7 +29,7 @@ def turned_about_z(vectors: Array, angle: Array) -> Array:
     c, s = xp.cos(angle), xp.sin(angle)
     each = xp.reshape(vectors, (*vectors.shape[:-1], -1, 3))
     x, y, z = (each[..., i] for i in range(3))
-    return xp.reshape(xp.stack([c * x - s * y, s * x + c * y, z], axis=-1), vectors.shape)
+    return xp.reshape(parts.joined([c * x - s * y, s * x + c * y, z]), vectors.shape)
 
 
 def dot(a: Array, b: Array) -> Array:
@@ -41,51 +39,44 @@ def dot(a: Array, b: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """a x b for (..., 3) each, broadcast -> (..., 3)."""
-    xp = a.__array_namespace__()
-    return xp.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )
+    ax, ay, az = parts.split(a)
+    bx, by, bz = parts.split(b)
+    return parts.joined([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def euler_from_matrix(matrix: Array) -> Array:
     """(phi, theta, psi) [rad] of `matrix` (..., 3, 3) -> (..., 3); |phi| <= pi/2, singular at its ends."""
     xp = matrix.__array_namespace__()
-    roll = xp.asin(xp.clip(matrix[..., 2, 1], -1.0, 1.0))
+    roll = xp.asin(parts.clipped(matrix[..., 2, 1], -1.0, 1.0))
     pitch = xp.atan2(-matrix[..., 2, 0], matrix[..., 2, 2])
     yaw = xp.atan2(-matrix[..., 0, 1], matrix[..., 1, 1])
-    return xp.stack([roll, pitch, yaw], axis=-1)
+    return parts.joined([roll, pitch, yaw])
 
 
 def matrix_from_quaternion(quaternion: Array) -> Array:
     """R of a unit `quaternion` (w, x, y, z) (..., 4) -> (..., 3, 3)."""
-    xp = quaternion.__array_namespace__()
     w, x, y, z = (quaternion[..., i] for i in range(4))
-    rows = [
-        xp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-        xp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-        xp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-    ]
-    return xp.stack(rows, axis=-2)
+    return parts.joined(
+        [
+            parts.joined([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            parts.joined([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            parts.joined([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ],
+        axis=-2,
+    )
 
 
 def multiply_quaternions(a: Array, b: Array) -> Array:
     """Hamilton product a b of `a`, `b` (w, x, y, z) (..., 4) -> (..., 4)."""
-    xp = a.__array_namespace__()
     aw, ax, ay, az = (a[..., i] for i in range(4))
     bw, bx, by, bz = (b[..., i] for i in range(4))
-    return xp.stack(
+    return parts.joined(
         [
             aw * bw - ax * bx - ay * by - az * bz,
             aw * bx + ax * bw + ay * bz - az * by,
             aw * by - ax * bz + ay * bw + az * bx,
             aw * bz + ax * by - ay * bx + az * bw,
-        ],
-        axis=-1,
+        ]
     )
 
 
@@ -93,12 +84,9 @@ def quaternion_from_euler(euler: Array) -> Array:
     """Unit quaternion of Rz(psi) Rx(phi) Ry(theta), `euler` = (phi, theta, psi) (..., 3) -> (..., 4)."""
     xp = euler.__array_namespace__()
     half = euler / 2
-    c, s = xp.cos(half), xp.sin(half)
-    zero = xp.zeros_like(c[..., 0])
-    about_z = xp.stack([c[..., 2], zero, zero, s[..., 2]], axis=-1)
-    about_x = xp.stack([c[..., 0], s[..., 0], zero, zero], axis=-1)
-    about_y = xp.stack([c[..., 1], zero, s[..., 1], zero], axis=-1)
-    return multiply_quaternions(multiply_quaternions(about_z, about_x), about_y)
+    (cx, cy, cz), (sx, sy, sz) = parts.split(xp.cos(half)), parts.split(xp.sin(half))
+    w, x, y, z = cz * cx, cz * sx, sz * sx, sz * cx  # of Rz Rx
+    return parts.joined([w * cy - y * sy, x * cy - z * sy, w * sy + y * cy, x * sy + z * cy])
 
 
 def roll_of_quaternion(quaternion: Array) -> Array:

@@ -14,6 +14,7 @@ from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_frames
 from mjxball.plant import PlantParameters
+from mjxball.plant.parts import clipped, joined
 
 Array = Any
 ANGLE_STATES, HEIGHT_STATES, CONTEXT = 5, 3, 5
@@ -63,7 +64,7 @@ class TeamLqg(NamedTuple):
         zero = xp.zeros_like(roll)
         state = [roll, roll_rate, zero, zero, zero, pitch, pitch_rate, zero, zero, zero, climb, zero, zero]
         known = xp.broadcast_to(xp.asarray(context, dtype=observation.dtype), (*roll.shape, CONTEXT))
-        return xp.concat([xp.stack(state, axis=-1), known], axis=-1)
+        return xp.concat([joined(state), known], axis=-1)
 
     def estimate(self, memory: Array, observation: Array) -> tuple[Array, Array]:
         """State about roll and pitch (..., 2, 5) and of the height (..., 3) at `observation`."""
@@ -72,10 +73,10 @@ class TeamLqg(NamedTuple):
         parts, found = [], measured(observation)
         for number in (0, 1):
             predicted = memory[..., number * ANGLE_STATES : (number + 1) * ANGLE_STATES]
-            left = xp.stack([found[number] - predicted[..., 0], found[2 + number] - predicted[..., 1]], axis=-1)
+            left = joined([found[number] - predicted[..., 0], found[2 + number] - predicted[..., 1]])
             parts.append(predicted + left @ gain.T)
         predicted = memory[..., 2 * ANGLE_STATES : STATES]
-        turning = xp.stack(parts, axis=-2)
+        turning = joined(parts, axis=-2)
         return turning, predicted + (found[4] - predicted[..., 0])[..., None] * rising
 
     def features(self, memory: Array, observation: Array) -> Array:
@@ -85,7 +86,7 @@ class TeamLqg(NamedTuple):
         expected = [turning[..., 0, 0], turning[..., 1, 0], turning[..., 0, 1], turning[..., 1, 1], rising[..., 0]]
         left = [a - b for a, b in zip(measured(observation), expected, strict=True)]
         estimated = [turning[..., 0, 2:], turning[..., 1, 2:], rising[..., 1:], memory[..., STATES:]]
-        return xp.concat([xp.stack(left, axis=-1), *estimated], axis=-1)
+        return xp.concat([joined(left), *estimated], axis=-1)
 
     def command(self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
         """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it.
@@ -135,11 +136,11 @@ class TeamLqg(NamedTuple):
         error, rate = observation[..., ERROR], observation[..., ERROR_RATE]
         tilt_limit, rise_limit, load_limit = (float(limit) for limit in self.limits)
         k_error, k_velocity = (float(gain) for gain in self.rise)
-        rise = xp.clip(k_error * error[..., 2] + k_velocity * rate[..., 2], -rise_limit, rise_limit) - rising[..., 2]
-        vertical = xp.clip(share * rise - (share - 1.0) * led[..., 2], -leader[-1], leader[-1])
+        rise = clipped(k_error * error[..., 2] + k_velocity * rate[..., 2], -rise_limit, rise_limit) - rising[..., 2]
+        vertical = clipped(share * rise - (share - 1.0) * led[..., 2], -leader[-1], leader[-1])
         k_error, k_velocity, k_angle, k_rate = (float(gain) for gain in self.tilt)
         far = k_error * error + k_velocity * rate
-        far = within(xp, xp.stack([-far[..., 1], far[..., 0]], axis=-1), tilt_limit)
+        far = within(xp, joined([-far[..., 1], far[..., 0]]), tilt_limit)
         wanted = far - k_angle * observation[..., 3:5] - k_rate * observation[..., 9:11]
         load = turning[..., 2] / self.stiffness + lever * (vertical - led[..., 2])[..., None]
         load, held = within(xp, load, load_limit), None
@@ -162,7 +163,7 @@ def team_context(parameters: PlantParameters, plant: Plant, object_mass: Array) 
     count = xp.astype((parameters.drone_mass > 0).sum(axis=-1), parameters.mounts.dtype)
     lifted = parameters.known_mass[..., lead] + parameters.share[..., lead] * object_mass
     x, y = parameters.mounts[..., lead, 0], parameters.mounts[..., lead, 1]
-    per_command = xp.stack([-y, x], axis=-1) * (lifted / count)[..., None] / parameters.gains.kp[..., :2]
+    per_command = joined([-y, x]) * (lifted / count)[..., None] / parameters.gains.kp[..., :2]
     hover = parameters.gravity * (parameters.known_mass + parameters.share * object_mass[..., None]) / 4
     room = 2 * parameters.arm * xp.minimum(hover, parameters.rotor_force_max - hover)  # [N m]
     several = len(plant.followers) > 1
@@ -176,7 +177,7 @@ def team_context(parameters: PlantParameters, plant: Plant, object_mass: Array) 
     along, across = xp.cos(angles) ** 2, xp.sin(angles) ** 2
     most = [room / (along * kp[..., 0] + across * kp[..., 1]), room / (along * kp[..., 1] + across * kp[..., 0])]
     turned = rotations.turned_about_z(flat, -angles)[..., :2]
-    return xp.concat([share[..., None], turned, xp.maximum(xp.stack(most, axis=-1), 1e-3)], axis=-1)
+    return xp.concat([share[..., None], turned, xp.maximum(joined(most), 1e-3)], axis=-1)
 
 
 def measured(observation: Array) -> list[Array]:

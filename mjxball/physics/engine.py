@@ -58,7 +58,7 @@ def coordinates(value: Coordinates, directions: int) -> list[Scalar]:
 
 def joined(values: Sequence[Scalar]) -> Coordinates:
     """The inverse of `coordinates`."""
-    return values[0] if len(values) == 1 else values[0].__array_namespace__().stack(values, axis=-1)
+    return values[0] if len(values) == 1 else parts.joined(values)
 
 
 class PathShape(NamedTuple):
@@ -151,7 +151,6 @@ def contact_wrenches(
     F_i = T_i e3 - m_i g R^T E3 - m_i a_i, a_i = a_b + w' x r_i + w x (w x r_i),
     tau_i = tau_rotor,i - w x I_i w - I_i w', torques about each drone's own centre.
     """
-    xp = state.rates.__array_namespace__()
     matrix = rotations.matrix_from_quaternion(state.quaternion)
     rates, down = parts.split(state.rates), parts.split(matrix[..., 2, :])
     body, turning = parts.split(rotations.rotate_back(matrix, linear)), parts.split(angular)
@@ -169,7 +168,7 @@ def contact_wrenches(
         torque = parts.subtract(spun, parts.rotate(own, turning))
         forces.append(parts.stacked(force, thrust))
         torques.append(parts.stacked(torque, thrust))
-    return xp.stack(forces, axis=-2), xp.stack(torques, axis=-2)
+    return parts.joined(forces, axis=-2), parts.joined(torques, axis=-2)
 
 
 def has_diverged(plant: PlantState) -> Bool[Array, "..."]:

@@ -7,6 +7,7 @@ Python. Works on NumPy and JAX arrays alike.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -176,4 +177,23 @@ def split(vector: Any) -> Parts:
 def stacked(parts: Parts, like: Any) -> Any:
     """Array (..., 3) of `parts`, with the shape (...) and type of `like` where they are numbers."""
     xp = like.__array_namespace__()
-    return xp.stack([xp.full_like(like, part) if known(part) else part for part in parts], axis=-1)
+    return joined([xp.full_like(like, part) if known(part) else part for part in parts])
+
+
+def joined(components: Sequence[Any], axis: int = -1) -> Any:
+    """Arrays of one shape as one, along a new last `axis` (-1) or last but one (-2).
+
+    What `stack` does, of which NumPy's takes twice as long on small arrays.
+    """
+    first = components[0]
+    if isinstance(first, np.ndarray | np.generic):
+        index = (..., None) if axis == -1 else (..., None, slice(None))
+        return np.concatenate([component[index] for component in components], axis=axis)
+    return first.__array_namespace__().stack(components, axis=axis)
+
+
+def clipped(value: Any, low: Any, high: Any) -> Any:
+    """`value` (...) within `low` and `high`: `clip`, of which NumPy's takes twice as long on small arrays."""
+    if isinstance(value, np.ndarray | np.generic):
+        return np.minimum(np.maximum(value, low), high)
+    return value.__array_namespace__().clip(value, low, high)

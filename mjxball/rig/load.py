@@ -177,7 +177,7 @@ class LoadWatch:
         loaded = np.clip((part.time + BIN / 2 - step) / BIN, 0.0, 1.0)
         # climb: (dv/dt + g) / (L cos cos) = f / M, and what its change says of M
         ratio = (part.climbing + self._config.plant.gravity) / part.lift_up
-        (before, change), spreads, climb_misfit = _least_squares(np.stack([1 - loaded, loaded], axis=1), ratio)
+        (before, change), spreads, misfit = _least_squares(np.stack([1 - loaded, loaded], axis=-1), ratio)
         if min(before, change) <= 0:
             return None
         after, factor = self._mass * before / change, before * self._mass
@@ -185,25 +185,24 @@ class LoadWatch:
         # roll: f Q - J dp/dt = S f L / M
         weight = factor * part.lift / (self._mass + loaded * (after - self._mass))
         turned = factor * part.moment - self._inertia * part.turning
-        since = part.time - step
-        roll = []
-        for speed in speeds:
-            shapes = [np.ones_like(since), loaded, np.sin(speed * since), np.cos(speed * since)]
-            roll.append((speed, *_least_squares(weight[:, None] * np.stack(shapes, axis=1), turned)))
-        speed, (own, moment, sine, cosine), spreads, roll_misfit = min(roll, key=lambda one: one[3])
+        phase = speeds[:, None] * (part.time - step)
+        shapes = np.stack([np.ones_like(phase), loaded + 0 * phase, np.sin(phase), np.cos(phase)], axis=-1)
+        fits = _least_squares(weight[:, None] * shapes, turned)
+        best = int(np.argmin(fits.misfit))
+        own, moment, sine, cosine = fits.solution[best]
         load = IdentifiedLoad(
             time=step,
             mass=float(after - self._mass),
             moment=float(moment),
             mass_spread=float(mass_spread),
-            moment_spread=float(spreads[1]),
+            moment_spread=float(fits.spreads[best, 1]),
             own_moment=float(own),
             swing=math.hypot(sine, cosine),
-            speed=float(speed),
+            speed=float(speeds[best]),
             phase=math.atan2(cosine, sine),
             volts=float(part.volts.mean()),
         )
-        return math.log(climb_misfit) + math.log(roll_misfit), load
+        return math.log(misfit) + math.log(fits.misfit[best]), load
 
 
 class _Bins(NamedTuple):
@@ -251,10 +250,20 @@ class _Bins(NamedTuple):
         return _Bins(*(values[used] for values in self))
 
 
-def _least_squares(shapes: Array, values: Array) -> tuple[Array, Array, float]:
-    """(solution (k,), its standard deviations (k,), root mean square of what is left) of shapes (n, k) x = values."""
-    normal = np.linalg.pinv(shapes.T @ shapes)
-    solution = normal @ (shapes.T @ values)
-    left = values - shapes @ solution
-    misfit = float(np.sqrt((left @ left) / max(len(values) - len(solution), 1)))
-    return solution, misfit * np.sqrt(np.diag(normal)), max(misfit, 1e-12)
+class _Fits(NamedTuple):
+    """What least squares give, of each set of shapes."""
+
+    solution: Array  # (..., k)
+    spreads: Array  # (..., k) one standard deviation of each
+    misfit: Array  # (...) root mean square of what is left, never 0
+
+
+def _least_squares(shapes: Array, values: Array) -> _Fits:
+    """Of shapes (..., n, k) x = values (n,)."""
+    across = shapes.mT
+    normal = np.linalg.pinv(across @ shapes)
+    solution = (normal @ (across @ values)[..., None])[..., 0]
+    left = values - (shapes @ solution[..., None])[..., 0]
+    misfit = np.sqrt(np.vecdot(left, left) / max(shapes.shape[-2] - shapes.shape[-1], 1))
+    spreads = misfit[..., None] * np.sqrt(np.linalg.diagonal(normal))
+    return _Fits(solution, spreads, np.maximum(misfit, 1e-12))

@@ -83,11 +83,12 @@ class ClosedLoop(Laws):
         measurement at its end. `on_pid` (...): 1 for a network whose residual is on the PID law, 0
         for a law of its own. `physics` in place of the loop's own.
         """
-        commands = self.commands(state, observation, follower, goals[0], on_pid)
+        measured = self._leader_sees(state, observation, goals[0])
+        commands = self._commands(measured, state.integral, follower, goals[0], on_pid)
         plant = (physics or self._physics)(state.plant, self.stack(*commands), load)
         diverged = state.diverged | has_diverged(plant)
-        plant = state.plant.each(lambda old, new: _where(diverged, old, new), plant)
-        measured = self._leader_sees(state, observation, goals[0])
+        if not (isinstance(diverged, np.ndarray | np.generic) and not diverged.any()):
+            plant = state.plant.each(lambda old, new: _where(diverged, old, new), plant)
         on_pid = np.asarray(on_pid)[..., None]
         integral = self.integrate(state.integral, measured, goals[0], self._period, on_pid, commands.follower)
         sensors, observation = self._sensors.step(state.sensors, self.observe(plant, goals[1]), sample)
@@ -102,13 +103,18 @@ class ClosedLoop(Laws):
         on_pid: Scalar | float = 1.0,
     ) -> Commands:
         """All commands at `observation`; arguments as of `step`."""
-        leader_command = self.leader_command(self._leader_sees(state, observation, goal), goal, state.integral)
+        return self._commands(self._leader_sees(state, observation, goal), state.integral, follower, goal, on_pid)
+
+    def _commands(
+        self, measured: Body, integral: Integral, follower: FollowerCommand, goal: Vector, on_pid: Scalar | float
+    ) -> Commands:
+        leader_command = self.leader_command(measured, goal, integral)
         follower = self.in_body_axes(follower)
         if not self._on_pid:
             return Commands(leader_command, follower)
         xp, on_pid = leader_command.__array_namespace__(), np.asarray(on_pid)
         return Commands(
-            leader_command, xp.where(on_pid[..., None] > 0, self.follower_command(follower, state.integral), follower)
+            leader_command, xp.where(on_pid[..., None] > 0, self.follower_command(follower, integral), follower)
         )
 
     def _leader_sees(self, state: LoopState, observation: Observation, goal: Vector) -> Body:

@@ -13,6 +13,7 @@ from mjxball.config import Config
 from mjxball.control import leader, rotations
 from mjxball.control import observation as layout
 from mjxball.plant import PlantParameters
+from mjxball.plant.parts import clipped, joined
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -140,7 +141,7 @@ class Laws:
         xp, place = leader_command.__array_namespace__(), self._leader
         if not self._several:
             both = (leader_command, follower_command)
-            return xp.stack(both if place == 0 else both[::-1], axis=-2)
+            return joined(both if place == 0 else both[::-1], axis=-2)
         ahead, behind = follower_command[..., :place, :], follower_command[..., place:, :]
         return xp.concat([ahead, leader_command[..., None, :], behind], axis=-2)
 
@@ -193,14 +194,14 @@ class Laws:
         error, rate = self.leader_error(state, goal)
         lead = self._law.integral_lead_time
         error = error + lead * rate if lead else error
-        own = integral[..., :3] + period * xp.clip(error, -band, band)
+        own = integral[..., :3] + period * clipped(error, -band, band)
         if not self._on_pid:
             return own
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))
         axis = slice(self._axis, self._axis + 1)
         off = self._pid_command(state, goal, integral)[..., axis] - euler[..., axis]
         most = MAX_LIFT_DIFFERENCE / self._tilt_integral_gain if self._tilt_integral_gain else 0.0
-        level = xp.clip(integral[..., 3:4] + period * off, -most, most)
+        level = clipped(integral[..., 3:4] + period * off, -most, most)
         average = integral[..., 4:]
         if self._washout and follower_command is not None:
             # What was added is what was flown above the base, which is the leader's law, and what was taken off.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 
     from mjxball.physics.engine import Array, Coordinates
 
-# Observations (n, 18), of several followers (n, F, 18), and what is known -> commands (n, 3), or (n, F, 3).
-Act = Callable[[np.ndarray, PrivilegedInfo], np.ndarray]
+# Observations (n, 18), of several followers (n, F, 18), and who tells what is known -> commands (n, 3), or (n, F, 3).
+Act = Callable[[np.ndarray, Callable[[], PrivilegedInfo]], np.ndarray]
 
 Flights = Sequence[tuple[Follower, Sequence[Scenario]]]  # each follower with the scenarios that it flies
 
@@ -161,11 +162,13 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     for follower in followers:
         follower.reset()
 
-    def act(observation: np.ndarray, privileged: PrivilegedInfo) -> np.ndarray:
-        commands = []
+    told = any(isinstance(follower, Baseline) for follower in followers)
+
+    def act(observation: np.ndarray, privileged: Callable[[], PrivilegedInfo]) -> np.ndarray:
+        commands, known = [], privileged() if told else ()
         for follower, part in zip(followers, parts, strict=True):
             if isinstance(follower, Baseline):
-                follower.privileged = PrivilegedInfo(*(None if leaf is None else leaf[part] for leaf in privileged))
+                follower.privileged = PrivilegedInfo(*(None if leaf is None else leaf[part] for leaf in known))
             commands.append(np.asarray(follower(observation[part]), float))
         return np.concatenate(commands)
 
@@ -196,7 +199,7 @@ def fly(
     for number in range(count + 1):
         plant, goals = state.plant, (target[number], target[number + 1])
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
-        answer = act(observation, privileged(plant, load))
+        answer = act(observation, partial(privileged, plant, load))
         acting = load._replace(external_force=samples.at(number).force)
         after = loop.step(state, observation, answer, acting, goals, samples.at(number + 1), on_pid)
         # The time is exact, so that a mass change falls on the same row for every engine.

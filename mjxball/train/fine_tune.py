@@ -8,6 +8,8 @@ differentiated. Everything is compiled beforehand (`FineTuner.compile`); load an
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -19,13 +21,14 @@ import numpy as np
 
 from mjxball.algorithms.base import Phase
 from mjxball.algorithms.gradient import FirstOrderGradient, GradientState
-from mjxball.config import Config
+from mjxball.config import Config, to_dict
 from mjxball.env import PipelineState, TransportEnv
 from mjxball.policy import PolicyFile
 from mjxball.sim.disturbances import Sample
 from mjxball.sim.follower import follower_law
-from mjxball.train.compilation import CPU_OPTIONS
+from mjxball.train.compilation import CPU_OPTIONS, TracedProgram
 from mjxball.train.program import MATMUL_PRECISION, Environments
+from mjxball.train.run_directory import source_hash, versions
 
 Array = Any
 LEARN = Phase(np.asarray(False), np.asarray(False))
@@ -171,13 +174,23 @@ class FineTuner:
         load, flight, key = nominal_load(self.config), resting(self.config), jax.random.PRNGKey(0)
         worlds = jax.eval_shape(self._begin, load, flight, key)
         stacked = jax.tree.map(lambda leaf: np.stack([leaf] * len(SHARES)), self._start.layers)
-        asked: dict[str, tuple[Any, tuple[Any, ...]]] = {
-            "gradient": (self._step, (self._start, worlds, load, flight, key, np.float32(0))),
-            "flight ahead": (self._ahead, (self._start, load, flight, key)),
-            "comparison": (self._costs, (stacked, worlds, load, flight)),
+        start = self._start
+        asked: dict[str, tuple[Any, tuple[Any, ...], Any]] = {  # function, arguments, a tree like its result
+            "gradient": (self._step, (start, worlds, load, flight, key, np.float32(0)), (start, worlds)),
+            "flight_ahead": (self._ahead, (start, load, flight, key), worlds),
+            "comparison": (self._costs, (stacked, worlds, load, flight), 0.0),
         }
-        # Traced one after the other, compiled side by side.
-        lowered = {name: jax.jit(function).lower(*given) for name, (function, given) in asked.items()}
+        known = {
+            "config": to_dict(self.config),
+            "policy": self._flown_hash(),  # some of its numbers are constants in the programs
+            "source": source_hash(),
+            "versions": versions(),
+        }
+        # Traced one after the other, or found in the cache, and compiled side by side.
+        lowered = {
+            name: TracedProgram(name, known, function, jax.tree.map(_shape, given), result).lower()
+            for name, (function, given, result) in asked.items()
+        }
         with ThreadPoolExecutor(len(lowered)) as pool:
             waiting = {pool.submit(one.compile, CPU_OPTIONS): name for name, one in lowered.items()}
             for count, done in enumerate(as_completed(waiting), start=1):
@@ -191,7 +204,7 @@ class FineTuner:
         begun = time.monotonic()
         load, flight = _single(load), _single(flight)
         key, own = jax.random.split(jax.random.PRNGKey(0))
-        at_handover = worlds = self._programs["flight ahead"](self._start, load, flight, own)
+        at_handover = worlds = self._programs["flight_ahead"](self._start, load, flight, own)
         jax.block_until_ready(worlds)
         state, count, longest = self._start, 0, 0.0
         # What the comparison takes is known from before the flight, where nothing else ran.
@@ -215,6 +228,16 @@ class FineTuner:
 
     def _environments(self, load: KnownLoad, flight: FlightState, count: int | None = None) -> Environments:
         return Environments(LoadedEnv(self.config, load, flight), count or self._worlds)
+
+    def _flown_hash(self) -> str:
+        arrays = (
+            *self._flown.weights,
+            *self._flown.biases,
+            self._flown.observation_mean,
+            self._flown.observation_scale,
+        )
+        card = json.dumps(self._flown.card, sort_keys=True).encode()
+        return hashlib.sha256(card + b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
     def _contents(self, state: GradientState) -> PolicyFile:
         """The policy file of `state`, with the card of the flown one."""
@@ -292,3 +315,7 @@ def resting(config: Config) -> FlightState:
 def _single(values: Any) -> Any:
     """Leaves as float32 arrays."""
     return jax.tree.map(lambda value: np.asarray(value, np.float32), values)
+
+
+def _shape(value: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(np.shape(value), value.dtype)

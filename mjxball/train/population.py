@@ -168,7 +168,8 @@ class Population:
 
     def start_from(self, state: TrainState, policy: PolicyFile) -> TrainState:
         """`state` with the network of `policy` in every member; see `FirstOrderGradient.start_from`."""
-        known, algorithm = processes.gather(state.algorithm), self.program.algorithm
+        algorithm: Any = self.program.algorithm  # of its kind
+        known = processes.gather(state.algorithm)
         begun = [algorithm.start_from(self.member(known, number), policy) for number in range(self.members)]
         known = begun[0] if self._single else jax.tree.map(lambda *leaves: np.stack(leaves), *begun)
         return state._replace(algorithm=self.place(known, self._whole))
