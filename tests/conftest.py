@@ -73,11 +73,11 @@ def by_the_clock(item: pytest.Item) -> bool:
 
 
 # What a flight by the clock then finds compiled, and beside it what takes as long.
-FIRST = ("test_fine_tune", "test_rig_rehearsal")
+FIRST = ("test_fine_tune", "test_rig_load")
 # Files that take longest, which begin first, so that no worker is left with one of them at the end.
 LONGEST = (
     *("test_fly_link", "test_fly_mocap_flight", "test_fly_main", "test_fly_watchdog", "test_fly_rehearsal"),
-    *("test_fly_retrain_flight", "test_rig_load", "test_population", "test_distributed", "test_cli_eval"),
+    *("test_fly_retrain_flight", "test_rig_rehearsal", "test_population", "test_distributed", "test_cli_eval"),
     *("test_docs", "test_team_env", "test_cli_train", "test_rigs"),
     *("test_algorithms", "test_extensions", "test_figures", "test_stability", "test_fly_defects", "test_resume"),
     *("test_engines", "test_program", "test_gym"),
