@@ -29,7 +29,8 @@ from mjxball.config import Config, preset, replace
 from mjxball.env import TransportEnv
 from mjxball.evaluate.rigs import AnyRigLaw, fly
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.sim.rigs import HELD_OUT_RIGS, RigTable, held_out, rig_config
+from mjxball.policy.export import with_network
+from mjxball.sim.rigs import RigTable, held_out, rig_config
 from mjxball.train.compilation import CPU_OPTIONS
 from mjxball.train.program import MATMUL_PRECISION, Environments
 
@@ -108,18 +109,7 @@ def train(config: Config, rigs: RigTable, policy: PolicyFile, options: Any) -> l
                 print(f"{size} drones: {count + 1} gradients, loss {np.median(state.loss):.3f}", file=sys.stderr)
     algorithm, known = parts(first)[1], jax.tree.map(np.asarray, state)
     one = lambda row: jax.tree.map(lambda leaf: leaf[row], known)  # noqa: E731
-    return [_contents(policy, algorithm.policy(one(row))) for row in range(rigs.total)]
-
-
-def _contents(policy: PolicyFile, learnt: Any) -> PolicyFile:
-    layers = [learnt.layers[f"hidden_{number}"] for number in range(len(policy.weights))]
-    return dataclasses.replace(
-        policy,
-        weights=tuple(layer["kernel"] for layer in layers),
-        biases=tuple(layer["bias"] for layer in layers),
-        observation_mean=learnt.mean,
-        observation_scale=np.where(policy.observation_scale > 0, 1 / learnt.deviation, 0.0).astype(np.float32),
-    )
+    return [with_network(policy, algorithm.policy(one(row))) for row in range(rigs.total)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -135,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     config, contents, rows = replace(preset("universal"), "rigs.mass_step", 0.0), load_file(options.policy), []
     for size in options.sizes:
-        rigs = held_out(config, size, HELD_OUT_RIGS).rows(slice(options.rigs))
+        rigs = held_out(config, size).rows(slice(options.rigs))
         flown, begun = {}, time.perf_counter()
         for name, make in judge.followers([options.policy]):
             if name in judge.KNOWING or name == options.policy.stem:

@@ -19,11 +19,13 @@ from conftest import with_settings
 from mjxball.algorithms.base import Phase, Shards
 from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.commands.train import main
-from mjxball.config import Config
+from mjxball.config import Config, preset
+from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, load_file, shipped_policy
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, find
 from mjxball.train.program import Environments, Program
+from mjxball.train.run_directory import file_hash, start_policy
 
 A, B = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
 Q, R = np.diag([1.0, 0.1]), np.array([[0.05]])
@@ -190,6 +192,14 @@ def test_a_run_by_gradient_writes_a_policy_and_resumes(
     np.testing.assert_allclose(after.observation_mean, before.observation_mean, atol=1e-6)
     np.testing.assert_allclose(after.observation_scale, before.observation_scale, rtol=1e-3)
     assert after.card["start_from"]["policy"] == "run/policy.npz"
+
+
+def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:
+    path = shipped_policy("universal")
+    start = {"policy": str(path), "sha256": file_hash(path)}
+    assert start_policy(start, preset("universal")).card["preset"] == "universal"
+    with pytest.raises(InputError, match="SHA-256 has changed"):
+        start_policy({**start, "sha256": "0" * 64}, preset("universal"))
 
 
 @pytest.mark.parametrize(

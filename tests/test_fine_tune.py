@@ -1,4 +1,4 @@
-"""Fine-tuning a flown policy by gradients through the Crazyflies' cascade; last, in a rehearsal by the clock."""
+"""Fine-tuning a flown policy by gradients through the Crazyflies' cascade."""
 
 from __future__ import annotations
 

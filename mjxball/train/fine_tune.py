@@ -24,6 +24,7 @@ from mjxball.algorithms.gradient import FirstOrderGradient, GradientState
 from mjxball.config import Config, to_dict
 from mjxball.env import PipelineState, TransportEnv
 from mjxball.policy import PolicyFile
+from mjxball.policy.export import with_network
 from mjxball.sim.disturbances import Sample
 from mjxball.sim.follower import follower_law
 from mjxball.train.compilation import CPU_OPTIONS, TracedProgram
@@ -244,15 +245,7 @@ class FineTuner:
 
     def _contents(self, state: GradientState) -> PolicyFile:
         """The policy file of `state`, with the card of the flown one."""
-        learnt, seen = self._algorithm.policy(state), self._flown.observation_scale > 0
-        layers = [learnt.layers[f"hidden_{number}"] for number in range(len(learnt.layers))]
-        return dataclasses.replace(
-            self._flown,
-            weights=tuple(np.asarray(layer["kernel"], np.float32) for layer in layers),
-            biases=tuple(np.asarray(layer["bias"], np.float32) for layer in layers),
-            observation_mean=np.asarray(learnt.mean, np.float32),
-            observation_scale=np.where(seen, 1 / np.asarray(learnt.deviation), 0.0).astype(np.float32),
-        )
+        return with_network(self._flown, self._algorithm.policy(state))
 
     # The programs.
 
