@@ -245,7 +245,10 @@ class Link:
         with self._wake:
             self._closing = True
             self._wake.notify()
-        if self._crazyflie is not None and not bounded(self._crazyflie.close_link, self._deadlines.close):
+        if self._crazyflie is None:
+            return
+        self._crazyflie.incoming.stop()  # with the next packet; close_link tells it too late and waits 1 s for it
+        if not bounded(self._crazyflie.close_link, self._deadlines.close):
             self._note("warning", text=f"the link of the {self.name} did not close in time")
 
     def _send_all(self) -> None:

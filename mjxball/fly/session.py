@@ -26,7 +26,7 @@ from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.onboard import Apps, OnboardFlight
 from mjxball.fly.preflight import Preflight, check, prepare
-from mjxball.fly.process import Metronome, Timing, urgent
+from mjxball.fly.process import Metronome, Timing, together, urgent
 from mjxball.fly.retrain import Retrainer
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
@@ -102,8 +102,7 @@ def fly(
             journal.note("refused", text=str(error))
             raise
         finally:
-            for link in links:
-                link.close()
+            together([link.close for link in links])
             sys.setswitchinterval(before)
 
 
