@@ -34,11 +34,12 @@ import numpy as np
 from mjxball import cli
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
-from mjxball.config import Config, preset, replace
+from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Copy, Law
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import flies_any_rig, load_policy
 from mjxball.evaluate.rigs import AnyRigBase, AnyRigLaw, Flown, cg_jumps, fly, mass_changes, rig_laws
+from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, held_out, rig_config, unpadded
 
@@ -108,8 +109,14 @@ def followers(paths: Sequence[Path]) -> list[Made]:
 
 
 def _network(path: Path, config: Config, rigs: RigTable) -> Law:
-    policy = load_policy(path, rig_config(config, rigs, 0))
-    return AnyRigLaw(policy) if flies_any_rig(policy) else NetworkLaw(policy)
+    """A policy for any rig, or one for a single plant, which takes every rig for its own."""
+    policy = Policy.load(path)
+    if flies_any_rig(policy):
+        return AnyRigLaw(load_policy(path, rig_config(config, rigs, 0)))
+    own, size = from_record(policy.card["config"]), int(rigs.size[0])
+    if own.plant.count != size:
+        raise InputError(f"{path} was made for {own.plant.count} drones, not {size}; say --sizes {own.plant.count}")
+    return NetworkLaw(load_policy(path, own))
 
 
 def _adaptive(config: Config) -> Law:

@@ -12,7 +12,7 @@ from tables import rows
 from test_engines import TOLERANCE, jitted, relative_difference
 
 from engines import random_states
-from mjxball.config import Attitude, Plant
+from mjxball.config import Attitude, Plant, preset
 from mjxball.control import rotations
 from mjxball.physics import mjx, mujoco, newton_euler
 from mjxball.physics.engine import Load, contact_wrenches, total_wrench
@@ -91,6 +91,23 @@ def test_every_world_may_have_another_rig(engine: str) -> None:
         alone = jax.tree.map(lambda leaf: leaf[number : number + 1], arguments)  # noqa: B023
         expected = newton_euler.make_engine(rig, Attitude()).rolling(*alone)
         assert relative_difference([leaf[number : number + 1] for leaf in found], expected) <= TOLERANCE
+
+
+def test_rotors_may_be_commanded_themselves() -> None:
+    """A tenth more than hover: g / 10 upwards, less the rotors' lag T: v = g / 10 (t - T (1 - exp(-t / T)))."""
+    config = preset("team")
+    engine = newton_euler.make_engine(config.plant, config.attitude)
+    step = make_control_step(config, engine, autopilot=lambda state, forces, load: (state.loops, forces))
+    zero, none, mass = np.zeros(3), np.zeros(0), np.float64(config.plant.object_mass)
+    load = Load(mass, mass, *np.zeros(3), none, none)
+    state = start_state(config, zero, zero, zero, mass, np.zeros(2))
+    forces = 1.1 * state.rotor_force
+    for _ in range(10):
+        state = step(state, forces, load)
+    time, lag = 10 * config.timing.control_period, config.plant.rotor_lag
+    climb = 0.1 * config.plant.gravity * (time - lag * (1 - np.exp(-time / lag)))
+    assert state.velocity == pytest.approx([0, 0, climb], abs=1e-9)
+    assert state.rates == pytest.approx(zero, abs=1e-9)
 
 
 def test_a_control_step_of_every_world_may_have_another_rig() -> None:

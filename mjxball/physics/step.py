@@ -15,7 +15,7 @@ from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import motion
-from mjxball.physics.autopilot import make_autopilot
+from mjxball.physics.autopilot import Autopilot, make_autopilot
 from mjxball.physics.engine import Array, Engine, Load, PlantState, Wrench, total_wrench
 from mjxball.plant import PlantParameters, parts, plant_parameters
 from mjxball.plant.parameters import shared
@@ -48,11 +48,16 @@ def jax_repeat(body: Callable[[PlantState], PlantState], count: int, value: Plan
 
 
 def make_control_step(
-    config: Config, engine: Engine, repeat: Repeat = python_repeat, parameters: PlantParameters | None = None
+    config: Config,
+    engine: Engine,
+    repeat: Repeat = python_repeat,
+    parameters: PlantParameters | None = None,
+    autopilot: Autopilot | None = None,
 ) -> ControlStep:
     """Return the function that advances the plant one control period with commands held.
 
     `parameters`: the plant's numbers, if they are not those of `config.plant`; the engine must have the same.
+    `autopilot` in place of the one that `config` names; commands are then what it takes.
 
     Each physics step samples the attitude loop, moves the rotors' first-order lag exactly (its mean force
     acts over the step), and integrates drift-kick-drift: half a step of motion, the accelerations there,
@@ -64,7 +69,7 @@ def make_control_step(
     numbers = plant_parameters(plant, config.attitude) if parameters is None else parameters
     h = config.physics_step
     accelerate = make_accelerations(config, engine, numbers)
-    autopilot = make_autopilot(config, numbers)
+    autopilot = autopilot or make_autopilot(config, numbers)
 
     def physics_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
         loops, target = autopilot(state, commands, load)
