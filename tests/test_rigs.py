@@ -211,6 +211,9 @@ class TestUniversal:
         heavy = dataclasses.replace(paper, plant=dataclasses.replace(paper.plant, object_mass=2.0, rotor_force_max=9.0))
         load_policy(POLICY, heavy)
         assert "object's mass over that of all drones 1, trained from 0.05 to 0.6" in capsys.readouterr().err
+        # 2 arms of 0.12 m times 9.81 * 6.9 / 24 N, over 0.369 kg m2 * (10 rad/s)^2 / 6
+        load_policy(POLICY, with_plant(preset("transport"), "team6"))
+        assert "rotors saturate from a tilt step of 0.11 rad on, trained from 0.15 rad" in capsys.readouterr().err
 
     def test_it_flies_no_stand(self) -> None:
         with pytest.raises(InputError, match="made for free flight, not for a stand"):

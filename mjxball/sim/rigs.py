@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config import Attitude, Config, Drone, Plant, Range
-from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, rigid_inertia
+from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, plant_parameters, rigid_inertia
 from mjxball.plant.trim import safe_radius
 
 Array = Any
@@ -368,12 +368,26 @@ def outside(config: Config, trained: Config) -> list[str]:
             ("attitude loop", loops, (slow * FREQUENCY_RATIO[0], fast * FREQUENCY_RATIO[1]), " rad/s"),
             ("damping of the attitude loop", [damping], ranges.loop_damping, ""),
         ]
-    return [
+    texts = [
         f"{name} {value:.3g}{unit}, trained from {low:g} to {high:g}{unit}"
         for name, values, (low, high), unit in found
         for value in sorted({min(values), max(values)})
         if not low * (1 - 1e-6) <= value <= high * (1 + 1e-6)
     ]
+    answered = _answered_tilt(config, gravity * weight / (4 * plant.count))
+    if config.autopilot.kind == "ideal" and answered < ranges.authority * (1 - 1e-6):
+        texts.append(
+            f"rotors saturate from a tilt step of {answered:.3g} rad on, trained from {ranges.authority:g} rad upwards"
+        )
+    return texts
+
+
+def _answered_tilt(config: Config, hover: float) -> float:
+    """Tilt step that all drones' loops answer without saturation [rad]; a rotor hovers with `hover` [N]."""
+    plant = config.plant
+    drones = zip(plant.of_drones("arm"), plant.of_drones("rotor_force_max"), strict=True)
+    room = min(2 * arm * min(hover, strongest - hover) for arm, strongest in drones)
+    return room / float(np.max(plant_parameters(plant, config.attitude).gains.kp[:2]))
 
 
 def _over_usual_arm(plant: Plant) -> list[float]:
