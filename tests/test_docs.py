@@ -26,7 +26,7 @@ RUN = [
     "README.md",
     "docs/getting-started.md",
     "docs/view.md",
-    *(f"docs/howto/own-{n}.md" for n in ("rig", "reward", "baseline")),
+    *(f"docs/howto/own-{n}.md" for n in ("rig", "reward", "baseline", "environment", "algorithm")),
 ]
 MAINS = {
     "train.py": "mjxball.commands.train",

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 import toys
+from command_line import REPOSITORY, environment
 from conftest import with_settings
 
 from mjxball.algorithms.sac import SoftActorCritic
@@ -137,11 +140,18 @@ def test_a_run_on_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest
     [
         ("--env", "toys", "package.module:Name"),
         ("--env", "nowhere:Env", "no module nowhere"),
-        ("--env", "toys:Nothing", "has no Nothing"),
+        ("--env", "toys:Missing", "has no Missing"),
         ("--env", "toys:Needy", "needs mass"),
         ("--env", "toys:Wide", "obs of shape (3,), not (2,)"),
         ("--env", "toys:Broken", "no such wheel"),
         ("--env", "toys:effort", "needs state"),
+        ("--env", "toys:Nothing", "lacks reset, step, observation_size, action_size"),
+        ("--env", "toys:Fed", "step must take (state, action)"),
+        ("--env", "toys:Sizeless", "observation_size raised ValueError: no ruler"),
+        ("--env", "toys:Masked", "input_mask must hold observation_size = 2 numbers"),
+        ("--env", "toys:Bare", "whose info is a dictionary"),
+        ("--env", "toys:Branching", "made of JAX operations"),
+        ("--reward", "toys:NUMBER", "--reward toys:NUMBER is no function"),
         ("--reward", "toys:vector", "one number"),
         ("--reward", "toys:binary", "(state, action, next state)"),
         ("--algorithm", "toys:Wide", "lacks init"),
@@ -156,6 +166,17 @@ def test_mistakes_are_one_sentence(
     assert flag in line
     assert word in line
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_mistake_ends_the_process_with_one_sentence(tmp_path: Path) -> None:
+    """Also while the device's runtime, which a thread starts, is not there yet."""
+    command = [sys.executable, REPOSITORY / "train.py", "--env", "toys:Needy", "--physics", "newton-euler"]
+    child = {**environment(), "PYTHONPATH": f"{REPOSITORY}:{Path(__file__).parent}"}
+    for _ in range(3):
+        done = subprocess.run(command, cwd=tmp_path, env=child, capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert len(done.stderr.splitlines()) == 1
 
 
 def test_our_environment_and_algorithm_need_no_exception() -> None:

@@ -71,6 +71,38 @@ class Broken(DoubleIntegrator):
         raise ValueError("no such wheel")
 
 
+class Fed(DoubleIntegrator):
+    def step(self, state: Any, action: Any, food: Any) -> Any:
+        return super().step(state, action)
+
+
+class Sizeless(DoubleIntegrator):
+    @property
+    def observation_size(self) -> int:
+        raise ValueError("no ruler")
+
+
+class Masked(DoubleIntegrator):
+    input_mask = 3
+
+
+class Bare(DoubleIntegrator):
+    def reset(self, rng: Any) -> Any:
+        return super().reset(rng).replace(info=None)
+
+
+class Branching(DoubleIntegrator):
+    def step(self, state: Any, action: Any) -> Any:
+        return super().step(state, action if action[0] > 0 else 0 * action)
+
+
+class Nothing:
+    """No environment."""
+
+
+NUMBER = 3.0
+
+
 def effort(state: Any, action: Any, after: Any) -> Any:
     """The pair's error and the action, squared."""
     return -after.metrics["error"] - (action**2).sum()

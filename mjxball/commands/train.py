@@ -156,10 +156,13 @@ def _run(
 
 @functools.cache
 def _wake_devices() -> None:
-    """Start the accelerator's runtime (2 s of waiting on a GPU) beside the imports that follow."""
+    """Start the accelerator's runtime (2 s of waiting on a GPU) beside the imports that follow.
+
+    Whatever ends the process waits for the thread: one that Python stops inside XLA aborts it.
+    """
     import jax  # here: two threads must not both import it
 
-    threading.Thread(target=_first_kernel, args=(jax.numpy,), daemon=True).start()
+    threading.Thread(target=_first_kernel, args=(jax.numpy,)).start()
 
 
 def _first_kernel(xp: Any) -> None:

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
@@ -57,7 +58,10 @@ def find(name: str, flag: str) -> Any:
         raise InputError(f"{flag} {name}: importing {module} raised {_said(error)}; mend that module") from None
     if not hasattr(found, attribute):
         raise InputError(f"{flag} {name}: {module} has no {attribute}; check the name behind the colon")
-    return getattr(found, attribute)
+    named = getattr(found, attribute)
+    if flag == "--reward" and not callable(named):
+        raise InputError(f"{flag} {name} is no function of (state, action, next state)")
+    return named
 
 
 def resolve(extensions: Extensions) -> Extensions:
@@ -186,13 +190,18 @@ def _made(kind: Any, config: Config, physics: str) -> Any:
 
 def _check_env(env: Any, name: str) -> None:
     flag = f"--env {name}"
-    lost = [part for part in ("reset", "step", "observation_size", "action_size") if not hasattr(env, part)]
+    lost = [part for part in ("reset", "step", "observation_size", "action_size") if not _has(env, part)]
     if lost:
         raise InputError(f"{flag} is no Brax environment: it lacks {', '.join(lost)}; derive it from brax.envs.Env")
-    sizes = env.observation_size, env.action_size
+    _takes(flag, "reset", env.reset, ("rng",))
+    _takes(flag, "step", env.step, ("state", "action"))
+    first = _traced(flag, "reset", env.reset, jax.random.PRNGKey(0))
+    for part in ("info", "metrics"):
+        if not isinstance(getattr(first, part, None), dict):
+            raise InputError(f"{flag}: reset must return a brax.envs.State whose {part} is a dictionary, perhaps empty")
+    sizes = _read(flag, env, "observation_size"), _read(flag, env, "action_size")
     if not all(isinstance(size, int) and size > 0 for size in sizes):
         raise InputError(f"{flag}: observation_size and action_size must be whole numbers, not {sizes}; flatten them")
-    first = _traced(flag, "reset", env.reset, jax.random.PRNGKey(0))
     each: tuple[int, ...] = first.reward.shape if is_pair(env) else ()  # followers of a team
     after = _traced(flag, "step", env.step, first, jax.ShapeDtypeStruct((*each, sizes[1]), "float32"))
     for part, state in (("reset", first), ("step", after)):
@@ -205,8 +214,34 @@ def _check_env(env: Any, name: str) -> None:
     ):
         raise InputError(f"{flag}: step must return a state of the same fields, shapes and types as reset")
     for mask in ("input_mask", "critic_mask"):
-        if len(getattr(env, mask, None) or [0] * sizes[0]) != sizes[0]:
+        given = _read(flag, env, mask) if _has(env, mask) else None
+        if given is not None and np.shape(given) != (sizes[0],):
             raise InputError(f"{flag}: {mask} must hold observation_size = {sizes[0]} numbers")
+
+
+def _has(env: Any, part: str) -> bool:
+    """Whether there is such a part, even if reading it raises an error of its own."""
+    try:
+        getattr(env, part)
+    except AttributeError:
+        return False
+    except Exception:
+        return True
+    return True
+
+
+def _read(flag: str, env: Any, part: str) -> Any:
+    try:
+        return getattr(env, part)
+    except Exception as error:
+        raise InputError(f"{flag}: {part} raised {_said(error)}; mend it") from None
+
+
+def _takes(flag: str, what: str, function: Callable[..., Any], names: tuple[str, ...]) -> None:
+    try:
+        inspect.signature(function).bind(*names)
+    except (TypeError, ValueError):
+        raise InputError(f"{flag}: {what} must take ({', '.join(names)})") from None
 
 
 def _check_reward(env: Any, reward: Any) -> None:
@@ -230,7 +265,8 @@ def _traced(flag: str, what: str, function: Callable[..., Any], *arguments: Any)
     try:
         return jax.eval_shape(function, *arguments)
     except Exception as error:
-        raise InputError(f"{flag}: {what} raised {_said(error)}; it must be made of JAX operations") from None
+        mend = "it must be made of JAX operations" if isinstance(error, jax.errors.JAXTypeError) else "mend it"
+        raise InputError(f"{flag}: {what} raised {_said(error)}; {mend}") from None
 
 
 def _said(error: Exception) -> str:
