@@ -16,6 +16,7 @@ from mjxball.config import Config, Plant
 from mjxball.control.followers import Law, PrivilegedInfo
 from mjxball.control.multi_model_lqg import team_geometry
 from mjxball.env import PipelineState, State, TransportEnv
+from mjxball.evaluate.metrics import SETTLED, STEADY_AFTER
 from mjxball.physics.motion import object_mass
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import RigTable, rig_config
@@ -23,7 +24,7 @@ from mjxball.sim.rigs import RigTable, rig_config
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-SECONDS, STEADY_AFTER, SETTLED = 30.0, 20.0, 0.02  # [s], [s], of the first error
+SECONDS = 30.0  # of a flight
 Change = Callable[[PipelineState], PipelineState]
 
 
@@ -35,7 +36,7 @@ class Flown(NamedTuple):
 
     def settling(self, period: float) -> Float[np.ndarray, "R K"]:
         """Last time at which the error exceeds 2 % of the first one [s]; inf: it never settles."""
-        late = self.error > SETTLED * self.error[..., :1]
+        late = self.error > SETTLED[0] * self.error[..., :1]
         last = self.error.shape[-1] - 1 - late[..., ::-1].argmax(axis=-1)
         return np.where(self.failed | (last > self.error.shape[-1] - 6), np.inf, period * last)
 
