@@ -41,7 +41,16 @@ from mjxball.evaluate.policies import flies_any_rig, load_policy
 from mjxball.evaluate.rigs import AnyRigBase, AnyRigLaw, Flown, cg_jumps, fly, mass_changes, rig_laws
 from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
-from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, held_out, rig_config, unpadded
+from mjxball.sim.rigs import (
+    HELD_OUT,
+    HELD_OUT_RIGS,
+    RigTable,
+    draw_rigs,
+    held_out,
+    loop_damping,
+    rig_config,
+    unpadded,
+)
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3
 LATER, MORE, LENGTH = 1.25, 0.005, 0.17  # the bar: settling, peak [m], of a rig of that length [m]
@@ -198,7 +207,15 @@ def row_of(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) ->
         "small": float(small.mean()),
         "met": float((soon & small).mean()),
         "sooner": float((settling < best).mean()),
+        "met_by_damping": _by_damping(soon & small, rigs),
     }
+
+
+def _by_damping(met: np.ndarray, rigs: RigTable) -> list[float]:
+    """Shares that are met of the fifth of the rigs with the least damped attitude loops, of the next, and so on."""
+    lag = rigs.numbers.rotor_lag[:, :1]
+    damping = loop_damping(rigs.frequency[:, :2], rigs.damping[:, None], lag).min(axis=-1)
+    return [float(met[part].mean()) for part in np.array_split(np.argsort(damping), 5) if len(part)]
 
 
 def _quantile(values: np.ndarray, share: int) -> float | None:

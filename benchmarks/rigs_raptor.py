@@ -1,7 +1,7 @@
 """Two policies of RAPTOR, each of which flies one drone of a pair, on the random pairs of `benchmarks/rigs.py`.
 
     pip install foundation-policy
-    python benchmarks/rigs_raptor.py --json benchmarks/results/rigs_raptor.json
+    python benchmarks/rigs_raptor.py policies/universal.npz policies/balance.npz --json rigs_raptor.json
 
 RAPTOR (Eschmann, Albani and Loianno, 2025) flies any single quadrotor to a point: a recurrent network that answers to
 position, attitude, velocities and its own last command with four rotor commands, at 100 Hz. Here one flies the leader
@@ -61,13 +61,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows.append({"follower": name, **judge.row_of(flown, name, rigs, config.timing.control_period)})
             print(json.dumps(rows[-1]), flush=True)
     for power, near in VARIANTS:
-        for number in (1, 2):
-            two = number == 2
-            error = fly_raptor(config, rigs, foundation_policy.Raptor, power, near, pair=two)
+        for pair in (False, True):
+            error = fly_raptor(config, rigs, foundation_policy.Raptor, power, near, pair)
             far = np.isnan(error).any(axis=-1) | (error > config.scenario.termination_distance).any(axis=-1)
             found = Flown(np.where(far[..., None], np.inf, error), far)
-            row = judge.row_of({**flown, "raptor": found} if two else {"raptor": found}, "raptor", rigs, 2 * PERIOD)
-            name = "raptor, two on the rig" if two else "raptor alone"
+            row = judge.row_of({**flown, "raptor": found} if pair else {"raptor": found}, "raptor", rigs, 2 * PERIOD)
+            name = "raptor, two on the rig" if pair else "raptor alone"
             rows.append({"follower": name, "power": power, "near": min(near, 1e9), **row})
             print(json.dumps(rows[-1]), flush=True)
     if options.json:

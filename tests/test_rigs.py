@@ -25,12 +25,12 @@ from mjxball.physics.step import make_control_step
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
+from mjxball.sim.outside import outside
 from mjxball.sim.rigs import (
     TRAINING,
     draw_rigs,
     held_out,
     loop_damping,
-    outside,
     rig_config,
     trimmed_reach,
     unpadded,

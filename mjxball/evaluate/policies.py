@@ -12,7 +12,7 @@ from mjxball.config import Config, with_current_names
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
-from mjxball.sim.rigs import outside
+from mjxball.sim.outside import outside
 
 
 def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjxball.config import Attitude, Config, Drone, Plant, Range
-from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, plant_parameters, rigid_inertia
+from mjxball.control.mixer import torque_per_force
+from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, rigid_inertia
 from mjxball.plant.trim import safe_radius
 
 Array = Any
@@ -207,7 +208,7 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
     about = [rows[axis][axis] + load * ball for axis in range(3)]
     # The loop is as fast as it was drawn, up to what the rotors can give for a step of `authority`.
     hover = gravity * (mass * size + carrier + load) / (4 * size)
-    room = 2 * arm * np.minimum(hover, strongest - hover)
+    room = torque_room(arm, config.plant.layout, hover, strongest)
     slowest, fastest = ranges.loop_frequency
     stiffest = np.sqrt(size * room / ranges.authority / np.maximum(about[0] * ratio**2, about[1]))
     pitch = slowest * (np.clip(stiffest, slowest, fastest) / slowest) ** place
@@ -346,53 +347,9 @@ def rig_config(config: Config, rigs: RigTable, row: int) -> Config:
     return dataclasses.replace(config, plant=plant, attitude=attitude, scenario=scenario, rigs=rigs_off)
 
 
-def outside(config: Config, trained: Config) -> list[str]:
-    """What of the rig of `config` lies outside the ranges that `trained` draws rigs from, one phrase each."""
-    plant, ranges = config.plant, trained.rigs
-    drones, gravity, sizes = plant.drones, plant.gravity, trained.scenario.team_sizes
-    masses = [drone.mass for drone in drones]
-    weight = sum(masses) + plant.carrier_mass + plant.object_mass
-    strongest = 4 * sum(plant.of_drones("rotor_force_max"))
-    found: list[tuple[str, Sequence[float], Range, str]] = [
-        ("drones", [plant.count], (min(sizes), max(sizes)), ""),
-        ("mass of a drone", masses, ranges.drone_mass, " kg"),
-        ("rotor arm over 0.12 m (mass / kg)^(1/3)", _over_usual_arm(plant), ranges.arm_scale, ""),
-        ("object's mass over that of all drones", [plant.object_mass / sum(masses)], ranges.object_share, ""),
-        ("largest thrust over the weight", [strongest / gravity / weight], ranges.thrust_to_weight, ""),
-        ("rotor lag", plant.of_drones("rotor_lag"), ranges.rotor_lag, " s"),
-    ]
-    if config.autopilot.kind == "ideal":
-        loops, damping = config.attitude.natural_frequency[:2], config.attitude.damping
-        slow, fast = ranges.loop_frequency
-        found += [
-            ("attitude loop", loops, (slow * FREQUENCY_RATIO[0], fast * FREQUENCY_RATIO[1]), " rad/s"),
-            ("damping of the attitude loop", [damping], ranges.loop_damping, ""),
-        ]
-    texts = [
-        f"{name} {value:.3g}{unit}, trained from {low:g} to {high:g}{unit}"
-        for name, values, (low, high), unit in found
-        for value in sorted({min(values), max(values)})
-        if not low * (1 - 1e-6) <= value <= high * (1 + 1e-6)
-    ]
-    answered = _answered_tilt(config, gravity * weight / (4 * plant.count))
-    if config.autopilot.kind == "ideal" and answered < ranges.authority * (1 - 1e-6):
-        texts.append(
-            f"rotors saturate from a tilt step of {answered:.3g} rad on, trained from {ranges.authority:g} rad upwards"
-        )
-    return texts
-
-
-def _answered_tilt(config: Config, hover: float) -> float:
-    """Tilt step that all drones' loops answer without saturation [rad]; a rotor hovers with `hover` [N]."""
-    plant = config.plant
-    drones = zip(plant.of_drones("arm"), plant.of_drones("rotor_force_max"), strict=True)
-    room = min(2 * arm * min(hover, strongest - hover) for arm, strongest in drones)
-    return room / float(np.max(plant_parameters(plant, config.attitude).gains.kp[:2]))
-
-
-def _over_usual_arm(plant: Plant) -> list[float]:
-    arms = zip(plant.drones, plant.of_drones("arm"), strict=True)
-    return [arm / ARM / math.cbrt(drone.mass) for drone, arm in arms]
+def torque_room(arm: Array, layout: str, hover: Array, strongest: Array) -> Array:
+    """Roll or pitch torque that a drone's rotors have at hover [N m]; forces of a rotor [N]."""
+    return torque_per_force(arm, layout) * np.minimum(hover, strongest - hover)
 
 
 def _tuple(values: Array) -> Any:

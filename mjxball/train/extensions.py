@@ -59,8 +59,8 @@ def find(name: str, flag: str) -> Any:
     if not hasattr(found, attribute):
         raise InputError(f"{flag} {name}: {module} has no {attribute}; check the name behind the colon")
     named = getattr(found, attribute)
-    if flag == "--reward" and not callable(named):
-        raise InputError(f"{flag} {name} is no function of (state, action, next state)")
+    if flag == "--reward":
+        _check_callable(f"{flag} {name}", named)
     return named
 
 
@@ -246,8 +246,7 @@ def _takes(flag: str, what: str, function: Callable[..., Any], names: tuple[str,
 
 def _check_reward(env: Any, reward: Any) -> None:
     flag = f"--reward {name_of(reward)}"
-    if not callable(reward):
-        raise InputError(f"{flag} is no function of (state, action, next state)")
+    _check_callable(flag, reward)
     try:
         inspect.signature(reward).bind(None, None, None)
     except (TypeError, ValueError):
@@ -259,6 +258,11 @@ def _check_reward(env: Any, reward: Any) -> None:
     if shape not in ((), state.reward.shape) or not kind.startswith("float"):
         each = f" or one for each follower, shape {state.reward.shape}" if state.reward.shape else ""
         raise InputError(f"{flag} must return one number{each}, not shape {shape} of {kind}; sum it and use floats")
+
+
+def _check_callable(what: str, reward: Any) -> None:
+    if not callable(reward):
+        raise InputError(f"{what} is no function of (state, action, next state)")
 
 
 def _traced(flag: str, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
