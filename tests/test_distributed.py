@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from command_line import environment
 
+from mjxball.algorithms import ALGORITHMS
 from mjxball.commands.train import main as train
 from mjxball.errors import InputError
 from mjxball.policy import Policy
@@ -103,7 +104,7 @@ def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None
 def test_worlds_of_one_follower_are_split_over_the_processes(tmp_path: Path) -> None:
     run = tmp_path / "run"
     children = launch(
-        [*SMALL, "--algorithm", "sac", "--sac.total_steps", "2400", "--out", str(run)], tmp_path / "cache"
+        [*SMALL, "--algorithm", ALGORITHMS["sac"], "--sac.total_steps", "2400", "--out", str(run)], tmp_path / "cache"
     )
     outputs = finish(children)
     assert [child.returncode for child in children] == [0, 0], outputs

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import gc
 import json
 import os
 import sys
@@ -22,6 +23,7 @@ import numpy as np
 
 from mjxball.cli import make_parser
 from mjxball.config import Config
+from mjxball.entry import COLLECTED_AFTER
 from mjxball.errors import InputError
 from mjxball.fly.card import Controller, config_of
 from mjxball.fly.flight_log import Tail
@@ -48,6 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     threading.Thread(target=_end_with_input, daemon=True).start()
     os.nice(NICE)
+    gc.set_threshold(*COLLECTED_AFTER)
     try:
         return retrain(options)
     except InputError as error:
