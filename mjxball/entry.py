@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import gc
-
-from mjxball.cli import quit_on_interrupt, run_command
-
-# Tracing makes millions of objects that live on: looking through them for cycles as often as Python does by itself
-# takes a tenth of a short training.
-COLLECTED_AFTER = (100_000, 50, 100)  # objects, and collections of each younger generation
+from mjxball.cli import collect_seldom, quit_on_interrupt, run_command
 
 
 def train() -> int:
     """Run `train.py`; return its exit code."""
     quit_on_interrupt()  # until training starts there is nothing to save
-    gc.set_threshold(*COLLECTED_AFTER)
+    collect_seldom()
 
     def command() -> int:
         from mjxball.commands.train import main
@@ -27,7 +21,7 @@ def train() -> int:
 def evaluate() -> int:
     """Run `eval.py`; return its exit code."""
     quit_on_interrupt()  # there is nothing to save
-    gc.set_threshold(*COLLECTED_AFTER)
+    collect_seldom()
 
     def command() -> int:
         from mjxball.commands.evaluate import main

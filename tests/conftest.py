@@ -6,7 +6,6 @@ import atexit
 import contextlib
 import dataclasses
 import fcntl
-import gc
 import os
 import shutil
 import tempfile
@@ -24,12 +23,11 @@ import pytest
 import short_train
 from command_line import HASTY
 
-from mjxball import cache
+from mjxball import cache, cli
 from mjxball import config as configs
 from mjxball.algorithms import sac
 from mjxball.algorithms.base import PolicyNetwork
 from mjxball.config import Config
-from mjxball.entry import COLLECTED_AFTER
 from mjxball.env import TransportEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
@@ -43,7 +41,7 @@ if cache.VARIABLE not in os.environ:  # one compilation cache a run: of its work
     atexit.register(shutil.rmtree, os.environ[cache.VARIABLE], ignore_errors=True)
 cache.enable_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # tests share hundreds of tiny programs
-gc.set_threshold(*COLLECTED_AFTER)  # as in the commands
+cli.collect_seldom()  # as the commands do
 
 # Derandomised: the same examples on every machine, so that a red build is never a matter of luck.
 hypothesis.settings.register_profile("mjxball", deadline=None, derandomize=True, database=None, max_examples=60)

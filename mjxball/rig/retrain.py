@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import gc
 import json
 import os
 import sys
@@ -21,9 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.cli import make_parser
+from mjxball.cli import collect_seldom, make_parser
 from mjxball.config import Config
-from mjxball.entry import COLLECTED_AFTER
 from mjxball.errors import InputError
 from mjxball.fly.card import Controller, config_of
 from mjxball.fly.flight_log import Tail
@@ -50,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     threading.Thread(target=_end_with_input, daemon=True).start()
     os.nice(NICE)
-    gc.set_threshold(*COLLECTED_AFTER)
+    collect_seldom()
     try:
         return retrain(options)
     except InputError as error:
