@@ -1,11 +1,13 @@
 """Retraining in flight on the twin: loads that the card does not know, with and without `--retrain`.
 
-`python benchmarks/retrain.py [--loads 4:-60 6:50 ...] [--seconds 45] [--clock 2] [--json FILE]`
+`python benchmarks/retrain.py [--loads 4:-60 6:50 ... | --random N] [--seconds 45] [--clock 2] [--steps K]
+[--json FILE]`
 
 First `--clock` rehearsals by the clock each with and without `--retrain`: deadlines of the control loop, how long it
-took, how many gradient steps that was. Then in virtual time with as many steps (the median; without rehearsals all),
-each load (grams, millimetres from O toward the leader) twice from the same seed: the flown policy to the end, and one
-that takes over 5 s after the load was identified. Figures are of the truth from there to the end.
+took, how many gradient steps that was. Then in virtual time with as many steps (the median, or K; without rehearsals
+all), each load (grams, millimetres from O toward the leader) twice from the same seed: the flown policy to the end, and
+one that takes over 5 s after the load was identified. Figures are of the truth from there to the end.
+`--random N` draws loads instead of those of the list: 3 to 8 g within 12 cm of O, of at most 420 mg m.
 """
 
 from __future__ import annotations
@@ -51,6 +53,16 @@ def read_load(text: str) -> AddedLoad:
     """`GRAMS:MILLIMETRES`."""
     mass, offset = map(float, text.split(":"))
     return AddedLoad(1e-3 * mass, 1e-3 * offset, COMES)
+
+
+def random_loads(count: int) -> list[str]:
+    """Loads that nothing was chosen by, always the same."""
+    draw, loads = np.random.default_rng(0), []
+    while len(loads) < count:
+        grams, place = draw.uniform(3.0, 8.0), draw.uniform(-120.0, 120.0)
+        if abs(grams * place) <= 420.0:
+            loads.append(f"{grams:.1f}:{place:.0f}")
+    return loads
 
 
 def fly(
@@ -159,6 +171,8 @@ def main() -> None:
     """Fly, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--loads", nargs="+", default=LOADS, metavar="G:MM")
+    parser.add_argument("--random", type=int, metavar="N", help="loads drawn at random instead")
+    parser.add_argument("--steps", type=int, metavar="K", help="of gradients in virtual time")
     parser.add_argument("--seconds", type=float, default=45.0, help="under both laws")
     parser.add_argument("--clock", type=int, default=2, metavar="N", help="rehearsals by the clock of each kind")
     parser.add_argument("--json", type=Path, metavar="FILE")
@@ -173,11 +187,11 @@ def main() -> None:
             clock.append(rehearse(read_load(options.loads[0]), CLOCK_SECONDS, retrains))
             print(json.dumps(clock[-1]), flush=True)
     counts = [row["steps"] for row in clock if row["steps"] is not None]
-    most = round(statistics.median(counts)) if counts else MOST_STEPS
+    most = options.steps or (round(statistics.median(counts)) if counts else MOST_STEPS)
     rows = []
     print(f"virtual time, {most} gradient steps")
     print("load g:mm   found g, mg m (true)      cost            retrain   rms  along height   peak   tilt  ended")
-    for text in options.loads:
+    for text in random_loads(options.random) if options.random else options.loads:
         load = read_load(text)
         new = fly(load, options.seconds, tuner, most)
         old = fly(load, options.seconds, None, begin=new["begin"])
