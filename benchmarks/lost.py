@@ -38,7 +38,8 @@ FLIGHTS, SECONDS = 200, 40.0
 MASSES, AMPLITUDES, SPEEDS, TIMES = (0.05, 0.4), (0.0, 0.3), (0.1, 3.1), (5.0, 15.0)  # [kg] for each drone, [m], ...
 POINTS = 24  # of a path
 CLASSICAL = ("copy", "adaptive", "adaptive-mass", "lqg", "lqg-offset-free", "lqg-known-failures")
-LIFTED = preset("lost").follower.load_by_lift  # share of the load's torque that `lqg-offset-free` lifts apart here
+# Share of the load's torque that `lqg-offset-free` lifts apart here.
+LIFTED = preset("lost").follower.differential_thrust_share
 VERTICAL_LIMIT, USUAL_LIMIT = 12.0, 6.0  # of commands [m/s2]
 HELD, LAST = 0.05, 10.0  # [m] in the last seconds
 COMES_DOWN = 5.0  # [s] after the loss in which team4's descent is measured
@@ -117,7 +118,7 @@ def margin(config: Config, scenario: Scenario) -> float:
 
 def flying(config: Config, names: Sequence[str], policies: Sequence[Path]) -> list[tuple[Config, Follower]]:
     """Classical followers and policies, each with the configuration that it flies with."""
-    apart = replace(replace(config, "follower.base", "lqg"), "follower.load_by_lift", LIFTED)
+    apart = replace(replace(config, "follower.base", "lqg"), "follower.differential_thrust_share", LIFTED)
     setups = [apart if name == "lqg-offset-free" else config for name in names]
     made = [(setup, make_baseline(name, setup)) for name, setup in zip(names, setups, strict=True)]
     for path in policies:

@@ -248,7 +248,7 @@ def test_every_range_of_a_rig_acts(moved) -> None:
 
 
 def lifting(config: Config) -> Config:
-    return configs.replace(config, "follower.load_by_lift", 0.9)
+    return configs.replace(config, "follower.differential_thrust_share", 0.9)
 
 
 @rows("count", [4, 5, 6])
@@ -312,12 +312,12 @@ def test_four_drones_come_down_slowly_and_upright_without_a_neighbour_of_the_lea
 
 
 def test_lifting_apart_takes_four_drones(tmp_path) -> None:
-    with pytest.raises(InputError, match=r"follower.load_by_lift needs teams of at least 4 drones, not 3"):
+    with pytest.raises(InputError, match=r"follower.differential_thrust_share needs teams of at least 4 drones, not 3"):
         configs.validate(lifting(ring(3)))
-    with pytest.raises(InputError, match=r"follower.load_by_lift needs teams of at least 4 drones, not 2"):
+    with pytest.raises(InputError, match=r"follower.differential_thrust_share needs teams of at least 4 drones, not 2"):
         configs.validate(configs.override(configs.preset("lost"), "scenario.team_sizes", "2,6"))
-    with pytest.raises(InputError, match=r"follower.load_by_lift is of teams with follower.base lqg"):
-        configs.validate(configs.override(configs.preset("transport"), "follower.load_by_lift", "0.5"))
+    with pytest.raises(InputError, match=r"follower.differential_thrust_share is of teams with follower.base lqg"):
+        configs.validate(configs.override(configs.preset("transport"), "follower.differential_thrust_share", "0.5"))
     path = tmp_path / "apart.npz"
     save_file(path, silent(lifting(ring(6))))
     with pytest.raises(InputError, match="apart needs a team of at least 4 drones, not 3"):

@@ -45,7 +45,7 @@ SLOW_LIFT = Forgetting()
 
 def team_lqg(config: Config) -> TeamLqg:
     """The law for teams like that of `config`; InputError unless it flies freely with ideal loops that are alike."""
-    model, lifting = ideal_model(config, NAME), config.follower.load_by_lift
+    model, lifting = ideal_model(config, NAME), config.follower.differential_thrust_share
     tuning, forgetting = (QUICK, QUICK_LIFT) if lifting else (TUNING, SLOW_LIFT)
     roll, pitch, _ = config.attitude.natural_frequency
     if roll != pitch:

@@ -193,7 +193,7 @@ def _lost() -> Config:
         team,
         preset="lost",
         command=replace(team.command, vertical_limit=12.0),
-        follower=replace(team.follower, load_by_lift=0.9, action_scale_vertical=4.0),
+        follower=replace(team.follower, differential_thrust_share=0.9, action_scale_vertical=4.0),
         scenario=replace(team.scenario, team_sizes=(), object_mass=(0.3, 2.4), lost_follower_probability=0.6),
         sac=replace(team.sac, num_envs=560, replay_size=560_000),
         ppo=Ppo(num_envs=560),

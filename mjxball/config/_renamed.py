@@ -45,6 +45,7 @@ RENAMED = {
     "scenario.unknown_share": "scenario.unknown_mass_probability",
     "follower.washout": "follower.washout_time",
     "follower.shares_integrals": "follower.residual_on_pid",
+    "follower.load_by_lift": "follower.differential_thrust_share",
     "leader.level_gain": "leader.tilt_integral_gain",
     "leader.integral_band": "leader.integral_error_limit",
     "leader.integral_lead": "leader.integral_lead_time",
@@ -54,6 +55,8 @@ RENAMED = {
     "gradient.learning_rate_end": "gradient.learning_rate_final_ratio",
     "gradient.damping": "gradient.gradient_decay",
     "reward.standing": "reward.steady_action",
+    "rigs.fade": "rigs.thrust_fade",
+    "rigs.authority": "rigs.unsaturated_tilt",
     "reward.opposition": "reward.tilt_disagreement",
 }
 # Former settings that are constants now, with their value. Files may hold no other.

@@ -35,12 +35,12 @@ class Rigs:
         2.0, "largest factor by which the object's mass is believed wrongly", low=1, high=4
     )
     thrust_scale: Range = drawn((0.8, 1.2), "share that each drone gives of the force it is asked for", above=0)
-    fade: Range = drawn(
+    thrust_fade: Range = drawn(
         (0.0, 0.002), "share of all thrust that is lost in a second as batteries empty [1/s]", low=0, high=0.02
     )
     loop_frequency: Range = drawn((4.0, 20.0), "natural frequency of the pitch loop, by factor [rad/s]", above=0)
     loop_damping: Range = drawn((0.5, 1.1), "damping of the attitude loops without rotor lag", above=0)
-    authority: float = setting(
+    unsaturated_tilt: float = setting(
         0.15, "tilt step that all rotors can answer without saturation, at least: it caps loop_frequency [rad]", above=0
     )
     least_damping: float = setting(

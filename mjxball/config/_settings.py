@@ -110,7 +110,7 @@ class Follower:
         "what a residual action is added to: the PD law, or an offset-free LQG that estimates the load's torque (in a "
         "team one of each follower's own)",
     )
-    load_by_lift: float = setting(
+    differential_thrust_share: float = setting(
         0.0,
         "in a team of four or more, with base lqg: share of the load's torque that followers hold by lifting apart, "
         "the rest by tilting",

@@ -140,16 +140,18 @@ def _validate_plant(plant: Plant) -> None:
 
 def _check_lifting(config: Config) -> None:
     if config.follower.base != "lqg":
-        raise InputError("follower.load_by_lift is of teams with follower.base lqg")
+        raise InputError("follower.differential_thrust_share is of teams with follower.base lqg")
     smallest = min(config.scenario.team_sizes, default=config.plant.count)
     if smallest < LEAST_LIFTING:
-        raise InputError(f"follower.load_by_lift needs teams of at least {LEAST_LIFTING} drones, not {smallest}")
+        raise InputError(
+            f"follower.differential_thrust_share needs teams of at least {LEAST_LIFTING} drones, not {smallest}"
+        )
 
 
 def _validate_team(config: Config) -> None:
     """What is for teams, and what is for pairs alone."""
     plant, scenario = config.plant, config.scenario
-    if config.follower.load_by_lift:
+    if config.follower.differential_thrust_share:
         _check_lifting(config)
     if config.follower.residual_on_pid and plant.count > 2:
         raise InputError("follower.residual_on_pid is for a pair, whose two drones lift each other's integral away")

@@ -41,9 +41,10 @@ def outside(config: Config, trained: Config) -> list[str]:
         if not low * (1 - 1e-6) <= value <= high * (1 + 1e-6)
     ]
     answered = _answered_tilt(config, gravity * weight / (4 * plant.count))
-    if config.autopilot.kind == "ideal" and answered < ranges.authority * (1 - 1e-6):
+    if config.autopilot.kind == "ideal" and answered < ranges.unsaturated_tilt * (1 - 1e-6):
         texts.append(
-            f"rotors saturate from a tilt step of {answered:.3g} rad on, trained from {ranges.authority:g} rad upwards"
+            f"rotors saturate from a tilt step of {answered:.3g} rad on, "
+            f"trained from {ranges.unsaturated_tilt:g} rad upwards"
         )
     return texts
 

@@ -162,7 +162,9 @@ class ResetDistribution:
         change = jnp.where(later < 0, 0.0, change)
         reach = jnp.where(later < 0, own.reach, jnp.minimum(own.reach, later))
         return load._replace(
-            cg_amplitude=far * reach, mass_change=change[None], thrust_fade=own.fade if ranges.fade[1] > 0 else None
+            cg_amplitude=far * reach,
+            mass_change=change[None],
+            thrust_fade=own.thrust_fade if ranges.thrust_fade[1] > 0 else None,
         )
 
     def trimmed(self, load: Load, rig: Rig | None = None) -> Scalar:
@@ -194,7 +196,7 @@ class ResetDistribution:
         flying = (jnp.asarray(numbers.drone_mass) > 0).sum() - 1
         gain = jnp.min(jnp.asarray(numbers.gains.kp)[..., :2], axis=-1)
         held = (1 - margin) * flying * gain * tilt / (numbers.gravity * object_mass)
-        by_lift = self.config.follower.load_by_lift
+        by_lift = self.config.follower.differential_thrust_share
         return held / (1 - by_lift) if by_lift < 1 else jnp.full_like(held, jnp.inf)
 
     def _varied(self, load: Load, key: Array) -> Load:

@@ -40,7 +40,7 @@ class RigTable(NamedTuple):
     object_mass: Array  # (R,) true [kg]
     believed_mass: Array  # (R,) that every drone assumes [kg]
     thrust: Array  # (R, N) share that each drone gives of the force it is asked for, with a full battery
-    fade: Array  # (R,) share of all thrust that is lost in a second as batteries empty [1/s]
+    thrust_fade: Array  # (R,) share of all thrust that is lost in a second as batteries empty [1/s]
     reach: Array  # (R,) how far the CG may be from O, so that followers can trim it and it stays on the carrier [m]
     length: Array  # (R,) largest distance of a drone from O [m]
     frequency: Array  # (R, 3) natural frequency of the attitude loops about roll, pitch, yaw [rad/s]
@@ -176,7 +176,7 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
     lag = by_factor(ranges.rotor_lag)
     place, ratio = random.uniform(0, 1, count), by_factor(FREQUENCY_RATIO)
     damping = even(ranges.loop_damping)
-    fade = even(ranges.fade)
+    fade = even(ranges.thrust_fade)
     shares = _load_shares(mounts)
 
     def alike(value: Array) -> Array:
@@ -206,11 +206,11 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
     )
     rows = rigid_inertia(whole(numbers, gravity))
     about = [rows[axis][axis] + load * ball for axis in range(3)]
-    # The loop is as fast as it was drawn, up to what the rotors can give for a step of `authority`.
+    # The loop is as fast as it was drawn, up to what the rotors can give for a step of `unsaturated_tilt`.
     hover = gravity * (mass * size + carrier + load) / (4 * size)
     room = torque_room(arm, config.plant.layout, hover, strongest)
     slowest, fastest = ranges.loop_frequency
-    stiffest = np.sqrt(size * room / ranges.authority / np.maximum(about[0] * ratio**2, about[1]))
+    stiffest = np.sqrt(size * room / ranges.unsaturated_tilt / np.maximum(about[0] * ratio**2, about[1]))
     pitch = slowest * (np.clip(stiffest, slowest, fastest) / slowest) ** place
     frequency = np.stack([pitch * ratio, pitch, YAW_RATIO * pitch], axis=-1)
     kp, kd = (np.stack(list(gain), axis=-1) for gain in design_gains(about, frequency.T, damping, size))
@@ -231,7 +231,7 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
         object_mass=load,
         believed_mass=believed,
         thrust=np.concatenate([thrust, np.ones((count, most - size))], axis=1),
-        fade=fade,
+        thrust_fade=fade,
         reach=np.minimum(reach, 0.9 * radius),
         length=length,
         frequency=frequency,
