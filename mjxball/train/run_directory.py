@@ -84,10 +84,8 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     contents = load_file(path)
     if file_hash(path) != start["sha256"]:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
-    own, trained = (
-        json.loads(json.dumps(configs.to_dict(config)["follower"])),
-        contents.card.get("config", {}).get("follower", {}),
-    )
+    own = json.loads(json.dumps(configs.to_dict(config)["follower"]))
+    trained = configs.with_current_names(contents.card.get("config", {})).get("follower", {})
     changed = [f"follower.{name}" for name in own if own[name] != trained.get(name)]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")
