@@ -28,10 +28,10 @@ def test_a_rehearsal_finds_its_load_and_fine_tunes(tmp_path: Path) -> None:
         "--twin-load",
         "0.006",
         "-0.04",
-        "10",
+        "7",
     ]
     done = subprocess.run(
-        [sys.executable, *map(str, command), "--seconds", "22", "--log", str(log)],
+        [sys.executable, *map(str, command), "--seconds", "19", "--log", str(log)],
         cwd=tmp_path,
         env={**environment(), "PYTHONPATH": str(REPOSITORY)},
         stdin=subprocess.DEVNULL,

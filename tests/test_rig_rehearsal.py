@@ -51,7 +51,7 @@ class Case(NamedTuple):
     @property
     def seconds(self) -> float:
         """Under both laws."""
-        return 11.0 if self.goals else 8.0
+        return 9.0 if self.goals else 6.0
 
 
 HEAVY = {"plant.leader_inertia": (2e-4, 1.66e-5, 2e-4)}  # 13 % more about the roll axis

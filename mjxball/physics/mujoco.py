@@ -171,11 +171,14 @@ def slide_force(
     model: mujoco.MjModel, data: mujoco.MjData, slides: slice, acceleration: Array, pushed: Float[np.ndarray, " nv"]
 ) -> Float[np.ndarray, " n"]:
     """Force [N] on the joints `slides` that gives them `acceleration` [m/s2] beside the generalized forces `pushed`."""
-    unit = np.eye(model.nv)[slides]
-    free, response = np.zeros((1, model.nv)), np.zeros_like(unit)
-    mujoco.mj_solveM(model, data, free, pushed[None])
-    mujoco.mj_solveM(model, data, response, unit)
-    return np.linalg.solve(response[:, slides], np.atleast_1d(acceleration) - free[0, slides])
+    count = slides.stop - slides.start
+    pushes, answers = np.zeros((1 + count, model.nv)), np.empty((1 + count, model.nv))
+    pushes[0] = pushed
+    for number in range(count):
+        pushes[1 + number, slides.start + number] = 1.0
+    mujoco.mj_solveM(model, data, answers, pushes)
+    lacking, response = acceleration - answers[0, slides], answers[1:, slides]
+    return lacking / response[0] if count == 1 else np.linalg.solve(response, lacking)
 
 
 def flown_contact_wrenches(
