@@ -197,7 +197,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     if not 1 <= members <= MOST_MEMBERS:
         raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
     extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
-    if extensions.get("algorithm") == "sac":  # which needs no look: the device wakes sooner
+    if extensions.get("algorithm") == "sac":  # the default, of which nothing is to be checked
         del extensions["algorithm"]
     physics = options.physics or "mjx"
     if extensions:

@@ -55,9 +55,9 @@ RENAMED = {
     "gradient.learning_rate_end": "gradient.learning_rate_final_ratio",
     "gradient.damping": "gradient.gradient_decay",
     "reward.standing": "reward.steady_action",
+    "reward.opposition": "reward.tilt_disagreement",
     "rigs.fade": "rigs.thrust_fade",
     "rigs.authority": "rigs.unsaturated_tilt",
-    "reward.opposition": "reward.tilt_disagreement",
 }
 # Former settings that are constants now, with their value. Files may hold no other.
 CONSTANT: dict[str, Any] = {

@@ -83,11 +83,11 @@ def draw_members(run: Path, path: Path) -> None:
     labels = (("eval_steady_error", "steady-state error [m]"), ("eval_return", "return of an episode"))
     for axis, (name, label) in zip(axes, labels, strict=True):
         table = np.array([[row[name] for row in rows if row["steps"] == step] for step in steps])
-        axis.plot(steps, table, color="#9bb7cc", linewidth=0.8)
+        axis.plot(steps, table, ".-", color="#9bb7cc", linewidth=0.8)  # one evaluation is a point
         if (known := np.isfinite(table).any(axis=1)).any():  # short episodes have no steady state
             at, (low, middle, high) = np.array(steps)[known], np.nanpercentile(table[known], [25, 50, 75], axis=1)
             axis.fill_between(at, low, high, color="#1b6ca8", alpha=0.2, label="quartiles")
-            axis.plot(at, middle, color="#1b6ca8", linewidth=2, label="median")
+            axis.plot(at, middle, ".-", color="#1b6ca8", linewidth=2, label="median")
         axis.set_ylabel(label)
         axis.grid(alpha=0.25)
     if any(row["eval_steady_error"] > 0 for row in rows):
