@@ -88,7 +88,7 @@ def our_command(options: argparse.Namespace, seed: int, out: Path, steps: int) -
     replay = math.ceil(steps / options.worlds) * options.worlds
     flags = ["--sac.total_steps", steps, "--sac.replay_size", replay, "--sac.num_evaluations", 1]
     flags += ["--sac.learning_rate", options.learning_rate, "--sac.num_envs", options.worlds]
-    flags += ["--sac.updates_per_step", options.updates, "--sac.batch_size", options.batch]
+    flags += ["--sac.updates_per_step", options.updates, "--sac.batch_size", options.batch, "--sac.tau", 0.02]
     command = ["train.py", "transport", "--seed", seed, "--out", out, "--physics", options.physics, *flags]
     return [str(word) for word in command]
 

@@ -85,4 +85,8 @@ def _light(spec: mujoco.MjSpec, plant: Plant) -> None:
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35, 0.35, 0.35], [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.1, 0.1, 0.1]
     spec.visual.quality.shadowsize = 4096
+    spec.visual.quality.numslices, spec.visual.quality.numstacks = (
+        12,
+        8,
+    )  # a quarter sooner without a GPU
     spec.visual.map.haze = 0.0

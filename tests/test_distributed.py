@@ -179,7 +179,7 @@ def test_unsound_meetings_are_refused(meeting, word) -> None:
 
 def test_sizes_that_cannot_be_split_are_refused(transport) -> None:
     Program(transport, "newton-euler").algorithm.check_parts(4)
-    with pytest.raises(InputError, match=r"sac\.num_envs = 128"):
+    with pytest.raises(InputError, match=r"sac\.num_envs = 512"):
         Program(transport, "newton-euler").algorithm.check_parts(3)
 
 

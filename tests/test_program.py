@@ -31,7 +31,10 @@ def compiled(transport) -> Compiled:
     """The transport preset, shortened to 128 000 environment steps, on closed-form physics."""
     steps = 128_000
     program = Program(
-        with_settings(transport, sac={"total_steps": steps, "replay_size": steps, "num_envs": WORLDS}), "newton-euler"
+        with_settings(
+            transport, sac={"total_steps": steps, "replay_size": steps, "num_envs": WORLDS, "updates_per_step": 4}
+        ),
+        "newton-euler",
     )
     return Compiled(program, *map(jax.jit, (program.create, program.advance, program.environments.reset)))
 
@@ -90,7 +93,13 @@ def test_prefill_records_every_step_and_learns_nothing(compiled, prefilled):
 
 
 def test_a_curriculum_widens_the_motion_until_its_share_of_training_is_over(transport) -> None:
-    changed = {"total_steps": 4 * WORLDS * 100, "replay_size": 4 * WORLDS * 100, "num_envs": WORLDS, "curriculum": 0.5}
+    changed = {
+        "total_steps": 4 * WORLDS * 100,
+        "replay_size": 4 * WORLDS * 100,
+        "num_envs": WORLDS,
+        "updates_per_step": 4,
+        "curriculum": 0.5,
+    }
     program = Program(with_settings(transport, sac=changed), "newton-euler")
     reset = jax.jit(program.environments.reset)
     low, high = transport.scenario.cg_amplitude

@@ -56,11 +56,15 @@ def _transport() -> Config:
         reward=Reward(error_scale=0.05),
         sac=Sac(
             total_steps=768_000,
+            num_envs=512,
             replay_size=768_000,
+            updates_per_step=8,
             discount=0.97,
             n_step=5,
-            learning_rate=2e-3,
+            learning_rate=4e-3,
             learning_rate_final_ratio=0.02,
+            tau=0.03,
+            num_evaluations=3,
         ),
     )
 
