@@ -123,12 +123,12 @@ def flown(contents: PolicyFile, dtype: Any) -> Flight:
         if start:
             policy.reset()
         rows["start"].append(start)
-        rows["memory"].append(np.zeros(size) if policy._memory is None else policy._memory)
+        rows["memory"].append(np.zeros(size) if policy.memory is None else policy.memory)
         rows["observation"].append(seen)
-        memory = policy._memory
+        memory = policy.memory
         rows["action"].append(policy.scaled(seen))
-        after = policy._memory
-        policy._memory = memory
+        after = policy.memory
+        policy.memory = memory
         rows["command"].append(policy(seen))
         rows["next_memory"].append(np.zeros(0) if after is None else after)
     return Flight(**{name: np.array(values) for name, values in rows.items()})

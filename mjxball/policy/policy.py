@@ -17,6 +17,7 @@ from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import PolicyFile, law_of, load_file
+from mjxball.policy.single import SingleFollower, remembers_one
 
 Array = Any
 
@@ -96,6 +97,8 @@ class Policy:
         told = self._law.needs_context and "team" in card
         self._context: Array | None = np.array(card["team"]["context"], dtype) if told else None
         self._memory: Array | None = None
+        self._single: SingleFollower | None = None
+        self._ahead = False  # whether `_single` has the memory, newer than `_memory`
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:
@@ -114,16 +117,22 @@ class Policy:
 
     def reset(self) -> None:
         """Forget past observations: the next call starts an episode."""
-        self._memory = None
+        self.memory = None
 
     @property
     def memory(self) -> Array:
         """What it remembers (..., m), see `control.follower_law.FollowerLaw`; None: nothing yet."""
+        if self._ahead and self._single is not None:
+            return self._single.memory
         return self._memory
 
     @memory.setter
     def memory(self, memory: Array) -> None:
-        self._memory = None if memory is None else np.array(memory, self._dtype)
+        self._memory, self._ahead = None if memory is None else np.array(memory, self._dtype), False
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which do not share the buffers of `_single`."""
+        return {**self.__dict__, "_memory": self.memory, "_single": None, "_ahead": False}
 
     def scaled(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
@@ -141,14 +150,31 @@ class Policy:
                 f"observation must have {layout.OBSERVATION_SIZE} numbers last, not shape {observation.shape}"
             )
         law, remembers = self._law, self._law.size > 0
-        if remembers and self._memory is None:
+        if not self._ahead and remembers and self._memory is None:
             self._memory = law.start(observation, _known(self.name, law, self._context))
+        if observation.ndim == 1 and isinstance(law.lqg, MultiModelLqg):
+            alone = self._answer_alone(observation, law.lqg)
+            if alone is not None:
+                return alone
+        self._memory, self._ahead = self.memory, False
         full = law.network_input(observation, self._memory) if remembers else observation
         action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
         command = law.command(action, observation, self._memory)
         if remembers:
             self._memory = law.next(self._memory, observation, action, command)
         return action, command
+
+    def _answer_alone(self, observation: Array, lqg: MultiModelLqg) -> tuple[Array, Array] | None:
+        """`_answer` to one observation (18,), by a `SingleFollower`; None if that cannot answer it."""
+        if self._single is None:
+            network = (self._weights, self._biases, self._mean, self._scale)
+            self._single = SingleFollower(self._law, lqg, network)
+        if not self._ahead:
+            if not remembers_one(self._memory):
+                return None
+            self._single.memory, self._ahead = self._memory, True
+        found = self._single.answer(observation)
+        return None if found is None else (np.array(found[0], self._dtype), np.array(found[1], self._dtype))
 
 
 class NetworkLaw:

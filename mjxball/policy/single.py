@@ -1,0 +1,224 @@
+"""A policy of format 4 that answers one observation at a time, on NumPy: what `FollowerLaw` computes, in few steps.
+
+An operation of NumPy on the few numbers of one follower takes about as long whatever it computes. What is linear is
+therefore one matrix, made once by putting unit vectors through it, and the rest are Python's floats. All of it is in
+double precision.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.multi_model_lqg import ANGLE_STATES, CONTEXT, FEATURES, HEIGHT_STATES, LEAST_ROOM, MultiModelLqg
+from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
+
+Array = Any
+LARGEST = 1e6  # sum of what is seen, and of what is made of it
+
+
+class SingleFollower:
+    """Network, law and memory of one follower; names are those of `MultiModelLqg`."""
+
+    def __init__(self, law: FollowerLaw, lqg: MultiModelLqg, network: tuple[Any, ...]):
+        """Prepare `law`, with `lqg` in it, and `network`: the first four arguments of `policy.mean_action`."""
+        self._filters, self._network = _Filters(lqg), _Network(law, *network)
+        self._height, self._height_gain = lqg.height.tolist(), lqg.height_gain.tolist()
+        self._rise, self._limits, self._keep = lqg.rise.tolist(), lqg.limits.tolist(), float(lqg.keep[1])
+        self._reach, self._clip = law.action_scale, law.limits
+        self._leader = law.gravity, *law.kp, *law.kd
+
+    @property
+    def memory(self) -> Array:
+        """(m,) float64, laid out as that of `FollowerLaw`."""
+        filters, rest = self._filters, [*self._slow, *self._context]
+        parts = [self._network.history, filters.predicted.ravel(), self._rising, filters.scores.ravel(), rest]
+        return np.concatenate(parts)
+
+    @memory.setter
+    def memory(self, memory: Array) -> None:
+        filters, history = self._filters, self._network.history
+        sizes = (history.size, filters.predicted.size, HEIGHT_STATES, filters.scores.size, 2, CONTEXT)
+        parts = np.split(memory, np.cumsum(sizes)[:-1])
+        history[:], filters.predicted[:], filters.scores[:] = parts[0], parts[1].reshape(2, -1), parts[3].reshape(2, -1)
+        self._rising, self._slow, self._context = (part.tolist() for part in (parts[2], *parts[4:]))
+
+    def answer(self, observation: Array) -> tuple[list[float], list[float]] | None:
+        """(action in [-1, 1] (3), command (3)) for `observation` (18,), which is remembered.
+
+        None, and nothing is remembered, if numbers are not finite or huge: Python's floats do not treat those as
+        arrays do.
+        """
+        seen, rising, slow = observation.tolist(), self._rising, self._slow
+        if not sum(map(abs, seen)) < LARGEST:
+            return None
+        roll, pitch, roll_rate, pitch_rate, climb = seen[3], seen[4], seen[9], seen[10], -seen[17]
+        share, roll_per_lift, pitch_per_lift, room = self._context
+        # What is known.
+        (
+            (roll_mean, roll_rate_mean, *roll_load, roll_soft, roll_damping, r_error, r_velocity, r_angle, r_rate),
+            (pitch_mean, pitch_rate_mean, *pitch_load, pitch_soft, pitch_damping, p_error, p_velocity, p_angle, p_rate),
+        ) = self._filters.update(((roll, roll_rate), (pitch, pitch_rate)))
+        left = climb - rising[0]
+        height, lift, lift_error = (state + gain * left for state, gain in zip(rising, self._height_gain, strict=True))
+        roll_turn, pitch_turn = roll_per_lift * roll_soft, pitch_per_lift * pitch_soft
+        roll_room, pitch_room = room * roll_soft, room * pitch_soft
+        features = [roll - roll_mean, pitch - pitch_mean, roll_rate - roll_rate_mean, pitch_rate - pitch_rate_mean]
+        features += [climb - height, *roll_load, *pitch_load, lift, lift_error]
+        features += [-0.5 * math.log(roll_soft), -0.5 * math.log(pitch_soft)]
+        features += [roll_turn, pitch_turn, roll_room, pitch_room, share]
+        action = self._network.act(features, observation)
+        if not sum(map(abs, (*features, *action))) < LARGEST:
+            return None
+        # What the leader does.
+        (x, y, z), (vx, vy, vz), (tilt_limit, vertical_limit) = seen[12:15], seen[15:18], self._clip
+        gravity, kp_x, kp_y, kp_z, kd_x, kd_y, kd_z = self._leader
+        led_roll = _clipped(-(kp_y * y + kd_y * vy) / gravity, tilt_limit)
+        led_pitch = _clipped((kp_x * x + kd_x * vx) / gravity, tilt_limit)
+        led_vertical = _clipped(kp_z * z + kd_z * vz, vertical_limit)
+        # What the law alone would command.
+        error_limit, rise_limit, load_limit = self._limits
+        rise = _clipped(self._rise[0] * z + self._rise[1] * vz, rise_limit) - lift_error
+        vertical = _clipped(share * rise - (share - 1.0) * led_vertical, vertical_limit)
+        lifted = vertical - led_vertical
+        roll_far, pitch_far = -r_error * y - r_velocity * vy, p_error * x + p_velocity * vx
+        far = _within(roll_far, pitch_far, error_limit)
+        roll_held, pitch_held = roll_load[0] + roll_turn * lifted, pitch_load[0] + pitch_turn * lifted
+        held = _within(roll_held, pitch_held, load_limit)
+        roll_wanted = far * roll_far - r_angle * roll - r_rate * roll_rate - held * roll_held
+        pitch_wanted = far * pitch_far - p_angle * pitch - p_rate * pitch_rate - held * pitch_held
+        roll_rest, roll_most = roll + roll_damping * roll_rate, max(roll_room, LEAST_ROOM)
+        pitch_rest, pitch_most = pitch + pitch_damping * pitch_rate, max(pitch_room, LEAST_ROOM)
+        roll_own = share * roll_wanted - (share - 1.0) * led_roll - roll_rest
+        pitch_own = share * pitch_wanted - (share - 1.0) * led_pitch - pitch_rest
+        reached = _within(roll_own / roll_most, pitch_own / pitch_most, 1.0)
+        roll_own, pitch_own = roll_rest + reached * roll_own, pitch_rest + reached * pitch_own
+        tilt_reach, vertical_reach = self._reach
+        command = [
+            _clipped(roll_own + tilt_reach * action[0], tilt_limit),
+            _clipped(pitch_own + tilt_reach * action[1], tilt_limit),
+            _clipped(vertical + vertical_reach * action[2], vertical_limit),
+        ]
+        # What all drones command in the mean, as the filters take it.
+        keep, roll_added, pitch_added = self._keep, command[0] - roll_own, command[1] - pitch_own
+        slow = [keep * slow[0] + (1.0 - keep) * roll_added, keep * slow[1] + (1.0 - keep) * pitch_added]
+        roll_drive = (roll_own + roll_added - slow[0] + (share - 1.0) * led_roll) / share
+        pitch_drive = (pitch_own + pitch_added - slow[1] + (share - 1.0) * led_pitch) / share
+        up = height, lift, lift_error, (vertical + (share - 1.0) * led_vertical) / share
+        self._filters.advance(((roll_drive, roll_per_lift * lifted), (pitch_drive, pitch_per_lift * lifted)))
+        self._network.remember(action)
+        self._rising = [sum([a * b for a, b in zip(row, up, strict=True)]) for row in self._height]
+        self._slow = slow
+        return action, command
+
+
+class _Filters:
+    """Those of all models about roll and about pitch."""
+
+    def __init__(self, lqg: MultiModelLqg):
+        models, stiffness = lqg.models, lqg.stiffness
+        states = ANGLE_STATES * models
+        # Predicted states of all models, angle and rate -> states a step on, found states as tilts, innovations, and
+        # what these are multiplied by for the scores.
+        unit = np.eye(states + 2)
+        predicted, measured = unit[:states].reshape(models, ANGLE_STATES, -1), unit[states:]
+        left = measured - predicted[:, :2]
+        found = predicted + lqg.axis_gain @ left
+        onward = lqg.axis[..., :ANGLE_STATES] @ found
+        tilts = np.concatenate([found[:, :2], found[:, 2:] / stiffness[:, None, None]], axis=1)
+        first, second, (c00, c01, c11) = left[:, 0], left[:, 1], lqg.certainty.T[..., None]
+        rows = [onward, tilts, first, second, -0.5 * c00 * first - c01 * second, -0.5 * c11 * second]
+        self._matrix = np.concatenate([row.reshape(-1, states + 2) for row in rows]).T.copy()
+        self._state, self._seen = np.zeros((2, states + 2)), np.zeros((2, self._matrix.shape[1]))
+        self.predicted, self._measured = self._state[:, :-2], self._state[:, -2:]
+        self._onward, tilts, self._left, self._certain = np.split(
+            self._seen, np.cumsum([states, states, 2 * models]), axis=1
+        )
+        self._tilts = tilts.reshape(2, models, ANGLE_STATES)
+        # Scores, both parts of the distance, 1 -> scores.
+        self._scoring = np.vstack([lqg.keep[0] * np.eye(models), np.eye(models), np.eye(models), lqg.prior])
+        self._scored, self._next_scores = np.ones((2, 3 * models + 1)), np.zeros((2, models))
+        self.scores, self._distance = self._scored[:, :models], self._scored[:, models:-1]
+        # What is averaged: tilts, 1 / stiffness, damping, gains on error, velocity, angle, rate, and 1.
+        known = np.column_stack([1.0 / stiffness, lqg.damping, lqg.tilt, np.ones(models)])
+        self._known = np.concatenate([np.zeros((2, models, ANGLE_STATES)), np.stack([known] * 2)], axis=-1)
+        self._odds, self._found = np.zeros((2, 1, models)), self._known[..., :ANGLE_STATES]
+        self._drives, self._driven = np.zeros((2, 2)), np.zeros((2, states))
+        self._drive = np.stack([lqg.axis[..., -1], lqg.axis[..., -1] / stiffness[:, None]]).reshape(2, -1)
+
+    def update(self, measured: tuple[tuple[float, float], tuple[float, float]]) -> list[list[float]]:
+        """Means (2, 11) over the models after (angle, rate) of both axes were `measured`."""
+        self._measured[:] = measured
+        np.dot(self._state, self._matrix, out=self._seen)
+        np.multiply(self._left, self._certain, out=self._distance)
+        scores = np.dot(self._scored, self._scoring, out=self._next_scores)
+        np.subtract(scores, np.maximum.reduce(scores, axis=1, keepdims=True), out=scores)
+        np.exp(scores, out=self._odds[:, 0])
+        self._found[:] = self._tilts
+        sums = np.matmul(self._odds, self._known)[:, 0].tolist()
+        return [[value / total for value in values] for *values, total in sums]
+
+    def advance(self, drives: tuple[tuple[float, float], tuple[float, float]]) -> None:
+        """Predict the next states with `drives`: the mean command, and the angular acceleration of lifting apart."""
+        self._drives[:] = drives
+        np.dot(self._drives, self._drive, out=self._driven)
+        np.add(self._onward, self._driven, out=self.predicted)
+        self.scores[:] = self._next_scores
+
+
+class _Network:
+    """The network with the history that it sees. Every input ends or begins with a 1, for the biases."""
+
+    def __init__(self, law: FollowerLaw, weights: Sequence[Array], biases: Sequence[Array], mean: Array, scale: Array):
+        history, size = law.history, OBSERVATION_SIZE + law.history.size
+        unit = np.eye(size + ACTION_SIZE)
+        observation, past, action = np.split(unit, [OBSERVATION_SIZE, size], axis=1)
+        self._next_history = history.next(past, observation, action)
+        shown = history.network_input(observation[:size], past[:size])
+        # Features, 1, observation, history -> the normalised input -> the first layer.
+        count = shown.shape[1]
+        normal = np.zeros((FEATURES + 1 + size, count + FEATURES))
+        normal[:FEATURES, count:], normal[FEATURES], normal[FEATURES + 1 :, :count] = np.eye(FEATURES), -mean, shown
+        first = normal * scale @ weights[0].astype(np.float64)
+        first[FEATURES] += biases[0]
+        rest = [np.vstack(layer).astype(np.float64) for layer in zip(weights[1:], biases[1:], strict=True)]
+        *layers, self._last = first, *rest
+        outputs = [np.ones(layer.shape[1] + 1) for layer in layers]
+        self._layers = [(layer, output, output[:-1]) for layer, output in zip(layers, outputs, strict=True)]
+        seen = np.ones(FEATURES + 1 + size + ACTION_SIZE)
+        self._features, self._input, self._past = seen[:FEATURES], seen[:-ACTION_SIZE], seen[FEATURES + 1 :]
+        self._observation, self.history, self._action = np.split(self._past, [OBSERVATION_SIZE, size])
+        self._zero = np.zeros(())
+
+    def act(self, features: list[float], observation: Array) -> list[float]:
+        """Action in [-1, 1] (3)."""
+        self._features[:], self._observation[:] = features, observation
+        given = self._input
+        for weight, output, inner in self._layers:
+            np.dot(given, weight, out=inner)
+            np.maximum(inner, self._zero, out=inner)
+            given = output
+        return [math.tanh(value) for value in np.dot(given, self._last).tolist()]
+
+    def remember(self, action: list[float]) -> None:
+        """Move the history on by the newest observation and its `action`."""
+        self._action[:] = action
+        self.history[:] = np.dot(self._past, self._next_history)
+
+
+def remembers_one(memory: Array | None) -> bool:
+    """Whether `memory` is one that a `SingleFollower` can take over: of one follower, finite, with a sound share."""
+    return memory is not None and memory.ndim == 1 and bool(np.isfinite(memory).all()) and memory[-CONTEXT] > 0
+
+
+def _clipped(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
+
+
+def _within(x: float, y: float, limit: float) -> float:
+    """What (x, y) is multiplied by in `team_lqg.within`."""
+    return limit / max(math.sqrt(x * x + y * y + 1e-12), limit)

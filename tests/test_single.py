@@ -1,0 +1,204 @@
+"""One observation at a time, a policy of format 4 answers and remembers what the law of arrays does."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import itertools
+import pickle
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjxball.baselines.multi_model_lqg import multi_model_lqg
+from mjxball.cli import plant_setup
+from mjxball.config import preset
+from mjxball.control.multi_model_lqg import CONTEXT
+from mjxball.errors import InputError
+from mjxball.export import in_team
+from mjxball.policy import Policy, PolicyFile, load_file
+from mjxball.policy.file import law_of, shipped_policy
+from mjxball.policy.policy import NetworkLaw
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import Scenario
+
+UNIVERSAL = load_file(shipped_policy("universal"))
+TEAMS = {"pair": None, "team3": 1, "team4": 3, "plate4": 2, "team6": 4}  # plant: which of its followers
+
+
+class Reference:
+    """The law of arrays, step by step."""
+
+    def __init__(self, policy: Policy):
+        self.law, self.memory = NetworkLaw(policy), None
+
+    def __call__(self, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(action, command)."""
+        if self.memory is None:
+            self.memory = self.law.start(observation)
+        action, command, self.memory = self.law.answer(self.memory, observation)
+        return action, command
+
+
+def told(plant: str, dtype: type = np.float64, contents: PolicyFile = UNIVERSAL) -> tuple[Policy, Reference]:
+    """A policy that is told its team, and what it must do."""
+    policy = Policy(in_team(contents, "universal", Path(plant), TEAMS[plant]), "universal", dtype)
+    return policy, Reference(policy)
+
+
+def walk(steps: int, seed: int = 0, size: float = 0.03) -> np.ndarray:
+    """Observations (T, 18) that change by `size` in a step."""
+    random = np.random.default_rng(seed)
+    return np.cumsum(size * random.standard_normal((steps, 18)), axis=0) + 0.3 * random.standard_normal(18)
+
+
+def agree(
+    policy: Policy, reference: Reference, flight: np.ndarray, tolerance: float = 1e-9, remembered: float = 1e-9
+) -> None:
+    """`policy` commands and remembers what `reference` does, in every step of a `flight` (T, 18)."""
+    for seen in flight.astype(policy._dtype):
+        wanted, found = reference(seen)[1], policy(seen)
+        assert (found.shape, found.dtype) == ((3,), seen.dtype)
+        np.testing.assert_allclose(found, wanted, tolerance, tolerance)
+        np.testing.assert_allclose(policy.memory, reference.memory, remembered, remembered)
+
+
+@pytest.mark.parametrize("plant", TEAMS)
+@pytest.mark.parametrize(("size", "tolerance"), [(1e-3, 1e-9), (0.03, 1e-9), (3.0, 1e-5)])
+def test_it_is_the_law_of_arrays(plant: str, size: float, tolerance: float) -> None:
+    """Scores are differences of squared distances, which large steps make so large that doubles round them to 1e-6."""
+    policy, reference = told(plant)
+    agree(policy, reference, walk(300, size=size), tolerance, tolerance)
+    assert policy._ahead  # none of these were answered by the law of arrays
+
+
+@pytest.mark.parametrize("plant", ["pair", "team4"])
+def test_of_a_flight_it_is_the_law_of_arrays_as_rounded(plant: str) -> None:
+    """In float32 the law of arrays rounds what this does not: a command of up to 8 m/s2, states of fast models most."""
+    config, pilot = plant_setup(Path(plant)), Policy(UNIVERSAL, "universal")
+    pilot.join(config.plant, config.attitude)
+    flown = simulate(config, pilot, Scenario(omega=1.0, amplitude=0.03, seconds=8.0), "newton-euler")
+    flight = flown.observation.reshape(len(flown.observation), -1, 18)[:, -1]
+    agree(*told(plant, np.float32), flight, 1e-4, 5e-4)
+    agree(*told(plant), flight)
+
+
+def test_it_does_not_round_between_observation_and_command() -> None:
+    policy, (_, reference) = told("team3", np.float32)[0], told("team3")
+    for seen in walk(500).astype(np.float32):
+        np.testing.assert_allclose(policy(seen), reference(seen.astype(np.float64))[1], 1e-6, 1e-6)
+
+
+def test_a_pair_that_has_joined_and_what_is_scaled() -> None:
+    config, policy = plant_setup(Path("pair")), Policy(UNIVERSAL, "universal", np.float64)
+    with pytest.raises(InputError, match="told its team"):
+        policy(np.zeros(18))
+    policy.join(config.plant, config.attitude)
+    reference = Reference(policy)
+    for seen in walk(50):
+        np.testing.assert_allclose(policy.scaled(seen), reference(seen)[0], 1e-9, 1e-9)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"history": 3, "previous_action": True},
+        {"history": 2, "filters": []},
+        {"history": 1, "previous_action": False, "filters": [0.1]},
+    ],
+)
+def test_any_history_and_any_gains(fields: dict[str, Any]) -> None:
+    """Also of one hidden layer, gains that differ on every axis, and limits that are met."""
+    random, gains = np.random.default_rng(5), {"leader_kp": [0.5, 0.7, 0.9], "leader_kd": [1, 1.2, 1.4]}
+    card = {**UNIVERSAL.card, **gains, **fields, "command_limits": [0.1, 0.6]}
+    size = 18 + law_of(card).shown
+    normal = lambda *shape: (random.standard_normal(shape) / np.sqrt(shape[0])).astype(np.float32)  # noqa: E731
+    contents = dataclasses.replace(
+        UNIVERSAL,
+        weights=(normal(size, 12), normal(12, 6)),
+        biases=(normal(12), normal(6)),
+        observation_mean=normal(size),
+        observation_scale=np.abs(normal(size)),
+        card=card,
+    )
+    agree(*told("team4", contents=contents), walk(200))
+
+
+def test_one_model_is_enough() -> None:
+    lqg = multi_model_lqg(preset("universal"), ((7.0, 0.05),))
+    card = {**UNIVERSAL.card, "lqg": {name: np.asarray(value).tolist() for name, value in lqg._asdict().items()}}
+    agree(*told("team3", contents=dataclasses.replace(UNIVERSAL, card=card)), walk(200))
+
+
+def test_alone_and_in_a_batch_by_turns() -> None:
+    """A memory may be read, kept, set again, and go on in a batch and back."""
+    policy, reference = told("team6")
+    flight = walk(120)
+    agree(policy, reference, flight[:20])
+    kept, wanted = policy.memory, reference.memory
+    for first in (20, 40):
+        agree(policy, reference, flight[first : first + 10])
+        assert policy._ahead
+        policy.memory = np.stack([policy.memory] * 2)
+        reference.memory = np.stack([reference.memory] * 2)
+        for seen in flight[first + 10 : first + 20]:
+            both = np.stack([seen, seen[::-1]])
+            np.testing.assert_allclose(policy(both), reference(both)[1], 1e-9, 1e-9)
+        assert not policy._ahead
+        policy.memory, reference.memory = policy.memory[0], reference.memory[0]
+    policy.memory, reference.memory = kept, wanted
+    kept[:] = 0.0  # what was read and set is a copy
+    agree(policy, reference, flight[60:80])
+    policy.reset()
+    assert policy.memory is None
+    reference.memory = None
+    agree(policy, reference, flight[80:])
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda policy: pickle.loads(pickle.dumps(policy))])
+def test_a_copy_goes_on_by_itself(duplicate: Any) -> None:
+    policy, reference = told("pair")
+    agree(policy, reference, walk(20))
+    other, own = duplicate(policy), copy.copy(reference)
+    for seen, aside in zip(walk(20, 1), walk(20, 2), strict=True):
+        agree(policy, reference, seen[None])
+        agree(other, own, aside[None])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e7])
+def test_what_is_not_finite_or_huge_is_left_to_the_law_of_arrays(value: float, dtype: type) -> None:
+    for slot, first in itertools.product(range(18), (0, 3)):
+        (policy, reference), flight = told("team4", dtype), walk(6).astype(dtype)
+        flight[first, slot] = value
+        with np.errstate(all="ignore"):
+            for number, seen in enumerate(flight):
+                wanted, found = reference(seen)[1], policy(seen)
+                np.testing.assert_allclose(found, wanted, *[1e-3 if dtype == np.float32 else 1e-9] * 2)
+                np.testing.assert_array_equal(np.isfinite(policy.memory), np.isfinite(reference.memory))
+                assert not np.isnan(value) or number < first or np.isnan(found).all()
+        policy.reset()
+        assert np.isfinite(policy(walk(1)[0])).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "places"),
+    [(np.nan, range(159)), (np.inf, range(159)), (1e200, (50, 100, 132)), (0.0, (-CONTEXT,))],
+)
+def test_a_memory_that_is_not_sound_is_left_to_the_law_of_arrays(value: float, places: Sequence[int]) -> None:
+    """Also states of filters whose squares overflow, and a share of the command of 0, by which a follower divides."""
+    policy, reference = told("pair")
+    agree(policy, reference, walk(5))
+    sound = policy.memory
+    assert sound.shape == (159,)
+    for place in places:
+        spoilt = sound.copy()
+        spoilt[place] = value
+        policy.memory, reference.memory = spoilt, spoilt
+        with np.errstate(all="ignore"):
+            for seen in walk(3, 1):
+                np.testing.assert_array_equal(policy(seen), reference(seen)[1])
+        np.testing.assert_array_equal(policy.memory, reference.memory)
