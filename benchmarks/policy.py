@@ -1,6 +1,8 @@
-"""Microseconds per command of a NumPy follower: the shipped 2 x 64 network and a random 2 x 256 one.
+"""Microseconds per command of a NumPy follower: shipped policies, and the first one with a random 2 x 256 network.
 
-`python benchmarks/policy.py [POLICY.npz] [--json FILE]`. One observation at a time, as in flight.
+`python benchmarks/policy.py [POLICY.npz ...] [--plant NAME or FILE.toml] [--json FILE]`. One observation at a time, as
+in flight (18), and as a batch of one (1 x 18), which the laws of arrays answer in every format. A policy that has to be
+told its team is told of the first follower of `--plant`, by default the pair.
 """
 
 from __future__ import annotations
@@ -15,10 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
+from mjxball.cli import plant_setup
 from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
+from mjxball.export import in_team
 from mjxball.policy import Policy, PolicyFile, load_file
+from mjxball.policy.file import law_of, shipped_policy
 
-SHIPPED = Path(__file__).parents[1] / "policies" / "balance.npz"
+SHIPPED = [shipped_policy(name) for name in ("balance", "universal")]
+SHAPES = {"18": (OBSERVATION_SIZE,), "1 x 18": (1, OBSERVATION_SIZE)}
 CALLS = 200  # in one repetition
 REPETITIONS = 100
 
@@ -33,9 +39,16 @@ def widened(contents: PolicyFile, width: int) -> PolicyFile:
     return dataclasses.replace(contents, weights=weights, biases=biases)
 
 
-def microseconds(policy: Policy) -> dict[str, float]:
-    """Median, 95th percentile and smallest of the repetitions' means [us per call]."""
-    seen = np.random.default_rng(1).normal(scale=0.3, size=(CALLS, OBSERVATION_SIZE))
+def told(contents: PolicyFile, plant: Path) -> PolicyFile:
+    """`contents` as the first follower on `plant` flies it, if it has to be told its team."""
+    if not law_of(contents.card).needs_context:
+        return contents
+    return in_team(contents, "policy", plant, plant_setup(plant).plant.followers[0])
+
+
+def microseconds(policy: Policy, shape: tuple[int, ...]) -> dict[str, float]:
+    """Median, 95th percentile and smallest of the repetitions' means [us per call] for observations of `shape`."""
+    seen = np.random.default_rng(1).normal(scale=0.3, size=(CALLS, *shape))
     means = []
     for _ in range(REPETITIONS + 3):
         policy.reset()
@@ -50,17 +63,21 @@ def microseconds(policy: Policy) -> dict[str, float]:
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("policy", nargs="?", type=Path, default=SHIPPED, metavar="POLICY.npz")
+    parser.add_argument("policies", nargs="*", type=Path, default=SHIPPED, metavar="POLICY.npz")
+    parser.add_argument("--plant", type=Path, default=Path("pair"), metavar="NAME", help="or FILE.toml (default pair)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as JSON")
     options = parser.parse_args()
-    shipped = load_file(options.policy)
+    measured = {path.stem: told(load_file(path), options.plant) for path in options.policies}
+    measured["random"] = widened(next(iter(measured.values())), 256)
     rows = []
-    for name, contents in ((options.policy.stem, shipped), ("random", widened(shipped, 256))):
+    for (name, contents), (label, shape) in itertools.product(measured.items(), SHAPES.items()):
         layers = " x ".join(str(bias.size) for bias in contents.biases[:-1])
-        rows.append({"policy": name, "layers": layers, **microseconds(Policy(contents, name))})
-    print(f"{'policy':>12}{'layers':>12}{'median us':>12}{'p95 us':>10}{'least us':>10}")
+        times = microseconds(Policy(contents, name), shape)
+        rows.append({"policy": name, "layers": layers, "observation": label, **times})
+    print(f"{'policy':>12}{'layers':>12}{'observation':>14}{'median us':>12}{'p95 us':>10}{'least us':>10}")
     for row in rows:
-        print(f"{row['policy']:>12}{row['layers']:>12}{row['median']:12.1f}{row['p95']:10.1f}{row['least']:10.1f}")
+        print(f"{row['policy']:>12}{row['layers']:>12}{row['observation']:>14}", end="")
+        print(f"{row['median']:12.1f}{row['p95']:10.1f}{row['least']:10.1f}")
     if options.json:
         options.json.write_text(json.dumps({"numpy": np.__version__, "rows": rows}, indent=2) + "\n")
 
