@@ -64,7 +64,7 @@ def _transport() -> Config:
             learning_rate=4e-3,
             learning_rate_final_ratio=0.02,
             tau=0.03,
-            num_evaluations=3,
+            num_evaluations=2,
         ),
     )
 
