@@ -113,11 +113,11 @@ def followers(paths: Sequence[Path]) -> list[Made]:
         ("lqg-multi-model", lambda config, rigs: AnyRigBase(config)),
         ("copy", lambda config, rigs: Copy(config)),
         ("adaptive-mass", lambda config, rigs: rig_laws(config, rigs, _adaptive)),
-        *((path.stem, functools.partial(_network, path)) for path in paths),
+        *((path.stem, functools.partial(network, path)) for path in paths),
     ]
 
 
-def _network(path: Path, config: Config, rigs: RigTable) -> Law:
+def network(path: Path, config: Config, rigs: RigTable) -> Law:
     """A policy for any rig, or one for a single plant, which takes every rig for its own."""
     policy = Policy.load(path)
     if flies_any_rig(policy):

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjxball.baselines.assembly_model import ideal_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
-from mjxball.baselines.lqg_design import feedback
+from mjxball.baselines.lqg_design import Tuning, feedback
 from mjxball.baselines.offset_free import NAME, OffsetFree
 from mjxball.baselines.team_lqg import TUNING, angle_filter, height_filter
 from mjxball.config import Config
@@ -30,16 +30,22 @@ SCORE_TIME = 8.0  # [s] in which a model's score is forgotten
 
 
 def multi_model_lqg(
-    config: Config, models: Sequence[tuple[float, float]] = MODELS, torque_walk: float = TORQUE_WALK
+    config: Config,
+    models: Sequence[tuple[float, float]] = MODELS,
+    torque_walk: float = TORQUE_WALK,
+    tuning: Tuning = TUNING,
 ) -> MultiModelLqg:
-    """The law for teams of ideal loops, damped like those of `config`; InputError unless they fly freely."""
+    """The law for teams of ideal loops, damped like those of `config`; InputError unless they fly freely.
+
+    Of `tuning` the costs and the limit of the tilt count.
+    """
     parts, period, damped = [], config.timing.control_period, config.attitude.damping
     for frequency, lag in models:
         attitude = dataclasses.replace(config.attitude, natural_frequency=(frequency, frequency, frequency))
         model = ideal_model(dataclasses.replace(config, attitude=attitude), NAME)
         stiffness, damping = frequency**2, 2 * damped * frequency
         *axis, gain, covariance = angle_filter(stiffness, damping, lag, period, torque_walk)
-        inverse, tilts = np.linalg.inv(covariance), feedback(model, TUNING).pitch
+        inverse, tilts = np.linalg.inv(covariance), feedback(model, tuning).pitch
         prior = -0.5 * np.log(np.linalg.det(covariance))
         certainty = np.array([inverse[0, 0], inverse[0, 1], inverse[1, 1]])
         parts.append((np.hstack(axis), gain, certainty, prior, np.array(tilts), stiffness, damping / stiffness))
@@ -56,8 +62,8 @@ def multi_model_lqg(
         damping=every_damping,
         height=np.hstack(height),
         height_gain=height_gain[:, 0],
-        rise=np.array(feedback(model, TUNING).height),
-        limits=np.array([TUNING.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
+        rise=np.array(feedback(model, tuning).height),
+        limits=np.array([tuning.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
         keep=1.0 - period / np.array([SCORE_TIME, ADDED_TIME]),
     )
 
