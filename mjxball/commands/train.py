@@ -71,7 +71,7 @@ def parser() -> cli.Parser:
     result.add_argument(
         "--algorithm", metavar="NAME", help=f"one of {', '.join(ALGORITHMS)} (default sac), or MODULE:CLASS, your own"
     )
-    result.add_argument("--physics", choices=TRAINING_ENGINES, help="physics engine (default mjx; newton-euler: sooner)")
+    result.add_argument("--physics", choices=TRAINING_ENGINES, help="engine (default mjx; newton-euler: quicker)")
     result.add_argument("--distributed", action="store_true", help="train with the other processes of this job")
     result.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
     result.add_argument("--processes", type=int, metavar="N", help="how many processes there are, with --coordinator")
