@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 
+from mjxball.cli import quit_on_interrupt
 from mjxball.commands import train
 from mjxball.config import Config
 from mjxball.evaluate.scenarios import standard_scenarios
@@ -17,5 +18,6 @@ def one_second(settings: Config) -> tuple[Scenario, ...]:
 
 
 if __name__ == "__main__":
+    quit_on_interrupt()  # as train.py does
     train.standard_scenarios = one_second
     sys.exit(train.main())

@@ -66,9 +66,10 @@ def checkpoints(run: Path) -> list[int]:
 
 @pytest.mark.slow
 def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None:
-    """Two members, one on each process."""
+    """Two members, one on each process; long after every checkpoint that the test waits for, the run goes on."""
     run, cache = tmp_path / "run", tmp_path / "cache"
-    children = launch([*SMALL, "--seeds", "2", "--sac.total_steps", "200000", "--out", str(run)], cache)
+    long = ["--sac.total_steps", "400000", "--sac.num_evaluations", "8"]
+    children = launch([*SMALL, "--seeds", "2", *long, "--out", str(run)], cache)
     try:
         deadline = time.monotonic() + LIMIT
         while not checkpoints(run) and children[0].poll() is None and time.monotonic() < deadline:
@@ -83,7 +84,7 @@ def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None
     assert children[0].returncode != 0, output
     assert f"Start all of them again with --resume {run}" in output
     kept = checkpoints(run)[-1]
-    assert kept < 200_000
+    assert kept < 400_000
 
     # What is left to do is cut short, so that the test is: the first chunk after the checkpoint, then Ctrl-C for all.
     children = launch(["--resume", str(run)], cache)
@@ -93,7 +94,7 @@ def test_lost_process_ends_the_other_and_the_run_resumes(tmp_path: Path) -> None
     for child in children:
         child.send_signal(signal.SIGINT)
     outputs = finish(children)
-    assert [child.returncode for child in children] in ([130, 130], [0, 0]), outputs
+    assert [child.returncode for child in children] == [130, 130], outputs
     assert f"continuing {run} after" in outputs[0]
     assert checkpoints(run)[-1] > kept
     for seed in (0, 1):
