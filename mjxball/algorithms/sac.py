@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -80,16 +81,13 @@ def make_update(
     `noise` (2, batch, actions) is standard normal: one part for the critic's next actions, one for the policy's.
     `mean` averages gradients and entropies over learners that share their parameters (data parallel).
     """
-    _, critic_loss, policy_loss = brax.losses.make_losses(networks, config.reward_scale, config.discount, action_size)
+    # The policy's loss takes the network's output in place of its parameters, since the entropy needs the output too.
+    of_output = networks._replace(policy_network=SimpleNamespace(apply=lambda normaliser, output, observation: output))
+    _, critic_loss, _ = brax.losses.make_losses(networks, config.reward_scale, config.discount, action_size)
+    _, _, policy_loss = brax.losses.make_losses(of_output, config.reward_scale, config.discount, action_size)
     value_loss, q_loss = make_value_losses(networks, config)
     distribution = networks.parametric_action_distribution
     target_entropy = config.target_entropy * action_size
-
-    def entropy_of(
-        learner: Learner, observation: Float[Array, "batch n"], noise: Float[Array, "batch actions"]
-    ) -> Float[Array, ""]:
-        parameters = networks.policy_network.apply(learner.normaliser, learner.policy, observation)
-        return -jnp.mean(distribution.log_prob(parameters, distribution.sample_no_postprocessing(parameters, noise)))
 
     def value_step(
         learner: Learner, batch: Any, noise: Float[Array, "batch actions"], step: Float[Array, ""]
@@ -118,16 +116,18 @@ def make_update(
         before: Learner, learner: Learner, batch: Any, noise: Float[Array, "batch actions"], rate: Float[Array, ""]
     ) -> tuple[Learner, Losses]:
         """Policy and temperature move against the critic `before` the batch's own critic step, as in Brax."""
-        # The entropy is that of the actions of the policy's own loss: XLA computes them once.
-        alpha, entropy = jnp.exp(before.log_alpha), mean(entropy_of(before, batch.observation, noise))
-        value, gradient = jax.value_and_grad(policy_loss)(
-            before.policy, before.normaliser, before.critic, alpha, batch, noise
+        output, back = jax.vjp(
+            lambda policy: networks.policy_network.apply(before.normaliser, policy, batch.observation), before.policy
         )
+        action = distribution.sample_no_postprocessing(output, noise)
+        alpha, entropy = jnp.exp(before.log_alpha), -mean(jnp.mean(distribution.log_prob(output, action)))
+        value, slope = jax.value_and_grad(policy_loss)(output, before.normaliser, before.critic, alpha, batch, noise)
+        (gradient,) = back(slope)
         step = rate * config.learning_rate
         policy, policy_adam = _descend(before.policy, mean(gradient), before.policy_adam, step)
         # d(alpha loss)/d(log alpha) of SAC's eq. 18: alpha (H - target).
-        slope = 0.0 * alpha if config.alpha_fixed else alpha * (entropy - target_entropy)
-        log_alpha, alpha_adam = _descend(before.log_alpha, slope, before.alpha_adam, rate * config.alpha_learning_rate)
+        rise = 0.0 * alpha if config.alpha_fixed else alpha * (entropy - target_entropy)
+        log_alpha, alpha_adam = _descend(before.log_alpha, rise, before.alpha_adam, rate * config.alpha_learning_rate)
         moved = learner._replace(
             policy=policy,
             log_alpha=log_alpha,
