@@ -2,10 +2,12 @@
 
     python benchmarks/rigs_law.py --json benchmarks/results/rigs_law.json
     python benchmarks/rigs_law.py --cases later --sizes 2 4 --seed 77 --policy policies/universal.npz
+    python benchmarks/rigs_law.py --cases told --sizes 2 4 --seed 77 --policy policies/universal.npz
 
 As `benchmarks/rigs.py`, of rigs of three drones, or of others that neither a training nor a judgement draws (`--seed`).
 The law flies alone, or under the network of `--policy` as it is, which was trained with another. A model is a natural
-frequency of the loops [rad/s] and a lag of the rotors [s], see `mjxball.baselines.multi_model_lqg`.
+frequency of the loops [rad/s] and a lag of the rotors [s], see `mjxball.baselines.multi_model_lqg`. `told`: one
+model, of the rig's own loops and rotors; and the LQGs that know the rig, each against the better of both.
 """
 
 from __future__ import annotations
@@ -18,18 +20,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 import rigs as judge
 from mjxball import cli
 from mjxball.baselines.multi_model_lqg import MODELS, SCORE_TIME, TORQUE_WALK, multi_model_lqg
 from mjxball.baselines.team_lqg import TUNING
-from mjxball.config import Config, preset, replace
+from mjxball.config import Config, Plant, preset, replace
 from mjxball.control.followers import Law
 from mjxball.control.multi_model_lqg import MultiModelLqg
-from mjxball.evaluate.rigs import AnyRigBase, Flown, fly
-from mjxball.policy import load_file, save_file
-from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, draw_rigs, unpadded
+from mjxball.evaluate.policies import load_policy
+from mjxball.evaluate.rigs import AnyRigBase, AnyRigLaw, Flown, fly
+from mjxball.policy import Policy, load_file, save_file
+from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, rig_config, unpadded
 
 LOOPS = (4.5, 7.0, 11.0, 17.0)
 Models = tuple[tuple[float, float], ...]
@@ -59,6 +63,7 @@ class Case(NamedTuple):
     position: float = TUNING.position  # that costs 1 [m]
     velocity: float = TUNING.velocity  # that costs 1 [m/s]
     damping: tuple[float, ...] = ()  # of each model; (): that of the preset
+    delay: float | None = None  # [s] added to the lag of the rig's own rotors, if its own loop is the only model
 
     def law(self, config: Config) -> MultiModelLqg:
         """Its numbers."""
@@ -72,6 +77,13 @@ class Case(NamedTuple):
         prior = 0.5 * np.log(c00 * c11 - c01 * c01)
         keep = np.array([1.0 - config.timing.control_period / self.score_time, laws[0].keep[1]])
         return laws[0]._replace(**numbers, prior=prior - prior.max(), keep=keep)
+
+    def of_rigs(self, config: Config, rigs: RigTable) -> MultiModelLqg:
+        """The numbers of the law of every rig, stacked where they differ, for `of_rig`."""
+        lags = rigs.numbers.rotor_lag.mean(axis=1) + self.delay
+        loops = zip(rigs.frequency[:, 0].tolist(), lags.tolist(), rigs.damping.tolist(), strict=True)
+        laws = [self._replace(models=((loop, lag),), damping=(damping,)).law(config) for loop, lag, damping in loops]
+        return laws[0]._replace(**{name: np.stack([getattr(law, name) for law in laws]) for name in OF_MODELS})
 
 
 OF_MODELS = ("axis", "axis_gain", "certainty", "tilt", "stiffness", "damping")
@@ -91,6 +103,11 @@ CASES = {
         *(Case("9 pairs", torque_walk=1000.0, position=position) for position in (0.17, 0.15)),
         Case("7 pairs, two dampings", MODELS[:3] + MODELS[4:6] + MODELS[7:], damping=TWO_DAMPINGS),
     ],
+    "told": [
+        *(Case("9 pairs", torque_walk=walk, position=position) for walk, position in ((300.0, 0.2), (1000.0, 0.17))),
+        *(Case("the rig's own loop", delay=delay) for delay in (0.0, 0.025)),
+        *(Case("the rig's own loop", torque_walk=1000.0, position=0.17, delay=delay) for delay in (0.0, 0.025)),
+    ],
 }
 
 
@@ -102,6 +119,40 @@ class Variant(AnyRigBase):
         self._law = law
 
 
+def of_rig(law: MultiModelLqg, masses: np.ndarray, rig: RigTable) -> MultiModelLqg:
+    """Of `law`, made by `Case.of_rigs` of rigs whose objects have these `masses`, the numbers for one `rig` of them."""
+    row = jnp.argmin(jnp.abs(jnp.asarray(masses, jnp.float32) - rig.object_mass))
+    return law._replace(**{name: jnp.asarray(getattr(law, name), jnp.float32)[row] for name in OF_MODELS})
+
+
+class ToldBase(Variant):
+    """The law that is told each rig's loop and rotors."""
+
+    def __init__(self, config: Config, law: MultiModelLqg, masses: np.ndarray):
+        super().__init__(config, law)
+        self._masses = masses
+
+    def on(self, rig: RigTable, plant: Plant) -> ToldBase:
+        """See `AnyRigBase`."""
+        found: Any = super().on(rig, plant)
+        found._law = of_rig(self._law, self._masses, rig)
+        return found
+
+
+class ToldLaw(AnyRigLaw):
+    """A policy whose law is told each rig's loop and rotors."""
+
+    def __init__(self, policy: Policy, law: MultiModelLqg, masses: np.ndarray):
+        super().__init__(policy)
+        self._told, self._masses = law, masses
+
+    def on(self, rig: RigTable, plant: Plant) -> ToldLaw:
+        """See `AnyRigLaw`."""
+        found: Any = super().on(rig, plant)
+        found._law = self._law._replace(lqg=of_rig(self._told, self._masses, rig))
+        return found
+
+
 def under(network: Path, law: MultiModelLqg, config: Config, rigs: Any) -> Law:
     """The policy of the file `network` with `law` in place of its own."""
     contents = load_file(network)
@@ -110,6 +161,37 @@ def under(network: Path, law: MultiModelLqg, config: Config, rigs: Any) -> Law:
         path = Path(place) / network.name
         save_file(path, dataclasses.replace(contents, card=card))
         return judge.network(path, config, rigs)
+
+
+def followers(case: Case, config: Config, rigs: RigTable, policy: Path | None) -> dict[str, Law]:
+    """The law of `case` alone and, if there is one, under the network of `policy`."""
+    if case.delay is not None:
+        told, masses = case.of_rigs(config, rigs), rigs.object_mass
+        made: dict[str, Law] = {"law alone": ToldBase(config, told, masses)}
+        if policy:
+            own = load_policy(policy, rig_config(config, rigs, 0))
+            made[policy.stem] = ToldLaw(own, told, masses)
+        return made
+    law = case.law(config)
+    made = {"law alone": Variant(config, law)}
+    if policy:
+        made[policy.stem] = under(policy, law, config, rigs)
+    return made
+
+
+def judged(
+    size: int, follower: str, case: Case | None, knowing: dict[str, Flown], flown: Flown, rigs: RigTable, config: Config
+) -> dict[str, Any]:
+    """What `flown` is against the LQGs that know the rigs; printed too."""
+    found = judge.row_of(knowing | {"law": flown}, "law", rigs, config.timing.control_period)
+    told = ""
+    if case:
+        told = (
+            f"{case.name:22} {case.torque_walk:5g} {case.score_time:4g} s {case.position:5g} m {case.velocity:4g} m/s"
+        )
+        told += "" if case.delay is None else f" {case.delay:5g} s"
+    print(f"{size} {follower:10} {told} " + " ".join(f"{key} {found[key]:.3f}" for key in SHOWN), flush=True)
+    return {"drones": size, "follower": follower, **(case._asdict() if case else {}), **found}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -129,18 +211,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, make in judge.followers([]):
             if name in judge.KNOWING:
                 flown[name] = fly(config, rigs, make(config, rigs), judge.FLIGHTS)
+        told = judge.KNOWING if options.cases == "told" else ()
+        rows += [judged(size, name, None, flown, flown[name], rigs, config) for name in told]
         for case in CASES[options.cases]:
-            law = case.law(config)
-            made: dict[str, Law] = {"law alone": Variant(config, law)}
-            if options.policy:
-                made[options.policy.stem] = under(options.policy, law, config, rigs)
-            for follower, one in made.items():
-                flown["law"] = fly(config, rigs, one, judge.FLIGHTS)
-                found = judge.row_of(flown, "law", rigs, config.timing.control_period)
-                rows.append({"drones": size, "follower": follower, **case._asdict(), **found})
-                shown = " ".join(f"{key} {found[key]:.3f}" for key in SHOWN)
-                told = f"{case.torque_walk:5g} {case.score_time:4g} s {case.position:5g} m {case.velocity:4g} m/s"
-                print(f"{size} {follower:10} {case.name:22} {told} {shown}", flush=True)
+            for follower, law in followers(case, config, rigs, options.policy).items():
+                flights = fly(config, rigs, law, judge.FLIGHTS)
+                rows.append(judged(size, follower, case, flown, flights, rigs, config))
     if options.json:
         settings = {"rigs": options.rigs, "seed": options.seed}
         options.json.write_text(json.dumps({**settings, "rows": rows}, indent=1) + "\n")
