@@ -12,10 +12,8 @@ model, of the rig's own loops and rotors; and the LQGs that know the rig, each a
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +30,7 @@ from mjxball.control.followers import Law
 from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.rigs import AnyRigBase, AnyRigLaw, Flown, fly
-from mjxball.policy import Policy, load_file, save_file
+from mjxball.policy import Policy
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, rig_config, unpadded
 
 LOOPS = (4.5, 7.0, 11.0, 17.0)
@@ -139,44 +137,37 @@ class ToldBase(Variant):
         return found
 
 
-class ToldLaw(AnyRigLaw):
+class UnderNetwork(AnyRigLaw):
+    """A policy with another law in place of its own."""
+
+    def __init__(self, policy: Policy, law: MultiModelLqg):
+        super().__init__(policy)
+        self._law = self._law._replace(lqg=law)
+
+
+class ToldLaw(UnderNetwork):
     """A policy whose law is told each rig's loop and rotors."""
 
     def __init__(self, policy: Policy, law: MultiModelLqg, masses: np.ndarray):
-        super().__init__(policy)
-        self._told, self._masses = law, masses
+        super().__init__(policy, law)
+        self._masses = masses
 
     def on(self, rig: RigTable, plant: Plant) -> ToldLaw:
         """See `AnyRigLaw`."""
         found: Any = super().on(rig, plant)
-        found._law = self._law._replace(lqg=of_rig(self._told, self._masses, rig))
+        found._law = self._law._replace(lqg=of_rig(self._law.lqg, self._masses, rig))
         return found
 
 
-def under(network: Path, law: MultiModelLqg, config: Config, rigs: Any) -> Law:
-    """The policy of the file `network` with `law` in place of its own."""
-    contents = load_file(network)
-    card = {**contents.card, "lqg": {name: np.asarray(value).tolist() for name, value in law._asdict().items()}}
-    with tempfile.TemporaryDirectory() as place:
-        path = Path(place) / network.name
-        save_file(path, dataclasses.replace(contents, card=card))
-        return judge.network(path, config, rigs)
-
-
-def followers(case: Case, config: Config, rigs: RigTable, policy: Path | None) -> dict[str, Law]:
-    """The law of `case` alone and, if there is one, under the network of `policy`."""
+def followers(case: Case, config: Config, rigs: RigTable, path: Path | None) -> dict[str, Law]:
+    """The law of `case` alone and, if there is a policy at `path`, under its network."""
+    policy = load_policy(path, rig_config(config, rigs, 0)) if path else None
     if case.delay is not None:
         told, masses = case.of_rigs(config, rigs), rigs.object_mass
-        made: dict[str, Law] = {"law alone": ToldBase(config, told, masses)}
-        if policy:
-            own = load_policy(policy, rig_config(config, rigs, 0))
-            made[policy.stem] = ToldLaw(own, told, masses)
-        return made
+        alone: Law = ToldBase(config, told, masses)
+        return {"law alone": alone} | ({policy.name: ToldLaw(policy, told, masses)} if policy else {})
     law = case.law(config)
-    made = {"law alone": Variant(config, law)}
-    if policy:
-        made[policy.stem] = under(policy, law, config, rigs)
-    return made
+    return {"law alone": Variant(config, law)} | ({policy.name: UnderNetwork(policy, law)} if policy else {})
 
 
 def judged(
