@@ -155,7 +155,8 @@ class ToldLaw(UnderNetwork):
     def on(self, rig: RigTable, plant: Plant) -> ToldLaw:
         """See `AnyRigLaw`."""
         found: Any = super().on(rig, plant)
-        found._law = self._law._replace(lqg=of_rig(self._law.lqg, self._masses, rig))
+        stacked: Any = self._law.lqg
+        found._law = self._law._replace(lqg=of_rig(stacked, self._masses, rig))
         return found
 
 
