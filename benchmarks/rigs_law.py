@@ -2,6 +2,7 @@
 
     python benchmarks/rigs_law.py --json benchmarks/results/rigs_law.json
     python benchmarks/rigs_law.py --cases later --sizes 2 4 --seed 77 --policy policies/universal.npz
+    python benchmarks/rigs_law.py --cases delay --sizes 2 3 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases told --sizes 2 4 --seed 77 --policy policies/universal.npz
 
 As `benchmarks/rigs.py`, of rigs of three drones, or of others that neither a training nor a judgement draws (`--seed`).
@@ -23,8 +24,7 @@ import numpy as np
 
 import rigs as judge
 from mjxball import cli
-from mjxball.baselines.multi_model_lqg import MODELS, SCORE_TIME, TORQUE_WALK, multi_model_lqg
-from mjxball.baselines.team_lqg import TUNING
+from mjxball.baselines.multi_model_lqg import MODELS, SCORE_TIME, TUNING, multi_model_lqg
 from mjxball.config import Config, Plant, preset, replace
 from mjxball.control.followers import Law
 from mjxball.control.multi_model_lqg import MultiModelLqg
@@ -48,33 +48,48 @@ EIGHT: Models = (
     *((4.5, 0.04), (4.5, 0.14), (7.0, 0.025), (7.0, 0.1)),
     *((11.0, 0.02), (11.0, 0.07), (17.0, 0.018), (17.0, 0.05)),
 )
+NINE: Models = (
+    *((4.5, 0.03), (4.5, 0.08), (4.5, 0.15)),
+    *((7.0, 0.025), (7.0, 0.06), (7.0, 0.12)),
+    *((11.0, 0.025), (11.0, 0.07), (17.0, 0.03)),
+)
+NINETEEN = tuple(
+    (loop, lag) for loop in (4.5, 6, 8, 11, 15) for lag in (0.04, 0.06, 0.09, 0.13, 0.18) if loop * lag <= 1.25
+)
 TWO_DAMPINGS = (0.6, 0.95)
 
 
+def later(seconds: float, models: Models = NINE) -> Models:
+    """`models` with lags that are `seconds` longer."""
+    return tuple((loop, lag + seconds) for loop, lag in models)
+
+
 class Case(NamedTuple):
-    """What differs from one law to the next."""
+    """What differs from one law to the next, and what it was until commit ae6ef53."""
 
     name: str
-    models: Models = MODELS
-    torque_walk: float = TORQUE_WALK
+    models: Models = NINE
+    torque_walk: float = 300.0
     score_time: float = SCORE_TIME  # [s]
-    position: float = TUNING.position  # that costs 1 [m]
+    position: float = 0.2  # that costs 1 [m]
     velocity: float = TUNING.velocity  # that costs 1 [m/s]
     damping: tuple[float, ...] = ()  # of each model; (): that of the preset
+    added_lift: float = 0.0  # share of the lift that the network adds whose torque the filters are told
     delay: float | None = None  # [s] added to the lag of the rig's own rotors, if its own loop is the only model
 
     def law(self, config: Config) -> MultiModelLqg:
         """Its numbers."""
-        tuning = TUNING._replace(position=self.position, velocity=self.velocity)
+        tuning = TUNING._replace(position=self.position, velocity=self.velocity, torque_walk=self.torque_walk)
         laws = []
         for damping in self.damping or (config.attitude.damping,):
             damped = replace(config, "attitude.damping", damping)
-            laws.append(multi_model_lqg(damped, self.models, self.torque_walk, tuning))
+            laws.append(multi_model_lqg(damped, self.models, tuning))
         numbers = {name: np.concatenate([getattr(law, name) for law in laws]) for name in OF_MODELS}
         c00, c01, c11 = numbers["certainty"].T
         prior = 0.5 * np.log(c00 * c11 - c01 * c01)
         keep = np.array([1.0 - config.timing.control_period / self.score_time, laws[0].keep[1]])
-        return laws[0]._replace(**numbers, prior=prior - prior.max(), keep=keep)
+        common = {"prior": prior - prior.max(), "keep": keep, "added_lift": np.array(self.added_lift)}
+        return laws[0]._replace(**numbers, **common)
 
     def of_rigs(self, config: Config, rigs: RigTable) -> MultiModelLqg:
         """The numbers of the law of every rig, stacked where they differ, for `of_rig`."""
@@ -84,22 +99,29 @@ class Case(NamedTuple):
         return laws[0]._replace(**{name: np.stack([getattr(law, name) for law in laws]) for name in OF_MODELS})
 
 
+AS_IT_IS = Case("as it is", MODELS, TUNING.torque_walk, position=TUNING.position, added_lift=1.0)
 OF_MODELS = ("axis", "axis_gain", "certainty", "tilt", "stiffness", "damping")
 CASES = {
     "first": [
         *(Case("4 loops, one lag", FOUR, walk, score) for walk, score in ((20.0, 4.0), (300.0, SCORE_TIME))),
         *(Case("10 pairs", TEN, walk) for walk in (5.0, 20.0, 60.0, 400.0)),
         Case("8 pairs", EIGHT),
-        *(Case("13 pairs", THIRTEEN, TORQUE_WALK, score) for score in (2.0, SCORE_TIME, 16.0)),
-        Case("9 pairs: as it is"),
+        *(Case("13 pairs", THIRTEEN, score_time=score) for score in (2.0, SCORE_TIME, 16.0)),
+        Case("9 pairs"),
     ],
     "later": [
-        Case("9 pairs: as it is"),
+        Case("9 pairs"),
         *(Case("9 pairs", torque_walk=walk) for walk in (1000.0, 3000.0)),
         *(Case("9 pairs", position=position) for position in (0.15, 0.3)),
         *(Case("9 pairs", velocity=velocity) for velocity in (0.5, 0.8)),
         *(Case("9 pairs", torque_walk=1000.0, position=position) for position in (0.17, 0.15)),
-        Case("7 pairs, two dampings", MODELS[:3] + MODELS[4:6] + MODELS[7:], damping=TWO_DAMPINGS),
+        Case("7 pairs, two dampings", NINE[:3] + NINE[4:6] + NINE[7:], damping=TWO_DAMPINGS),
+    ],
+    "delay": [
+        *(Case("9 pairs", later(delay), 1000.0, position=0.17) for delay in (0.0, 0.015, 0.025)),
+        *(Case("12 pairs", MODELS, 1000.0, score, position=0.17) for score in (SCORE_TIME, 3.0)),
+        Case("19 pairs", NINETEEN, 1000.0, position=0.17),
+        AS_IT_IS,
     ],
     "told": [
         *(Case("9 pairs", torque_walk=walk, position=position) for walk, position in ((300.0, 0.2), (1000.0, 0.17))),

@@ -12,39 +12,36 @@ from mjxball.baselines.assembly_model import ideal_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import Tuning, feedback
 from mjxball.baselines.offset_free import NAME, OffsetFree
-from mjxball.baselines.team_lqg import TUNING, angle_filter, height_filter
+from mjxball.baselines.team_lqg import angle_filter, height_filter
 from mjxball.config import Config
 from mjxball.control.followers import copy_gains
 from mjxball.control.multi_model_lqg import ADDED_TIME, MultiModelLqg
 
 Array = Any
-# Natural frequency of the attitude loops [rad/s] and lag of the rotors [s] of each model; loops stay hardly damped
-# behind slower rotors.
+# Natural frequency of the attitude loops [rad/s] and lag [s] of each model: of the rotors, and of what is measured, in
+# the mean 25 ms. Behind slower rotors loops are hardly damped.
 MODELS = (
-    *((4.5, 0.03), (4.5, 0.08), (4.5, 0.15)),
-    *((7.0, 0.025), (7.0, 0.06), (7.0, 0.12)),
-    *((11.0, 0.025), (11.0, 0.07), (17.0, 0.03)),
+    *((4.7, 0.05), (4.7, 0.1), (4.7, 0.17)),
+    *((6.5, 0.045), (6.5, 0.09), (6.5, 0.15)),
+    *((9.0, 0.04), (9.0, 0.08), (9.0, 0.13)),
+    *((13.0, 0.035), (13.0, 0.07), (18.0, 0.045)),
 )
-TORQUE_WALK = 300.0  # intensity of the white noise that drives the rate of a load's torque over the inertia
+TUNING = Tuning(position=0.17, velocity=0.6, torque_walk=1000.0, tilt_limit=0.3)  # of a load's torque over the inertia
 SCORE_TIME = 8.0  # [s] in which a model's score is forgotten
 
 
 def multi_model_lqg(
     config: Config,
     models: Sequence[tuple[float, float]] = MODELS,
-    torque_walk: float = TORQUE_WALK,
     tuning: Tuning = TUNING,
 ) -> MultiModelLqg:
-    """The law for teams of ideal loops, damped like those of `config`; InputError unless they fly freely.
-
-    Of `tuning` the costs and the limit of the tilt count.
-    """
+    """The law for teams of ideal loops, damped like those of `config`; InputError unless they fly freely."""
     parts, period, damped = [], config.timing.control_period, config.attitude.damping
     for frequency, lag in models:
         attitude = dataclasses.replace(config.attitude, natural_frequency=(frequency, frequency, frequency))
         model = ideal_model(dataclasses.replace(config, attitude=attitude), NAME)
         stiffness, damping = frequency**2, 2 * damped * frequency
-        *axis, gain, covariance = angle_filter(stiffness, damping, lag, period, torque_walk)
+        *axis, gain, covariance = angle_filter(stiffness, damping, lag, period, tuning.torque_walk)
         inverse, tilts = np.linalg.inv(covariance), feedback(model, tuning).pitch
         prior = -0.5 * np.log(np.linalg.det(covariance))
         certainty = np.array([inverse[0, 0], inverse[0, 1], inverse[1, 1]])
@@ -65,6 +62,7 @@ def multi_model_lqg(
         rise=np.array(feedback(model, tuning).height),
         limits=np.array([tuning.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
         keep=1.0 - period / np.array([SCORE_TIME, ADDED_TIME]),
+        added_lift=1.0,
     )
 
 

@@ -2,7 +2,8 @@
 
 One Kalman filter for each of M pairs of loop frequency and rotor lag runs about roll and about pitch; their weights are
 those of Magill (1965), by how well each predicts what is measured, forgotten over some seconds. Feedback gains and
-estimates are weighted means. Everything else is as in `control.team_lqg`. What a follower must be told is its team's
+estimates are weighted means. To the filters what the network lifts is part of the load; the weights know better: a
+third set of states holds what that lift has turned about pitch. Everything else is as in `control.team_lqg`. What a follower must be told is its team's
 geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg` makes the numbers, which stand in the policy
 file.
 """
@@ -19,7 +20,7 @@ from mjxball.control.team_lqg import measured, within
 from mjxball.plant.parts import clipped, joined
 
 Array = Any
-ANGLE_STATES, HEIGHT_STATES, CONTEXT, FEATURES = 5, 3, 4, 20
+AXES, ANGLE_STATES, HEIGHT_STATES, CONTEXT, FEATURES = 3, 5, 3, 4, 20
 # Medians of random rigs (`sim.rigs`), with tilt torques of a ring of N drones N a m r^2, a = 1 for a pair and 1/2 else:
 # what lifting 1 m/s2 more than the leader turns, times N a r [1]; what rotors hold as a tilt of the loops [m/s2].
 LEVER, ROOM = 1.25, 1.75
@@ -42,6 +43,7 @@ class MultiModelLqg(NamedTuple):
     rise: Array  # (2,) feedback on the vertical (error, velocity)
     limits: Array  # (3,) of the error's part in a tilt [rad], of that in the height [m/s2], against the load [rad]
     keep: Array  # (2,) share that a step leaves of the models' scores, and of the slow part of what was added
+    added_lift: Array | float = 0.0  # () share of the lift that the network adds whose torque the scores are told
 
     @property
     def models(self) -> int:
@@ -51,7 +53,7 @@ class MultiModelLqg(NamedTuple):
     @property
     def size(self) -> int:
         """Numbers in the memory: filters as predicted, height, scores, slow part of added tilts, context."""
-        return 2 * self.models * (ANGLE_STATES + 1) + HEIGHT_STATES + 2 + CONTEXT
+        return self.models * (AXES * ANGLE_STATES + 2) + HEIGHT_STATES + 2 + CONTEXT
 
     @property
     def shown(self) -> int:
@@ -65,7 +67,7 @@ class MultiModelLqg(NamedTuple):
         zero = xp.zeros_like(roll)
         turning = [
             joined([angle, rate, zero, zero, zero])
-            for angle, rate in ((roll, roll_rate), (pitch, pitch_rate))
+            for angle, rate in ((roll, roll_rate), (pitch, pitch_rate), (zero, zero))
             for _ in range(self.models)
         ]
         rest = joined([climb, *[zero] * (HEIGHT_STATES - 1 + 2 * self.models + 2)])
@@ -81,7 +83,7 @@ class MultiModelLqg(NamedTuple):
         """
         xp = observation.__array_namespace__()
         seen = self._estimate(memory, observation)
-        turning, soft = seen.turning, self._each(seen.weights, 1.0 / self.stiffness)
+        turning, soft = seen.turning[..., :2, :, :], self._each(seen.weights, 1.0 / self.stiffness)
         middle = (seen.weights[..., None] * turning[..., :2]).sum(axis=-2)
         inverse = (seen.weights / self._like(self.stiffness, observation))[..., None]
         loads = (inverse * turning[..., 2:]).sum(axis=-2)
@@ -103,7 +105,8 @@ class MultiModelLqg(NamedTuple):
         """Memory of the next step, after `observation` was answered by `command`.
 
         The drones are taken to be commanded what the law itself says and the fast part of what the network adds: of
-        its slow part each follower would expect another mean, and the difference would drift unseen.
+        its slow part each follower would expect another mean, and the difference would drift unseen. What its network
+        lifts more turns the team about the follower's own pitch axis; what others' networks lift it does not know.
         """
         xp, models = observation.__array_namespace__(), self.models
         own, seen = self._plan(memory, observation, leader)
@@ -114,12 +117,16 @@ class MultiModelLqg(NamedTuple):
         tilts = own[..., :2] + added - slow
         mean = (xp.concat([tilts, own[..., 2:]], axis=-1) + (share - 1.0) * led) / share
         lifted = context[..., 1:3] * (own - led)[..., 2:]
-        drive = mean[..., :2, None] + lifted[..., None] / self._like(self.stiffness, observation)
+        roll, pitch = context[..., 1:2], context[..., 2:3]
+        lever = xp.sqrt(roll * roll + pitch * pitch)  # the follower's own, as long as that of the leader
+        turned = float(self.added_lift) * lever * (command - own)[..., 2:]
+        turns = xp.concat([lifted, turned], axis=-1)[..., None] / self._like(self.stiffness, observation)
+        drive = xp.concat([mean[..., :2], 0.0 * turned], axis=-1)[..., None] + turns
         axis, height = self._like(self.axis, observation), self._like(self.height, observation)
         turning = (axis[..., :ANGLE_STATES] * seen.turning[..., None, :]).sum(axis=-1)
         turning = turning + axis[..., ANGLE_STATES] * drive[..., None]
         climbing = xp.concat([seen.rising, mean[..., 2:]], axis=-1) @ height.T
-        flat = [turning[..., k, m, :] for k in (0, 1) for m in range(models)]
+        flat = [turning[..., k, m, :] for k in range(AXES) for m in range(models)]
         scores = [seen.scores[..., k, :] for k in (0, 1)]
         return xp.concat([*flat, climbing, *scores, slow, context], axis=-1)
 
@@ -133,15 +140,17 @@ class MultiModelLqg(NamedTuple):
     def _estimate(self, memory: Array, observation: Array) -> Estimate:
         """What is known at `observation`."""
         xp, models = observation.__array_namespace__(), self.models
-        ends = 2 * models * ANGLE_STATES
-        rows = [memory[..., k * ANGLE_STATES : (k + 1) * ANGLE_STATES] for k in range(2 * models)]
-        predicted = xp.stack([joined(rows[:models], axis=-2), joined(rows[models:], axis=-2)], axis=-3)
+        ends = AXES * models * ANGLE_STATES
+        rows = [memory[..., k * ANGLE_STATES : (k + 1) * ANGLE_STATES] for k in range(AXES * models)]
+        predicted = xp.stack([joined(rows[k * models : (k + 1) * models], axis=-2) for k in range(AXES)], axis=-3)
         rising, found = memory[..., ends : ends + HEIGHT_STATES], measured(observation)
-        angle, rate = (joined([found[k], found[k + 1]])[..., None] for k in (0, 2))
+        zero = xp.zeros_like(found[0])
+        angle, rate = (joined([found[k], found[k + 1], zero])[..., None] for k in (0, 2))
         left = joined([angle - predicted[..., 0], rate - predicted[..., 1]])
         gain, certainty = self._like(self.axis_gain, observation), self._like(self.certainty, observation)
         turning = predicted + (gain * left[..., None, :]).sum(axis=-1)
-        first, second = left[..., 0], left[..., 1]
+        told = xp.stack([left[..., 0, :, :], left[..., 1, :, :] + left[..., 2, :, :]], axis=-3)
+        first, second = told[..., 0], told[..., 1]
         distance = (
             certainty[:, 0] * first * first + 2.0 * certainty[:, 1] * first * second + certainty[:, 2] * second * second
         )
@@ -170,7 +179,7 @@ class MultiModelLqg(NamedTuple):
         far = gains[..., 0] * _crossed(xp, error) + gains[..., 1] * _crossed(xp, rate)
         angles, rates = observation[..., 3:5], observation[..., 9:11]
         wanted = within(xp, far, tilt_limit) - gains[..., 2] * angles - gains[..., 3] * rates
-        load = (weights * seen.turning[..., 2] / self._like(self.stiffness, observation)).sum(axis=-1)
+        load = (weights * seen.turning[..., :2, :, 2] / self._like(self.stiffness, observation)).sum(axis=-1)
         load = load + context[..., 1:3] * soft * (vertical - led[..., 2])[..., None]
         wanted = wanted - within(xp, load, load_limit)
         own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
@@ -182,7 +191,7 @@ class MultiModelLqg(NamedTuple):
 class Estimate(NamedTuple):
     """What filters know at an observation."""
 
-    turning: Array  # (..., 2, M, 5) about roll and pitch
+    turning: Array  # (..., 3, M, 5) about roll and pitch, and what the network's lift has turned about pitch
     scores: Array  # (..., 2, M) log odds of the models
     weights: Array  # (..., 2, M) that sum to 1
     rising: Array  # (..., 3) of the height

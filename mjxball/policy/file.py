@@ -90,7 +90,7 @@ TEAM_LQG_SHAPES: dict[str, tuple[int, ...]] = {
     "stiffness": (),
     "damping": (),
 }
-LATER_LQG_SHAPES: dict[str, tuple[int, ...]] = {"lifting": ()}  # of teams, absent from the first files
+LATER_LQG_SHARES = {3: "lifting", 4: "added_lift"}  # a share that is absent from a format's first files
 
 
 MULTI_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # behind an axis of models
@@ -130,10 +130,10 @@ def _lqg_of(card: dict[str, Any]) -> OffsetFreeLqg | TeamLqg | MultiModelLqg | N
     lqg = card.get("lqg")
     if lqg is None:
         return None
+    numbers: dict[str, Any] = {name: np.array(value) for name, value in lqg.items()}
     if card["format_version"] == 4:
-        return MultiModelLqg(**{name: np.array(lqg[name]) for name in MultiModelLqg._fields})
+        return MultiModelLqg(**numbers)
     if card["format_version"] == 3:
-        numbers: dict[str, Any] = {name: np.array(value) for name, value in lqg.items()}
         return TeamLqg(**numbers)
     return OffsetFreeLqg._make(np.array(lqg[name]) for name in LQG_SHAPES)
 
@@ -299,8 +299,6 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
     """Raise PolicyFileError unless later formats have the numbers of their LQG and format 1 has none."""
     lqg, version = card.get("lqg"), card["format_version"]
     in_team, shapes = version in CONTEXTS, {2: LQG_SHAPES, 3: TEAM_LQG_SHAPES}.get(version, {})
-    if version == 3 and isinstance(lqg, dict):
-        shapes = shapes | {field: shape for field, shape in LATER_LQG_SHAPES.items() if field in lqg}
     if version == 1:
         if lqg is not None:
             raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 to 4, not 1")
@@ -312,6 +310,9 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
             raise PolicyFileError(f"{name}: card field lqg.stiffness must be 1 to {MAX_MODELS} numbers")
         every = {field: (models, *shape) for field, shape in MULTI_MODEL_SHAPES.items()}
         shapes = {**every, **MULTI_MODEL_COMMON}
+    later = LATER_LQG_SHARES.get(version)
+    if later and isinstance(lqg, dict) and later in lqg:
+        shapes = {**shapes, later: ()}
     positive = ("stiffness", "limits", "damping" if in_team else "carried")
     if not isinstance(lqg, dict) or lqg.keys() != shapes.keys() or card["action_mode"] != "residual":
         raise PolicyFileError(
@@ -325,8 +326,8 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
         _check_team(card["team"], name, CONTEXTS[version])
     if min(np.min(lqg[field]) for field in positive) <= 0:
         raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
-    if not 0 <= lqg.get("lifting", 0) <= 1:
-        raise PolicyFileError(f"{name}: card field lqg.lifting must be a share from 0 to 1")
+    if later and not 0 <= lqg.get(later, 0) <= 1:
+        raise PolicyFileError(f"{name}: card field lqg.{later} must be a share from 0 to 1")
 
 
 def _check_team(team: Any, name: str, context: tuple[str, ...]) -> None:

@@ -29,6 +29,7 @@ class SingleFollower:
         self._filters, self._network = _Filters(lqg), _Network(law, *network)
         self._height, self._height_gain = lqg.height.tolist(), lqg.height_gain.tolist()
         self._rise, self._limits, self._keep = lqg.rise.tolist(), lqg.limits.tolist(), float(lqg.keep[1])
+        self._added_lift = float(lqg.added_lift)
         self._reach, self._clip = law.action_scale, law.limits
         self._leader = law.gravity, *law.kp, *law.kd
 
@@ -109,7 +110,9 @@ class SingleFollower:
         roll_drive = (roll_own + roll_added - slow[0] + (share - 1.0) * led_roll) / share
         pitch_drive = (pitch_own + pitch_added - slow[1] + (share - 1.0) * led_pitch) / share
         up = height, lift, lift_error, (vertical + (share - 1.0) * led_vertical) / share
-        self._filters.advance(((roll_drive, roll_per_lift * lifted), (pitch_drive, pitch_per_lift * lifted)))
+        turned = self._added_lift * math.hypot(roll_per_lift, pitch_per_lift) * (command[2] - vertical)
+        turns = roll_per_lift * lifted, pitch_per_lift * lifted + turned
+        self._filters.advance(((roll_drive, turns[0]), (pitch_drive, turns[1])))
         self._network.remember(action)
         self._rising = [sum([a * b for a, b in zip(row, up, strict=True)]) for row in self._height]
         self._slow = slow

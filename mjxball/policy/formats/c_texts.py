@@ -390,14 +390,16 @@ static inline void mjxball_lqg_next(
     const mjxball_real *context = memory + MJXBALL_TOLD, share = context[0];
     mjxball_real *slow = memory + MJXBALL_SLOW, *height = memory + MJXBALL_HEIGHT, drive, before[5];
     const float *row = mjxball_lqg_height;
+    mjxball_real lever = mjxball_root(context[1] * context[1] + context[2] * context[2]);
     for (int axis = 0; axis < 2; axis++) {
-        mjxball_real added = command[axis] - own[axis], mean;
+        mjxball_real turns = context[1 + axis] * (own[2] - led[2]), added = command[axis] - own[axis], mean;
         slow[axis] = mjxball_lqg_keep[1] * slow[axis] + (1 - mjxball_lqg_keep[1]) * added;
+        if (axis == 1) turns += mjxball_lqg_added_lift[0] * lever * (command[2] - own[2]);
         mean = (own[axis] + added - slow[axis] + (share - 1) * led[axis]) / share;
         for (int model = 0; model < MJXBALL_MODELS; model++) {
             mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
             const float *turn = mjxball_lqg_axis + 30 * model;
-            drive = mean + context[1 + axis] * (own[2] - led[2]) / mjxball_lqg_stiffness[model];
+            drive = mean + turns / mjxball_lqg_stiffness[model];
             mjxball_copy(before, state, 5);
             for (int k = 0; k < 5; k++, turn += 6) {
                 state[k] = turn[5] * drive;
