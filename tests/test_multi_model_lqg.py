@@ -54,7 +54,8 @@ def test_one_model_is_the_law_of_teams() -> None:
         command = known.command(nothing, one, observation, leader)
         np.testing.assert_allclose(unknown.command(nothing, other, observation, leader), command, rtol=1e-9, atol=1e-12)
         one, other = known.next(one, observation, command, leader), unknown.next(other, observation, command, leader)
-        np.testing.assert_allclose(other[:, :13], one[:, :13], rtol=1e-9, atol=1e-12)
+        states = np.concatenate([other[:, :10], other[:, 15:18]], axis=1)
+        np.testing.assert_allclose(states, one[:, :13], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("frequency", [5.0, 10.0, 16.0])
@@ -117,7 +118,7 @@ def test_what_the_network_adds_enters_but_not_what_it_adds_all_the_time() -> Non
     for _ in range(500):
         memory = law.next(np.concatenate([start[:-6], memory[-6:]]), level, added, leader)
     np.testing.assert_allclose(memory[-6:-4], added[:2], rtol=1e-3)  # all of it is taken for slow
-    np.testing.assert_allclose(memory[: 10 * count], plain[: 10 * count], atol=1e-3)
+    np.testing.assert_allclose(memory[: 15 * count], plain[: 15 * count], atol=1e-3)
 
 
 def test_the_lift_that_the_network_adds_turns_the_team_about_its_own_pitch_axis() -> None:
@@ -129,10 +130,28 @@ def test_the_lift_that_the_network_adds_turns_the_team_about_its_own_pitch_axis(
         radius, lift_alone = np.linalg.norm(mounts[1]), lift[2] / len(mounts)
         inertia = radius**2 * (1.0 if len(mounts) == 2 else 0.5)  # of a ring of equal masses, over one drone's share
         plain, lifted = (law.next(law.start(level, context), level, command, leader) for command in (0 * lift, lift))
-        found = (lifted - plain)[: 10 * law.models].reshape(2, law.models, 5)
-        np.testing.assert_allclose(found[0], 0.0, atol=1e-12)
+        found = (lifted - plain)[: 15 * law.models].reshape(3, law.models, 5)
+        np.testing.assert_allclose(found[:2], 0.0, atol=1e-12)  # the estimates take it for a load
         torque = LEVER * radius * lift_alone / inertia  # over the inertia, of the middling rig
-        np.testing.assert_allclose(found[1], law.axis[..., 5] * torque / law.stiffness[:, None], rtol=1e-6)
+        np.testing.assert_allclose(found[2], law.axis[..., 5] * torque / law.stiffness[:, None], rtol=1e-6)
+
+
+def test_scores_are_those_of_filters_that_are_told_what_the_network_lifts() -> None:
+    law, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), np.random.default_rng(3)
+    memory, pitch, turned = (
+        law.start(np.zeros(18), np.array([2.0, 0.0, 6.0, 40.0])),
+        *np.split(np.arange(15 * law.models), 3)[1:],
+    )
+    for _ in range(20):
+        observation = 0.05 * random.standard_normal(18)
+        told = memory.copy()
+        told[pitch], told[turned] = memory[pitch] + memory[turned], 0.0
+        seen, known = law._estimate(memory, observation), law._estimate(told, observation)
+        np.testing.assert_allclose(seen.scores, known.scores, atol=1e-9)
+        np.testing.assert_allclose(seen.turning[1] + seen.turning[2], known.turning[1], atol=1e-9)
+        own = law.command(np.zeros(3), memory, observation, leader)
+        memory = law.next(memory, observation, own + np.array([0.0, 0.0, random.standard_normal()]), leader)
+    assert np.abs(memory[turned]).max() > 0.1
 
 
 def test_a_file_without_the_lift_share_flies_as_before(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import copy
 import dataclasses
 import itertools
 import pickle
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -187,19 +186,18 @@ def test_what_is_not_finite_or_huge_is_left_to_the_law_of_arrays(value: float, d
 
 @pytest.mark.parametrize(
     ("value", "places"),
-    [(np.nan, range(159)), (np.inf, range(159)), (1e200, (50, 100, 132)), (0.0, (-CONTEXT,))],
+    [(np.nan, slice(None)), (np.inf, slice(None)), (1e200, slice(50, 200, 40)), (0.0, slice(-CONTEXT, 1 - CONTEXT))],
 )
-def test_a_memory_that_is_not_sound_is_left_to_the_law_of_arrays(value: float, places: Sequence[int]) -> None:
+def test_a_memory_that_is_not_sound_is_left_to_the_law_of_arrays(value: float, places: slice) -> None:
     """Also states of filters whose squares overflow, and a share of the command of 0, by which a follower divides."""
     policy, reference = told("pair")
     agree(policy, reference, walk(5))
     sound = policy.memory
-    assert sound.shape == (159,)
-    for place in places:
+    for place in range(sound.size)[places]:
         spoilt = sound.copy()
         spoilt[place] = value
         policy.memory, reference.memory = spoilt, spoilt
         with np.errstate(all="ignore"):
             for seen in walk(3, 1):
-                np.testing.assert_array_equal(policy(seen), reference(seen)[1])
-        np.testing.assert_array_equal(policy.memory, reference.memory)
+                np.testing.assert_allclose(policy(seen), reference(seen)[1], 1e-9, 1e-12)
+        np.testing.assert_allclose(policy.memory, reference.memory, 1e-9, 1e-9)

@@ -3,9 +3,9 @@
 One Kalman filter for each of M pairs of loop frequency and rotor lag runs about roll and about pitch; their weights are
 those of Magill (1965), by how well each predicts what is measured, forgotten over some seconds. Feedback gains and
 estimates are weighted means. To the filters what the network lifts is part of the load; the weights know better: a
-third set of states holds what that lift has turned about pitch. Everything else is as in `control.team_lqg`. What a follower must be told is its team's
-geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg` makes the numbers, which stand in the policy
-file.
+third set of states holds what that lift has turned about pitch. Everything else is as in `control.team_lqg`. What a
+follower must be told is its team's geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg` makes the
+numbers, which stand in the policy file.
 """
 
 from __future__ import annotations

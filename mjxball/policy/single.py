@@ -14,7 +14,15 @@ from typing import Any
 import numpy as np
 
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.multi_model_lqg import ANGLE_STATES, CONTEXT, FEATURES, HEIGHT_STATES, LEAST_ROOM, MultiModelLqg
+from mjxball.control.multi_model_lqg import (
+    ANGLE_STATES,
+    AXES,
+    CONTEXT,
+    FEATURES,
+    HEIGHT_STATES,
+    LEAST_ROOM,
+    MultiModelLqg,
+)
 from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
 
 Array = Any
@@ -45,7 +53,11 @@ class SingleFollower:
         filters, history = self._filters, self._network.history
         sizes = (history.size, filters.predicted.size, HEIGHT_STATES, filters.scores.size, 2, CONTEXT)
         parts = np.split(memory, np.cumsum(sizes)[:-1])
-        history[:], filters.predicted[:], filters.scores[:] = parts[0], parts[1].reshape(2, -1), parts[3].reshape(2, -1)
+        history[:], filters.predicted[:], filters.scores[:] = (
+            parts[0],
+            parts[1].reshape(AXES, -1),
+            parts[3].reshape(2, -1),
+        )
         self._rising, self._slow, self._context = (part.tolist() for part in (parts[2], *parts[4:]))
 
     def answer(self, observation: Array) -> tuple[list[float], list[float]] | None:
@@ -111,8 +123,8 @@ class SingleFollower:
         pitch_drive = (pitch_own + pitch_added - slow[1] + (share - 1.0) * led_pitch) / share
         up = height, lift, lift_error, (vertical + (share - 1.0) * led_vertical) / share
         turned = self._added_lift * math.hypot(roll_per_lift, pitch_per_lift) * (command[2] - vertical)
-        turns = roll_per_lift * lifted, pitch_per_lift * lifted + turned
-        self._filters.advance(((roll_drive, turns[0]), (pitch_drive, turns[1])))
+        drives = (roll_drive, roll_per_lift * lifted), (pitch_drive, pitch_per_lift * lifted), (0.0, turned)
+        self._filters.advance(drives)
         self._network.remember(action)
         self._rising = [sum([a * b for a, b in zip(row, up, strict=True)]) for row in self._height]
         self._slow = slow
@@ -120,7 +132,7 @@ class SingleFollower:
 
 
 class _Filters:
-    """Those of all models about roll and about pitch."""
+    """Those of all models about roll and about pitch, and what the network's lift has turned about pitch."""
 
     def __init__(self, lqg: MultiModelLqg):
         models, stiffness = lqg.models, lqg.stiffness
@@ -136,12 +148,13 @@ class _Filters:
         first, second, (c00, c01, c11) = left[:, 0], left[:, 1], lqg.certainty.T[..., None]
         rows = [onward, tilts, first, second, -0.5 * c00 * first - c01 * second, -0.5 * c11 * second]
         self._matrix = np.concatenate([row.reshape(-1, states + 2) for row in rows]).T.copy()
-        self._state, self._seen = np.zeros((2, states + 2)), np.zeros((2, self._matrix.shape[1]))
-        self.predicted, self._measured = self._state[:, :-2], self._state[:, -2:]
+        self._state, self._seen = np.zeros((AXES, states + 2)), np.zeros((AXES, self._matrix.shape[1]))
+        self.predicted, self._measured = self._state[:, :-2], self._state[:2, -2:]
         self._onward, tilts, self._left, self._certain = np.split(
             self._seen, np.cumsum([states, states, 2 * models]), axis=1
         )
-        self._tilts = tilts.reshape(2, models, ANGLE_STATES)
+        self._tilts = tilts[:2].reshape(2, models, ANGLE_STATES)
+        self._pitch, self._turned = self._seen[1:, 2 * states :]
         # Scores, both parts of the distance, 1 -> scores.
         self._scoring = np.vstack([lqg.keep[0] * np.eye(models), np.eye(models), np.eye(models), lqg.prior])
         self._scored, self._next_scores = np.ones((2, 3 * models + 1)), np.zeros((2, models))
@@ -150,14 +163,15 @@ class _Filters:
         known = np.column_stack([1.0 / stiffness, lqg.damping, lqg.tilt, np.ones(models)])
         self._known = np.concatenate([np.zeros((2, models, ANGLE_STATES)), np.stack([known] * 2)], axis=-1)
         self._odds, self._found = np.zeros((2, 1, models)), self._known[..., :ANGLE_STATES]
-        self._drives, self._driven = np.zeros((2, 2)), np.zeros((2, states))
+        self._drives, self._driven = np.zeros((AXES, 2)), np.zeros((AXES, states))
         self._drive = np.stack([lqg.axis[..., -1], lqg.axis[..., -1] / stiffness[:, None]]).reshape(2, -1)
 
     def update(self, measured: tuple[tuple[float, float], tuple[float, float]]) -> list[list[float]]:
         """Means (2, 11) over the models after (angle, rate) of both axes were `measured`."""
         self._measured[:] = measured
         np.dot(self._state, self._matrix, out=self._seen)
-        np.multiply(self._left, self._certain, out=self._distance)
+        np.add(self._pitch, self._turned, out=self._pitch)
+        np.multiply(self._left[:2], self._certain[:2], out=self._distance)
         scores = np.dot(self._scored, self._scoring, out=self._next_scores)
         np.subtract(scores, np.maximum.reduce(scores, axis=1, keepdims=True), out=scores)
         np.exp(scores, out=self._odds[:, 0])
@@ -165,8 +179,11 @@ class _Filters:
         sums = np.matmul(self._odds, self._known)[:, 0].tolist()
         return [[value / total for value in values] for *values, total in sums]
 
-    def advance(self, drives: tuple[tuple[float, float], tuple[float, float]]) -> None:
-        """Predict the next states with `drives`: the mean command, and the angular acceleration of lifting apart."""
+    def advance(self, drives: tuple[tuple[float, float], ...]) -> None:
+        """Predict the next states with `drives`: the mean command, and the angular acceleration of lifting apart.
+
+        The third: of what the network lifts more.
+        """
         self._drives[:] = drives
         np.dot(self._drives, self._drive, out=self._driven)
         np.add(self._onward, self._driven, out=self.predicted)

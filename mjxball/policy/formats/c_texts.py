@@ -268,12 +268,12 @@ static inline void mjxball_lqg_next(mjxball_real *memory, const mjxball_real *le
 }
 """
 MULTI_MODEL_LQG = """
-/* LQG for loops of unknown speed; its memory: the filters' states about roll (5 of each model) and about pitch, of the
- * height (3), the models' scores about roll and about pitch, the slow part of what is added (2), and what it is told of
- * its team (4). */
+/* LQG for loops of unknown speed; its memory: the filters' states about roll (5 of each model), about pitch, and what
+ * the network's lift has turned of the latter, of the height (3), the models' scores about roll and about pitch, the
+ * slow part of what is added (2), and what it is told of its team (4). */
 enum {
     MJXBALL_MODELS = sizeof mjxball_lqg_stiffness / sizeof *mjxball_lqg_stiffness,
-    MJXBALL_HEIGHT = 10 * MJXBALL_MODELS,
+    MJXBALL_HEIGHT = 15 * MJXBALL_MODELS,
     MJXBALL_SCORES = MJXBALL_HEIGHT + 3,
     MJXBALL_SLOW = MJXBALL_SCORES + 2 * MJXBALL_MODELS,
     MJXBALL_TOLD = MJXBALL_SLOW + 2
@@ -299,8 +299,16 @@ static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real
             mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
             const float *gain = mjxball_lqg_axis_gain + 10 * model, *sure = mjxball_lqg_certainty + 3 * model;
             mjxball_real angle = observation[3 + axis] - state[0], rate = observation[9 + axis] - state[1];
-            mjxball_real far = angle * (sure[0] * angle + 2 * sure[1] * rate) + sure[2] * rate * rate;
+            mjxball_real far;
             for (int row = 0; row < 5; row++) state[row] += angle * gain[2 * row] + rate * gain[2 * row + 1];
+            if (axis == 1) {
+                mjxball_real *turned = state + 5 * MJXBALL_MODELS, off_angle = -turned[0], off_rate = -turned[1];
+                for (int row = 0; row < 5; row++)
+                    turned[row] += off_angle * gain[2 * row] + off_rate * gain[2 * row + 1];
+                angle += off_angle;
+                rate += off_rate;
+            }
+            far = angle * (sure[0] * angle + 2 * sure[1] * rate) + sure[2] * rate * rate;
             scores[model] = mjxball_lqg_keep[0] * scores[model] + mjxball_lqg_prior[model] - (mjxball_real)0.5 * far;
             if (model == 0 || scores[model] > most) most = scores[model];
         }
@@ -390,12 +398,17 @@ static inline void mjxball_lqg_next(
     const mjxball_real *context = memory + MJXBALL_TOLD, share = context[0];
     mjxball_real *slow = memory + MJXBALL_SLOW, *height = memory + MJXBALL_HEIGHT, drive, before[5];
     const float *row = mjxball_lqg_height;
-    mjxball_real lever = mjxball_root(context[1] * context[1] + context[2] * context[2]);
-    for (int axis = 0; axis < 2; axis++) {
-        mjxball_real turns = context[1 + axis] * (own[2] - led[2]), added = command[axis] - own[axis], mean;
-        slow[axis] = mjxball_lqg_keep[1] * slow[axis] + (1 - mjxball_lqg_keep[1]) * added;
-        if (axis == 1) turns += mjxball_lqg_added_lift[0] * lever * (command[2] - own[2]);
-        mean = (own[axis] + added - slow[axis] + (share - 1) * led[axis]) / share;
+    for (int axis = 0; axis < 3; axis++) {
+        mjxball_real mean = 0, turns;
+        if (axis < 2) {
+            mjxball_real added = command[axis] - own[axis];
+            slow[axis] = mjxball_lqg_keep[1] * slow[axis] + (1 - mjxball_lqg_keep[1]) * added;
+            mean = (own[axis] + added - slow[axis] + (share - 1) * led[axis]) / share;
+            turns = context[1 + axis] * (own[2] - led[2]);
+        } else {
+            turns = mjxball_root(context[1] * context[1] + context[2] * context[2]) * (command[2] - own[2]);
+            turns *= mjxball_lqg_added_lift[0];
+        }
         for (int model = 0; model < MJXBALL_MODELS; model++) {
             mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
             const float *turn = mjxball_lqg_axis + 30 * model;
