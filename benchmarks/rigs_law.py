@@ -53,9 +53,6 @@ NINE: Models = (
     *((7.0, 0.025), (7.0, 0.06), (7.0, 0.12)),
     *((11.0, 0.025), (11.0, 0.07), (17.0, 0.03)),
 )
-NINETEEN = tuple(
-    (loop, lag) for loop in (4.5, 6, 8, 11, 15) for lag in (0.04, 0.06, 0.09, 0.13, 0.18) if loop * lag <= 1.25
-)
 TWO_DAMPINGS = (0.6, 0.95)
 
 
@@ -74,7 +71,7 @@ class Case(NamedTuple):
     position: float = 0.2  # that costs 1 [m]
     velocity: float = TUNING.velocity  # that costs 1 [m/s]
     damping: tuple[float, ...] = ()  # of each model; (): that of the preset
-    added_lift: float = 0.0  # share of the lift that the network adds whose torque the filters are told
+    added_lift: float = 0.0  # share of the lift that the network adds whose torque a pair's scores are told
     delay: float | None = None  # [s] added to the lag of the rig's own rotors, if its own loop is the only model
 
     def law(self, config: Config) -> MultiModelLqg:
@@ -118,9 +115,9 @@ CASES = {
         Case("7 pairs, two dampings", NINE[:3] + NINE[4:6] + NINE[7:], damping=TWO_DAMPINGS),
     ],
     "delay": [
-        *(Case("9 pairs", later(delay), 1000.0, position=0.17) for delay in (0.0, 0.015, 0.025)),
-        *(Case("12 pairs", MODELS, 1000.0, score, position=0.17) for score in (SCORE_TIME, 3.0)),
-        Case("19 pairs", NINETEEN, 1000.0, position=0.17),
+        Case("9 pairs"),
+        Case("9 pairs, 25 ms later", later(0.025), 1000.0, position=0.17),
+        *(Case("12 pairs", MODELS, walk, position=position) for walk, position in ((1000.0, 0.17), (500.0, 0.2))),
         AS_IT_IS,
     ],
     "told": [

@@ -121,18 +121,17 @@ def test_what_the_network_adds_enters_but_not_what_it_adds_all_the_time() -> Non
     np.testing.assert_allclose(memory[: 15 * count], plain[: 15 * count], atol=1e-3)
 
 
-def test_the_lift_that_the_network_adds_turns_the_team_about_its_own_pitch_axis() -> None:
+def test_scores_know_that_what_the_network_lifts_turns_a_pair_about_pitch() -> None:
     law, leader = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL)
     level, lift = np.zeros(18), np.array([0.0, 0.0, 2.0])
     for config in (dataclasses.replace(UNIVERSAL, plant=preset("transport").plant), ring_config(TEAM, 4)):
         mounts = np.array([drone.mount for drone in config.plant.drones])
         context = np.atleast_2d(team_geometry(config.plant, mounts, np.float64(len(mounts))))[0]
-        radius, lift_alone = np.linalg.norm(mounts[1]), lift[2] / len(mounts)
-        inertia = radius**2 * (1.0 if len(mounts) == 2 else 0.5)  # of a ring of equal masses, over one drone's share
+        radius = np.linalg.norm(mounts[1])
         plain, lifted = (law.next(law.start(level, context), level, command, leader) for command in (0 * lift, lift))
         found = (lifted - plain)[: 15 * law.models].reshape(3, law.models, 5)
         np.testing.assert_allclose(found[:2], 0.0, atol=1e-12)  # the estimates take it for a load
-        torque = LEVER * radius * lift_alone / inertia  # over the inertia, of the middling rig
+        torque = LEVER * lift[2] / (2 * radius) if len(mounts) == 2 else 0.0  # over the inertia, of a middling rig
         np.testing.assert_allclose(found[2], law.axis[..., 5] * torque / law.stiffness[:, None], rtol=1e-6)
 
 

@@ -26,7 +26,7 @@ MODELS = (
     *((9.0, 0.04), (9.0, 0.08), (9.0, 0.13)),
     *((13.0, 0.035), (13.0, 0.07), (18.0, 0.045)),
 )
-TUNING = Tuning(position=0.17, velocity=0.6, torque_walk=1000.0, tilt_limit=0.3)  # of a load's torque over the inertia
+TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=500.0, tilt_limit=0.3)  # of a load's torque over the inertia
 SCORE_TIME = 8.0  # [s] in which a model's score is forgotten
 
 

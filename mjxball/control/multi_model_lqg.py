@@ -2,10 +2,10 @@
 
 One Kalman filter for each of M pairs of loop frequency and rotor lag runs about roll and about pitch; their weights are
 those of Magill (1965), by how well each predicts what is measured, forgotten over some seconds. Feedback gains and
-estimates are weighted means. To the filters what the network lifts is part of the load; the weights know better: a
-third set of states holds what that lift has turned about pitch. Everything else is as in `control.team_lqg`. What a
-follower must be told is its team's geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg` makes the
-numbers, which stand in the policy file.
+estimates are weighted means. To the filters what the network lifts is part of the load; of a pair the weights know
+better: a third set of states holds what that lift has turned about pitch. Everything else is as in `control.team_lqg`.
+What a follower must be told is its team's geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg`
+makes the numbers, which stand in the policy file.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class MultiModelLqg(NamedTuple):
     rise: Array  # (2,) feedback on the vertical (error, velocity)
     limits: Array  # (3,) of the error's part in a tilt [rad], of that in the height [m/s2], against the load [rad]
     keep: Array  # (2,) share that a step leaves of the models' scores, and of the slow part of what was added
-    added_lift: Array | float = 0.0  # () share of the lift that the network adds whose torque the scores are told
+    added_lift: Array | float = 0.0  # () share of the lift that the network adds whose torque a pair's scores are told
 
     @property
     def models(self) -> int:
@@ -106,7 +106,7 @@ class MultiModelLqg(NamedTuple):
 
         The drones are taken to be commanded what the law itself says and the fast part of what the network adds: of
         its slow part each follower would expect another mean, and the difference would drift unseen. What its network
-        lifts more turns the team about the follower's own pitch axis; what others' networks lift it does not know.
+        lifts more turns a pair about pitch; of more drones others lift too, which a follower does not know.
         """
         xp, models = observation.__array_namespace__(), self.models
         own, seen = self._plan(memory, observation, leader)
@@ -119,7 +119,8 @@ class MultiModelLqg(NamedTuple):
         lifted = context[..., 1:3] * (own - led)[..., 2:]
         roll, pitch = context[..., 1:2], context[..., 2:3]
         lever = xp.sqrt(roll * roll + pitch * pitch)  # the follower's own, as long as that of the leader
-        turned = float(self.added_lift) * lever * (command - own)[..., 2:]
+        told = float(self.added_lift) * clipped(2.0 * share - 3.0, 0.0, 1.0)  # of a pair; of more drones 0
+        turned = told * lever * (command - own)[..., 2:]
         turns = xp.concat([lifted, turned], axis=-1)[..., None] / self._like(self.stiffness, observation)
         drive = xp.concat([mean[..., :2], 0.0 * turned], axis=-1)[..., None] + turns
         axis, height = self._like(self.axis, observation), self._like(self.height, observation)

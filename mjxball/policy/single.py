@@ -59,6 +59,8 @@ class SingleFollower:
             parts[3].reshape(2, -1),
         )
         self._rising, self._slow, self._context = (part.tolist() for part in (parts[2], *parts[4:]))
+        share, roll, pitch, _ = self._context
+        self._told = self._added_lift * min(max(2.0 * share - 3.0, 0.0), 1.0) * math.hypot(roll, pitch)
 
     def answer(self, observation: Array) -> tuple[list[float], list[float]] | None:
         """(action in [-1, 1] (3), command (3)) for `observation` (18,), which is remembered.
@@ -122,7 +124,7 @@ class SingleFollower:
         roll_drive = (roll_own + roll_added - slow[0] + (share - 1.0) * led_roll) / share
         pitch_drive = (pitch_own + pitch_added - slow[1] + (share - 1.0) * led_pitch) / share
         up = height, lift, lift_error, (vertical + (share - 1.0) * led_vertical) / share
-        turned = self._added_lift * math.hypot(roll_per_lift, pitch_per_lift) * (command[2] - vertical)
+        turned = self._told * (command[2] - vertical)
         drives = (roll_drive, roll_per_lift * lifted), (pitch_drive, pitch_per_lift * lifted), (0.0, turned)
         self._filters.advance(drives)
         self._network.remember(action)

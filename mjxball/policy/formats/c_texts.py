@@ -407,7 +407,7 @@ static inline void mjxball_lqg_next(
             turns = context[1 + axis] * (own[2] - led[2]);
         } else {
             turns = mjxball_root(context[1] * context[1] + context[2] * context[2]) * (command[2] - own[2]);
-            turns *= mjxball_lqg_added_lift[0];
+            turns *= mjxball_lqg_added_lift[0] * (share < (mjxball_real)1.5 ? 0 : share > 2 ? 1 : 2 * share - 3);
         }
         for (int model = 0; model < MJXBALL_MODELS; model++) {
             mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
