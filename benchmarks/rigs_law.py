@@ -2,7 +2,7 @@
 
     python benchmarks/rigs_law.py --json benchmarks/results/rigs_law.json
     python benchmarks/rigs_law.py --cases later --sizes 2 4 --seed 77 --policy policies/universal.npz
-    python benchmarks/rigs_law.py --cases delay --sizes 2 3 4 --seed 77 --policy policies/universal.npz
+    python benchmarks/rigs_law.py --cases delay --sizes 2 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases told --sizes 2 4 --seed 77 --policy policies/universal.npz
 
 As `benchmarks/rigs.py`, of rigs of three drones, or of others that neither a training nor a judgement draws (`--seed`).

@@ -199,5 +199,6 @@ def test_a_memory_that_is_not_sound_is_left_to_the_law_of_arrays(value: float, p
         policy.memory, reference.memory = spoilt, spoilt
         with np.errstate(all="ignore"):
             for seen in walk(3, 1):
+                # Of what the lift has turned only the scores are made: they stay finite, and rounded another way.
                 np.testing.assert_allclose(policy(seen), reference(seen)[1], 1e-9, 1e-12)
         np.testing.assert_allclose(policy.memory, reference.memory, 1e-9, 1e-9)
