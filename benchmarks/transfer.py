@@ -3,7 +3,7 @@
 `python benchmarks/transfer.py [--envs inverted_pendulum ant] [--algorithms sac ppo] [--trainers ours stock]
 [--seeds K] [--backend NAME] [--scale S] [--json FILE]`
 
-Ours is `mjxball.train.train(config, key, env=..., algorithm=...)`, the function behind `train.py --env`; stock is
+Ours is `mjxball.train.train(config, key, env=..., algorithm=...)`, compiled with the options of `train.py`; stock is
 `brax.training.agents.{sac,ppo}.train`. Both get Brax's published hyper-parameters (notebooks/training.ipynb) and
 backend (`positional`, as there), the same network sizes and steps. Both SACs evaluate once, at the end, in 128 000
 steps. PPO is not evaluated while the clock runs. Brax publishes PPO for both environments; its SAC has those of
@@ -36,6 +36,7 @@ from mjxball.algorithms.ppo import ProximalPolicyOptimization
 from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.quiet import import_brax_env
 from mjxball.train import train
+from mjxball.train.compilation import compiler_options
 from stock_sac import replicated
 from training import say, versions
 
@@ -120,9 +121,11 @@ def ours(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Policy:
     """Train."""
     config = our_config(algorithm, given)
     kind = {"sac": SoftActorCritic, "ppo": ProximalPolicyOptimization}[algorithm]
-    policy, _ = jax.jit(lambda key: train(config, key, env=env, algorithm=kind, evaluate=algorithm == "sac"))(
-        jax.random.PRNGKey(seed)
+    whole = jax.jit(
+        lambda key: train(config, key, env=env, algorithm=kind, evaluate=algorithm == "sac"),
+        compiler_options=compiler_options(),
     )
+    policy, _ = whole(jax.random.PRNGKey(seed))
     return lambda network, observation: network(observation), jax.block_until_ready(policy)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -91,7 +92,11 @@ class TransportEnv:
         self._followers = followers_axis(config)
         self._loop = None if self._resets.rigs else self._make_loop()
         self._ball_limit = ball_limit(config.plant)
-        self._law = follower_law(config)
+        self._law = law = follower_law(config)
+        # Calls of their own, which `algorithms.scalar_form` leaves as they are if their arrays are large. A law has no
+        # hash, as `jax.jit` wants; `partial` has.
+        jitted = (jax.jit(functools.partial(part)) for part in (law.network_input, law.command, law.next))
+        self._network_input, self._law_command, self._law_next = jitted
         self._cg = make_cg_offset(config)
         self._commanded = np.array(layout.commanded(config.follower.load_axis_only, config.plant.cg_axis))
         self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # of roll and pitch the one that no load turns
@@ -165,7 +170,7 @@ class TransportEnv:
         world: PipelineState = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
-        command = self._law.command(action, self._observed(state), world.history)
+        command = self._law_command(action, self._observed(state), world.history)
         return self._step(state, command, action, ~finite | world.loop.diverged, 1.0, physics)
 
     def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
@@ -209,7 +214,7 @@ class TransportEnv:
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
-            history=self._law.next(world.history, observation, action, command) if self._law.size else (),
+            history=self._law_next(world.history, observation, action, command) if self._law.size else (),
             action=action,
             command=command,
             steps=world.steps + 1,
@@ -287,7 +292,7 @@ class TransportEnv:
 
     def _input(self, observation: Float[Array, "... 18"], world: PipelineState) -> Float[Array, "... input"]:
         """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
-        shown = self._law.network_input(observation, world.history) if self._law.size else observation
+        shown = self._network_input(observation, world.history) if self._law.size else observation
         if not self.config.follower.privileged_critic:
             return shown
         return jnp.concatenate([shown, self._privileged(world)], axis=-1)

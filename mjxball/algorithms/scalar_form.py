@@ -74,6 +74,9 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     name, parameters = equation.primitive.name, equation.params
     if name in CALLS and parameters.get(CALLS[name]) is not None:
         called = parameters[CALLS[name]]
+        if _largest(called.jaxpr) > LARGEST:
+            arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
+            return equation.primitive.bind(*arrays, **parameters)
         return _evaluate(called.jaxpr, called.consts, inputs)
     if name == "scan" and _repeats(equation):
         return _scan(parameters["jaxpr"], parameters["length"], inputs)
@@ -96,6 +99,11 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     for index in np.ndindex(shape):
         outputs[index] = _compute(equation, [part[index] for part in spread])
     return [outputs]
+
+
+def _largest(jaxpr: Any) -> int:
+    """Numbers of the largest array in `jaxpr`."""
+    return max((v.aval.size for e in jaxpr.eqns for v in (*e.invars, *e.outvars) if hasattr(v.aval, "size")), default=0)
 
 
 def _spreads(own: tuple[int, ...], shape: tuple[int, ...]) -> bool:

@@ -28,6 +28,16 @@ if jax.__version_info__ < (0, 11):
 PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in both matrices
 
 
+def compiler_options(algorithm: Any = None, members: int = 1) -> dict[str, Any] | None:
+    """XLA's options for training `members` followers at once by `algorithm` on JAX's default device.
+
+    Also for `mjxball.train.train`: `jax.jit(lambda key: train(config, key), compiler_options=compiler_options())`.
+    """
+    if jax.default_backend() == "gpu":
+        return GPU_OPTIONS | (PLAIN_PRODUCTS if members == 1 else {})
+    return CPU_OPTIONS if getattr(algorithm, "prefers_cpu", False) else None
+
+
 def partitioned_by_gspmd(mesh: Mesh | None) -> contextlib.AbstractContextManager[None]:
     """Leave the partitioning over `mesh` to XLA's older partitioner, GSPMD.
 

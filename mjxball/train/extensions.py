@@ -94,13 +94,7 @@ def make_env(extensions: Extensions, config: Config, physics: str) -> Any:
         env: Any = TransportEnv(config, physics)
     else:
         env = _made(kind, config, physics)
-        env = env if is_pair(env) else TracedOnce(env)
-        _check_env(env, name_of(extensions.env))
-        if "truncation" not in jax.eval_shape(env.reset, jax.random.PRNGKey(0)).info:
-            import_brax_env()
-            from brax.envs.wrappers.training import EpisodeWrapper
-
-            env = EpisodeWrapper(env, config.timing.episode_steps, 1)
+        env = _checked_env(env if is_pair(env) else TracedOnce(env), name_of(extensions.env), config)
     if extensions.reward is not None:
         env = Rewarded(env, extensions.reward)
     return env
@@ -188,7 +182,8 @@ def _made(kind: Any, config: Config, physics: str) -> Any:
         raise InputError(f"{flag} could not be made: {_said(error)}; mend its constructor") from None
 
 
-def _check_env(env: Any, name: str) -> None:
+def _checked_env(env: Any, name: str, config: Config) -> Any:
+    """`env`, with a time limit if it keeps none itself."""
     flag = f"--env {name}"
     lost = [part for part in ("reset", "step", "observation_size", "action_size") if not _has(env, part)]
     if lost:
@@ -203,6 +198,13 @@ def _check_env(env: Any, name: str) -> None:
     if not all(isinstance(size, int) and size > 0 for size in sizes):
         raise InputError(f"{flag}: observation_size and action_size must be whole numbers, not {sizes}; flatten them")
     each: tuple[int, ...] = first.reward.shape if is_pair(env) else ()  # followers of a team
+    timed = env
+    if "truncation" not in first.info:
+        import_brax_env()
+        from brax.envs.wrappers.training import EpisodeWrapper
+
+        timed = EpisodeWrapper(env, config.timing.episode_steps, 1)
+        first = jax.eval_shape(timed.reset, jax.random.PRNGKey(0))  # as it will be stepped, so that it is traced once
     after = _traced(flag, "step", env.step, first, jax.ShapeDtypeStruct((*each, sizes[1]), "float32"))
     for part, state in (("reset", first), ("step", after)):
         for field, wanted in (("obs", (*each, sizes[0])), ("reward", each), ("done", ())):
@@ -217,6 +219,7 @@ def _check_env(env: Any, name: str) -> None:
         given = _read(flag, env, mask) if _has(env, mask) else None
         if given is not None and np.shape(given) != (sizes[0],):
             raise InputError(f"{flag}: {mask} must hold observation_size = {sizes[0]} numbers")
+    return timed
 
 
 def _has(env: Any, part: str) -> bool:

@@ -35,8 +35,9 @@ def train(
     the setting's name, which may be traced: `jax.vmap(lambda rate: train(config, key, overrides={"sac.learning_rate":
     rate}))(rates)`. Returns the policy, which can be called with an observation, and of each evaluation
     (`num_evaluations`,): `steps`, `episode_return` (exploring), the algorithm's metrics, `eval_return`, and the
-    means of the environment's metrics as `eval_<name>`. Without `evaluate` it
-    trains in one stretch, and what is named `eval_` holds nothing. Raises InputError if one of them does not fit.
+    means of the environment's metrics as `eval_<name>`. Without `evaluate` it trains in one stretch, and what is named
+    `eval_` holds nothing. `mjxball.train.compilation.compiler_options()` are the options with which `train.py` compiles
+    sooner. Raises InputError if one of them does not fit.
     """
     program = Program(config, physics, overrides, extensions=Extensions(env, reward, algorithm))
     program.algorithm.check_parts(1)

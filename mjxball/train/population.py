@@ -19,10 +19,8 @@ from mjxball.config import Config
 from mjxball.policy import PolicyFile
 from mjxball.train import processes
 from mjxball.train.compilation import (
-    CPU_OPTIONS,
-    GPU_OPTIONS,
-    PLAIN_PRODUCTS,
     TracedProgram,
+    compiler_options,
     jax_setting,
     partitioned_by_gspmd,
 )
@@ -113,9 +111,7 @@ class Population:
 
     def compile(self, creating: bool) -> Executables:
         """Compile everything a run needs, side by side; `create` only if `creating`."""
-        options = CPU_OPTIONS if getattr(self.program.algorithm, "prefers_cpu", False) else None
-        if jax.default_backend() == "gpu":
-            options = GPU_OPTIONS | (PLAIN_PRODUCTS if self._single else {})
+        options = compiler_options(self.program.algorithm, self.members)
         # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
         # end a process that shares GPUs with others by a segfault.
         with (

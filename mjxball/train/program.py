@@ -270,7 +270,8 @@ class Program:
         for path, value in (overrides or {}).items():
             config = configs.replace(config, configs.current_name(path), value)
         self.config, self._shards = config, shards or Shards()
-        self.env = make_env(extensions, config, physics)
+        with jax.default_matmul_precision(MATMUL_PRECISION):  # what is traced for checks need not be traced again
+            self.env = make_env(extensions, config, physics)
         make: Any = extensions.algorithm or find(ALGORITHMS["sac"], "--algorithm")
         # The algorithm says how many environments there are, and is told the part of them that is here.
         sizes = getattr(self.env, "team_sizes", None)
