@@ -12,6 +12,8 @@ The better of both is the reference of a rig, by the median of its flights, in s
 where the policy's median settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over
 0.17 m where that is larger, above the reference's, or where the reference itself has none.
 
+With --seed 77 the rigs are others than those held out: to choose among policies.
+
 With --beyond: outside one range of training at a time, on rigs that are drawn like the others.
 
 With --steps: at 15 s the object's mass changes by 30 %, or the CG jumps to where it would be half a period later.
@@ -46,7 +48,6 @@ from mjxball.sim.rigs import (
     HELD_OUT_RIGS,
     RigTable,
     draw_rigs,
-    held_out,
     loop_damping,
     rig_config,
     unpadded,
@@ -70,7 +71,10 @@ BEYOND = {
     "scenario.noise": (1.0, 2.0),
 }
 MASS_STEP = 0.3  # largest, of the object's mass
-SHARES = (*("failed", "unsettled", "crashed_alone", "soon", "small", "met", "sooner"),)
+SHARES = (
+    *("failed", "unsettled", "crashed_alone", "soon", "small", "met", "sooner"),
+    *(f"{part}_{one}" for one in KNOWING for part in ("met_beside", "sooner_than")),
+)
 
 Made = tuple[str, Callable[[Config, RigTable], Law | list[Law]]]
 
@@ -82,6 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--rigs", type=int, default=HELD_OUT_RIGS, metavar="N", help="of each number of drones (default 200)"
     )
+    parser.add_argument("--seed", type=int, default=HELD_OUT, help="of other rigs, to choose policies by")
     parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), metavar="N", help="numbers of drones")
     parser.add_argument("--mass-step", action="store_true", help="a change of the mass in every flight, as in training")
     parser.add_argument("--beyond", action="store_true", help="rigs just outside one range at a time instead")
@@ -142,17 +147,19 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
     """Every follower on held-out rigs of all sizes, and the shares of rigs that are met."""
     period, rows, whole = config.timing.control_period, [], {}
     for size in options.sizes:
-        drawn = draw_rigs(config, size, options.rigs, HELD_OUT)
+        drawn = draw_rigs(config, size, options.rigs, options.seed)
         rigs = unpadded(drawn.rigs, size)
         flown: dict[str, Flown] = {}
         for name, make in followers(options.policies):
             begun = time.perf_counter()
             flown[name] = fly(config, rigs, make(config, rigs), FLIGHTS)
-            row = {"drones": size, "follower": name, **row_of(flown, name, rigs, period)}
-            rows.append({**row, "seconds": round(time.perf_counter() - begun, 1)})
-            whole.setdefault(name, []).append(row)
-            print(json.dumps(rows[-1]))
-            sys.stdout.flush()
+            seconds = round(time.perf_counter() - begun, 1)
+            for known in judged(name):
+                row = {"drones": size, "follower": known, **row_of(flown, known, rigs, period)}
+                rows.append({**row, "seconds": seconds})
+                whole.setdefault(known, []).append(row)
+                print(json.dumps(rows[-1]))
+                sys.stdout.flush()
         rejected = {"drawn": drawn.draws, "unstable": drawn.unstable, "untrimmed": drawn.untrimmed}
         rows.append({"drones": size, "rigs": options.rigs, **rejected})
     shares = {
@@ -163,21 +170,32 @@ def compare(config: Config, options: Any) -> dict[str, Any]:
     return {"rows": rows, "all": shares}
 
 
+def rigs_of(config: Config, size: int, options: Any) -> RigTable:
+    """The rigs of `size` drones to fly."""
+    return unpadded(draw_rigs(config, size, options.rigs, options.seed).rigs, size)
+
+
 def beyond(config: Config, options: Any) -> dict[str, Any]:
     """The LQGs that know the rig and the policies outside one range at a time."""
     rows = []
     for path, ends in BEYOND.items():
         outside = replace(config, path, ends)
         for size in options.sizes:
-            rigs, flown = held_out(outside, size, options.rigs), {}
+            rigs, flown = rigs_of(outside, size, options), {}
             for name, make in followers(options.policies):
                 if name not in WORST:
                     flown[name] = fly(outside, rigs, make(outside, rigs), FLIGHTS)
-                    row = row_of(flown, name, rigs, config.timing.control_period)
-                    rows.append({"setting": path, "range": ends, "drones": size, "follower": name, **row})
-                    print(json.dumps(rows[-1]))
-                    sys.stdout.flush()
+                    for known in judged(name):
+                        row = row_of(flown, known, rigs, config.timing.control_period)
+                        rows.append({"setting": path, "range": ends, "drones": size, "follower": known, **row})
+                        print(json.dumps(rows[-1]))
+                        sys.stdout.flush()
     return {"rows": rows}
+
+
+def judged(name: str) -> Sequence[str]:
+    """Whose rows are complete when `name` has flown: those of the two LQGs once both have."""
+    return {KNOWING[0]: (), KNOWING[1]: KNOWING}.get(name, (name,))
 
 
 def row_of(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) -> dict[str, Any]:
@@ -189,16 +207,24 @@ def row_of(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) ->
         **{f"settling_{q}": _quantile(settling, q) for q in (50, 90)},
         **{f"peak_{q}": _quantile(peak, q) for q in (50, 90)},
     }
-    if not set(KNOWING) <= flown.keys() or name in KNOWING:
+    if not set(KNOWING) <= flown.keys():
         return row
     knowing = [flown[one] for one in KNOWING]
-    best, smallest = (
-        np.min([np.median(getattr(one, part)(period), axis=1) for one in knowing], axis=0)
+    theirs = {
+        part: np.array([np.median(getattr(one, part)(period), axis=1) for one in knowing])
         for part in ("settling", "peak")
-    )
-    soon = (settling <= LATER * best) | np.isinf(best)
-    small = (peak <= smallest + MORE * np.maximum(rigs.length / LENGTH, 1.0)) | np.isinf(smallest)
+    }
+    more = MORE * np.maximum(rigs.length / LENGTH, 1.0)
+
+    def reached(settled: np.ndarray, highest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (settling <= LATER * settled) | np.isinf(settled), (peak <= highest + more) | np.isinf(highest)
+
+    best, smallest = (theirs[part].min(axis=0) for part in ("settling", "peak"))
+    soon, small = reached(best, smallest)
     alone = flown[name].failed & ~np.all([one.failed for one in knowing], axis=0)
+    for one, settled, highest in zip(KNOWING, theirs["settling"], theirs["peak"], strict=True):
+        row[f"met_beside_{one}"] = float(np.all(reached(settled, highest), axis=0).mean())
+        row[f"sooner_than_{one}"] = float((settling < settled).mean())
     return {
         **row,
         "crashed_alone": float(alone.mean()),
@@ -232,7 +258,7 @@ def steps(config: Config, options: Any) -> dict[str, Any]:
     )
     for kind, made in CHANGES.items():
         for size in options.sizes:
-            rigs = held_out(config, size, options.rigs)
+            rigs = rigs_of(config, size, options)
             for name, make in followers(options.policies):
                 found = fly(
                     some if kind == "mass" else none, rigs, make(config, rigs), FLIGHTS, STEP + AFTER, 1, (STEP, made)

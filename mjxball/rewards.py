@@ -51,11 +51,9 @@ def task_reward(weights: Reward, step: Transition) -> Scalar:
         return (vector * vector).sum(axis=-1)
 
     distance = xp.sqrt(1.0 + square(step.error) / weights.error_scale**2) - 1.0
-    arriving = weights.error * distance + weights.velocity * square(step.velocity)
-    if _used(weights.saturation):
-        arriving = weights.saturation * xp.log(1.0 + arriving / weights.saturation)
     total = -(
-        arriving
+        weights.error * distance
+        + weights.velocity * square(step.velocity)
         + weights.tilt * square(step.euler[..., :2])
         + weights.rates * square(step.rates)
         + weights.effort * square(step.action)

@@ -47,6 +47,16 @@ def test_only_programs_of_ours_are_kept() -> None:
     assert not Extensions(reward=len).ours()
 
 
+def test_an_environment_of_ones_own_is_traced_once(small: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checking it and training on it share what was traced: that of a physics engine may take seconds."""
+    traced = []
+    step = toys.DoubleIntegrator.step
+    monkeypatch.setattr(toys.DoubleIntegrator, "step", lambda *given: (traced.append(1), step(*given))[1])
+    key = jax.random.PRNGKey(0)
+    jax.make_jaxpr(lambda key: train(small, key, env=toys.DoubleIntegrator, algorithm=SoftActorCritic)[1])(key)
+    assert len(traced) == 1
+
+
 @pytest.mark.slow
 def test_any_brax_environment_trains(small: Config) -> None:
     """From pushing at random to standing at 0: the return of 60 steps is about -1.5 for the optimal law."""

@@ -31,6 +31,17 @@ def large(x: Any) -> Any:
     return jnp.sort(wide[:, -1]) + jax.random.normal(jax.random.PRNGKey(0), x.shape)
 
 
+@jax.jit
+def wide_call(x: Any) -> Any:
+    """A call with small and large arrays in it."""
+    return jnp.outer(x + 1.0, jnp.arange(LARGEST, dtype=x.dtype)).sum(axis=1) + jnp.sin(x)
+
+
+def calling(x: Any) -> Any:
+    """`wide_call` between small arrays."""
+    return wide_call(x[::-1] * 2.0)[:2] + x[:2]
+
+
 def retyped(x: Any) -> Any:
     """A number as one integer of its size, and as two of half of it."""
     whole, halves = (jax.lax.bitcast_convert_type(jnp.round(x), kind) for kind in (jnp.int32, jnp.int16))
@@ -43,7 +54,7 @@ def looped(x: Any) -> Any:
     return total, each
 
 
-@pytest.mark.parametrize("function", [rotation, large, looped, retyped])
+@pytest.mark.parametrize("function", [rotation, large, looped, retyped, calling])
 def test_values_and_gradients_are_those_of_the_function(function: Any) -> None:
     points = np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
 
@@ -81,3 +92,11 @@ def test_a_step_of_an_environment_is_the_same(name: str) -> None:
     expected, found = whole(whole(states, actions), actions), form(form(states, actions), actions)
     assert jax.tree.structure(expected) == jax.tree.structure(found)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5), found, expected)
+
+
+def test_a_call_with_a_large_array_stays_one_call() -> None:
+    def names(form: Any) -> list[str]:
+        return [str(one.params.get("name")) for one in jax.make_jaxpr(form)(jnp.zeros(4)).eqns]
+
+    assert names(scalar_form(calling)).count("wide_call") == 1
+    assert all(one == "None" for one in names(scalar_form(jax.jit(lambda x: x * 2.0 + x[0]))))

@@ -248,9 +248,6 @@ class Reward:
     error: float = setting(1.0, "weight of |e_o| over error_scale, saturating [1]", low=0)
     error_scale: float = setting(0.1, "|e_o| at which the error's cost turns from square to linear [m]", above=0)
     velocity: float = setting(0.1, "weight of |de_o/dt|^2 [s2/m2]", low=0)
-    saturation: float = setting(
-        0.0, "cost of error and velocity together above which it grows as its logarithm, 0: never", low=0
-    )
     tilt: float = setting(0.0, "weight of roll^2 + pitch^2 [1/rad2]", low=0)
     rates: float = setting(0.05, "weight of the squared body rates [s2/rad2]", low=0)
     effort: float = setting(0.02, "weight of the squared network action in [-1, 1]", low=0)
