@@ -108,7 +108,7 @@ class MultiModelLqg(NamedTuple):
         its slow part each follower would expect another mean, and the difference would drift unseen. What its network
         lifts more turns a pair about pitch; of more drones others lift too, which a follower does not know.
         """
-        xp = observation.__array_namespace__()
+        xp, models = observation.__array_namespace__(), self.models
         own, seen = self._plan(memory, observation, leader)
         led, context = copy_command(observation, *leader), memory[..., -CONTEXT:]
         slow, share = memory[..., -CONTEXT - 2 : -CONTEXT], context[..., :1]
@@ -127,8 +127,9 @@ class MultiModelLqg(NamedTuple):
         turning = (axis[..., :ANGLE_STATES] * seen.turning[..., None, :]).sum(axis=-1)
         turning = turning + axis[..., ANGLE_STATES] * drive[..., None]
         climbing = xp.concat([seen.rising, mean[..., 2:]], axis=-1) @ height.T
-        turning, scores = (xp.reshape(part, (*memory.shape[:-1], -1)) for part in (turning, seen.scores))
-        return xp.concat([turning, climbing, scores, slow, context], axis=-1)
+        flat = [turning[..., k, m, :] for k in range(AXES) for m in range(models)]
+        scores = [seen.scores[..., k, :] for k in (0, 1)]
+        return xp.concat([*flat, climbing, *scores, slow, context], axis=-1)
 
     def _like(self, numbers: Array, observation: Array) -> Array:
         return observation.__array_namespace__().asarray(numbers, dtype=observation.dtype)
@@ -141,7 +142,8 @@ class MultiModelLqg(NamedTuple):
         """What is known at `observation`."""
         xp, models = observation.__array_namespace__(), self.models
         ends = AXES * models * ANGLE_STATES
-        predicted = xp.reshape(memory[..., :ends], (*memory.shape[:-1], AXES, models, ANGLE_STATES))
+        rows = [memory[..., k * ANGLE_STATES : (k + 1) * ANGLE_STATES] for k in range(AXES * models)]
+        predicted = xp.stack([joined(rows[k * models : (k + 1) * models], axis=-2) for k in range(AXES)], axis=-3)
         rising, found = memory[..., ends : ends + HEIGHT_STATES], measured(observation)
         zero = xp.zeros_like(found[0])
         angle, rate = (joined([found[k], found[k + 1], zero])[..., None] for k in (0, 2))
@@ -154,7 +156,7 @@ class MultiModelLqg(NamedTuple):
             certainty[:, 0] * first * first + 2.0 * certainty[:, 1] * first * second + certainty[:, 2] * second * second
         )
         begin = ends + HEIGHT_STATES
-        scores = xp.reshape(memory[..., begin : begin + 2 * models], (*memory.shape[:-1], 2, models))
+        scores = joined([memory[..., begin + k * models : begin + (k + 1) * models] for k in (0, 1)], axis=-2)
         scores = self.keep[0] * scores + self._like(self.prior, observation) - 0.5 * distance
         scores = scores - xp.max(scores, axis=-1, keepdims=True)
         odds = xp.exp(scores)
