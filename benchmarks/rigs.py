@@ -12,6 +12,8 @@ The better of both is the reference of a rig, by the median of its flights, in s
 where the policy's median settling is at most 1.25 times and its median peak at most 5 mm, times the rig's length over
 0.17 m where that is larger, above the reference's, or where the reference itself has none.
 
+The two LQGs are held to the same bar; what is met beside either of them alone stands in fields of its own.
+
 With --seed 77 the rigs are others than those held out: to choose among policies.
 
 With --beyond: outside one range of training at a time, on rigs that are drawn like the others.

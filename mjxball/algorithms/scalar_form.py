@@ -39,7 +39,7 @@ def scalar_form(function: Callable[..., Any]) -> Callable[..., Any]:
     Slices, stacks and transposes of small arrays vanish, products with constants that are 0 as well (0 times infinity
     then is 0), and sums are added in order. A `lax.scan` without inputs and outputs for each step, as `fori_loop` of a
     fixed count becomes, is computed again when its gradient is taken instead of remembering what happened in it. What
-    is unknown here or larger than `LARGEST` stays as it is.
+    is unknown here or larger than `LARGEST` stays as it is, and so does a call (`jax.jit`) with such an array in it.
     """
 
     def transformed(*arguments: Any) -> Any:
@@ -75,8 +75,7 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     if name in CALLS and parameters.get(CALLS[name]) is not None:
         called = parameters[CALLS[name]]
         if _largest(called.jaxpr) > LARGEST:
-            arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
-            return equation.primitive.bind(*arrays, **parameters)
+            return _as_it_is(equation, inputs)
         return _evaluate(called.jaxpr, called.consts, inputs)
     if name == "scan" and _repeats(equation):
         return _scan(parameters["jaxpr"], parameters["length"], inputs)
@@ -85,9 +84,7 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     rewritten = (name in ELEMENTWISE and alike) or name in REDUCTIONS or name in REARRANGED
     keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals)
     if keys or not rewritten or max(aval.size for aval in avals) > LARGEST:
-        arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
-        outputs = equation.primitive.bind(*arrays, **parameters)
-        return outputs if equation.primitive.multiple_results else [outputs]
+        return _as_it_is(equation, inputs)
     parts = [_parts(value) for value in inputs]
     if name in REARRANGED:
         result = REARRANGED[name](parameters, shape, parts)
@@ -99,6 +96,13 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     for index in np.ndindex(shape):
         outputs[index] = _compute(equation, [part[index] for part in spread])
     return [outputs]
+
+
+def _as_it_is(equation: Any, inputs: list[Value]) -> Sequence[Value]:
+    """What `equation` makes of `inputs`, on arrays."""
+    arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
+    outputs = equation.primitive.bind(*arrays, **equation.params)
+    return outputs if equation.primitive.multiple_results else [outputs]
 
 
 def _largest(jaxpr: Any) -> int:
