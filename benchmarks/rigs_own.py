@@ -31,7 +31,7 @@ from mjxball.evaluate.rigs import AnyRigLaw, fly
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.export import with_network
 from mjxball.sim.rigs import RigTable, held_out, rig_config
-from mjxball.train.compilation import CPU_OPTIONS
+from mjxball.train.compilation import compiler_options
 from mjxball.train.program import MATMUL_PRECISION, Environments
 
 LEARN = Phase(np.asarray(False), np.asarray(False))
@@ -99,7 +99,8 @@ def train(config: Config, rigs: RigTable, policy: PolicyFile, options: Any) -> l
         worlds = jax.jit(jax.vmap(begin))(tables, jax.random.split(key, rigs.total))
         mapped = jax.vmap(gradient, in_axes=(0, 0, 0, 0, None))
         keys = jax.random.split(key, rigs.total)
-        step = jax.jit(mapped).lower(tables, state, worlds, keys, np.float32(0)).compile(CPU_OPTIONS)
+        options_of_xla = compiler_options(FirstOrderGradient, rigs.total)
+        step = jax.jit(mapped).lower(tables, state, worlds, keys, np.float32(0)).compile(options_of_xla)
         for count in range(options.steps):
             key, own_key = jax.random.split(key)
             state, worlds = step(

@@ -122,10 +122,11 @@ class FirstOrderGradient:
 
     def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
         policy, decay = self.policy(state._replace(layers=layers)), self._config.gradient_decay
+        plain = isinstance(decay, float) and decay == 1  # not where a sweep traces it
 
         def step(carry: tuple[Any, Array], _: None) -> tuple[Any, tuple[Array, Array]]:
             envs, flies = carry
-            envs = envs._replace(states=_decayed(envs.states, decay)) if decay < 1 else envs
+            envs = envs if plain else envs._replace(states=_decayed(envs.states, decay))
             seen = envs.states.obs
             envs, after = self._environments.step(envs, policy(seen), None)
             reward = after.reward * flies if self._config.until_termination else after.reward
