@@ -111,6 +111,7 @@ class Environments(Protocol):
     action_size: int
     policy_mask: Any  # (n,) 1 for what the policy may use of an observation, else 0
     critic_mask: Any  # (n,) the same for what is needed in training only
+    turn: Any  # (count,) in which of several turns, again and again, each is to start anew where all do so in turn
     shards: Shards
 
     def restart(self, envs: Any, key: Array, others: Bool[Array, " envs"] | None = None) -> Any:

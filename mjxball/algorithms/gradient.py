@@ -18,6 +18,7 @@ from mjxball.policy.file import PolicyFile
 
 Array = Any
 ADAM = optax.scale_by_adam()
+OUTLIER = 3.0  # times the geometric mean of the norms of worlds' gradients
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
 
 
@@ -102,7 +103,7 @@ class FirstOrderGradient:
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
         """One window of all environments and its gradient; the first one gives the observations' statistics."""
         own = self._environments
-        turn = (jnp.arange(own.count) + state.windows) % self._config.windows_per_episode == 0
+        turn = (own.turn + state.windows) % self._config.windows_per_episode == 0
         envs = own.restart(envs, keys[0], turn & phase.recording)
         (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(state.layers, state, envs)
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
@@ -126,7 +127,14 @@ class FirstOrderGradient:
 
         def step(carry: tuple[Any, Array], _: None) -> tuple[Any, tuple[Array, Array]]:
             envs, flies = carry
-            envs = envs if plain else envs._replace(states=_decayed(envs.states, decay))
+            if not plain:
+                states = envs.states
+                envs = envs._replace(
+                    states=states.replace(
+                        pipeline_state=_passed(states.pipeline_state, jnp.asarray(decay, jnp.float32)),
+                        obs=_passed(states.obs, jnp.asarray(decay, jnp.float32)),
+                    )
+                )
             seen = envs.states.obs
             envs, after = self._environments.step(envs, policy(seen), None)
             reward = after.reward * flies if self._config.until_termination else after.reward
@@ -185,12 +193,31 @@ def _forget(envs: Any) -> Any:
     return envs._replace(states=states.replace(**past), statistics=still(envs.statistics))
 
 
-def _decayed(tree: Any, factor: float) -> Any:
-    """`tree` as it is; a gradient that passes through its floats is multiplied by `factor`."""
+@jax.custom_vjp
+def _passed(tree: Any, factor: Array) -> Any:
+    """`tree` (worlds, ...) as it is; a gradient that passes is multiplied by `factor`, that of outliers cut.
+
+    A few worlds near instability would else be most of it: none's norm passes `OUTLIER` times the geometric mean.
+    """
+    return tree
+
+
+def _remember(tree: Any, factor: Array) -> tuple[Any, Array]:
+    return tree, factor
+
+
+def _cut(factor: Array, slope: Any) -> tuple[Any, Array]:
+    leaves = [leaf for leaf in jax.tree.leaves(slope) if leaf.dtype != jax.dtypes.float0]
+    square = sum((leaf.reshape(leaf.shape[0], -1) ** 2).sum(axis=-1) for leaf in leaves) + 1e-30
+    log = 0.5 * jnp.log(square)
+    least = jnp.minimum(1.0, OUTLIER * jnp.exp(log.mean() - log))
 
     def one(leaf: Array) -> Array:
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+        if leaf.dtype == jax.dtypes.float0:
             return leaf
-        return factor * leaf + (1.0 - factor) * jax.lax.stop_gradient(leaf)
+        return factor * leaf * least.reshape((-1,) + (1,) * (leaf.ndim - 1))
 
-    return jax.tree.map(one, tree)
+    return jax.tree.map(one, slope), jnp.zeros_like(factor)
+
+
+_passed.defvjp(_remember, _cut)

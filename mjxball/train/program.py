@@ -73,6 +73,8 @@ class Agents:
         followers = [size - 1 for size in sizes] * (count // each)
         self.world = np.repeat(np.arange(self.worlds), followers)
         self.first = np.concatenate([[0], np.cumsum(followers)[:-1]])  # (worlds,) the agent in the first slot
+        # (count,) so that worlds of every size, and every one of a few worlds, have turns of their own.
+        self.turn = self.world // len(sizes) + self.world % len(sizes)
         self.slot = np.arange(count) - self.first[self.world]
         # (worlds, F); slots that nobody fills show the first agent, whatever it does there has no effect.
         filled = np.arange(slots) < np.array(followers)[:, None]
@@ -113,6 +115,7 @@ class Environments:
         self._step = jax.vmap(env.step)
         sizes = getattr(env, "team_sizes", None)
         self._agents = Agents(sizes, env.config.plant.count - 1, count) if sizes else None
+        self.turn = self._agents.turn if self._agents else np.arange(count)
 
     @property
     def _worlds(self) -> int:
