@@ -224,6 +224,18 @@ class TestAgents:
         for agent in range(22):
             assert agents.table[agents.world[agent], agents.slot[agent]] == agent
 
+    @pytest.mark.parametrize(
+        ("sizes", "count", "turns"), [((2, 3, 4, 5, 6), 180, 6), ((2, 3, 4), 72, 6), ((2, 3, 4, 6), 44, 4)]
+    )
+    def test_worlds_of_every_size_take_turns_evenly(self, sizes: tuple[int, ...], count: int, turns: int) -> None:
+        agents = Agents(sizes, 5, count)
+        size = np.array(sizes)[np.arange(agents.worlds) % len(sizes)]
+        turn = agents.turn[agents.first] % turns
+        np.testing.assert_array_equal(agents.turn, agents.turn[agents.first][agents.world])
+        for one in sizes:
+            counts = np.bincount(turn[size == one], minlength=turns)
+            assert counts.min() == counts.max() == count // (sum(sizes) - len(sizes)) // turns
+
     def test_a_count_that_fills_no_worlds_is_refused(self) -> None:
         with pytest.raises(InputError, match="multiple of 11"):
             Agents(SIZES, 5, 32)
