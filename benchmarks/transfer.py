@@ -123,7 +123,7 @@ def ours(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Policy:
     kind = {"sac": SoftActorCritic, "ppo": ProximalPolicyOptimization}[algorithm]
     whole = jax.jit(
         lambda key: train(config, key, env=env, algorithm=kind, evaluate=algorithm == "sac"),
-        compiler_options=compiler_options(),
+        compiler_options=compiler_options(kind),
     )
     policy, _ = whole(jax.random.PRNGKey(seed))
     return lambda network, observation: network(observation), jax.block_until_ready(policy)

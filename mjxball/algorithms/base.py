@@ -140,6 +140,7 @@ class Algorithm(Protocol):
     """A learning algorithm. All its functions are pure, and can be jitted and vmapped.
 
     One that is done on a CPU before it could be compiled well, or at all for a GPU, may say so: `prefers_cpu = True`.
+    One whose products of matrices are large enough to be worth XLA's tuning on a GPU: `worth_tuning = True`.
     """
 
     schedule: Schedule

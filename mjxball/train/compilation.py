@@ -19,6 +19,8 @@ OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionabl
 # Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
 # (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/archive.)
 GPU_OPTIONS: dict[str, Any] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
+# Batches of thousands gain a third of the run from tuned products (PPO of `ant`: docs/archive/training.md).
+TUNED_GPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
 # For algorithms that are done sooner than XLA, which then compiles twice as fast what runs a quarter slower.
 CPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
 if jax.__version_info__ < (0, 11):
@@ -31,9 +33,12 @@ PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in b
 def compiler_options(algorithm: Any = None, members: int = 1) -> dict[str, Any] | None:
     """XLA's options for training `members` followers at once by `algorithm` on JAX's default device.
 
-    Also for `mjxball.train.train`: `jax.jit(lambda key: train(config, key), compiler_options=compiler_options())`.
+    Also for `mjxball.train.train`: `jax.jit(lambda key: train(config, key), compiler_options=compiler_options())`, with
+    the class of the algorithm if it is not SAC.
     """
     if jax.default_backend() == "gpu":
+        if getattr(algorithm, "worth_tuning", False):
+            return TUNED_GPU_OPTIONS
         return GPU_OPTIONS | (PLAIN_PRODUCTS if members == 1 else {})
     return CPU_OPTIONS if getattr(algorithm, "prefers_cpu", False) else None
 
