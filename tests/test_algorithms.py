@@ -82,24 +82,19 @@ def test_the_gradient_of_a_linear_policy_is_that_of_the_lyapunov_equations(trans
         np.testing.assert_allclose(found, wanted, rtol=0.01, atol=1e-11)
 
 
-@pytest.mark.parametrize(("decay", "outlier"), [(1.0, 0.0), (0.9, 0.0), (1.0, 1.1), (0.9, 1.1)])
-def test_a_gradient_decays_at_every_step_and_is_cut_where_it_is_an_outlier_and_the_loss_stays(
-    decay: float, outlier: float, transport: Config
-) -> None:
+@pytest.mark.parametrize("decay", [1.0, 0.9])
+def test_a_gradient_decays_by_its_factor_at_every_step_and_the_loss_stays(decay: float, transport: Config) -> None:
     gain, steps = np.array([[2.0, 1.5]]), 30
-    x, loss, found = gradient_of(transport, gain, horizon=steps, gradient_decay=decay, outlier_norm=outlier)
+    x, loss, found = gradient_of(transport, gain, horizon=steps, gradient_decay=decay)
     states = [x]
     for _ in range(steps):
         states.append(states[-1] @ (A - B @ gain).T)
     later, wanted, cost = np.zeros_like(x), np.zeros((1, 2)), 0.0
     for x in states[-2::-1]:  # backwards: `later` is the gradient with respect to the next state
         u = -x @ gain.T
-        pushed = 2 * u @ R + later @ B
+        pushed = 2 * u @ R + decay * later @ B
         wanted -= pushed.T @ x / (steps * len(x))
-        later = 2 * x @ Q + later @ A - pushed @ gain
-        norm = np.linalg.norm(later, axis=1, keepdims=True)
-        limit = outlier * np.exp(np.log(norm).mean()) if outlier else np.inf
-        later = decay * later * np.minimum(1.0, limit / norm)
+        later = 2 * x @ Q + decay * later @ A - pushed @ gain
         cost += ((x @ Q) * x).sum() / (steps * len(x)) + ((u @ R) * u).sum() / (steps * len(x))
     np.testing.assert_allclose(loss, cost, rtol=1e-3)
     np.testing.assert_allclose(found, wanted, rtol=2e-3)

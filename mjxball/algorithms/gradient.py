@@ -40,8 +40,7 @@ class FirstOrderGradient:
     `collect` flies a window and differentiates its mean reward with respect to the policy's weights; `update` takes
     the step. Windows follow one another in an episode of `gradient.windows_per_episode`; the environments begin theirs
     in turn, so that every window has flights towards the goal and flights at it. `gradient.gradient_decay` multiplies
-    the gradient that passes from one control step to the one before, and `gradient.outlier_norm` limits that of worlds
-    near instability, which would else be most of it.
+    the gradient that passes from one control step to the one before.
     """
 
     metrics = ("loss", "gradient_norm")
@@ -122,24 +121,20 @@ class FirstOrderGradient:
         return known, envs
 
     def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
-        policy, own = self.policy(state._replace(layers=layers)), self._config
-        outlier = own.outlier_norm
-        decay: Any = own.gradient_decay
-        plain = isinstance(decay, float) and decay == 1 and not outlier  # a sweep traces the decay
+        policy = self.policy(state._replace(layers=layers))
+        decay: Any = self._config.gradient_decay
+        plain = isinstance(decay, float) and decay == 1  # not where a sweep traces it
 
         def step(carry: tuple[Any, Array], _: None) -> tuple[Any, tuple[Array, Array]]:
             envs, flies = carry
-            if not plain:
-                states = envs.states
-                inner, obs = (_passed(part, decay, outlier) for part in (states.pipeline_state, states.obs))
-                envs = envs._replace(states=states.replace(pipeline_state=inner, obs=obs))
+            envs = envs if plain else envs._replace(states=_decayed(envs.states, decay))
             seen = envs.states.obs
             envs, after = self._environments.step(envs, policy(seen), None)
-            reward = after.reward * flies if own.until_termination else after.reward
+            reward = after.reward * flies if self._config.until_termination else after.reward
             return (_forget(envs), flies * (1.0 - after.terminated)), (reward, jax.lax.stop_gradient(seen))
 
         start = envs, jnp.ones_like(envs.states.reward)
-        (envs, _), (rewards, seen) = jax.lax.scan(step, start, length=own.horizon)
+        (envs, _), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
 
     def update(
@@ -191,35 +186,12 @@ def _forget(envs: Any) -> Any:
     return envs._replace(states=states.replace(**past), statistics=still(envs.statistics))
 
 
-def _passed(tree: Any, decay: Any, outlier: float) -> Any:
-    """`tree` (rows, ...) as it is; the gradient that passes is multiplied by `decay`, of outlying rows by less.
+def _decayed(tree: Any, factor: float) -> Any:
+    """`tree` as it is; a gradient that passes through its floats is multiplied by `factor`."""
 
-    No row's norm is then more than `outlier` times the geometric mean of those that are not 0; with 0 it may be.
-    """
+    def one(leaf: Array) -> Array:
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            return leaf
+        return factor * leaf + (1.0 - factor) * jax.lax.stop_gradient(leaf)
 
-    @jax.custom_vjp
-    def passed(tree: Any, decay: Array) -> Any:
-        return tree
-
-    def forward(tree: Any, decay: Array) -> tuple[Any, Array]:
-        return tree, decay
-
-    def backward(decay: Array, slope: Any) -> tuple[Any, Array]:
-        rows = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(slope) if _real(leaf)]
-        square = sum((row**2).sum(axis=-1) for row in rows)
-        some = square > 0
-        log = 0.5 * jnp.log(jnp.where(some, square, 1.0))
-        middle = log.sum() / jnp.maximum(some.sum(), 1)
-        factor = decay * (jnp.minimum(1.0, outlier * jnp.exp(middle - log)) if outlier else jnp.ones_like(log))
-        passes = lambda leaf: (  # noqa: E731
-            leaf * factor.reshape(-1, *[1] * (leaf.ndim - 1)) if _real(leaf) else leaf
-        )
-        return jax.tree.map(passes, slope), jnp.zeros_like(decay)
-
-    passed.defvjp(forward, backward)
-    return passed(tree, jnp.asarray(decay, jnp.float32))
-
-
-def _real(leaf: Any) -> bool:
-    """Whether a gradient's leaf is one of floats; that of an integer has no bits."""
-    return leaf.dtype != jax.dtypes.float0
+    return jax.tree.map(one, tree)

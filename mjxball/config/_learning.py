@@ -92,11 +92,6 @@ class Gradient:
     gradient_decay: float = setting(
         1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1
     )
-    outlier_norm: float = setting(
-        0.0,
-        "largest norm of the gradient that passes in one world, over the geometric mean of all worlds'; 0: any",
-        low=0,
-    )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
     until_termination: bool = setting(
         False,

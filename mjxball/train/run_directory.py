@@ -197,7 +197,7 @@ def differences(recorded: Mapping[str, Any]) -> list[str]:
 
 
 # The program branches on whether they are 0 or 1.
-UNSWEPT = ("sac.curriculum", "gradient.outlier_norm")
+UNSWEPT = ("sac.curriculum",)
 # Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
 SWEEPABLE = (
     *(
