@@ -227,7 +227,7 @@ class TestUniversal:
         flown = []
         for turned in (preset("paper").plant, dataclasses.replace(plant, cg_axis="xy")):
             config = dataclasses.replace(preset("paper"), plant=dataclasses.replace(turned, object_size=(0.34,) * 3))
-            flight = simulate(config, load_policy(POLICY, config), Scenario(amplitude=0.0, seconds=4.0), "newton-euler")
+            flight = simulate(config, load_policy(POLICY, config), Scenario(amplitude=0.0, seconds=6.0), "newton-euler")
             flown.append(np.linalg.norm(flight.error[-1]))
         assert max(flown) < 0.03
 
