@@ -1,6 +1,7 @@
 """How much better a follower is that was trained for one rig alone: `universal` goes on training on each of some rigs.
 
-    python benchmarks/rigs_own.py policies/universal.npz --json benchmarks/results/rigs_own.json
+    python benchmarks/rigs_own.py policies/universal.npz --json FILE     # 15 minutes on one core
+    python benchmarks/rigs_own.py policies/universal.npz --sizes 2 3 4 --rigs 100 --worlds 24 --steps 500     # a GPU's
 
 The first held-out rigs of each size. Every rig has weights of its own, which begin as the policy's and take steps of
 Adam by first-order gradients (`algorithms.gradient`) on flights of that rig alone; all rigs of a size are one program.
@@ -99,8 +100,8 @@ def train(config: Config, rigs: RigTable, policy: PolicyFile, options: Any) -> l
         worlds = jax.jit(jax.vmap(begin))(tables, jax.random.split(key, rigs.total))
         mapped = jax.vmap(gradient, in_axes=(0, 0, 0, 0, None))
         keys = jax.random.split(key, rigs.total)
-        options_of_xla = compiler_options(FirstOrderGradient, rigs.total)
-        step = jax.jit(mapped).lower(tables, state, worlds, keys, np.float32(0)).compile(options_of_xla)
+        lowered = jax.jit(mapped).lower(tables, state, worlds, keys, np.float32(0))
+        step = lowered.compile(compiler_options(FirstOrderGradient, rigs.total))
         for count in range(options.steps):
             key, own_key = jax.random.split(key)
             state, worlds = step(

@@ -53,19 +53,29 @@ class LinearQuadratic(toys.Env):
         return state.replace(obs=A @ x + B @ action, reward=-cost)
 
 
-def gradient_of(config: Config, gain: np.ndarray, **settings: Any) -> tuple[np.ndarray, float, np.ndarray]:
-    """(start states (32, 2), loss, its gradient (1, 2)) of u = -gain x on 32 worlds, none of which begins anew."""
+def gradient_of(
+    config: Config, gain: np.ndarray, swept: dict[str, float] | None = None, **settings: Any
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """(start states (32, 2), loss, its gradient (1, 2)) of u = -gain x on 32 worlds, none of which begins anew.
+
+    `swept` settings are traced, as in a population.
+    """
     settings = {"num_envs": 32, "windows_per_episode": 33, "policy_layers": (), **settings}
     environments = Environments(LinearQuadratic(), 32, Shards())
-    changed = dataclasses.replace(config, gradient=dataclasses.replace(config.gradient, **settings))
-    algorithm = FirstOrderGradient(changed, environments)
     states = environments.reset(jax.random.PRNGKey(0))
     kernel = jnp.concatenate([-jnp.asarray(gain.T, jnp.float32), jnp.zeros((2, 1))], axis=1)
-    state = algorithm.init(jax.random.PRNGKey(1))._replace(
-        layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=jnp.ones((), jnp.int32)
-    )
-    after, _ = algorithm.collect(state, environments.begin(states, 1.0), [jax.random.PRNGKey(2)], TRAIN)
-    return np.asarray(states.obs, float), float(after.loss), -np.asarray(after.slope["hidden_0"]["kernel"])[:, :1].T
+
+    def collected(traced: dict[str, Any]) -> tuple[Any, Any]:
+        own = dataclasses.replace(config.gradient, **settings, **traced)
+        algorithm = FirstOrderGradient(dataclasses.replace(config, gradient=own), environments)
+        state = algorithm.init(jax.random.PRNGKey(1))._replace(
+            layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=jnp.ones((), jnp.int32)
+        )
+        after, _ = algorithm.collect(state, environments.begin(states, 1.0), [jax.random.PRNGKey(2)], TRAIN)
+        return after.loss, after.slope["hidden_0"]["kernel"]
+
+    loss, slope = jax.jit(collected)(swept or {})
+    return np.asarray(states.obs, float), float(loss), -np.asarray(slope)[:, :1].T
 
 
 def test_the_gradient_of_a_linear_policy_is_that_of_the_lyapunov_equations(transport: Config) -> None:
@@ -82,10 +92,13 @@ def test_the_gradient_of_a_linear_policy_is_that_of_the_lyapunov_equations(trans
         np.testing.assert_allclose(found, wanted, rtol=0.01, atol=1e-11)
 
 
+@pytest.mark.parametrize("swept", [False, True])
 @pytest.mark.parametrize("decay", [1.0, 0.9])
-def test_a_gradient_decays_by_its_factor_at_every_step_and_the_loss_stays(decay: float, transport: Config) -> None:
-    gain, steps = np.array([[2.0, 1.5]]), 30
-    x, loss, found = gradient_of(transport, gain, horizon=steps, gradient_decay=decay)
+def test_a_gradient_decays_by_its_factor_at_every_step_and_the_loss_stays(
+    decay: float, swept: bool, transport: Config
+) -> None:
+    gain, steps, own = np.array([[2.0, 1.5]]), 30, {"gradient_decay": decay}
+    x, loss, found = gradient_of(transport, gain, horizon=steps, **({"swept": own} if swept else own))
     states = [x]
     for _ in range(steps):
         states.append(states[-1] @ (A - B @ gain).T)

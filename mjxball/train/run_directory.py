@@ -196,8 +196,7 @@ def differences(recorded: Mapping[str, Any]) -> list[str]:
     return found
 
 
-# The program branches on whether they are 0 or 1.
-UNSWEPT = ("sac.curriculum",)
+UNSWEPT = ("sac.curriculum",)  # the program branches on whether it is 0
 # Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
 SWEEPABLE = (
     *(
