@@ -27,6 +27,9 @@ MODELS = (
     *((13.0, 0.035), (13.0, 0.07), (18.0, 0.045)),
 )
 TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=500.0, tilt_limit=0.3)  # of a load's torque over the inertia
+# Inertia of a pair about pitch over that about roll, the median of random rigs (`sim.rigs`): the same torque turns it
+# about roll as much more, and rotors hold as much more of a tilt.
+PAIR_INERTIA_RATIO = 13.0
 SCORE_TIME = 8.0  # [s] in which a model's score is forgotten
 
 
@@ -41,13 +44,12 @@ def multi_model_lqg(
         attitude = dataclasses.replace(config.attitude, natural_frequency=(frequency, frequency, frequency))
         model = ideal_model(dataclasses.replace(config, attitude=attitude), NAME)
         stiffness, damping = frequency**2, 2 * damped * frequency
-        *axis, gain, covariance = angle_filter(stiffness, damping, lag, period, tuning.torque_walk)
-        inverse, tilts = np.linalg.inv(covariance), feedback(model, tuning).pitch
-        prior = -0.5 * np.log(np.linalg.det(covariance))
-        certainty = np.array([inverse[0, 0], inverse[0, 1], inverse[1, 1]])
-        parts.append((np.hstack(axis), gain, certainty, prior, np.array(tilts), stiffness, damping / stiffness))
+        of_loop, tilts = (stiffness, damping, lag, period), feedback(model, tuning).pitch
+        axis, *own = _filter(*of_loop, tuning.torque_walk)
+        _, *of_pair = _filter(*of_loop, tuning.torque_walk * PAIR_INERTIA_RATIO**2)
+        parts.append((axis, *own, *of_pair, np.array(tilts), stiffness, damping / stiffness))
     stacked = [np.stack(part) for part in zip(*parts, strict=True)]
-    axes, gains, certainty, prior, tilt, every_stiffness, every_damping = stacked
+    axes, gains, certainty, prior, *rolling, tilt, every_stiffness, every_damping = stacked
     *height, height_gain = height_filter(config.plant.rotor_lag, period)
     return MultiModelLqg(
         axis=axes,
@@ -63,7 +65,19 @@ def multi_model_lqg(
         limits=np.array([tuning.tilt_limit, VERTICAL_LIMIT, CORRECTION_LIMIT]),
         keep=1.0 - period / np.array([SCORE_TIME, ADDED_TIME]),
         added_lift=1.0,
+        pair_roll_gain=rolling[0],
+        pair_roll_certainty=rolling[1],
+        pair_roll_prior=rolling[2] - rolling[2].max(),
+        pair_roll_room=PAIR_INERTIA_RATIO,
     )
+
+
+def _filter(stiffness: float, damping: float, lag: float, period: float, walk: float) -> tuple[Any, ...]:
+    """(A B, K, elements of the inverse covariance of the innovation, log of the root of its determinant)."""
+    *axis, gain, covariance = angle_filter(stiffness, damping, lag, period, walk)
+    inverse = np.linalg.inv(covariance)
+    certainty = np.array([inverse[0, 0], inverse[0, 1], inverse[1, 1]])
+    return np.hstack(axis), gain, certainty, -0.5 * np.log(np.linalg.det(covariance))
 
 
 class MultiModelOffsetFree(OffsetFree):

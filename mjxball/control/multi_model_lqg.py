@@ -3,7 +3,8 @@
 One Kalman filter for each of M pairs of loop frequency and rotor lag runs about roll and about pitch; their weights are
 those of Magill (1965), by how well each predicts what is measured, forgotten over some seconds. Feedback gains and
 estimates are weighted means. To the filters what the network lifts is part of the load; of a pair the weights know
-better: a third set of states holds what that lift has turned about pitch. Everything else is as in `control.team_lqg`.
+better: a third set of states holds what that lift has turned about pitch. About roll a pair's inertia is small, so that
+it has filters of its own there, for larger loads, and more room. Everything else is as in `control.team_lqg`.
 What a follower must be told is its team's geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg`
 makes the numbers, which stand in the policy file.
 """
@@ -44,6 +45,11 @@ class MultiModelLqg(NamedTuple):
     limits: Array  # (3,) of the error's part in a tilt [rad], of that in the height [m/s2], against the load [rad]
     keep: Array  # (2,) share that a step leaves of the models' scores, and of the slow part of what was added
     added_lift: Array | float = 0.0  # () share of the lift that the network adds whose torque a pair's scores are told
+    # The same about roll of a pair; None: as of every team.
+    pair_roll_gain: Array | None = None  # (M, 5, 2)
+    pair_roll_certainty: Array | None = None  # (M, 3)
+    pair_roll_prior: Array | None = None  # (M,)
+    pair_roll_room: Array | float = 1.0  # () factor on what rotors hold as a tilt
 
     @property
     def models(self) -> int:
@@ -119,8 +125,7 @@ class MultiModelLqg(NamedTuple):
         lifted = context[..., 1:3] * (own - led)[..., 2:]
         roll, pitch = context[..., 1:2], context[..., 2:3]
         lever = xp.sqrt(roll * roll + pitch * pitch)  # the follower's own, as long as that of the leader
-        told = float(self.added_lift) * clipped(2.0 * share - 3.0, 0.0, 1.0)  # of a pair; of more drones 0
-        turned = told * lever * (command - own)[..., 2:]
+        turned = float(self.added_lift) * is_pair(share) * lever * (command - own)[..., 2:]
         turns = xp.concat([lifted, turned], axis=-1)[..., None] / self._like(self.stiffness, observation)
         drive = xp.concat([mean[..., :2], 0.0 * turned], axis=-1)[..., None] + turns
         axis, height = self._like(self.axis, observation), self._like(self.height, observation)
@@ -134,13 +139,25 @@ class MultiModelLqg(NamedTuple):
     def _like(self, numbers: Array, observation: Array) -> Array:
         return observation.__array_namespace__().asarray(numbers, dtype=observation.dtype)
 
+    def _about_axes(self, numbers: Array, of_pair: Array | None, pair: Array, axes: int = 2) -> Array:
+        """`numbers` (M, ...) of each model about roll and `axes` - 1 others (..., axes or 1, M, ...).
+
+        `of_pair`: those about roll where `pair` (...) is 1.
+        """
+        every = self._like(numbers, pair)
+        if of_pair is None:
+            return every[None]
+        xp = pair.__array_namespace__()
+        roll = every + pair.reshape(*pair.shape, *(1,) * every.ndim) * (self._like(of_pair, pair) - every)
+        return xp.stack([roll, *[xp.broadcast_to(every, roll.shape)] * (axes - 1)], axis=-1 - every.ndim)
+
     def _each(self, weights: Array, numbers: Array) -> Array:
         """Weighted mean (..., 2) of a number (M,) of each model."""
         return (weights * self._like(numbers, weights)).sum(axis=-1)
 
     def _estimate(self, memory: Array, observation: Array) -> Estimate:
         """What is known at `observation`."""
-        xp, models = observation.__array_namespace__(), self.models
+        xp, models, pair = observation.__array_namespace__(), self.models, is_pair(memory[..., -CONTEXT])
         ends = AXES * models * ANGLE_STATES
         rows = [memory[..., k * ANGLE_STATES : (k + 1) * ANGLE_STATES] for k in range(AXES * models)]
         predicted = xp.stack([joined(rows[k * models : (k + 1) * models], axis=-2) for k in range(AXES)], axis=-3)
@@ -148,16 +165,17 @@ class MultiModelLqg(NamedTuple):
         zero = xp.zeros_like(found[0])
         angle, rate = (joined([found[k], found[k + 1], zero])[..., None] for k in (0, 2))
         left = joined([angle - predicted[..., 0], rate - predicted[..., 1]])
-        gain, certainty = self._like(self.axis_gain, observation), self._like(self.certainty, observation)
+        gain = self._about_axes(self.axis_gain, self.pair_roll_gain, pair, AXES)
+        certainty = self._about_axes(self.certainty, self.pair_roll_certainty, pair)
+        prior = self._about_axes(self.prior, self.pair_roll_prior, pair)
         turning = predicted + (gain * left[..., None, :]).sum(axis=-1)
         told = xp.stack([left[..., 0, :, :], left[..., 1, :, :] + left[..., 2, :, :]], axis=-3)
         first, second = told[..., 0], told[..., 1]
-        distance = (
-            certainty[:, 0] * first * first + 2.0 * certainty[:, 1] * first * second + certainty[:, 2] * second * second
-        )
+        own, mixed, other = certainty[..., 0], certainty[..., 1], certainty[..., 2]
+        distance = own * first * first + 2.0 * mixed * first * second + other * second * second
         begin = ends + HEIGHT_STATES
         scores = joined([memory[..., begin + k * models : begin + (k + 1) * models] for k in (0, 1)], axis=-2)
-        scores = self.keep[0] * scores + self._like(self.prior, observation) - 0.5 * distance
+        scores = self.keep[0] * scores + prior - 0.5 * distance
         scores = scores - xp.max(scores, axis=-1, keepdims=True)
         odds = xp.exp(scores)
         weights = odds / odds.sum(axis=-1, keepdims=True)
@@ -185,6 +203,8 @@ class MultiModelLqg(NamedTuple):
         wanted = wanted - within(xp, load, load_limit)
         own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
         rest, most = angles + damping * rates, xp.maximum(context[..., 3:] * soft, LEAST_ROOM)
+        wider = 1.0 + (float(self.pair_roll_room) - 1.0) * is_pair(share)
+        most = most * joined([wider, xp.ones_like(wider)])
         own = rest + most * within(xp, (own - rest) / most, 1.0)
         return xp.concat([own, vertical[..., None]], axis=-1), seen
 
@@ -222,6 +242,11 @@ def ring_context(count: Array, leader: Array) -> Array:
     lever = LEVER / ((x * x + y * y) * count * spread)
     room = ROOM * 2.0 * xp.sin(math.pi / count) / (spread * xp.sqrt(x * x + y * y))
     return joined([count / (count - 1.0), -y * lever, x * lever, room])
+
+
+def is_pair(share: Array) -> Array:
+    """1 for a pair's N / (N - 1) = 2, 0 for that of more drones."""
+    return clipped(2.0 * share - 3.0, 0.0, 1.0)
 
 
 def _crossed(xp: Any, vector: Array) -> Array:

@@ -44,7 +44,7 @@ def policy_file(
         "filters": list(follower.observation_averages),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
-        **({} if law.lqg is None else {"lqg": {k: np.asarray(v).tolist() for k, v in law.lqg._asdict().items()}}),
+        **({} if law.lqg is None else {"lqg": _numbers(law.lqg)}),
         **({"context": list(CONTEXTS[version])} if law.needs_context else {}),
         "action_reach": action_scale,
         "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
@@ -124,3 +124,8 @@ def is_sound(policy: PolicyFile) -> bool:
         math.isfinite(float(np.abs(array).sum()))
         for array in (*policy.weights, *policy.biases, policy.observation_mean, policy.observation_scale)
     )
+
+
+def _numbers(lqg: Any) -> dict[str, Any]:
+    """The numbers of `lqg` that a card holds; what it leaves out is None."""
+    return {name: np.asarray(value).tolist() for name, value in lqg._asdict().items() if value is not None}

@@ -102,6 +102,12 @@ MULTI_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # behind an axis of models
     "stiffness": (),
     "damping": (),
 }
+PAIR_ROLL_SHAPES: dict[str, tuple[int, ...]] = {  # 0 for the models; absent, all of them, from the first files
+    "pair_roll_gain": (0, 5, 2),
+    "pair_roll_certainty": (0, 3),
+    "pair_roll_prior": (0,),
+    "pair_roll_room": (),
+}
 MULTI_MODEL_COMMON: dict[str, tuple[int, ...]] = {
     "height": (3, 4),
     "height_gain": (3,),
@@ -313,6 +319,8 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
     later = LATER_LQG_SHARES.get(version)
     if later and isinstance(lqg, dict) and later in lqg:
         shapes = {**shapes, later: ()}
+    if version == 4 and isinstance(lqg, dict) and lqg.keys() & PAIR_ROLL_SHAPES.keys():
+        shapes = {**shapes, **{field: shape and (models, *shape[1:]) for field, shape in PAIR_ROLL_SHAPES.items()}}
     positive = ("stiffness", "limits", "damping" if in_team else "carried")
     if not isinstance(lqg, dict) or lqg.keys() != shapes.keys() or card["action_mode"] != "residual":
         raise PolicyFileError(
@@ -326,6 +334,8 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
         _check_team(card["team"], name, CONTEXTS[version])
     if min(np.min(lqg[field]) for field in positive) <= 0:
         raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
+    if version == 4 and not lqg.get("pair_roll_room", 1.0) > 0:
+        raise PolicyFileError(f"{name}: card field lqg.pair_roll_room must be positive")
     if later and not 0 <= lqg.get(later, 0) <= 1:
         raise PolicyFileError(f"{name}: card field lqg.{later} must be a share from 0 to 1")
 
