@@ -15,10 +15,13 @@ import pytest
 from command_line import assert_one_line, call, listing, load_arrays, run, write_arrays
 from conftest import Trained
 
+from mjxball.baselines.multi_model_lqg import multi_model_lqg
 from mjxball.cli import plant_setup
+from mjxball.config import preset
 from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
+from mjxball.policy.export import _numbers
 from mjxball.policy.file import law_of, save_file, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
@@ -60,6 +63,7 @@ int main(void) {
 
 
 ROUNDED = 5e-5  # of what is large in a memory: angular accelerations, scores of models
+SCORES = 1e-3  # of models' scores in double: the numbers of the law, of which large ones cancel, are float in C
 
 
 @pytest.fixture(scope="module")
@@ -81,12 +85,14 @@ def limited(remembering: Trained) -> PolicyFile:
         *("trained", "direct", "remembering", "limited", "estimating"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
         *("team pair", "team team3", "universal pair", "universal team3", "lifting team6"),
+        *("rolling pair", "rolling team3", "older pair"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
     name, _, plant = request.param.partition(" ")
     if plant:
-        policy = lifting() if name == "lifting" else load_file(shipped_policy(name))
+        laws = {"lifting": lifting, "rolling": rolling, "older": older}
+        policy = laws[name]() if name in laws else load_file(shipped_policy(name))
         return in_team(policy, name, Path(plant), None if plant == "pair" else 2)
     if name in ("balance", "transport", "robust", "flight", "stand", "paper"):
         return load_file(shipped_policy(name))
@@ -98,6 +104,20 @@ def lifting() -> PolicyFile:
     """`team` with a law that holds most of the load by lifting apart."""
     team = load_file(shipped_policy("team"))
     return dataclasses.replace(team, card={**team.card, "lqg": {**team.card["lqg"], "lifting": 0.9}})
+
+
+def rolling() -> PolicyFile:
+    """`universal` with a law that has filters of its own about a pair's roll."""
+    universal = load_file(shipped_policy("universal"))
+    lqg = _numbers(multi_model_lqg(preset("universal")))
+    return dataclasses.replace(universal, card={**universal.card, "lqg": lqg})
+
+
+def older() -> PolicyFile:
+    """The same without these."""
+    made = rolling()
+    lqg = {name: value for name, value in made.card["lqg"].items() if not name.startswith("pair_roll")}
+    return dataclasses.replace(made, card={**made.card, "lqg": lqg})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +161,7 @@ def assert_remembered(found: np.ndarray, flight: Flight, contents: PolicyFile, t
     if isinstance(law.lqg, MultiModelLqg):
         last = -CONTEXT - 2
         scores = slice(last - 2 * law.lqg.models, last)
-        least[scores] += np.spacing(np.abs(wanted[:, scores]).max().astype(found.dtype))
+        least[scores] += max(np.spacing(np.abs(wanted[:, scores]).max().astype(found.dtype)), SCORES)
     excess = np.abs(found - wanted) - ROUNDED * np.abs(wanted) - least
     assert (excess <= 0).all(), np.argwhere(~(excess <= 0))
 
@@ -217,6 +237,32 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert 4 * (size + 2 * widest) == cost.stack
     assert f"{cost.stack} bytes of arrays on the stack" in text
     assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
+
+
+def test_only_a_pair_pays_for_filters_of_its_own_about_roll():
+    more, less = rolling(), older()
+    of_three = [in_team(made, "three", Path("team3"), 1) for made in (more, less)]
+    assert c_header(of_three[0], "follower") == c_header(of_three[1], "follower")
+    pairs = [in_team(made, "pair", Path("pair"), None) for made in (more, less)]
+    texts, costs = [c_header(made, "follower") for made in pairs], [footprint(made) for made in pairs]
+    assert costs[0].flash - costs[1].flash == 4 * (5 * 2 + 3 + 1) * law_of(more.card).lqg.models
+    assert ["pair_roll" in text for text in texts] == [True, False]
+    assert not any("nanf" in text for text in texts)  # what a law lacks
+    assert "#define MJXBALL_ROLL_ROOM 1.0e+00f\n" in texts[1]
+
+
+@pytest.mark.parametrize(("share", "weight", "room"), [(2.0, 1.0, "1.3e+01f"), (1.75, 0.5, "7.0e+00f")])
+def test_a_pairs_header_has_its_numbers_about_roll(share: float, weight: float, room: str):
+    """Also where a card names a share between those of a pair and of three."""
+    pair = in_team(rolling(), "pair", Path("pair"), None)
+    pair.card["team"]["context"][0] = share
+    text, lqg = c_header(pair, "follower"), pair.card["lqg"]
+    for own, every in (("roll_gain", "axis_gain"), ("roll_certainty", "certainty"), ("roll_prior", "prior")):
+        numbers = re.search(rf"mjxball_lqg_pair_{own}\[\d+\] = {{([^}}]*)}}", text)[1].replace("f", "").split(",")
+        wanted = weight * np.ravel(lqg[f"pair_{own}"]) + (1.0 - weight) * np.ravel(lqg[every])
+        np.testing.assert_allclose([float(number) for number in numbers], wanted, rtol=1e-6)
+        assert f"#define MJXBALL_{own.upper()} mjxball_lqg_pair_{own}\n" in text
+    assert f"#define MJXBALL_ROLL_ROOM {room}\n" in text
 
 
 @pytest.mark.slow

@@ -14,14 +14,16 @@ from mjxball.baselines.multi_model_lqg import MODELS, MultiModelOffsetFree, mult
 from mjxball.baselines.team_lqg import TUNING, team_lqg
 from mjxball.config import Config, preset
 from mjxball.control.followers import Baseline, copy_gains
-from mjxball.control.multi_model_lqg import LEVER, team_geometry
+from mjxball.control.multi_model_lqg import LEAST_ROOM, LEVER, MultiModelLqg, team_geometry
 from mjxball.plant.teams import ring_config
 from mjxball.policy.container import PolicyFileError
+from mjxball.policy.export import _numbers
 from mjxball.policy.file import law_of, load_file, save_file, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import CIRCLE, Scenario
 
 UNIVERSAL, TEAM = preset("universal"), preset("team")
+PAIR_ROLL = ("pair_roll_gain", "pair_roll_certainty", "pair_roll_prior", "pair_roll_room")
 
 
 def team4(frequency: float) -> Config:
@@ -72,10 +74,11 @@ def test_it_finds_how_fast_the_loops_are(frequency: float) -> None:
     assert np.linalg.norm(flown.error[-1]) < 0.25 * np.linalg.norm(flown.error[0])
 
 
-def test_numpy_and_jax_agree_and_models_share_one_weight() -> None:
+@pytest.mark.parametrize("share", [1.5, 2.0])
+def test_numpy_and_jax_agree_and_models_share_one_weight(share: float) -> None:
     law, random = multi_model_lqg(UNIVERSAL), np.random.default_rng(1)
     leader = copy_gains(UNIVERSAL)
-    memory = law.start(np.zeros((2, 18)), np.array([1.5, 3.0, -1.0, 30.0]))
+    memory = law.start(np.zeros((2, 18)), np.array([share, 3.0, -1.0, 30.0]))
     assert memory.shape == (2, law.size)
     for _ in range(10):
         observation = 0.1 * random.standard_normal((2, 18))
@@ -162,3 +165,99 @@ def test_a_file_without_the_lift_share_flies_as_before(tmp_path: Path) -> None:
     card["lqg"]["added_lift"] = 1.5
     with pytest.raises(PolicyFileError, match="added_lift must be a share from 0 to 1"):
         save_file(tmp_path / "odd.npz", dataclasses.replace(contents, card=card))
+
+
+def without_own_roll(law: MultiModelLqg) -> MultiModelLqg:
+    """`law` as files have it that know nothing of a pair's roll."""
+    return law._replace(**{name: MultiModelLqg._field_defaults[name] for name in PAIR_ROLL})
+
+
+def steps_to_find(law: MultiModelLqg, share: float, axis: int) -> int:
+    """After how many steps the estimate stays within a fifth of a load torque that sets in about an `axis`."""
+    memory, leader, late = law.start(np.zeros(18), np.array([share, 0.0, 0.0, 40.0])), copy_gains(UNIVERSAL), 0
+    state, (onward, drive) = np.array([0.0, 0.0, 20.0, 0.0, 0.0]), np.split(law.axis[0], [5], axis=1)
+    for step in range(100):
+        seen = np.zeros(18)
+        seen[[3 + axis, 9 + axis]] = state[:2]
+        found = law.features(memory, seen)[5 + 3 * axis] * law.stiffness[0]
+        late = step + 1 if abs(found - state[2]) > 0.2 * 20.0 else late
+        command = law.command(np.zeros(3), memory, seen, leader)
+        memory, state = law.next(memory, seen, command, leader), onward @ state + drive[:, 0] * command[axis] / share
+    return late
+
+
+def test_a_load_about_a_pairs_roll_is_found_sooner() -> None:
+    law = multi_model_lqg(UNIVERSAL, ((9.0, 0.08),))
+    before = steps_to_find(without_own_roll(law), 2.0, 0)
+    assert steps_to_find(law, 2.0, 0) <= 0.5 * before < 10
+    assert steps_to_find(law, 2.0, 1) == steps_to_find(law, 1.5, 0) == before
+
+
+@pytest.mark.parametrize("share", [1.5, 4 / 3, 1.2])
+def test_teams_of_three_and_more_know_nothing_of_a_pairs_roll(share: float) -> None:
+    own, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), np.random.default_rng(4)
+    plain, context = without_own_roll(own), np.array([share, 3.0, -1.0, 20.0])
+    memory = own.start(np.zeros((2, 18)), context)
+    for _ in range(20):
+        observation = 0.1 * random.standard_normal((2, 18))
+        command, other = (law.command(np.zeros((2, 3)), memory, observation, leader) for law in (own, plain))
+        np.testing.assert_array_equal(command, other)
+        memory, other = (law.next(memory, observation, command, leader) for law in (own, plain))
+        np.testing.assert_array_equal(memory, other)
+
+
+def test_about_pitch_a_pair_has_the_filters_of_every_team() -> None:
+    own, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), np.random.default_rng(5)
+    memory = own.start(np.zeros(18), np.array([2.0, 0.0, 6.0, 40.0]))
+    for _ in range(10):
+        observation = 0.1 * random.standard_normal(18)
+        mine, other = (law._estimate(memory, observation) for law in (own, without_own_roll(own)))
+        for part, same in ((mine.turning, other.turning), (mine.scores, other.scores)):
+            np.testing.assert_array_equal(part[1:], same[1:])
+            assert np.abs(part[0] - same[0]).max() > 1e-3
+        command = own.command(np.zeros(3), memory, observation, leader)
+        memory = own.next(memory, observation, command, leader)
+
+
+@pytest.mark.parametrize(("axis", "share", "factor"), [(0, 2.0, 2.0), (0, 1.75, 1.5), (0, 1.5, 1.0), (1, 2.0, 1.0)])
+def test_a_pair_has_more_room_about_roll(axis: int, share: float, factor: float) -> None:
+    """A level team far from its goal, whose rotors hold hardly a tilt."""
+    law, leader, far = multi_model_lqg(UNIVERSAL)._replace(pair_roll_room=2.0), copy_gains(UNIVERSAL), np.zeros(18)
+    far[13 - axis] = 5.0
+    memory = law.start(far, np.array([share, 0.0, 0.0, 1e-3]))
+    command = law.command(np.zeros(3), memory, far, leader)
+    np.testing.assert_allclose(np.abs(command[:2]), factor * LEAST_ROOM * (np.arange(2) == axis), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong"),
+    [
+        ("pair_roll_gain", np.zeros((len(MODELS), 5)).tolist()),
+        ("pair_roll_certainty", [[1.0, 0.0, 1.0]]),
+        ("pair_roll_prior", [0.0] * (len(MODELS) - 1)),
+        ("pair_roll_prior", None),
+        ("pair_roll_room", [13.0]),
+        ("pair_roll_room", True),
+        ("pair_roll_room", 0.0),
+        ("pair_roll_room", -1.0),
+    ],
+)
+def test_numbers_about_a_pairs_roll_that_do_not_fit_are_refused(field: str, wrong: object, tmp_path: Path) -> None:
+    contents = load_file(shipped_policy("universal"))
+    sound = {**contents.card, "lqg": _numbers(multi_model_lqg(UNIVERSAL))}
+    save_file(tmp_path / "sound.npz", dataclasses.replace(contents, card=sound))
+    card = {**sound, "lqg": {**sound["lqg"], field: wrong}}
+    with pytest.raises(PolicyFileError, match=rf"card field lqg\.{field} must be [^\n]*\Z"):
+        save_file(tmp_path / "odd.npz", dataclasses.replace(contents, card=card))
+    del card["lqg"][field]
+    with pytest.raises(PolicyFileError, match=rf"needs card field lqg: .*{field}"):
+        save_file(tmp_path / "odd.npz", dataclasses.replace(contents, card=card))
+
+
+def test_a_file_without_numbers_about_a_pairs_roll_flies_as_before(tmp_path: Path) -> None:
+    contents, law = load_file(shipped_policy("universal")), multi_model_lqg(UNIVERSAL)
+    for made in (law, without_own_roll(law)):
+        lqg = {name: value for name, value in _numbers(made).items() if made is law or name not in PAIR_ROLL}
+        save_file(tmp_path / "one.npz", dataclasses.replace(contents, card={**contents.card, "lqg": lqg}))
+        for name, value in law_of(load_file(tmp_path / "one.npz").card).lqg._asdict().items():
+            np.testing.assert_array_equal(value, getattr(made, name))

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjxball.baselines.multi_model_lqg import multi_model_lqg
+from mjxball.baselines.multi_model_lqg import MODELS, multi_model_lqg
 from mjxball.cli import plant_setup
 from mjxball.config import preset
 from mjxball.control.multi_model_lqg import CONTEXT
 from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.policy import Policy, PolicyFile, load_file
+from mjxball.policy.export import _numbers
 from mjxball.policy.file import law_of, shipped_policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rollout import simulate
@@ -26,6 +27,13 @@ from mjxball.sim.scenario import Scenario
 
 UNIVERSAL = load_file(shipped_policy("universal"))
 TEAMS = {"pair": None, "team3": 1, "team4": 3, "plate4": 2, "team6": 4}  # plant: which of its followers
+
+
+def with_law(own_roll: bool, models: Any = MODELS) -> PolicyFile:
+    """The shipped network with a law that has filters of its own about a pair's roll, or has none, as older files."""
+    lqg = _numbers(multi_model_lqg(preset("universal"), models))
+    left = {name: value for name, value in lqg.items() if own_roll or not name.startswith("pair_roll")}
+    return dataclasses.replace(UNIVERSAL, card={**UNIVERSAL.card, "lqg": left})
 
 
 class Reference:
@@ -70,7 +78,7 @@ def agree(
 def test_it_is_the_law_of_arrays(plant: str, size: float, tolerance: float) -> None:
     """Scores are differences of squared distances, which large steps make so large that doubles round them to 1e-6."""
     policy, reference = told(plant)
-    agree(policy, reference, walk(300, size=size), tolerance, tolerance)
+    agree(policy, reference, walk(300, size=size), tolerance, 10 * tolerance)
     assert policy._ahead  # none of these were answered by the law of arrays
 
 
@@ -126,10 +134,30 @@ def test_any_history_and_any_gains(fields: dict[str, Any]) -> None:
     agree(*told("team4", contents=contents), walk(200))
 
 
-def test_one_model_is_enough() -> None:
-    lqg = multi_model_lqg(preset("universal"), ((7.0, 0.05),))
-    card = {**UNIVERSAL.card, "lqg": {name: np.asarray(value).tolist() for name, value in lqg._asdict().items()}}
-    agree(*told("team3", contents=dataclasses.replace(UNIVERSAL, card=card)), walk(200))
+@pytest.mark.parametrize("plant", ["pair", "team3"])
+def test_one_model_is_enough(plant: str) -> None:
+    agree(*told(plant, contents=with_law(True, ((7.0, 0.05),))), walk(200))
+
+
+@pytest.mark.parametrize("own_roll", [True, False])
+@pytest.mark.parametrize("plant", ["pair", "team3"])
+def test_with_filters_of_a_pairs_own_about_roll_and_without(plant: str, own_roll: bool) -> None:
+    policy, reference = told(plant, contents=with_law(own_roll))
+    agree(policy, reference, walk(200), remembered=1e-8)
+    assert policy._ahead
+    assert (policy._single._filters._roll_matrix is not None) == (own_roll and plant == "pair")
+
+
+def test_a_memory_of_another_team_changes_the_filters_about_roll() -> None:
+    """Also one of a share between those of a pair and of three."""
+    policy, reference = told("pair", contents=with_law(True))
+    agree(policy, reference, walk(20))
+    for number, share in enumerate((1.75, 1.5, 2.0, 4 / 3)):
+        memory = policy.memory
+        memory[-CONTEXT] = share
+        policy.memory, reference.memory = memory, memory
+        agree(policy, reference, walk(20, number))
+        assert policy._ahead
 
 
 def test_alone_and_in_a_batch_by_turns() -> None:

@@ -148,8 +148,8 @@ class MultiModelLqg(NamedTuple):
         if of_pair is None:
             return every[None]
         xp = pair.__array_namespace__()
-        roll = every + pair.reshape(*pair.shape, *(1,) * every.ndim) * (self._like(of_pair, pair) - every)
-        return xp.stack([roll, *[xp.broadcast_to(every, roll.shape)] * (axes - 1)], axis=-1 - every.ndim)
+        roll = every + pair[(..., *(None,) * every.ndim)] * (self._like(of_pair, pair) - every)
+        return xp.stack([roll, *[every + xp.zeros_like(roll)] * (axes - 1)], axis=-1 - every.ndim)
 
     def _each(self, weights: Array, numbers: Array) -> Array:
         """Weighted mean (..., 2) of a number (M,) of each model."""
@@ -157,7 +157,8 @@ class MultiModelLqg(NamedTuple):
 
     def _estimate(self, memory: Array, observation: Array) -> Estimate:
         """What is known at `observation`."""
-        xp, models, pair = observation.__array_namespace__(), self.models, is_pair(memory[..., -CONTEXT])
+        xp, models = observation.__array_namespace__(), self.models
+        pair = self._like(is_pair(memory[..., -CONTEXT]), observation)
         ends = AXES * models * ANGLE_STATES
         rows = [memory[..., k * ANGLE_STATES : (k + 1) * ANGLE_STATES] for k in range(AXES * models)]
         predicted = xp.stack([joined(rows[k * models : (k + 1) * models], axis=-2) for k in range(AXES)], axis=-3)

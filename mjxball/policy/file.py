@@ -317,10 +317,8 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
         every = {field: (models, *shape) for field, shape in MULTI_MODEL_SHAPES.items()}
         shapes = {**every, **MULTI_MODEL_COMMON}
     later = LATER_LQG_SHARES.get(version)
-    if later and isinstance(lqg, dict) and later in lqg:
-        shapes = {**shapes, later: ()}
-    if version == 4 and isinstance(lqg, dict) and lqg.keys() & PAIR_ROLL_SHAPES.keys():
-        shapes = {**shapes, **{field: shape and (models, *shape[1:]) for field, shape in PAIR_ROLL_SHAPES.items()}}
+    if isinstance(lqg, dict):
+        shapes = {**shapes, **_optional_shapes(lqg, version)}
     positive = ("stiffness", "limits", "damping" if in_team else "carried")
     if not isinstance(lqg, dict) or lqg.keys() != shapes.keys() or card["action_mode"] != "residual":
         raise PolicyFileError(
@@ -338,6 +336,17 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
         raise PolicyFileError(f"{name}: card field lqg.pair_roll_room must be positive")
     if later and not 0 <= lqg.get(later, 0) <= 1:
         raise PolicyFileError(f"{name}: card field lqg.{later} must be a share from 0 to 1")
+
+
+def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the numbers that the first files of a format do not have, as far as `lqg` has them."""
+    later = LATER_LQG_SHARES.get(version)
+    shapes: dict[str, tuple[int, ...]] = {}
+    if later and later in lqg:
+        shapes[later] = ()
+    if version == 4 and lqg.keys() & PAIR_ROLL_SHAPES.keys():
+        shapes |= {field: shape and (len(lqg["stiffness"]), *shape[1:]) for field, shape in PAIR_ROLL_SHAPES.items()}
+    return shapes
 
 
 def _check_team(team: Any, name: str, context: tuple[str, ...]) -> None:

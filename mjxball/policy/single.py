@@ -22,6 +22,7 @@ from mjxball.control.multi_model_lqg import (
     HEIGHT_STATES,
     LEAST_ROOM,
     MultiModelLqg,
+    is_pair,
 )
 from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
 
@@ -37,7 +38,7 @@ class SingleFollower:
         self._filters, self._network = _Filters(lqg), _Network(law, *network)
         self._height, self._height_gain = lqg.height.tolist(), lqg.height_gain.tolist()
         self._rise, self._limits, self._keep = lqg.rise.tolist(), lqg.limits.tolist(), float(lqg.keep[1])
-        self._added_lift = float(lqg.added_lift)
+        self._added_lift, self._pair_roll_room = float(lqg.added_lift), float(lqg.pair_roll_room)
         self._reach, self._clip = law.action_scale, law.limits
         self._leader = law.gravity, *law.kp, *law.kd
 
@@ -60,7 +61,10 @@ class SingleFollower:
         )
         self._rising, self._slow, self._context = (part.tolist() for part in (parts[2], *parts[4:]))
         share, roll, pitch, _ = self._context
-        self._told = self._added_lift * min(max(2.0 * share - 3.0, 0.0), 1.0) * math.hypot(roll, pitch)
+        pair = float(is_pair(np.float64(share)))
+        self._told = self._added_lift * pair * math.hypot(roll, pitch)
+        self._wider = 1.0 + (self._pair_roll_room - 1.0) * pair
+        filters.tell(pair)
 
     def answer(self, observation: Array) -> tuple[list[float], list[float]] | None:
         """(action in [-1, 1] (3), command (3)) for `observation` (18,), which is remembered.
@@ -106,7 +110,7 @@ class SingleFollower:
         held = _within(roll_held, pitch_held, load_limit)
         roll_wanted = far * roll_far - r_angle * roll - r_rate * roll_rate - held * roll_held
         pitch_wanted = far * pitch_far - p_angle * pitch - p_rate * pitch_rate - held * pitch_held
-        roll_rest, roll_most = roll + roll_damping * roll_rate, max(roll_room, LEAST_ROOM)
+        roll_rest, roll_most = roll + roll_damping * roll_rate, max(roll_room, LEAST_ROOM) * self._wider
         pitch_rest, pitch_most = pitch + pitch_damping * pitch_rate, max(pitch_room, LEAST_ROOM)
         roll_own = share * roll_wanted - (share - 1.0) * led_roll - roll_rest
         pitch_own = share * pitch_wanted - (share - 1.0) * led_pitch - pitch_rest
@@ -139,28 +143,32 @@ class _Filters:
     def __init__(self, lqg: MultiModelLqg):
         models, stiffness = lqg.models, lqg.stiffness
         states = ANGLE_STATES * models
-        # Predicted states of all models, angle and rate -> states a step on, found states as tilts, innovations, and
-        # what these are multiplied by for the scores.
-        unit = np.eye(states + 2)
-        predicted, measured = unit[:states].reshape(models, ANGLE_STATES, -1), unit[states:]
-        left = measured - predicted[:, :2]
-        found = predicted + lqg.axis_gain @ left
-        onward = lqg.axis[..., :ANGLE_STATES] @ found
-        tilts = np.concatenate([found[:, :2], found[:, 2:] / stiffness[:, None, None]], axis=1)
-        first, second, (c00, c01, c11) = left[:, 0], left[:, 1], lqg.certainty.T[..., None]
-        rows = [onward, tilts, first, second, -0.5 * c00 * first - c01 * second, -0.5 * c11 * second]
-        self._matrix = np.concatenate([row.reshape(-1, states + 2) for row in rows]).T.copy()
+        gain, certainty, prior = (
+            every if of_pair is None else of_pair
+            for every, of_pair in (
+                (lqg.axis_gain, lqg.pair_roll_gain),
+                (lqg.certainty, lqg.pair_roll_certainty),
+                (lqg.prior, lqg.pair_roll_prior),
+            )
+        )
+        self._matrix = _known_of(lqg, lqg.axis_gain, lqg.certainty)
+        more = _known_of(lqg, gain, certainty) - self._matrix
+        self._of_pair: Array = more if more.any() else None  # what a pair's matrix about roll has more
+        self._roll_matrix: Array = None  # another than `_matrix` for that axis
         self._state, self._seen = np.zeros((AXES, states + 2)), np.zeros((AXES, self._matrix.shape[1]))
+        self._roll, self._roll_seen = self._state[0], self._seen[0]
         self.predicted, self._measured = self._state[:, :-2], self._state[:2, -2:]
         self._onward, tilts, self._left, self._certain = np.split(
             self._seen, np.cumsum([states, states, 2 * models]), axis=1
         )
         self._tilts = tilts[:2].reshape(2, models, ANGLE_STATES)
         self._pitch, self._turned = self._seen[1:, 2 * states :]
-        # Scores, both parts of the distance, 1 -> scores.
-        self._scoring = np.vstack([lqg.keep[0] * np.eye(models), np.eye(models), np.eye(models), lqg.prior])
-        self._scored, self._next_scores = np.ones((2, 3 * models + 1)), np.zeros((2, models))
-        self.scores, self._distance = self._scored[:, :models], self._scored[:, models:-1]
+        # Scores, both parts of the distance, 1, share of a pair's prior -> scores.
+        unit = np.eye(models)
+        self._scoring = np.vstack([lqg.keep[0] * unit, unit, unit, lqg.prior, prior - lqg.prior])
+        self._scored, self._next_scores = np.ones((2, 3 * models + 2)), np.zeros((2, models))
+        self._scored[:, -1] = 0.0
+        self.scores, self._distance = self._scored[:, :models], self._scored[:, models:-2]
         # What is averaged: tilts, 1 / stiffness, damping, gains on error, velocity, angle, rate, and 1.
         known = np.column_stack([1.0 / stiffness, lqg.damping, lqg.tilt, np.ones(models)])
         self._known = np.concatenate([np.zeros((2, models, ANGLE_STATES)), np.stack([known] * 2)], axis=-1)
@@ -168,10 +176,18 @@ class _Filters:
         self._drives, self._driven = np.zeros((AXES, 2)), np.zeros((AXES, states))
         self._drive = np.stack([lqg.axis[..., -1], lqg.axis[..., -1] / stiffness[:, None]]).reshape(2, -1)
 
+    def tell(self, pair: float) -> None:
+        """Filter about roll as a pair does where `pair` is 1, as every team where it is 0."""
+        own = self._of_pair is not None and pair > 0
+        self._roll_matrix = self._matrix + pair * self._of_pair if own else None
+        self._scored[0, -1] = pair
+
     def update(self, measured: tuple[tuple[float, float], tuple[float, float]]) -> list[list[float]]:
         """Means (2, 11) over the models after (angle, rate) of both axes were `measured`."""
         self._measured[:] = measured
         np.dot(self._state, self._matrix, out=self._seen)
+        if self._roll_matrix is not None:
+            np.dot(self._roll, self._roll_matrix, out=self._roll_seen)
         np.add(self._pitch, self._turned, out=self._pitch)
         np.multiply(self._left[:2], self._certain[:2], out=self._distance)
         scores = np.dot(self._scored, self._scoring, out=self._next_scores)
@@ -190,6 +206,24 @@ class _Filters:
         np.dot(self._drives, self._drive, out=self._driven)
         np.add(self._onward, self._driven, out=self.predicted)
         self.scores[:] = self._next_scores
+
+
+def _known_of(lqg: MultiModelLqg, gain: Array, certainty: Array) -> Array:
+    """Matrix of the filters of all models about one axis with `gain` (M, 5, 2) and `certainty` (M, 3).
+
+    Predicted states, angle and rate -> states a step on, found states as tilts, innovations, and what these are
+    multiplied by for the scores.
+    """
+    models, states = lqg.models, ANGLE_STATES * lqg.models
+    unit = np.eye(states + 2)
+    predicted, measured = unit[:states].reshape(models, ANGLE_STATES, -1), unit[states:]
+    left = measured - predicted[:, :2]
+    found = predicted + gain @ left
+    onward = lqg.axis[..., :ANGLE_STATES] @ found
+    tilts = np.concatenate([found[:, :2], found[:, 2:] / lqg.stiffness[:, None, None]], axis=1)
+    first, second, (c00, c01, c11) = left[:, 0], left[:, 1], certainty.T[..., None]
+    rows = [onward, tilts, first, second, -0.5 * c00 * first - c01 * second, -0.5 * c11 * second]
+    return np.concatenate([row.reshape(-1, states + 2) for row in rows]).T.copy()
 
 
 class _Network:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mjxball.control import multi_model_lqg, team_lqg
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.multi_model_lqg import LEAST_ROOM, MultiModelLqg
+from mjxball.control.multi_model_lqg import LEAST_ROOM, MultiModelLqg, is_pair
 from mjxball.control.observation import (
     ACTION_SIZE,
     ERROR,
@@ -29,6 +29,8 @@ from mjxball.policy.policy import known_context
 from mjxball.policy.quantize import Rows, rows_of
 
 FLOAT = 4  # bytes
+# Of `MultiModelLqg`: a pair's numbers about roll, and those of every team that they replace.
+PAIR_ROLL = {"pair_roll_gain": "axis_gain", "pair_roll_certainty": "certainty", "pair_roll_prior": "prior"}
 LQG_TEXTS = {  # helpers, law
     type(None): ("", ""),
     OffsetFreeLqg: (c_texts.COSINE, c_texts.LQG),
@@ -49,6 +51,34 @@ def _lqg_text(lqg: Any) -> str:
     return text
 
 
+def _pair(lqg: Any, context: Any) -> float:
+    """1 for a pair's follower with a law of format 4, which is told `context`; 0 for other teams and laws."""
+    return float(is_pair(np.float64(context[0]))) if isinstance(lqg, MultiModelLqg) and context is not None else 0.0
+
+
+def _lqg_numbers(lqg: Any, context: Any) -> dict[str, Any]:
+    """Arrays of the law that the header of a follower with `context` holds; those about a pair's roll for it alone."""
+    pair, left_out = _pair(lqg, context), {"pair_roll_room", *([] if _lifts(lqg) else ["lifting"])}
+    if pair == 0:
+        left_out |= PAIR_ROLL.keys()
+    fields = {} if lqg is None else lqg._asdict()
+    numbers = {name: value for name, value in fields.items() if value is not None and name not in left_out}
+    for name in numbers.keys() & PAIR_ROLL.keys():
+        every = numbers[PAIR_ROLL[name]]
+        numbers[name] = every + pair * (numbers[name] - every)
+    return numbers
+
+
+def _rooms_and_roll(lqg: MultiModelLqg, context: Any, numbers: dict[str, Any]) -> list[str]:
+    """Macros of the rooms, and of the arrays among `numbers` that are those about roll."""
+    wider = 1.0 + (float(lqg.pair_roll_room) - 1.0) * _pair(lqg, context)
+    lines = [f"#define MJXBALL_LEAST_ROOM {_number(LEAST_ROOM)}", f"#define MJXBALL_ROLL_ROOM {_number(wider)}"]
+    for name, every in PAIR_ROLL.items():
+        macro = name.removeprefix("pair_").upper()
+        lines += [f"#define MJXBALL_{macro} mjxball_lqg_{name if name in numbers else every}"]
+    return lines
+
+
 @dataclass(frozen=True)
 class Footprint:
     """What a header costs on board [bytes]; code comes on top, about 1 KiB with -Os."""
@@ -63,9 +93,8 @@ def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     weights, biases = mean_layers(policy)
     size = len(policy.observation_mean)
     widest = max(len(bias) for bias in biases)
-    lqg = law_of(policy.card).lqg
-    constants = 2 * ACTION_SIZE + (0 if lqg is None else sum(np.size(value) for value in lqg))
-    constants -= isinstance(lqg, TeamLqg) and not _lifts(lqg)
+    lqg, told = law_of(policy.card).lqg, policy.card.get("team")
+    constants = 2 * ACTION_SIZE + sum(np.size(value) for value in _lqg_numbers(lqg, told and told["context"]).values())
     constants += {TeamLqg: team_lqg.CONTEXT, MultiModelLqg: multi_model_lqg.CONTEXT}.get(type(lqg), 0)
     state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest)
     if int8:
@@ -89,16 +118,15 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
     arrays = _float_arrays(policy) if not int8 else []
     tilt, vertical = card["command_limits"]
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
-    if law.lqg is not None:
-        arrays += [
-            _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
-            for name, value in law.lqg._asdict().items()
-            if name != "lifting" or _lifts(law.lqg)
-        ]
+    numbers = _lqg_numbers(law.lqg, context)
+    arrays += [
+        _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
+        for name, value in numbers.items()
+    ]
     if context is not None:
         arrays += [_array("lqg_context", context)]
     if isinstance(law.lqg, MultiModelLqg):
-        arrays += [f"#define MJXBALL_LEAST_ROOM {_number(LEAST_ROOM)}"]
+        arrays += _rooms_and_roll(law.lqg, context, numbers)
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
     helpers += (c_texts.APPROACH if history.filters else "") + LQG_TEXTS[type(law.lqg)][0]
     layers = _network_int8(sizes) if int8 else _network(sizes)

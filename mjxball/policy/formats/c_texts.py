@@ -295,9 +295,12 @@ static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real
     for (int row = 0; row < 3; row++) height[row] += off * mjxball_lqg_height_gain[row];
     for (int axis = 0; axis < 2; axis++) {
         mjxball_real *scores = memory + MJXBALL_SCORES + axis * MJXBALL_MODELS, most = 0;
+        const float *gains = axis == 0 ? MJXBALL_ROLL_GAIN : mjxball_lqg_axis_gain;
+        const float *certainty = axis == 0 ? MJXBALL_ROLL_CERTAINTY : mjxball_lqg_certainty;
+        const float *prior = axis == 0 ? MJXBALL_ROLL_PRIOR : mjxball_lqg_prior;
         for (int model = 0; model < MJXBALL_MODELS; model++) {
             mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
-            const float *gain = mjxball_lqg_axis_gain + 10 * model, *sure = mjxball_lqg_certainty + 3 * model;
+            const float *gain = gains + 10 * model, *sure = certainty + 3 * model;
             mjxball_real angle = observation[3 + axis] - state[0], rate = observation[9 + axis] - state[1];
             mjxball_real far;
             for (int row = 0; row < 5; row++) state[row] += angle * gain[2 * row] + rate * gain[2 * row + 1];
@@ -309,7 +312,7 @@ static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real
                 rate += off_rate;
             }
             far = angle * (sure[0] * angle + 2 * sure[1] * rate) + sure[2] * rate * rate;
-            scores[model] = mjxball_lqg_keep[0] * scores[model] + mjxball_lqg_prior[model] - (mjxball_real)0.5 * far;
+            scores[model] = mjxball_lqg_keep[0] * scores[model] + prior[model] - (mjxball_real)0.5 * far;
             if (model == 0 || scores[model] > most) most = scores[model];
         }
         for (int model = 0; model < MJXBALL_MODELS; model++) scores[model] -= most;
@@ -380,6 +383,7 @@ static inline void mjxball_lqg_command(
         most[i] = context[3] * soft;
         if (most[i] < MJXBALL_LEAST_ROOM) most[i] = MJXBALL_LEAST_ROOM;
     }
+    most[0] *= MJXBALL_ROLL_ROOM;
     far[0] = -(gains[0][0] * observation[13] + gains[0][1] * observation[16]);
     far[1] = gains[1][0] * observation[12] + gains[1][1] * observation[15];
     mjxball_within(far, mjxball_lqg_limits[0]);

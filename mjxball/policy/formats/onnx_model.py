@@ -169,6 +169,12 @@ class Namespace:
         return value.binary("Sub", value, value)
 
     @staticmethod
+    def ones_like(value: TracedArray) -> TracedArray:
+        """Ones (N, ...)."""
+        zero = Namespace.zeros_like(value)
+        return zero.binary("Add", zero, 1.0)
+
+    @staticmethod
     def broadcast_to(value: np.ndarray, shape: tuple[Any, ...]) -> TracedArray:
         """A constant (k,) for each of N flights, (N, k)."""
         rows: TracedArray = shape[0]
