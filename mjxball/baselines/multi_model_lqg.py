@@ -69,6 +69,7 @@ def multi_model_lqg(
         pair_roll_certainty=rolling[1],
         pair_roll_prior=rolling[2] - rolling[2].max(),
         pair_roll_room=PAIR_INERTIA_RATIO,
+        rig_axes=1.0,
     )
 
 

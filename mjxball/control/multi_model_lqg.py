@@ -4,7 +4,9 @@ One Kalman filter for each of M pairs of loop frequency and rotor lag runs about
 those of Magill (1965), by how well each predicts what is measured, forgotten over some seconds. Feedback gains and
 estimates are weighted means. To the filters what the network lifts is part of the load; of a pair the weights know
 better: a third set of states holds what that lift has turned about pitch. About roll a pair's inertia is small, so that
-it has filters of its own there, for larger loads, and more room. Everything else is as in `control.team_lqg`.
+it has filters of its own there, for larger loads, and more room. A rig's loops about roll and pitch differ; seen from a
+follower that stands askew to them each of its axes would turn as both do, so that all of this is about the rig's axes,
+of which the first points to the leader. Everything else is as in `control.team_lqg`.
 What a follower must be told is its team's geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg`
 makes the numbers, which stand in the policy file.
 """
@@ -12,6 +14,7 @@ makes the numbers, which stand in the policy file.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from mjxball.config import Plant
@@ -50,6 +53,7 @@ class MultiModelLqg(NamedTuple):
     pair_roll_certainty: Array | None = None  # (M, 3)
     pair_roll_prior: Array | None = None  # (M,)
     pair_roll_room: Array | float = 1.0  # () factor on what rotors hold as a tilt
+    rig_axes: Array | float = 0.0  # () 1: states are about the rig's axes; 0: about those of the mount frame
 
     @property
     def models(self) -> int:
@@ -69,7 +73,8 @@ class MultiModelLqg(NamedTuple):
     def start(self, observation: Array, context: Array) -> Array:
         """Memory (..., m) before the first `observation` (..., 18) of followers with `context` (..., 4)."""
         xp = observation.__array_namespace__()
-        roll, pitch, roll_rate, pitch_rate, climb = measured(observation)
+        known = xp.broadcast_to(xp.asarray(context, dtype=observation.dtype), (*observation.shape[:-1], CONTEXT))
+        roll, pitch, roll_rate, pitch_rate, climb = measured(_turned(observation, self._frame(known)))
         zero = xp.zeros_like(roll)
         turning = [
             joined([angle, rate, zero, zero, zero])
@@ -77,7 +82,6 @@ class MultiModelLqg(NamedTuple):
             for _ in range(self.models)
         ]
         rest = joined([climb, *[zero] * (HEIGHT_STATES - 1 + 2 * self.models + 2)])
-        known = xp.broadcast_to(xp.asarray(context, dtype=observation.dtype), (*roll.shape, CONTEXT))
         return xp.concat([*turning, rest, known], axis=-1)
 
     def features(self, memory: Array, observation: Array) -> Array:
@@ -88,6 +92,8 @@ class MultiModelLqg(NamedTuple):
         N / (N - 1).
         """
         xp = observation.__array_namespace__()
+        context, frame = self._told(memory, observation)
+        observation = _turned(observation, frame)
         seen = self._estimate(memory, observation)
         turning, soft = seen.turning[..., :2, :, :], self._each(seen.weights, 1.0 / self.stiffness)
         middle = (seen.weights[..., None] * turning[..., :2]).sum(axis=-2)
@@ -95,17 +101,28 @@ class MultiModelLqg(NamedTuple):
         loads = (inverse * turning[..., 2:]).sum(axis=-2)
         expected = [middle[..., 0, 0], middle[..., 1, 0], middle[..., 0, 1], middle[..., 1, 1], seen.rising[..., 0]]
         left = [a - b for a, b in zip(measured(observation), expected, strict=True)]
-        context = memory[..., -CONTEXT:]
+        states = range(ANGLE_STATES - 2)
+        pairs: list[Sequence[Array]] = [left[:2], left[2:4], *([loads[..., 0, k], loads[..., 1, k]] for k in states)]
+        levers = context[..., 1:3] * soft
+        pairs += [[levers[..., 0], levers[..., 1]]]
+        angles, rates, *every, lever = (_turned_back(pair, frame) for pair in pairs)
+        soft = _mixed(soft, frame)
         speed = -0.5 * xp.log(soft)
-        parts = [joined(left), loads[..., 0, :], loads[..., 1, :], seen.rising[..., 1:], speed]
-        return xp.concat([*parts, context[..., 1:3] * soft, context[..., 3:] * soft, context[..., :1]], axis=-1)
+        parts = [joined([*angles, *rates, left[4]]), *(joined([load[axis] for load in every]) for axis in (0, 1))]
+        parts += [seen.rising[..., 1:], speed, joined(lever), context[..., 3:] * soft, context[..., :1]]
+        return xp.concat(parts, axis=-1)
 
     def command(self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
         """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it.
 
         `leader`: the arguments of `copy_command` after the observation.
         """
-        return self._plan(memory, observation, leader)[0] + added
+        context, frame = self._told(memory, observation)
+        own = self._plan(memory, _turned(observation, frame), context, leader)[0]
+        if frame is None:
+            return own + added
+        roll, pitch = _turned_back([own[..., 0], own[..., 1]], frame)
+        return joined([roll, pitch, own[..., 2]]) + added
 
     def next(self, memory: Array, observation: Array, command: Array, leader: tuple[Any, ...]) -> Array:
         """Memory of the next step, after `observation` was answered by `command`.
@@ -115,8 +132,10 @@ class MultiModelLqg(NamedTuple):
         lifts more turns a pair about pitch; of more drones others lift too, which a follower does not know.
         """
         xp, models = observation.__array_namespace__(), self.models
-        own, seen = self._plan(memory, observation, leader)
-        led, context = copy_command(observation, *leader), memory[..., -CONTEXT:]
+        context, frame = self._told(memory, observation)
+        observation, command = _turned(observation, frame), _turned(command, frame)
+        own, seen = self._plan(memory, observation, context, leader)
+        led = copy_command(observation, *leader)
         slow, share = memory[..., -CONTEXT - 2 : -CONTEXT], context[..., :1]
         added = command[..., :2] - own[..., :2]
         slow = self.keep[1] * slow + (1.0 - self.keep[1]) * added
@@ -134,10 +153,29 @@ class MultiModelLqg(NamedTuple):
         climbing = xp.concat([seen.rising, mean[..., 2:]], axis=-1) @ height.T
         flat = [turning[..., k, m, :] for k in range(AXES) for m in range(models)]
         scores = [seen.scores[..., k, :] for k in (0, 1)]
-        return xp.concat([*flat, climbing, *scores, slow, context], axis=-1)
+        return xp.concat([*flat, climbing, *scores, slow, memory[..., -CONTEXT:]], axis=-1)
 
     def _like(self, numbers: Array, observation: Array) -> Array:
         return observation.__array_namespace__().asarray(numbers, dtype=observation.dtype)
+
+    def _frame(self, context: Array) -> Frame | None:
+        """Where the filters' axes are for a follower with `context` (..., 4); None: as those of its mount frame."""
+        if not float(self.rig_axes):
+            return None
+        roll, pitch = context[..., 1], context[..., 2]
+        lever = context.__array_namespace__().sqrt(roll * roll + pitch * pitch)
+        return Frame(pitch / lever, -roll / lever)
+
+    def _told(self, memory: Array, observation: Array) -> tuple[Array, Frame | None]:
+        """(context as seen from the filters' axes, where these are)."""
+        context = memory[..., -CONTEXT:]
+        frame = self._frame(context)
+        if frame is None:
+            return context, None
+        context, frame = self._like(context, observation), Frame(*(self._like(part, observation) for part in frame))
+        lever = context[..., 2] * frame.cos - context[..., 1] * frame.sin
+        zero = observation.__array_namespace__().zeros_like(lever)
+        return joined([context[..., 0], zero, lever, context[..., 3]]), frame
 
     def _about_axes(self, numbers: Array, of_pair: Array | None, pair: Array, axes: int = 2) -> Array:
         """`numbers` (M, ...) of each model about roll and `axes` - 1 others (..., axes or 1, M, ...).
@@ -183,10 +221,12 @@ class MultiModelLqg(NamedTuple):
         climbed = (found[4] - rising[..., 0])[..., None] * self._like(self.height_gain, observation)
         return Estimate(turning, scores, weights, rising + climbed)
 
-    def _plan(self, memory: Array, observation: Array, leader: tuple[Any, ...]) -> tuple[Array, Estimate]:
-        """(the law's own command, only its vertical part clipped, what is known)."""
+    def _plan(
+        self, memory: Array, observation: Array, context: Array, leader: tuple[Any, ...]
+    ) -> tuple[Array, Estimate]:
+        """(the law's own command, only its vertical part clipped, what is known), all about the filters' axes."""
         xp = observation.__array_namespace__()
-        seen, context = self._estimate(memory, observation), memory[..., -CONTEXT:]
+        seen = self._estimate(memory, observation)
         weights, share = seen.weights, context[..., 0]
         led, error, rate = copy_command(observation, *leader), observation[..., ERROR], observation[..., ERROR_RATE]
         tilt_limit, rise_limit, load_limit = (float(limit) for limit in self.limits)
@@ -208,6 +248,13 @@ class MultiModelLqg(NamedTuple):
         most = most * joined([wider, xp.ones_like(wider)])
         own = rest + most * within(xp, (own - rest) / most, 1.0)
         return xp.concat([own, vertical[..., None]], axis=-1), seen
+
+
+class Frame(NamedTuple):
+    """Direction of a rig's leader in the mount frame of a follower."""
+
+    cos: Array  # (...)
+    sin: Array
 
 
 class Estimate(NamedTuple):
@@ -248,6 +295,33 @@ def ring_context(count: Array, leader: Array) -> Array:
 def is_pair(share: Array) -> Array:
     """1 for a pair's N / (N - 1) = 2, 0 for that of more drones."""
     return clipped(2.0 * share - 3.0, 0.0, 1.0)
+
+
+def _turned(vectors: Array, frame: Frame | None) -> Array:
+    """Every three numbers of `vectors` (..., 3 k) in a mount frame as a vector in `frame`."""
+    if frame is None:
+        return vectors
+    parts: list[Array] = []
+    for k in range(0, vectors.shape[-1], 3):
+        x, y = vectors[..., k], vectors[..., k + 1]
+        parts += [frame.cos * x + frame.sin * y, frame.cos * y - frame.sin * x, vectors[..., k + 2]]
+    return joined(parts)
+
+
+def _turned_back(pair: Sequence[Array], frame: Frame | None) -> Sequence[Array]:
+    """A vector (x, y) in `frame` in the mount frame."""
+    if frame is None:
+        return pair
+    x, y = pair
+    return frame.cos * x - frame.sin * y, frame.sin * x + frame.cos * y
+
+
+def _mixed(soft: Array, frame: Frame | None) -> Array:
+    """What commands turn about the axes of the mount frame by what they turn about those of `frame` (..., 2)."""
+    if frame is None:
+        return soft
+    along, across, roll, pitch = frame.cos * frame.cos, frame.sin * frame.sin, soft[..., 0], soft[..., 1]
+    return joined([along * roll + across * pitch, across * roll + along * pitch])
 
 
 def _crossed(xp: Any, vector: Array) -> Array:

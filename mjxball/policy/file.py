@@ -102,11 +102,12 @@ MULTI_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # behind an axis of models
     "stiffness": (),
     "damping": (),
 }
-PAIR_ROLL_SHAPES: dict[str, tuple[int, ...]] = {  # 0 for the models; absent, all of them, from the first files
+LATER_SHAPES: dict[str, tuple[int, ...]] = {  # 0 for the models; absent, all of them, from the first files
     "pair_roll_gain": (0, 5, 2),
     "pair_roll_certainty": (0, 3),
     "pair_roll_prior": (0,),
     "pair_roll_room": (),
+    "rig_axes": (),
 }
 MULTI_MODEL_COMMON: dict[str, tuple[int, ...]] = {
     "height": (3, 4),
@@ -332,10 +333,18 @@ def _check_lqg(card: dict[str, Any], name: str) -> None:
         _check_team(card["team"], name, CONTEXTS[version])
     if min(np.min(lqg[field]) for field in positive) <= 0:
         raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
-    if version == 4 and not lqg.get("pair_roll_room", 1.0) > 0:
-        raise PolicyFileError(f"{name}: card field lqg.pair_roll_room must be positive")
+    if version == 4:
+        _check_later(lqg, name)
     if later and not 0 <= lqg.get(later, 0) <= 1:
         raise PolicyFileError(f"{name}: card field lqg.{later} must be a share from 0 to 1")
+
+
+def _check_later(lqg: dict[str, Any], name: str) -> None:
+    """Raise PolicyFileError unless what the first files of format 4 do not have is sound, or absent."""
+    if not lqg.get("pair_roll_room", 1.0) > 0:
+        raise PolicyFileError(f"{name}: card field lqg.pair_roll_room must be positive")
+    if lqg.get("rig_axes", 0) not in (0, 1):
+        raise PolicyFileError(f"{name}: card field lqg.rig_axes must be 0 or 1")
 
 
 def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, ...]]:
@@ -344,8 +353,8 @@ def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, 
     shapes: dict[str, tuple[int, ...]] = {}
     if later and later in lqg:
         shapes[later] = ()
-    if version == 4 and lqg.keys() & PAIR_ROLL_SHAPES.keys():
-        shapes |= {field: shape and (len(lqg["stiffness"]), *shape[1:]) for field, shape in PAIR_ROLL_SHAPES.items()}
+    if version == 4 and lqg.keys() & LATER_SHAPES.keys():
+        shapes |= {field: shape and (len(lqg["stiffness"]), *shape[1:]) for field, shape in LATER_SHAPES.items()}
     return shapes
 
 
