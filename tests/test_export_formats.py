@@ -22,7 +22,7 @@ from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.export import _numbers
-from mjxball.policy.file import law_of, save_file, shipped_policy
+from mjxball.policy.file import LATER_SHAPES, law_of, save_file, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 
@@ -85,13 +85,13 @@ def limited(remembering: Trained) -> PolicyFile:
         *("trained", "direct", "remembering", "limited", "estimating"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
         *("team pair", "team team3", "universal pair", "universal team3", "lifting team6"),
-        *("rolling pair", "rolling team3", "older pair"),
+        *("newer pair", "newer team3", "older pair", "older team3"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
     name, _, plant = request.param.partition(" ")
     if plant:
-        laws = {"lifting": lifting, "rolling": rolling, "older": older}
+        laws = {"lifting": lifting, "newer": newer, "older": older}
         policy = laws[name]() if name in laws else load_file(shipped_policy(name))
         return in_team(policy, name, Path(plant), None if plant == "pair" else 2)
     if name in ("balance", "transport", "robust", "flight", "stand", "paper"):
@@ -106,8 +106,8 @@ def lifting() -> PolicyFile:
     return dataclasses.replace(team, card={**team.card, "lqg": {**team.card["lqg"], "lifting": 0.9}})
 
 
-def rolling() -> PolicyFile:
-    """`universal` with a law that has filters of its own about a pair's roll."""
+def newer() -> PolicyFile:
+    """`universal` with filters of its own about a pair's roll, and all of them about the rig's axes."""
     universal = load_file(shipped_policy("universal"))
     lqg = _numbers(multi_model_lqg(preset("universal")))
     return dataclasses.replace(universal, card={**universal.card, "lqg": lqg})
@@ -115,8 +115,8 @@ def rolling() -> PolicyFile:
 
 def older() -> PolicyFile:
     """The same without these."""
-    made = rolling()
-    lqg = {name: value for name, value in made.card["lqg"].items() if not name.startswith("pair_roll")}
+    made = newer()
+    lqg = {name: value for name, value in made.card["lqg"].items() if name not in LATER_SHAPES}
     return dataclasses.replace(made, card={**made.card, "lqg": lqg})
 
 
@@ -234,27 +234,38 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert f"Flash: {cost.flash} bytes" in text
     assert f"RAM: {cost.state} bytes" in text
     size, widest = map(int, re.search(r"mjxball_real input\[(\d+)\], hidden\[2\]\[(\d+)\];", text).groups())
-    assert 4 * (size + 2 * widest) == cost.stack
+    turned = 18 * isinstance(law_of(contents.card).lqg, MultiModelLqg)
+    assert ("mjxball_real seen[18];" in text) == bool(turned)
+    assert 4 * (size + 2 * widest + turned) == cost.stack
     assert f"{cost.stack} bytes of arrays on the stack" in text
     assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
 
 
 def test_only_a_pair_pays_for_filters_of_its_own_about_roll():
-    more, less = rolling(), older()
+    more, less = newer(), older()
     of_three = [in_team(made, "three", Path("team3"), 1) for made in (more, less)]
-    assert c_header(of_three[0], "follower") == c_header(of_three[1], "follower")
+    assert footprint(of_three[0]) == footprint(of_three[1])
+    own, other = (c_header(made, "follower").splitlines() for made in of_three)
+    found = [pair for pair in zip(own, other, strict=True) if pair[0] != pair[1]]
+    assert [line.rpartition(" ")[0] for pair in found for line in pair] == [
+        *["#define MJXBALL_RIG_COS"] * 2,
+        *["#define MJXBALL_RIG_SIN"] * 2,
+    ]
     pairs = [in_team(made, "pair", Path("pair"), None) for made in (more, less)]
     texts, costs = [c_header(made, "follower") for made in pairs], [footprint(made) for made in pairs]
     assert costs[0].flash - costs[1].flash == 4 * (5 * 2 + 3 + 1) * law_of(more.card).lqg.models
     assert ["pair_roll" in text for text in texts] == [True, False]
     assert not any("nanf" in text for text in texts)  # what a law lacks
     assert "#define MJXBALL_ROLL_ROOM 1.0e+00f\n" in texts[1]
+    for text in (*texts, c_header(of_three[1], "follower")):
+        assert "#define MJXBALL_RIG_COS 1.0e+00f\n#define MJXBALL_RIG_SIN" in text
+        assert re.search(r"#define MJXBALL_RIG_SIN -?0\.0e\+00f\n", text)
 
 
 @pytest.mark.parametrize(("share", "weight", "room"), [(2.0, 1.0, "1.3e+01f"), (1.75, 0.5, "7.0e+00f")])
 def test_a_pairs_header_has_its_numbers_about_roll(share: float, weight: float, room: str):
     """Also where a card names a share between those of a pair and of three."""
-    pair = in_team(rolling(), "pair", Path("pair"), None)
+    pair = in_team(newer(), "pair", Path("pair"), None)
     pair.card["team"]["context"][0] = share
     text, lqg = c_header(pair, "follower"), pair.card["lqg"]
     for own, every in (("roll_gain", "axis_gain"), ("roll_certainty", "certainty"), ("roll_prior", "prior")):

@@ -9,21 +9,23 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.random import default_rng
 
 from mjxball.baselines.multi_model_lqg import MODELS, MultiModelOffsetFree, multi_model_lqg
 from mjxball.baselines.team_lqg import TUNING, team_lqg
 from mjxball.config import Config, preset
+from mjxball.control import rotations
 from mjxball.control.followers import Baseline, copy_gains
-from mjxball.control.multi_model_lqg import LEAST_ROOM, LEVER, MultiModelLqg, team_geometry
+from mjxball.control.multi_model_lqg import CONTEXT, LEAST_ROOM, LEVER, MultiModelLqg, team_geometry
+from mjxball.control.observation import mount_frames
 from mjxball.plant.teams import ring_config
 from mjxball.policy.container import PolicyFileError
 from mjxball.policy.export import _numbers
-from mjxball.policy.file import law_of, load_file, save_file, shipped_policy
+from mjxball.policy.file import LATER_SHAPES, law_of, load_file, save_file, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import CIRCLE, Scenario
 
 UNIVERSAL, TEAM = preset("universal"), preset("team")
-PAIR_ROLL = ("pair_roll_gain", "pair_roll_certainty", "pair_roll_prior", "pair_roll_room")
 
 
 def team4(frequency: float) -> Config:
@@ -41,11 +43,11 @@ def law_of_geometry(config: Config) -> MultiModelOffsetFree:
 
 def test_one_model_is_the_law_of_teams() -> None:
     """The same loops, the same rotors, the same levers: the same commands and estimates, also of what is commanded."""
-    frequency, lag, random = 7.0, 0.05, np.random.default_rng(0)
+    frequency, lag, random = 7.0, 0.05, default_rng(0)
     config = dataclasses.replace(team4(frequency), plant=dataclasses.replace(ring_config(TEAM, 4).plant, rotor_lag=lag))
     attitude = dataclasses.replace(UNIVERSAL.attitude, natural_frequency=(7.0, 7.0, 4.0), damping=0.8)
     own = dataclasses.replace(UNIVERSAL, attitude=attitude, plant=dataclasses.replace(UNIVERSAL.plant, rotor_lag=lag))
-    unknown = multi_model_lqg(own, ((frequency, lag),), TUNING)
+    unknown = multi_model_lqg(own, ((frequency, lag),), TUNING)._replace(rig_axes=0.0)
     known, leader = team_lqg(config), copy_gains(config)
     lever, room = np.array([0.02, -0.05]), 0.3
     one = known.start(np.zeros((3, 18)), np.array([4 / 3, *lever, room, room]))
@@ -76,7 +78,7 @@ def test_it_finds_how_fast_the_loops_are(frequency: float) -> None:
 
 @pytest.mark.parametrize("share", [1.5, 2.0])
 def test_numpy_and_jax_agree_and_models_share_one_weight(share: float) -> None:
-    law, random = multi_model_lqg(UNIVERSAL), np.random.default_rng(1)
+    law, random = multi_model_lqg(UNIVERSAL), default_rng(1)
     leader = copy_gains(UNIVERSAL)
     memory = law.start(np.zeros((2, 18)), np.array([share, 3.0, -1.0, 30.0]))
     assert memory.shape == (2, law.size)
@@ -139,7 +141,7 @@ def test_scores_know_that_what_the_network_lifts_turns_a_pair_about_pitch() -> N
 
 
 def test_scores_are_those_of_filters_that_are_told_what_the_network_lifts() -> None:
-    law, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), np.random.default_rng(3)
+    law, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), default_rng(3)
     memory, pitch, turned = (
         law.start(np.zeros(18), np.array([2.0, 0.0, 6.0, 40.0])),
         *np.split(np.arange(15 * law.models), 3)[1:],
@@ -169,7 +171,7 @@ def test_a_file_without_the_lift_share_flies_as_before(tmp_path: Path) -> None:
 
 def without_own_roll(law: MultiModelLqg) -> MultiModelLqg:
     """`law` as files have it that know nothing of a pair's roll."""
-    return law._replace(**{name: MultiModelLqg._field_defaults[name] for name in PAIR_ROLL})
+    return law._replace(**{name: MultiModelLqg._field_defaults[name] for name in LATER_SHAPES if name != "rig_axes"})
 
 
 def steps_to_find(law: MultiModelLqg, share: float, axis: int) -> int:
@@ -195,7 +197,7 @@ def test_a_load_about_a_pairs_roll_is_found_sooner() -> None:
 
 @pytest.mark.parametrize("share", [1.5, 4 / 3, 1.2])
 def test_teams_of_three_and_more_know_nothing_of_a_pairs_roll(share: float) -> None:
-    own, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), np.random.default_rng(4)
+    own, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), default_rng(4)
     plain, context = without_own_roll(own), np.array([share, 3.0, -1.0, 20.0])
     memory = own.start(np.zeros((2, 18)), context)
     for _ in range(20):
@@ -207,7 +209,7 @@ def test_teams_of_three_and_more_know_nothing_of_a_pairs_roll(share: float) -> N
 
 
 def test_about_pitch_a_pair_has_the_filters_of_every_team() -> None:
-    own, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), np.random.default_rng(5)
+    own, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), default_rng(5)
     memory = own.start(np.zeros(18), np.array([2.0, 0.0, 6.0, 40.0]))
     for _ in range(10):
         observation = 0.1 * random.standard_normal(18)
@@ -240,9 +242,13 @@ def test_a_pair_has_more_room_about_roll(axis: int, share: float, factor: float)
         ("pair_roll_room", True),
         ("pair_roll_room", 0.0),
         ("pair_roll_room", -1.0),
+        ("rig_axes", 0.5),
+        ("rig_axes", 2),
+        ("rig_axes", True),
+        ("rig_axes", [1.0]),
     ],
 )
-def test_numbers_about_a_pairs_roll_that_do_not_fit_are_refused(field: str, wrong: object, tmp_path: Path) -> None:
+def test_later_numbers_that_do_not_fit_are_refused(field: str, wrong: object, tmp_path: Path) -> None:
     contents = load_file(shipped_policy("universal"))
     sound = {**contents.card, "lqg": _numbers(multi_model_lqg(UNIVERSAL))}
     save_file(tmp_path / "sound.npz", dataclasses.replace(contents, card=sound))
@@ -254,10 +260,133 @@ def test_numbers_about_a_pairs_roll_that_do_not_fit_are_refused(field: str, wron
         save_file(tmp_path / "odd.npz", dataclasses.replace(contents, card=card))
 
 
-def test_a_file_without_numbers_about_a_pairs_roll_flies_as_before(tmp_path: Path) -> None:
+def test_a_file_without_later_numbers_flies_as_before(tmp_path: Path) -> None:
     contents, law = load_file(shipped_policy("universal")), multi_model_lqg(UNIVERSAL)
-    for made in (law, without_own_roll(law)):
-        lqg = {name: value for name, value in _numbers(made).items() if made is law or name not in PAIR_ROLL}
+    for made in (law, without_own_roll(law)._replace(rig_axes=0.0)):
+        lqg = {name: value for name, value in _numbers(made).items() if made is law or name not in LATER_SHAPES}
         save_file(tmp_path / "one.npz", dataclasses.replace(contents, card={**contents.card, "lqg": lqg}))
         for name, value in law_of(load_file(tmp_path / "one.npz").card).lqg._asdict().items():
             np.testing.assert_array_equal(value, getattr(made, name))
+
+
+class Ring:
+    """Followers of a ring of three, of which the leader stands at +x."""
+
+    def __init__(self) -> None:
+        plant = ring_config(TEAM, 3).plant
+        mounts = np.array([drone.mount for drone in plant.drones])
+        self.context = np.asarray(team_geometry(plant, mounts, np.float64(3)))
+        self._angles = np.asarray(mount_frames(plant, mounts))
+
+    def seen(self, vectors: np.ndarray, follower: int) -> np.ndarray:
+        """Every three numbers of `vectors` (..., 3 k) in body axes as a vector in the mount frame of a follower."""
+        return self._turned(vectors, -self._angles[follower])
+
+    def commanded(self, command: np.ndarray, follower: int) -> np.ndarray:
+        """A follower's `command` in body axes."""
+        return self._turned(command, self._angles[follower])
+
+    @staticmethod
+    def _turned(vectors: np.ndarray, angle: float) -> np.ndarray:
+        parts = np.split(vectors, vectors.shape[-1] // 3, axis=-1)
+        return np.concatenate([rotations.turned_about_z(part, np.float64(angle)) for part in parts], axis=-1)
+
+
+@pytest.mark.parametrize("axes", [1.0, 0.0])
+def test_followers_that_see_the_same_rig_have_the_same_filters(axes: float) -> None:
+    """About the rig's axes; these are body axes here, in which both know and command the same."""
+    law, leader, random = multi_model_lqg(UNIVERSAL)._replace(rig_axes=axes), copy_gains(UNIVERSAL), default_rng(6)
+    ring, memories = Ring(), []
+    seen = 0.1 * random.standard_normal((40, 18)) * np.resize([1.0, 0.3, 0.5], 18)
+    added = 0.02 * random.standard_normal((40, 3))
+    for follower in (0, 1):
+        memory = law.start(ring.seen(seen[0], follower), ring.context[follower])
+        for observation, more in zip(ring.seen(seen, follower), ring.seen(added, follower), strict=True):
+            command = law.command(more, memory, observation, leader)
+            memory = law.next(memory, observation, command, leader)
+        memories.append(memory[:-CONTEXT])
+        command = ring.commanded(command, follower)
+    if axes:
+        np.testing.assert_allclose(memories[0], memories[1], rtol=1e-9, atol=1e-9)
+        level = multi_model_lqg(UNIVERSAL)._replace(rig_axes=0.0)  # of one whose mount frame is that of the rig
+        context = np.array([1.5, 0.0, np.linalg.norm(ring.context[0, 1:3]), ring.context[0, 3]])
+        memory = level.start(seen[0], context)
+        for observation, more in zip(seen, added, strict=True):
+            wanted = level.command(more, memory, observation, leader)
+            memory = level.next(memory, observation, wanted, leader)
+        np.testing.assert_allclose(memories[0], memory[:-CONTEXT], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(command, wanted, rtol=1e-9, atol=1e-9)
+    else:
+        scores = slice(-2 - 2 * law.models, -2)
+        assert np.abs(memories[0][scores] - memories[1][scores]).max() > 1.0
+
+
+def test_of_one_model_commands_and_features_do_not_depend_on_the_axes_of_its_filters() -> None:
+    """As long as the leader's law, of which each axis has a limit, meets none."""
+    turned, leader, random = multi_model_lqg(UNIVERSAL, ((7.0, 0.05),)), copy_gains(UNIVERSAL), default_rng(7)
+    plain, context = turned._replace(rig_axes=0.0), Ring().context[0]
+    one, other = turned.start(np.zeros(18), context), plain.start(np.zeros(18), context)
+    for _ in range(40):
+        observation = 0.1 * random.standard_normal(18)
+        shown, wanted = turned.features(one, observation), plain.features(other, observation)
+        np.testing.assert_allclose(shown, wanted, rtol=1e-9, atol=1e-9)
+        added = 0.02 * random.standard_normal(3)
+        command = turned.command(added, one, observation, leader)
+        np.testing.assert_allclose(command, plain.command(added, other, observation, leader), rtol=1e-9, atol=1e-9)
+        one, other = turned.next(one, observation, command, leader), plain.next(other, observation, command, leader)
+    assert np.abs(one - other).max() > 0.1
+
+
+def test_a_pairs_axes_are_those_of_its_mount_frame() -> None:
+    turned, leader, random = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), default_rng(8)
+    plain = turned._replace(rig_axes=0.0)
+    memory = turned.start(np.zeros(18), np.array([2.0, 0.0, 6.0, 40.0]))
+    for _ in range(10):
+        observation, added = 0.1 * random.standard_normal(18), 0.02 * random.standard_normal(3)
+        command, wanted = (law.command(added, memory, observation, leader) for law in (turned, plain))
+        np.testing.assert_array_equal(command, wanted)
+        shown, wanted = (law.features(memory, observation) for law in (turned, plain))
+        np.testing.assert_array_equal(shown, wanted)
+        memory, wanted = (law.next(memory, observation, command, leader) for law in (turned, plain))
+        np.testing.assert_array_equal(memory, wanted)
+
+
+def test_the_networks_view_of_unlike_loops_is_of_its_mount_frame() -> None:
+    """Of a follower whose roll is the rig's pitch: what both axes show changes places."""
+    law, level, leader = multi_model_lqg(UNIVERSAL), np.zeros(18), copy_gains(UNIVERSAL)
+    across = law.start(level, np.array([1.5, 6.0, 0.0, 30.0]))  # the leader at -y
+    along = law.start(level, np.array([1.5, 0.0, 6.0, 30.0]))
+    random = default_rng(9)
+    for _ in range(20):
+        seen = 0.1 * random.standard_normal(18) * np.resize([1.0, 0.3, 0.5], 18)
+        command = law.command(np.zeros(3), along, seen, leader)
+        along = law.next(along, seen, command, leader)
+        turned = Ring._turned(seen, -np.pi / 2)  # the same rig seen from a frame whose -y is the other's x
+        across = law.next(across, turned, Ring._turned(command, -np.pi / 2), leader)
+    one, other = law.features(along, seen), law.features(across, turned)
+    vectors, sizes = [(0, 1), (2, 3), (5, 8), (6, 9), (7, 10), (15, 16)], [(13, 14), (17, 18)]
+    for roll, pitch in vectors:
+        np.testing.assert_allclose([other[roll], other[pitch]], [one[pitch], -one[roll]], rtol=1e-9, atol=1e-9)
+    for roll, pitch in sizes:
+        np.testing.assert_allclose([other[roll], other[pitch]], [one[pitch], one[roll]], rtol=1e-9)
+        assert abs(one[roll] - one[pitch]) > 1e-3
+
+
+@pytest.mark.parametrize("follower", [0, 1])
+@pytest.mark.parametrize("axes", [1.0, 0.0])
+def test_unlike_loops_are_found_about_the_rigs_axes(axes: float, follower: int) -> None:
+    """A loop about roll that is 1.25 times as fast as that about pitch, seen from 60 degrees to each of them."""
+    law, leader, random = multi_model_lqg(UNIVERSAL, ((8.0, 0.06), (10.0, 0.06))), copy_gains(UNIVERSAL), default_rng(0)
+    law, ring, loops, states = law._replace(rig_axes=axes), Ring(), law.axis[::-1], np.zeros((2, 5))
+    share = ring.context[follower][0]
+    memory = law.start(np.zeros(18), ring.context[follower])
+    for _ in range(150):
+        body = np.zeros(18)
+        body[[3, 4]], body[[9, 10]] = states[:, 0], states[:, 1]
+        seen = ring.seen(body, follower)
+        command = law.command(0.05 * random.standard_normal(3) * [1, 1, 0], memory, seen, leader)
+        weights = law._estimate(memory, ring.seen(body, follower) if not axes else body).weights
+        memory = law.next(memory, seen, command, leader)
+        mean = ring.commanded(command, follower)[:2, None] / share
+        states = (loops @ np.concatenate([states, mean], axis=1)[..., None])[..., 0]
+    assert (weights[[0, 1], [1, 0]].min() > 0.99) == bool(axes)

@@ -15,12 +15,13 @@ import pytest
 from mjxball.baselines.multi_model_lqg import MODELS, multi_model_lqg
 from mjxball.cli import plant_setup
 from mjxball.config import preset
-from mjxball.control.multi_model_lqg import CONTEXT
+from mjxball.control.multi_model_lqg import CONTEXT, team_geometry
 from mjxball.errors import InputError
 from mjxball.export import in_team
+from mjxball.plant.teams import ring_config
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.export import _numbers
-from mjxball.policy.file import law_of, shipped_policy
+from mjxball.policy.file import LATER_SHAPES, law_of, shipped_policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
@@ -29,10 +30,13 @@ UNIVERSAL = load_file(shipped_policy("universal"))
 TEAMS = {"pair": None, "team3": 1, "team4": 3, "plate4": 2, "team6": 4}  # plant: which of its followers
 
 
-def with_law(own_roll: bool, models: Any = MODELS) -> PolicyFile:
-    """The shipped network with a law that has filters of its own about a pair's roll, or has none, as older files."""
+def with_law(newer: bool, models: Any = MODELS) -> PolicyFile:
+    """The shipped network with the law as it is made now, or as older files have it.
+
+    The newer has filters of its own about a pair's roll, and all of them about the rig's axes.
+    """
     lqg = _numbers(multi_model_lqg(preset("universal"), models))
-    left = {name: value for name, value in lqg.items() if own_roll or not name.startswith("pair_roll")}
+    left = {name: value for name, value in lqg.items() if newer or name not in LATER_SHAPES}
     return dataclasses.replace(UNIVERSAL, card={**UNIVERSAL.card, "lqg": left})
 
 
@@ -139,22 +143,30 @@ def test_one_model_is_enough(plant: str) -> None:
     agree(*told(plant, contents=with_law(True, ((7.0, 0.05),))), walk(200))
 
 
-@pytest.mark.parametrize("own_roll", [True, False])
-@pytest.mark.parametrize("plant", ["pair", "team3"])
-def test_with_filters_of_a_pairs_own_about_roll_and_without(plant: str, own_roll: bool) -> None:
-    policy, reference = told(plant, contents=with_law(own_roll))
-    agree(policy, reference, walk(200), remembered=1e-8)
+@pytest.mark.parametrize("newer", [True, False])
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize("size", [0.03, 0.3])
+def test_of_newer_and_of_older_files(count: int, newer: bool, size: float) -> None:
+    """Filters of a pair's own about roll, and all about the rig's axes, or neither; also where limits are met."""
+    plant, made = ring_config(preset("team"), count).plant, with_law(newer)
+    mounts = np.array([drone.mount for drone in plant.drones])
+    context = np.atleast_2d(team_geometry(plant, mounts, np.float64(count)))[-1].tolist()
+    card = {**made.card, "team": {"drone": count - 1, "mount_angle": 0.0, "context": context}}
+    policy = Policy(dataclasses.replace(made, card=card), "ring", np.float64)
+    agree(policy, Reference(policy), walk(200, size=size), remembered=1e-7)
     assert policy._ahead
-    assert (policy._single._filters._roll_matrix is not None) == (own_roll and plant == "pair")
+    assert (policy._single._filters._roll_matrix is not None) == (newer and count == 2)
+    assert (abs(policy._single._frame[1]) > 0.1) == (newer and count != 2)
 
 
-def test_a_memory_of_another_team_changes_the_filters_about_roll() -> None:
-    """Also one of a share between those of a pair and of three."""
-    policy, reference = told("pair", contents=with_law(True))
+@pytest.mark.parametrize("newer", [True, False])
+def test_a_memory_of_another_team_changes_the_filters(newer: bool) -> None:
+    """Also one of a share between those of a pair and of three, and one without a lever."""
+    policy, reference = told("pair", contents=with_law(newer))
     agree(policy, reference, walk(20))
-    for number, share in enumerate((1.75, 1.5, 2.0, 4 / 3)):
+    for number, told_now in enumerate(((1.75, 3.0, 4.0), (1.5, -2.0, 1.0), (2.0, 0.0, 5.0), (4 / 3, 0.0, 0.0))):
         memory = policy.memory
-        memory[-CONTEXT] = share
+        memory[-CONTEXT:-1] = told_now
         policy.memory, reference.memory = memory, memory
         agree(policy, reference, walk(20, number))
         assert policy._ahead

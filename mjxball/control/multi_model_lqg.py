@@ -29,6 +29,7 @@ AXES, ANGLE_STATES, HEIGHT_STATES, CONTEXT, FEATURES = 3, 5, 3, 4, 20
 # what lifting 1 m/s2 more than the leader turns, times N a r [1]; what rotors hold as a tilt of the loops [m/s2].
 LEVER, ROOM = 1.25, 1.75
 LEAST_ROOM = 0.15  # [rad] that the rotors of a rig can follow at least
+NO_LEVER = 1e-30  # [1/m]: who is told of no lever has the axes of its mount frame
 ADDED_TIME = 1.0  # [s] over which the slow part of what the network adds is found
 
 
@@ -74,7 +75,7 @@ class MultiModelLqg(NamedTuple):
         """Memory (..., m) before the first `observation` (..., 18) of followers with `context` (..., 4)."""
         xp = observation.__array_namespace__()
         known = xp.broadcast_to(xp.asarray(context, dtype=observation.dtype), (*observation.shape[:-1], CONTEXT))
-        roll, pitch, roll_rate, pitch_rate, climb = measured(_turned(observation, self._frame(known)))
+        roll, pitch, roll_rate, pitch_rate, climb = measured(_turned(observation, self.frame(known)))
         zero = xp.zeros_like(roll)
         turning = [
             joined([angle, rate, zero, zero, zero])
@@ -158,18 +159,18 @@ class MultiModelLqg(NamedTuple):
     def _like(self, numbers: Array, observation: Array) -> Array:
         return observation.__array_namespace__().asarray(numbers, dtype=observation.dtype)
 
-    def _frame(self, context: Array) -> Frame | None:
+    def frame(self, context: Array) -> Frame | None:
         """Where the filters' axes are for a follower with `context` (..., 4); None: as those of its mount frame."""
         if not float(self.rig_axes):
             return None
         roll, pitch = context[..., 1], context[..., 2]
         lever = context.__array_namespace__().sqrt(roll * roll + pitch * pitch)
-        return Frame(pitch / lever, -roll / lever)
+        return Frame((pitch + NO_LEVER) / (lever + NO_LEVER), -roll / (lever + NO_LEVER))
 
     def _told(self, memory: Array, observation: Array) -> tuple[Array, Frame | None]:
         """(context as seen from the filters' axes, where these are)."""
         context = memory[..., -CONTEXT:]
-        frame = self._frame(context)
+        frame = self.frame(context)
         if frame is None:
             return context, None
         context, frame = self._like(context, observation), Frame(*(self._like(part, observation) for part in frame))

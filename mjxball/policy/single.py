@@ -27,6 +27,7 @@ from mjxball.control.multi_model_lqg import (
 from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
 
 Array = Any
+TURNED = (0, 1), (2, 3), (5, 8), (6, 9), (7, 10), (15, 16)  # features about roll and pitch that are vectors
 LARGEST = 1e6  # sum of what is seen, and of what is made of it
 
 
@@ -39,6 +40,7 @@ class SingleFollower:
         self._height, self._height_gain = lqg.height.tolist(), lqg.height_gain.tolist()
         self._rise, self._limits, self._keep = lqg.rise.tolist(), lqg.limits.tolist(), float(lqg.keep[1])
         self._added_lift, self._pair_roll_room = float(lqg.added_lift), float(lqg.pair_roll_room)
+        self._frame_of = lqg.frame
         self._reach, self._clip = law.action_scale, law.limits
         self._leader = law.gravity, *law.kp, *law.kd
 
@@ -60,9 +62,14 @@ class SingleFollower:
             parts[3].reshape(2, -1),
         )
         self._rising, self._slow, self._context = (part.tolist() for part in (parts[2], *parts[4:]))
-        share, roll, pitch, _ = self._context
-        pair = float(is_pair(np.float64(share)))
-        self._told = self._added_lift * pair * math.hypot(roll, pitch)
+        share, roll, pitch, room = self._context
+        pair, lever = float(is_pair(np.float64(share))), math.hypot(roll, pitch)
+        # Where the filters' axes are in the mount frame, and the context as seen from these.
+        frame = self._frame_of(np.array(self._context))
+        self._frame = (1.0, 0.0) if frame is None else (float(frame.cos), float(frame.sin))
+        self._inside = tuple(self._context) if frame is None else (share, 0.0, lever, room)
+        self._network.tell(*self._frame)
+        self._told = self._added_lift * pair * lever
         self._wider = 1.0 + (self._pair_roll_room - 1.0) * pair
         filters.tell(pair)
 
@@ -75,27 +82,28 @@ class SingleFollower:
         seen, rising, slow = observation.tolist(), self._rising, self._slow
         if not sum(map(abs, seen)) < LARGEST:
             return None
-        roll, pitch, roll_rate, pitch_rate, climb = seen[3], seen[4], seen[9], seen[10], -seen[17]
-        share, roll_per_lift, pitch_per_lift, room = self._context
+        (cos, sin), (share, roll_per_lift, pitch_per_lift, room) = self._frame, self._inside
+        roll, pitch, roll_rate, pitch_rate, x, y, z, vx, vy, vz = _turned(seen, cos, sin)
         # What is known.
         (
             (roll_mean, roll_rate_mean, *roll_load, roll_soft, roll_damping, r_error, r_velocity, r_angle, r_rate),
             (pitch_mean, pitch_rate_mean, *pitch_load, pitch_soft, pitch_damping, p_error, p_velocity, p_angle, p_rate),
         ) = self._filters.update(((roll, roll_rate), (pitch, pitch_rate)))
-        left = climb - rising[0]
+        left = -vz - rising[0]
         height, lift, lift_error = (state + gain * left for state, gain in zip(rising, self._height_gain, strict=True))
         roll_turn, pitch_turn = roll_per_lift * roll_soft, pitch_per_lift * pitch_soft
         roll_room, pitch_room = room * roll_soft, room * pitch_soft
+        across = sin * sin * (pitch_soft - roll_soft)
+        roll_mixed, pitch_mixed = roll_soft + across, pitch_soft - across
         features = [roll - roll_mean, pitch - pitch_mean, roll_rate - roll_rate_mean, pitch_rate - pitch_rate_mean]
-        features += [climb - height, *roll_load, *pitch_load, lift, lift_error]
-        features += [-0.5 * math.log(roll_soft), -0.5 * math.log(pitch_soft)]
-        features += [roll_turn, pitch_turn, roll_room, pitch_room, share]
+        features += [-vz - height, *roll_load, *pitch_load, lift, lift_error]
+        features += [-0.5 * math.log(roll_mixed), -0.5 * math.log(pitch_mixed)]
+        features += [roll_turn, pitch_turn, room * roll_mixed, room * pitch_mixed, share]
         action = self._network.act(features, observation)
         if not sum(map(abs, (*features, *action))) < LARGEST:
             return None
         # What the leader does.
-        (x, y, z), (vx, vy, vz), (tilt_limit, vertical_limit) = seen[12:15], seen[15:18], self._clip
-        gravity, kp_x, kp_y, kp_z, kd_x, kd_y, kd_z = self._leader
+        (gravity, kp_x, kp_y, kp_z, kd_x, kd_y, kd_z), (tilt_limit, vertical_limit) = self._leader, self._clip
         led_roll = _clipped(-(kp_y * y + kd_y * vy) / gravity, tilt_limit)
         led_pitch = _clipped((kp_x * x + kd_x * vx) / gravity, tilt_limit)
         led_vertical = _clipped(kp_z * z + kd_z * vz, vertical_limit)
@@ -116,14 +124,17 @@ class SingleFollower:
         pitch_own = share * pitch_wanted - (share - 1.0) * led_pitch - pitch_rest
         reached = _within(roll_own / roll_most, pitch_own / pitch_most, 1.0)
         roll_own, pitch_own = roll_rest + reached * roll_own, pitch_rest + reached * pitch_own
-        tilt_reach, vertical_reach = self._reach
+        (tilt_reach, vertical_reach), keep = self._reach, self._keep
         command = [
-            _clipped(roll_own + tilt_reach * action[0], tilt_limit),
-            _clipped(pitch_own + tilt_reach * action[1], tilt_limit),
+            _clipped(cos * roll_own - sin * pitch_own + tilt_reach * action[0], tilt_limit),
+            _clipped(sin * roll_own + cos * pitch_own + tilt_reach * action[1], tilt_limit),
             _clipped(vertical + vertical_reach * action[2], vertical_limit),
         ]
         # What all drones command in the mean, as the filters take it.
-        keep, roll_added, pitch_added = self._keep, command[0] - roll_own, command[1] - pitch_own
+        roll_added, pitch_added = (
+            cos * command[0] + sin * command[1] - roll_own,
+            cos * command[1] - sin * command[0] - pitch_own,
+        )
         slow = [keep * slow[0] + (1.0 - keep) * roll_added, keep * slow[1] + (1.0 - keep) * pitch_added]
         roll_drive = (roll_own + roll_added - slow[0] + (share - 1.0) * led_roll) / share
         pitch_drive = (pitch_own + pitch_added - slow[1] + (share - 1.0) * led_pitch) / share
@@ -132,8 +143,7 @@ class SingleFollower:
         drives = (roll_drive, roll_per_lift * lifted), (pitch_drive, pitch_per_lift * lifted), (0.0, turned)
         self._filters.advance(drives)
         self._network.remember(action)
-        self._rising = [sum([a * b for a, b in zip(row, up, strict=True)]) for row in self._height]
-        self._slow = slow
+        self._rising, self._slow = [sum([a * b for a, b in zip(row, up, strict=True)]) for row in self._height], slow
         return action, command
 
 
@@ -241,6 +251,7 @@ class _Network:
         normal[:FEATURES, count:], normal[FEATURES], normal[FEATURES + 1 :, :count] = np.eye(FEATURES), -mean, shown
         first = normal * scale @ weights[0].astype(np.float64)
         first[FEATURES] += biases[0]
+        self._first, self._of_features = first, first[:FEATURES].copy()
         rest = [np.vstack(layer).astype(np.float64) for layer in zip(weights[1:], biases[1:], strict=True)]
         *layers, self._last = first, *rest
         outputs = [np.ones(layer.shape[1] + 1) for layer in layers]
@@ -249,6 +260,12 @@ class _Network:
         self._features, self._input, self._past = seen[:FEATURES], seen[:-ACTION_SIZE], seen[FEATURES + 1 :]
         self._observation, self.history, self._action = np.split(self._past, [OBSERVATION_SIZE, size])
         self._zero = np.zeros(())
+
+    def tell(self, cos: float, sin: float) -> None:
+        """Take features about axes that are turned in the mount frame, of which the network has learnt."""
+        for one, other in TURNED:
+            x, y = self._of_features[one], self._of_features[other]
+            self._first[one], self._first[other] = cos * x + sin * y, cos * y - sin * x
 
     def act(self, features: list[float], observation: Array) -> list[float]:
         """Action in [-1, 1] (3)."""
@@ -273,6 +290,15 @@ def remembers_one(memory: Array | None) -> bool:
 
 def _clipped(value: float, limit: float) -> float:
     return min(max(value, -limit), limit)
+
+
+def _turned(seen: list[float], cos: float, sin: float) -> tuple[float, ...]:
+    """Roll, pitch, their rates, error and error rate of an observation as `seen` from axes turned about z."""
+    _, _, _, roll, pitch, _, _, _, _, p, q, _, x, y, z, vx, vy, vz = seen
+    return (
+        *(cos * roll + sin * pitch, cos * pitch - sin * roll, cos * p + sin * q, cos * q - sin * p),
+        *(cos * x + sin * y, cos * y - sin * x, z, cos * vx + sin * vy, cos * vy - sin * vx, vz),
+    )
 
 
 def _within(x: float, y: float, limit: float) -> float:

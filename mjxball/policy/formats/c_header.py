@@ -58,7 +58,7 @@ def _pair(lqg: Any, context: Any) -> float:
 
 def _lqg_numbers(lqg: Any, context: Any) -> dict[str, Any]:
     """Arrays of the law that the header of a follower with `context` holds; those about a pair's roll for it alone."""
-    pair, left_out = _pair(lqg, context), {"pair_roll_room", *([] if _lifts(lqg) else ["lifting"])}
+    pair, left_out = _pair(lqg, context), {"pair_roll_room", "rig_axes", *([] if _lifts(lqg) else ["lifting"])}
     if pair == 0:
         left_out |= PAIR_ROLL.keys()
     fields = {} if lqg is None else lqg._asdict()
@@ -69,10 +69,12 @@ def _lqg_numbers(lqg: Any, context: Any) -> dict[str, Any]:
     return numbers
 
 
-def _rooms_and_roll(lqg: MultiModelLqg, context: Any, numbers: dict[str, Any]) -> list[str]:
-    """Macros of the rooms, and of the arrays among `numbers` that are those about roll."""
+def _rooms_and_axes(lqg: MultiModelLqg, context: Any, numbers: dict[str, Any]) -> list[str]:
+    """Macros of the rooms, of the direction of the filters' axes, and of the arrays among `numbers` about roll."""
     wider = 1.0 + (float(lqg.pair_roll_room) - 1.0) * _pair(lqg, context)
-    lines = [f"#define MJXBALL_LEAST_ROOM {_number(LEAST_ROOM)}", f"#define MJXBALL_ROLL_ROOM {_number(wider)}"]
+    cos, sin = lqg.frame(np.array(context, np.float64)) or (1.0, 0.0)
+    lines = [f"#define MJXBALL_RIG_{name} {_number(value)}" for name, value in (("COS", cos), ("SIN", sin))]
+    lines += [f"#define MJXBALL_LEAST_ROOM {_number(LEAST_ROOM)}", f"#define MJXBALL_ROLL_ROOM {_number(wider)}"]
     for name, every in PAIR_ROLL.items():
         macro = name.removeprefix("pair_").upper()
         lines += [f"#define MJXBALL_{macro} mjxball_lqg_{name if name in numbers else every}"]
@@ -96,7 +98,8 @@ def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     lqg, told = law_of(policy.card).lqg, policy.card.get("team")
     constants = 2 * ACTION_SIZE + sum(np.size(value) for value in _lqg_numbers(lqg, told and told["context"]).values())
     constants += {TeamLqg: team_lqg.CONTEXT, MultiModelLqg: multi_model_lqg.CONTEXT}.get(type(lqg), 0)
-    state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest)
+    turned = OBSERVATION_SIZE if isinstance(lqg, MultiModelLqg) else 0
+    state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest + turned)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
         return Footprint(flash, state + FLOAT, stack + 2 * (max(size, widest) + 7))
@@ -126,7 +129,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
     if context is not None:
         arrays += [_array("lqg_context", context)]
     if isinstance(law.lqg, MultiModelLqg):
-        arrays += _rooms_and_roll(law.lqg, context, numbers)
+        arrays += _rooms_and_axes(law.lqg, context, numbers)
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
     helpers += (c_texts.APPROACH if history.filters else "") + LQG_TEXTS[type(law.lqg)][0]
     layers = _network_int8(sizes) if int8 else _network(sizes)
@@ -208,9 +211,14 @@ def _table() -> str:
     return "\n".join(f" *   {slot:2d}  {name:<22}{unit}" for slot, (name, unit) in enumerate(OBSERVATION))
 
 
+def _seen(law: FollowerLaw) -> str:
+    """The observation that the law's filters are about."""
+    return "seen" if isinstance(law.lqg, MultiModelLqg) else "observation"
+
+
 def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
     """Lines that make the network's input of observation and memory (see `control.follower_law.FollowerLaw`)."""
-    history = law.history
+    history, seen = law.history, _seen(law)
     if not law.size:
         return "    (void)follower;"
     older, width = (history.length - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
@@ -221,17 +229,23 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
     for k in range(len(history.filters)):
         lines += [f"        mjxball_copy(memory + {older + k * width}, observation, {OBSERVATION_SIZE});"]
     if law.lqg is not None:
-        lines += [f"        mjxball_lqg_start(memory + {history.size}, observation);"]
+        lines += [f"        mjxball_lqg_start(memory + {history.size}, {seen});"]
     lines += ["        follower->running = 1;", "    }"]
     lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
     for k in range(len(history.filters)):
         place = OBSERVATION_SIZE + older + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
     if law.lqg is not None:
-        lines = ["    mjxball_real led[3];", "    mjxball_copy_law(observation, led);", *lines]
-        lines += [f"    mjxball_lqg_estimate(memory + {history.size}, observation);"]
+        lines = ["    mjxball_real led[3];", f"    mjxball_copy_law({seen}, led);", *lines]
+        lines += [f"    mjxball_lqg_estimate(memory + {history.size}, {seen});"]
         features = f"input + {OBSERVATION_SIZE + history.size}"
-        lines += [f"    mjxball_lqg_features(memory + {history.size}, observation, {features});"]
+        lines += [f"    mjxball_lqg_features(memory + {history.size}, {seen}, {features});"]
+    if seen != "observation":
+        turned = (
+            f"for (i = 3; i < {OBSERVATION_SIZE}; i += 3) mjxball_turn({seen} + i, {seen} + i + 1, MJXBALL_RIG_SIN);"
+        )
+        head = [f"mjxball_real {seen}[{OBSERVATION_SIZE}];", f"mjxball_copy({seen}, observation, {OBSERVATION_SIZE});"]
+        lines = [*(f"    {line}" for line in (*head, turned)), *lines]
     return "\n".join(lines)
 
 
@@ -381,14 +395,15 @@ def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
     added = "mjxball_action_scale[i] * action[i]"
     if law.needs_context:
         lifts = _lifts(law.lqg)
-        apart = " + (i == 2 ? own[3] : 0)" if lifts else ""
-        return "\n".join(
-            [
-                f"    mjxball_real own[{6 if lifts else 3}];",
-                f"    mjxball_lqg_command(memory + {law.history.size}, observation, led, own);",
-                f"    for (i = 0; i < 3; i++) command[i] = mjxball_clip(own[i]{apart} + {added}, mjxball_limit[i]);",
-            ]
-        )
+        lines = [f"    mjxball_real own[{6 if lifts else 3}];"]
+        lines += [f"    mjxball_lqg_command(memory + {law.history.size}, {_seen(law)}, led, own);"]
+        base = "own[i] + (i == 2 ? own[3] : 0)" if lifts else "own[i]"
+        if isinstance(law.lqg, MultiModelLqg):
+            lines += ["    mjxball_copy(command, own, 3);"]
+            lines += ["    mjxball_turn(command, command + 1, -MJXBALL_RIG_SIN);"]
+            base = "command[i]"
+        lines += [f"    for (i = 0; i < 3; i++) command[i] = mjxball_clip({base} + {added}, mjxball_limit[i]);"]
+        return "\n".join(lines)
     if law.lqg is not None:
         lines = [f"    for (i = 0; i < 3; i++) command[i] = {added};"]
         lines += [f"    mjxball_lqg_command(memory + {law.history.size}, observation, led, command);"]

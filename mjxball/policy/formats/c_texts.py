@@ -279,6 +279,19 @@ enum {
     MJXBALL_TOLD = MJXBALL_SLOW + 2
 };
 
+/* (x, y) in the mount frame as seen from the axes of the filters, with sin = MJXBALL_RIG_SIN; back with minus that. */
+static inline void mjxball_turn(mjxball_real *x, mjxball_real *y, mjxball_real sin) {
+    mjxball_real along = MJXBALL_RIG_COS * *x + sin * *y;
+    *y = MJXBALL_RIG_COS * *y - sin * *x;
+    *x = along;
+}
+
+/* What lifting turns about the axes of the filters. */
+static inline void mjxball_lqg_levers(const mjxball_real *memory, mjxball_real *levers) {
+    mjxball_copy(levers, memory + MJXBALL_TOLD + 1, 2);
+    mjxball_turn(levers, levers + 1, MJXBALL_RIG_SIN);
+}
+
 static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *observation) {
     for (int axis = 0; axis < 2; axis++)
         for (int model = 0; model < MJXBALL_MODELS; model++) {
@@ -343,8 +356,11 @@ static inline mjxball_real mjxball_depth(mjxball_real x) {
 
 static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
     const mjxball_real *context = memory + MJXBALL_TOLD, *height = memory + MJXBALL_HEIGHT;
+    mjxball_real soft[2];
+    mjxball_lqg_levers(memory, to + 15);
     for (int axis = 0; axis < 2; axis++) {
-        mjxball_real weights[MJXBALL_MODELS], soft = mjxball_lqg_weights(memory, axis, weights), mean[5] = {0};
+        mjxball_real weights[MJXBALL_MODELS], mean[5] = {0};
+        soft[axis] = mjxball_lqg_weights(memory, axis, weights);
         for (int model = 0; model < MJXBALL_MODELS; model++) {
             const mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
             mjxball_real softer = weights[model] / mjxball_lqg_stiffness[model];
@@ -353,26 +369,34 @@ static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxbal
         to[axis] = observation[3 + axis] - mean[0];
         to[2 + axis] = observation[9 + axis] - mean[1];
         mjxball_copy(to + 5 + 3 * axis, mean + 2, 3);
-        to[13 + axis] = (mjxball_real)0.5 * mjxball_depth(soft);
-        to[15 + axis] = context[1 + axis] * soft;
-        to[17 + axis] = context[3] * soft;
+        to[15 + axis] *= soft[axis];
+    }
+    mjxball_turn(to, to + 1, -MJXBALL_RIG_SIN);
+    mjxball_turn(to + 2, to + 3, -MJXBALL_RIG_SIN);
+    for (int k = 5; k < 8; k++) mjxball_turn(to + k, to + k + 3, -MJXBALL_RIG_SIN);
+    mjxball_turn(to + 15, to + 16, -MJXBALL_RIG_SIN);
+    for (int axis = 0; axis < 2; axis++) {
+        mjxball_real mixed = soft[axis] + MJXBALL_RIG_SIN * MJXBALL_RIG_SIN * (soft[1 - axis] - soft[axis]);
+        to[13 + axis] = (mjxball_real)0.5 * mjxball_depth(mixed);
+        to[17 + axis] = context[3] * mixed;
     }
     to[4] = -observation[17] - height[0];
     mjxball_copy(to + 11, height + 1, 2);
     to[19] = context[0];
 }
 
-/* own: the law's command, to which the network's is added. */
+/* own: the law's command about the axes of the filters, to which the network's is added. */
 static inline void mjxball_lqg_command(
     const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *own) {
     const mjxball_real *context = memory + MJXBALL_TOLD, share = context[0];
-    mjxball_real far[2], load[2], room[2], rest[2], most[2], gains[2][4] = {{0}};
+    mjxball_real levers[2], far[2], load[2], room[2], rest[2], most[2], gains[2][4] = {{0}};
     mjxball_real rise = mjxball_lqg_rise[0] * observation[14] + mjxball_lqg_rise[1] * observation[17];
     rise = mjxball_clip(rise, mjxball_lqg_limits[1]) - memory[MJXBALL_HEIGHT + 2];
     own[2] = mjxball_clip(share * rise - (share - 1) * led[2], mjxball_limit[2]);
+    mjxball_lqg_levers(memory, levers);
     for (int i = 0; i < 2; i++) {
         mjxball_real weights[MJXBALL_MODELS], soft = mjxball_lqg_weights(memory, i, weights), damping = 0;
-        load[i] = context[1 + i] * soft * (own[2] - led[2]);
+        load[i] = levers[i] * soft * (own[2] - led[2]);
         for (int model = 0; model < MJXBALL_MODELS; model++) {
             const mjxball_real *state = memory + 5 * (i * MJXBALL_MODELS + model);
             load[i] += weights[model] * state[2] / mjxball_lqg_stiffness[model];
@@ -400,15 +424,18 @@ static inline void mjxball_lqg_command(
 static inline void mjxball_lqg_next(
     mjxball_real *memory, const mjxball_real *led, const mjxball_real *own, const mjxball_real *command) {
     const mjxball_real *context = memory + MJXBALL_TOLD, share = context[0];
-    mjxball_real *slow = memory + MJXBALL_SLOW, *height = memory + MJXBALL_HEIGHT, drive, before[5];
+    mjxball_real *slow = memory + MJXBALL_SLOW, *height = memory + MJXBALL_HEIGHT, drive, before[5], levers[2];
+    mjxball_real turned[2] = {command[0], command[1]};
     const float *row = mjxball_lqg_height;
+    mjxball_turn(turned, turned + 1, MJXBALL_RIG_SIN);
+    mjxball_lqg_levers(memory, levers);
     for (int axis = 0; axis < 3; axis++) {
         mjxball_real mean = 0, turns;
         if (axis < 2) {
-            mjxball_real added = command[axis] - own[axis];
+            mjxball_real added = turned[axis] - own[axis];
             slow[axis] = mjxball_lqg_keep[1] * slow[axis] + (1 - mjxball_lqg_keep[1]) * added;
             mean = (own[axis] + added - slow[axis] + (share - 1) * led[axis]) / share;
-            turns = context[1 + axis] * (own[2] - led[2]);
+            turns = levers[axis] * (own[2] - led[2]);
         } else {
             turns = mjxball_root(context[1] * context[1] + context[2] * context[2]) * (command[2] - own[2]);
             turns *= mjxball_lqg_added_lift[0] * (share < (mjxball_real)1.5 ? 0 : share > 2 ? 1 : 2 * share - 3);

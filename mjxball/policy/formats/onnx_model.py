@@ -177,8 +177,9 @@ class Namespace:
     @staticmethod
     def broadcast_to(value: np.ndarray, shape: tuple[Any, ...]) -> TracedArray:
         """A constant (k,) for each of N flights, (N, k)."""
-        rows: TracedArray = shape[0]
-        return Namespace.zeros_like(rows)[..., None] + value
+        flights: TracedArray = shape[0]
+        one_each = flights[(..., *(0,) * len(flights.sizes))]
+        return Namespace.zeros_like(one_each)[..., None] + value
 
     @staticmethod
     def maximum(value: TracedArray, other: Any) -> TracedArray:
