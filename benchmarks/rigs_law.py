@@ -4,11 +4,13 @@
     python benchmarks/rigs_law.py --cases later --sizes 2 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases delay --sizes 2 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases told --sizes 2 4 --seed 77 --policy policies/universal.npz
+    python benchmarks/rigs_law.py --cases axes --sizes 2 3 --seed 77 --policy policies/universal.npz
 
 As `benchmarks/rigs.py`, of rigs of three drones, or of others that neither a training nor a judgement draws (`--seed`).
 The law flies alone, or under the network of `--policy` as it is, which was trained with another. A model is a natural
 frequency of the loops [rad/s] and a lag of the rotors [s], see `mjxball.baselines.multi_model_lqg`. `told`: one
-model, of the rig's own loops and rotors; and the LQGs that know the rig, each against the better of both.
+model, of the rig's own loops and rotors; and the LQGs that know the rig, each against the better of both. `axes`: a
+pair's own filters and room about roll, and all of it about the rig's axes.
 """
 
 from __future__ import annotations
@@ -72,6 +74,8 @@ class Case(NamedTuple):
     velocity: float = TUNING.velocity  # that costs 1 [m/s]
     damping: tuple[float, ...] = ()  # of each model; (): that of the preset
     added_lift: float = 0.0  # share of the lift that the network adds whose torque a pair's scores are told
+    pair_roll: bool = False  # whether a pair has its own filters and room about roll
+    rig_axes: bool = False  # whether all this is about the rig's axes, not those of the mount frame
     delay: float | None = None  # [s] added to the lag of the rig's own rotors, if its own loop is the only model
 
     def law(self, config: Config) -> MultiModelLqg:
@@ -86,6 +90,10 @@ class Case(NamedTuple):
         prior = 0.5 * np.log(c00 * c11 - c01 * c01)
         keep = np.array([1.0 - config.timing.control_period / self.score_time, laws[0].keep[1]])
         common = {"prior": prior - prior.max(), "keep": keep, "added_lift": np.array(self.added_lift)}
+        common["rig_axes"] = np.array(float(self.rig_axes))
+        if not self.pair_roll:
+            common |= dict.fromkeys(("pair_roll_gain", "pair_roll_certainty", "pair_roll_prior"), None)
+            common["pair_roll_room"] = np.array(1.0)
         return laws[0]._replace(**numbers, **common)
 
     def of_rigs(self, config: Config, rigs: RigTable) -> MultiModelLqg:
@@ -96,7 +104,8 @@ class Case(NamedTuple):
         return laws[0]._replace(**{name: np.stack([getattr(law, name) for law in laws]) for name in OF_MODELS})
 
 
-AS_IT_IS = Case("as it is", MODELS, TUNING.torque_walk, position=TUNING.position, added_lift=1.0)
+LIFT_TOLD = Case("12 pairs, lift told", MODELS, TUNING.torque_walk, position=TUNING.position, added_lift=1.0)
+AS_IT_IS = LIFT_TOLD._replace(name="as it is", pair_roll=True, rig_axes=True)
 OF_MODELS = ("axis", "axis_gain", "certainty", "tilt", "stiffness", "damping")
 CASES = {
     "first": [
@@ -118,8 +127,9 @@ CASES = {
         Case("9 pairs"),
         Case("9 pairs, 25 ms later", later(0.025), 1000.0, position=0.17),
         *(Case("12 pairs", MODELS, walk, position=position) for walk, position in ((1000.0, 0.17), (500.0, 0.2))),
-        AS_IT_IS,
+        LIFT_TOLD,
     ],
+    "axes": [LIFT_TOLD, LIFT_TOLD._replace(name="a pair's own roll", pair_roll=True), AS_IT_IS],
     "told": [
         *(Case("9 pairs", torque_walk=walk, position=position) for walk, position in ((300.0, 0.2), (1000.0, 0.17))),
         *(Case("the rig's own loop", delay=delay) for delay in (0.0, 0.025)),
