@@ -28,8 +28,8 @@ MODELS = (
 )
 TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=500.0, tilt_limit=0.3)  # of a load's torque over the inertia
 # Inertia of a pair about pitch over that about roll, the median of random rigs (`sim.rigs`): the same torque turns it
-# about roll as much more, and rotors hold as much more of a tilt.
-PAIR_INERTIA_RATIO = 13.0
+# about roll as much more, and rotors hold as much more of a tilt. Across the pair the CG goes half as far in the mean.
+PAIR_INERTIA_RATIO, ACROSS = 13.0, 0.5
 SCORE_TIME = 8.0  # [s] in which a model's score is forgotten
 
 
@@ -46,7 +46,7 @@ def multi_model_lqg(
         stiffness, damping = frequency**2, 2 * damped * frequency
         of_loop, tilts = (stiffness, damping, lag, period), feedback(model, tuning).pitch
         axis, *own = _filter(*of_loop, tuning.torque_walk)
-        _, *of_pair = _filter(*of_loop, tuning.torque_walk * PAIR_INERTIA_RATIO**2)
+        _, *of_pair = _filter(*of_loop, tuning.torque_walk * (ACROSS * PAIR_INERTIA_RATIO) ** 2)
         parts.append((axis, *own, *of_pair, np.array(tilts), stiffness, damping / stiffness))
     stacked = [np.stack(part) for part in zip(*parts, strict=True)]
     axes, gains, certainty, prior, *rolling, tilt, every_stiffness, every_damping = stacked
