@@ -191,7 +191,8 @@ def steps_to_find(law: MultiModelLqg, share: float, axis: int) -> int:
 def test_a_load_about_a_pairs_roll_is_found_sooner() -> None:
     law = multi_model_lqg(UNIVERSAL, ((9.0, 0.08),))
     before = steps_to_find(without_own_roll(law), 2.0, 0)
-    assert steps_to_find(law, 2.0, 0) <= 0.5 * before < 10
+    # A load that walks 42 times as far in the square is found 42^(1/6) = 1.9 times as soon, less what whole steps take.
+    assert 1.6 * steps_to_find(law, 2.0, 0) <= before < 20
     assert steps_to_find(law, 2.0, 1) == steps_to_find(law, 1.5, 0) == before
 
 
