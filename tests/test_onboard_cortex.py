@@ -65,8 +65,8 @@ def test_a_cortex_m4_computes_the_same_bits(int8: bool, tmp_path: Path):
         found = benchmark.compare(benchmark.policy_of(shipped_policy(name)), tmp_path, int8, 500)
         assert found["identical"], name
         if not int8:
-            # Odds of nine filters multiply what float32 rounds.
-            assert found["error"] <= (5e-5 if name == "universal" else 1e-5)
+            # Odds of twelve filters multiply what float32 rounds; rms 5e-7.
+            assert found["error"] <= (1e-4 if name == "universal" else 1e-5)
 
 
 # Each record: state, heartbeat of the other drone, time, order -> setpoint, command, integral, heartbeat.

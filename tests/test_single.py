@@ -88,12 +88,16 @@ def test_it_is_the_law_of_arrays(plant: str, size: float, tolerance: float) -> N
 
 @pytest.mark.parametrize("plant", ["pair", "team4"])
 def test_of_a_flight_it_is_the_law_of_arrays_as_rounded(plant: str) -> None:
-    """In float32 the law of arrays rounds what this does not: a command of up to 8 m/s2, states of fast models most."""
+    """In float32 the law of arrays rounds what this does not.
+
+    Scores of thousands to 1e-4 and so the weights, commands of up to 8 m/s2 to 6e-5 of that; how fast a load changes
+    [rad/s3] is the sum of innovations times gains of up to 470.
+    """
     config, pilot = plant_setup(Path(plant)), Policy(UNIVERSAL, "universal")
     pilot.join(config.plant, config.attitude)
     flown = simulate(config, pilot, Scenario(omega=1.0, amplitude=0.03, seconds=8.0), "newton-euler")
     flight = flown.observation.reshape(len(flown.observation), -1, 18)[:, -1]
-    agree(*told(plant, np.float32), flight, 1e-4, 2e-3)
+    agree(*told(plant, np.float32), flight, 5e-4, 1e-2)
     agree(*told(plant), flight)
 
 
