@@ -86,7 +86,7 @@ class MultiModelLqg(NamedTuple):
         return xp.concat([*turning, rest, known], axis=-1)
 
     def features(self, memory: Array, observation: Array) -> Array:
-        """(..., 20) for a network.
+        """(..., 20) for a network, in the mount frame.
 
         The measured less its estimate (5), of both axes the load, its rate and the rotors' part as tilts [rad] (6), the
         other estimates of the height (2), log frequencies (2), what lifting turns and what rotors hold as tilts (4),
