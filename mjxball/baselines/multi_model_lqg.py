@@ -12,6 +12,7 @@ from mjxball.baselines.assembly_model import ideal_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import Tuning, feedback
 from mjxball.baselines.offset_free import NAME, OffsetFree
+from mjxball.baselines.swing_design import ENERGY_TIME, ahead, observers
 from mjxball.baselines.team_lqg import angle_filter, height_filter
 from mjxball.config import Config
 from mjxball.control.followers import copy_gains
@@ -31,6 +32,7 @@ TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=500.0, tilt_limit=0.3)  
 # about roll as much more, and rotors hold as much more of a tilt. Across the pair the CG goes half as far in the mean.
 PAIR_INERTIA_RATIO, ACROSS = 13.0, 0.5
 SCORE_TIME = 8.0  # [s] in which a model's score is forgotten
+HELD_ROOM = 1.0  # over the load that is held: rotors that hold it have room for as much
 
 
 def multi_model_lqg(
@@ -47,9 +49,10 @@ def multi_model_lqg(
         of_loop, tilts = (stiffness, damping, lag, period), feedback(model, tuning).pitch
         axis, *own = _filter(*of_loop, tuning.torque_walk)
         _, *of_pair = _filter(*of_loop, tuning.torque_walk * (ACROSS * PAIR_INERTIA_RATIO) ** 2)
-        parts.append((axis, *own, *of_pair, np.array(tilts), stiffness, damping / stiffness))
+        swung = ahead(axis, own[0], lag, period)
+        parts.append((axis, *own, *of_pair, np.array(tilts), stiffness, damping / stiffness, swung))
     stacked = [np.stack(part) for part in zip(*parts, strict=True)]
-    axes, gains, certainty, prior, *rolling, tilt, every_stiffness, every_damping = stacked
+    axes, gains, certainty, prior, *rolling, tilt, every_stiffness, every_damping, every_ahead = stacked
     *height, height_gain = height_filter(config.plant.rotor_lag, period)
     return MultiModelLqg(
         axis=axes,
@@ -70,6 +73,10 @@ def multi_model_lqg(
         pair_roll_prior=rolling[2] - rolling[2].max(),
         pair_roll_room=PAIR_INERTIA_RATIO,
         rig_axes=1.0,
+        swing=observers(period),
+        swing_ahead=every_ahead,
+        swing_keep=1.0 - period / ENERGY_TIME,
+        held_room=HELD_ROOM,
     )
 
 

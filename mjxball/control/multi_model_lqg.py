@@ -6,7 +6,8 @@ estimates are weighted means. To the filters what the network lifts is part of t
 better: a third set of states holds what that lift has turned about pitch. About roll a pair's inertia is small, so that
 it has filters of its own there, for larger loads, and more room. A rig's loops about roll and pitch differ; seen from a
 follower that stands askew to them each of its axes would turn as both do, so that all of this is about the rig's axes,
-of which the first points to the leader. Everything else is as in `control.team_lqg`.
+of which the first points to the leader. What of the load swings is held against ahead of time, see `control.swing`.
+Everything else is as in `control.team_lqg`.
 What a follower must be told is its team's geometry: `ring_context`. Needs NumPy alone; `baselines.multi_model_lqg`
 makes the numbers, which stand in the policy file.
 """
@@ -18,7 +19,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from mjxball.config import Plant
-from mjxball.control import rotations
+from mjxball.control import rotations, swing
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_frames
 from mjxball.control.team_lqg import measured, within
 from mjxball.plant.parts import clipped, joined
@@ -55,6 +56,11 @@ class MultiModelLqg(NamedTuple):
     pair_roll_prior: Array | None = None  # (M,)
     pair_roll_room: Array | float = 1.0  # () factor on what rotors hold as a tilt
     rig_axes: Array | float = 0.0  # () 1: states are about the rig's axes; 0: about those of the mount frame
+    # Of J swings, see `control.swing`; None: loads are held as estimated.
+    swing: Array | None = None  # (J, 5)
+    swing_ahead: Array | None = None  # (M, J, 2)
+    swing_keep: Array | float = 0.0  # () share that a step leaves of the energies
+    held_room: Array | float = 0.0  # () what rotors hold as a tilt, at least, over what all hold of the load
 
     @property
     def models(self) -> int:
@@ -62,14 +68,20 @@ class MultiModelLqg(NamedTuple):
         return len(self.stiffness)
 
     @property
+    def swings(self) -> int:
+        """J."""
+        return 0 if self.swing is None else len(self.swing)
+
+    @property
     def size(self) -> int:
-        """Numbers in the memory: filters as predicted, height, scores, slow part of added tilts, context."""
-        return self.models * (AXES * ANGLE_STATES + 2) + HEIGHT_STATES + 2 + CONTEXT
+        """Numbers in the memory: filters as predicted, height, scores, swings, slow part of added tilts, context."""
+        swinging = 2 * self.swings * swing.STATES
+        return self.models * (AXES * ANGLE_STATES + 2) + HEIGHT_STATES + swinging + 2 + CONTEXT
 
     @property
     def shown(self) -> int:
         """How many numbers `features` has."""
-        return FEATURES
+        return FEATURES + (2 if self.swings else 0)
 
     def start(self, observation: Array, context: Array) -> Array:
         """Memory (..., m) before the first `observation` (..., 18) of followers with `context` (..., 4)."""
@@ -82,15 +94,16 @@ class MultiModelLqg(NamedTuple):
             for angle, rate in ((roll, roll_rate), (pitch, pitch_rate), (zero, zero))
             for _ in range(self.models)
         ]
-        rest = joined([climb, *[zero] * (HEIGHT_STATES - 1 + 2 * self.models + 2)])
+        zeros = HEIGHT_STATES - 1 + 2 * (self.models + self.swings * swing.STATES) + 2
+        rest = joined([climb, *[zero] * zeros])
         return xp.concat([*turning, rest, known], axis=-1)
 
     def features(self, memory: Array, observation: Array) -> Array:
-        """(..., 20) for a network, in the mount frame.
+        """(..., 20), of a law with swings (..., 22), for a network, in the mount frame.
 
         The measured less its estimate (5), of both axes the load, its rate and the rotors' part as tilts [rad] (6), the
         other estimates of the height (2), log frequencies (2), what lifting turns and what rotors hold as tilts (4),
-        N / (N - 1).
+        N / (N - 1), what the load will have grown by as a tilt (2).
         """
         xp = observation.__array_namespace__()
         context, frame = self._told(memory, observation)
@@ -111,6 +124,9 @@ class MultiModelLqg(NamedTuple):
         speed = -0.5 * xp.log(soft)
         parts = [joined([*angles, *rates, left[4]]), *(joined([load[axis] for load in every]) for axis in (0, 1))]
         parts += [seen.rising[..., 1:], speed, joined(lever), context[..., 3:] * soft, context[..., :1]]
+        if self.swings:
+            grown = self._swinging(memory, seen)[1]
+            parts += [joined(_turned_back([grown[..., 0], grown[..., 1]], frame))]
         return xp.concat(parts, axis=-1)
 
     def command(self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
@@ -154,7 +170,8 @@ class MultiModelLqg(NamedTuple):
         climbing = xp.concat([seen.rising, mean[..., 2:]], axis=-1) @ height.T
         flat = [turning[..., k, m, :] for k in range(AXES) for m in range(models)]
         scores = [seen.scores[..., k, :] for k in (0, 1)]
-        return xp.concat([*flat, climbing, *scores, slow, memory[..., -CONTEXT:]], axis=-1)
+        swinging = [] if self.swing is None else [swing.advanced(self.swing, self._swinging(memory, seen)[2])]
+        return xp.concat([*flat, climbing, *scores, *swinging, slow, memory[..., -CONTEXT:]], axis=-1)
 
     def _like(self, numbers: Array, observation: Array) -> Array:
         return observation.__array_namespace__().asarray(numbers, dtype=observation.dtype)
@@ -222,6 +239,16 @@ class MultiModelLqg(NamedTuple):
         climbed = (found[4] - rising[..., 0])[..., None] * self._like(self.height_gain, observation)
         return Estimate(turning, scores, weights, rising + climbed)
 
+    def _swinging(self, memory: Array, seen: Estimate) -> tuple[Array, Array, swing.Swinging | None]:
+        """(load as a tilt (..., 2), what it will have grown by when the rotors act (..., 2), its swings)."""
+        load = (seen.weights * seen.turning[..., :2, :, 2] / self._like(self.stiffness, memory)).sum(axis=-1)
+        if self.swing is None:
+            return load, 0.0, None
+        end = CONTEXT + 2
+        before = memory[..., -end - 2 * self.swings * swing.STATES : -end]
+        found = swing.seen(self.swing, self.swing_keep, before, load)
+        return load, swing.grown(self.swing_ahead, found, seen.weights), found
+
     def _plan(
         self, memory: Array, observation: Array, context: Array, leader: tuple[Any, ...]
     ) -> tuple[Array, Estimate]:
@@ -240,11 +267,14 @@ class MultiModelLqg(NamedTuple):
         far = gains[..., 0] * _crossed(xp, error) + gains[..., 1] * _crossed(xp, rate)
         angles, rates = observation[..., 3:5], observation[..., 9:11]
         wanted = within(xp, far, tilt_limit) - gains[..., 2] * angles - gains[..., 3] * rates
-        load = (weights * seen.turning[..., :2, :, 2] / self._like(self.stiffness, observation)).sum(axis=-1)
-        load = load + context[..., 1:3] * soft * (vertical - led[..., 2])[..., None]
+        load, grown, _ = self._swinging(memory, seen)
+        load = load + grown + context[..., 1:3] * soft * (vertical - led[..., 2])[..., None]
         wanted = wanted - within(xp, load, load_limit)
         own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
         rest, most = angles + damping * rates, xp.maximum(context[..., 3:] * soft, LEAST_ROOM)
+        if float(self.held_room):
+            held = xp.sqrt((load * load).sum(axis=-1, keepdims=True) + 1e-12)
+            most = xp.maximum(most, float(self.held_room) * share[..., None] * held)
         wider = 1.0 + (float(self.pair_roll_room) - 1.0) * is_pair(share)
         most = most * joined([wider, xp.ones_like(wider)])
         own = rest + most * within(xp, (own - rest) / most, 1.0)

@@ -102,12 +102,19 @@ MULTI_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # behind an axis of models
     "stiffness": (),
     "damping": (),
 }
-LATER_SHAPES: dict[str, tuple[int, ...]] = {  # 0 for the models; absent, all of them, from the first files
-    "pair_roll_gain": (0, 5, 2),
-    "pair_roll_certainty": (0, 3),
-    "pair_roll_prior": (0,),
+# Absent, all of a group, from earlier files; "M" for the models, "J" for the swings.
+LATER_SHAPES: dict[str, tuple[Any, ...]] = {
+    "pair_roll_gain": ("M", 5, 2),
+    "pair_roll_certainty": ("M", 3),
+    "pair_roll_prior": ("M",),
     "pair_roll_room": (),
     "rig_axes": (),
+}
+SWING_SHAPES: dict[str, tuple[Any, ...]] = {
+    "swing": ("J", 5),
+    "swing_ahead": ("M", "J", 2),
+    "swing_keep": (),
+    "held_room": (),
 }
 MULTI_MODEL_COMMON: dict[str, tuple[int, ...]] = {
     "height": (3, 4),
@@ -345,6 +352,10 @@ def _check_later(lqg: dict[str, Any], name: str) -> None:
         raise PolicyFileError(f"{name}: card field lqg.pair_roll_room must be positive")
     if lqg.get("rig_axes", 0) not in (0, 1):
         raise PolicyFileError(f"{name}: card field lqg.rig_axes must be 0 or 1")
+    if not 1 <= len(lqg.get("swing", [0])) <= MAX_MODELS:
+        raise PolicyFileError(f"{name}: card field lqg.swing must be 1 to {MAX_MODELS} rows")
+    if not 0 <= lqg.get("swing_keep", 0) < 1 or not lqg.get("held_room", 0) >= 0:
+        raise PolicyFileError(f"{name}: card field lqg.swing_keep must be a share below 1, held_room not negative")
 
 
 def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, ...]]:
@@ -353,8 +364,11 @@ def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, 
     shapes: dict[str, tuple[int, ...]] = {}
     if later and later in lqg:
         shapes[later] = ()
-    if version == 4 and lqg.keys() & LATER_SHAPES.keys():
-        shapes |= {field: shape and (len(lqg["stiffness"]), *shape[1:]) for field, shape in LATER_SHAPES.items()}
+    swings = lqg.get("swing")
+    counts = {"M": len(lqg["stiffness"]) if version == 4 else 0, "J": len(swings) if isinstance(swings, list) else 0}
+    for group in (LATER_SHAPES, SWING_SHAPES) if version == 4 else ():
+        if lqg.keys() & group.keys():
+            shapes |= {field: tuple(counts.get(size, size) for size in shape) for field, shape in group.items()}
     return shapes
 
 
