@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import re
 import shutil
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,14 @@ import onnxruntime
 import pytest
 from command_line import assert_one_line, call, listing, load_arrays, run, write_arrays
 from conftest import Trained
+from rig_laws import OLDEST, with_law
 
-from mjxball.baselines.multi_model_lqg import multi_model_lqg
 from mjxball.cli import plant_setup
-from mjxball.config import preset
+from mjxball.control import swing
 from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.export import _numbers
-from mjxball.policy.file import LATER_SHAPES, law_of, save_file, shipped_policy
+from mjxball.policy.file import LATER_SHAPES, SWING_SHAPES, law_of, save_file, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 
@@ -85,13 +86,14 @@ def limited(remembering: Trained) -> PolicyFile:
         *("trained", "direct", "remembering", "limited", "estimating"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
         *("team pair", "team team3", "universal pair", "universal team3", "lifting team6"),
-        *("newer pair", "newer team3", "older pair", "older team3"),
+        *("newer pair", "newer team3", "still pair", "older pair", "older team3"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
     name, _, plant = request.param.partition(" ")
     if plant:
-        laws = {"lifting": lifting, "newer": newer, "older": older}
+        older = {name: functools.partial(with_law, without) for name, without in OLDER.items()}
+        laws: dict[str, Callable[[], PolicyFile]] = {"lifting": lifting, **older}
         policy = laws[name]() if name in laws else load_file(shipped_policy(name))
         return in_team(policy, name, Path(plant), None if plant == "pair" else 2)
     if name in ("balance", "transport", "robust", "flight", "stand", "paper"):
@@ -100,24 +102,14 @@ def contents(request: pytest.FixtureRequest) -> PolicyFile:
     return made.contents if isinstance(made, Trained) else made
 
 
+# `universal` with the law as it is made now, and with what older files hold of it.
+OLDER = {"newer": (), "still": SWING_SHAPES, "older": OLDEST}
+
+
 def lifting() -> PolicyFile:
     """`team` with a law that holds most of the load by lifting apart."""
     team = load_file(shipped_policy("team"))
     return dataclasses.replace(team, card={**team.card, "lqg": {**team.card["lqg"], "lifting": 0.9}})
-
-
-def newer() -> PolicyFile:
-    """`universal` with filters of its own about a pair's roll, and all of them about the rig's axes."""
-    universal = load_file(shipped_policy("universal"))
-    lqg = _numbers(multi_model_lqg(preset("universal")))
-    return dataclasses.replace(universal, card={**universal.card, "lqg": lqg})
-
-
-def older() -> PolicyFile:
-    """The same without these."""
-    made = newer()
-    lqg = {name: value for name, value in made.card["lqg"].items() if name not in LATER_SHAPES}
-    return dataclasses.replace(made, card={**made.card, "lqg": lqg})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +151,7 @@ def assert_remembered(found: np.ndarray, flight: Flight, contents: PolicyFile, t
     wanted, law = flight.next_memory, law_of(contents.card)
     least = np.full(wanted.shape[1], 1e-6 + tolerance)
     if isinstance(law.lqg, MultiModelLqg):
-        last = -CONTEXT - 2
+        last = -CONTEXT - 2 - 2 * law.lqg.swings * swing.STATES
         scores = slice(last - 2 * law.lqg.models, last)
         least[scores] += max(np.spacing(np.abs(wanted[:, scores]).max().astype(found.dtype)), SCORES)
     excess = np.abs(found - wanted) - ROUNDED * np.abs(wanted) - least
@@ -242,7 +234,7 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
 
 
 def test_only_a_pair_pays_for_filters_of_its_own_about_roll():
-    more, less = newer(), older()
+    more, less = with_law(), with_law(LATER_SHAPES)
     of_three = [in_team(made, "three", Path("team3"), 1) for made in (more, less)]
     assert footprint(of_three[0]) == footprint(of_three[1])
     own, other = (c_header(made, "follower").splitlines() for made in of_three)
@@ -265,7 +257,7 @@ def test_only_a_pair_pays_for_filters_of_its_own_about_roll():
 @pytest.mark.parametrize(("share", "weight", "room"), [(2.0, 1.0, "1.3e+01f"), (1.75, 0.5, "7.0e+00f")])
 def test_a_pairs_header_has_its_numbers_about_roll(share: float, weight: float, room: str):
     """Also where a card names a share between those of a pair and of three."""
-    pair = in_team(newer(), "pair", Path("pair"), None)
+    pair = in_team(with_law(), "pair", Path("pair"), None)
     pair.card["team"]["context"][0] = share
     text, lqg = c_header(pair, "follower"), pair.card["lqg"]
     for own, every in (("roll_gain", "axis_gain"), ("roll_certainty", "certainty"), ("roll_prior", "prior")):

@@ -6,13 +6,14 @@ import copy
 import dataclasses
 import itertools
 import pickle
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rig_laws import OLDEST, with_law
 
-from mjxball.baselines.multi_model_lqg import MODELS, multi_model_lqg
 from mjxball.cli import plant_setup
 from mjxball.config import preset
 from mjxball.control.multi_model_lqg import CONTEXT, team_geometry
@@ -20,24 +21,13 @@ from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.plant.teams import ring_config
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.export import _numbers
-from mjxball.policy.file import LATER_SHAPES, law_of, shipped_policy
+from mjxball.policy.file import LATER_SHAPES, SWING_SHAPES, law_of, shipped_policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
 UNIVERSAL = load_file(shipped_policy("universal"))
 TEAMS = {"pair": None, "team3": 1, "team4": 3, "plate4": 2, "team6": 4}  # plant: which of its followers
-
-
-def with_law(newer: bool, models: Any = MODELS) -> PolicyFile:
-    """The shipped network with the law as it is made now, or as older files have it.
-
-    The newer has filters of its own about a pair's roll, and all of them about the rig's axes.
-    """
-    lqg = _numbers(multi_model_lqg(preset("universal"), models))
-    left = {name: value for name, value in lqg.items() if newer or name not in LATER_SHAPES}
-    return dataclasses.replace(UNIVERSAL, card={**UNIVERSAL.card, "lqg": left})
 
 
 class Reference:
@@ -144,29 +134,31 @@ def test_any_history_and_any_gains(fields: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("plant", ["pair", "team3"])
 def test_one_model_is_enough(plant: str) -> None:
-    agree(*told(plant, contents=with_law(True, ((7.0, 0.05),))), walk(200))
+    agree(*told(plant, contents=with_law(models=((7.0, 0.05),))), walk(200))
 
 
-@pytest.mark.parametrize("newer", [True, False])
+@pytest.mark.parametrize("without", [(), SWING_SHAPES, LATER_SHAPES, OLDEST])
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize("size", [0.03, 0.3])
-def test_of_newer_and_of_older_files(count: int, newer: bool, size: float) -> None:
-    """Filters of a pair's own about roll, and all about the rig's axes, or neither; also where limits are met."""
-    plant, made = ring_config(preset("team"), count).plant, with_law(newer)
+def test_of_newer_and_of_older_files(count: int, without: Collection[str], size: float) -> None:
+    """With and without swings, filters of a pair's own about roll and all about the rig's axes; limits are met, too."""
+    plant, made = ring_config(preset("team"), count).plant, with_law(without)
     mounts = np.array([drone.mount for drone in plant.drones])
     context = np.atleast_2d(team_geometry(plant, mounts, np.float64(count)))[-1].tolist()
     card = {**made.card, "team": {"drone": count - 1, "mount_angle": 0.0, "context": context}}
     policy = Policy(dataclasses.replace(made, card=card), "ring", np.float64)
     agree(policy, Reference(policy), walk(200, size=size), remembered=1e-7)
     assert policy._ahead
+    newer = "rig_axes" not in without
     assert (policy._single._filters._roll_matrix is not None) == (newer and count == 2)
     assert (abs(policy._single._frame[1]) > 0.1) == (newer and count != 2)
+    assert (policy._single._swings is None) == ("swing" in without)
 
 
-@pytest.mark.parametrize("newer", [True, False])
-def test_a_memory_of_another_team_changes_the_filters(newer: bool) -> None:
+@pytest.mark.parametrize("without", [(), LATER_SHAPES])
+def test_a_memory_of_another_team_changes_the_filters(without: Collection[str]) -> None:
     """Also one of a share between those of a pair and of three, and one without a lever."""
-    policy, reference = told("pair", contents=with_law(newer))
+    policy, reference = told("pair", contents=with_law(without))
     agree(policy, reference, walk(20))
     for number, told_now in enumerate(((1.75, 3.0, 4.0), (1.5, -2.0, 1.0), (2.0, 0.0, 5.0), (4 / 3, 0.0, 0.0))):
         memory = policy.memory

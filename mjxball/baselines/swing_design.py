@@ -16,7 +16,7 @@ ENERGY_TIME = 4.0  # [s] in which the energies are forgotten
 
 
 def observers(period: float, frequencies: Sequence[float] = FREQUENCIES, change: float = CHANGE) -> Array:
-    """(J, 5), see `swing.seen`: steady-state Kalman gains, of a measurement with a deviation of 1."""
+    """(J, 5), see `swings_seen`: steady-state Kalman gains, of a measurement with a deviation of 1."""
     rows = []
     for frequency in frequencies:
         cos, sin = np.cos(frequency * period), np.sin(frequency * period)
@@ -29,7 +29,7 @@ def observers(period: float, frequencies: Sequence[float] = FREQUENCIES, change:
 
 
 def ahead(axis: Array, gain: Array, lag: float, period: float, frequencies: Sequence[float] = FREQUENCIES) -> Array:
-    """(J, 2), see `swing.grown`: of a filter `axis` (5, 6), `gain` (5, 2) of loops behind rotors with a `lag` [s].
+    """(J, 2), see `swings_grown`: of a filter `axis` (5, 6), `gain` (5, 2) of loops behind rotors with a `lag` [s].
 
     A torque that swings reaches the loops through the filter's own model; what the filter then makes of their angle and
     rate is its estimate.

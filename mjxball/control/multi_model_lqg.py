@@ -19,8 +19,9 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from mjxball.config import Plant
-from mjxball.control import rotations, swing
+from mjxball.control import rotations
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_frames
+from mjxball.control.swing import STATES, Swinging, swings_advanced, swings_grown, swings_seen
 from mjxball.control.team_lqg import measured, within
 from mjxball.plant.parts import clipped, joined
 
@@ -75,7 +76,7 @@ class MultiModelLqg(NamedTuple):
     @property
     def size(self) -> int:
         """Numbers in the memory: filters as predicted, height, scores, swings, slow part of added tilts, context."""
-        swinging = 2 * self.swings * swing.STATES
+        swinging = 2 * self.swings * STATES
         return self.models * (AXES * ANGLE_STATES + 2) + HEIGHT_STATES + swinging + 2 + CONTEXT
 
     @property
@@ -94,7 +95,7 @@ class MultiModelLqg(NamedTuple):
             for angle, rate in ((roll, roll_rate), (pitch, pitch_rate), (zero, zero))
             for _ in range(self.models)
         ]
-        zeros = HEIGHT_STATES - 1 + 2 * (self.models + self.swings * swing.STATES) + 2
+        zeros = HEIGHT_STATES - 1 + 2 * (self.models + self.swings * STATES) + 2
         rest = joined([climb, *[zero] * zeros])
         return xp.concat([*turning, rest, known], axis=-1)
 
@@ -170,7 +171,8 @@ class MultiModelLqg(NamedTuple):
         climbing = xp.concat([seen.rising, mean[..., 2:]], axis=-1) @ height.T
         flat = [turning[..., k, m, :] for k in range(AXES) for m in range(models)]
         scores = [seen.scores[..., k, :] for k in (0, 1)]
-        swinging = [] if self.swing is None else [swing.advanced(self.swing, self._swinging(memory, seen)[2])]
+        found = self._swinging(memory, seen)[2]
+        swinging = [] if found is None else [swings_advanced(self.swing, found)]
         return xp.concat([*flat, climbing, *scores, *swinging, slow, memory[..., -CONTEXT:]], axis=-1)
 
     def _like(self, numbers: Array, observation: Array) -> Array:
@@ -239,15 +241,15 @@ class MultiModelLqg(NamedTuple):
         climbed = (found[4] - rising[..., 0])[..., None] * self._like(self.height_gain, observation)
         return Estimate(turning, scores, weights, rising + climbed)
 
-    def _swinging(self, memory: Array, seen: Estimate) -> tuple[Array, Array, swing.Swinging | None]:
+    def _swinging(self, memory: Array, seen: Estimate) -> tuple[Array, Array, Swinging | None]:
         """(load as a tilt (..., 2), what it will have grown by when the rotors act (..., 2), its swings)."""
         load = (seen.weights * seen.turning[..., :2, :, 2] / self._like(self.stiffness, memory)).sum(axis=-1)
         if self.swing is None:
             return load, 0.0, None
         end = CONTEXT + 2
-        before = memory[..., -end - 2 * self.swings * swing.STATES : -end]
-        found = swing.seen(self.swing, self.swing_keep, before, load)
-        return load, swing.grown(self.swing_ahead, found, seen.weights), found
+        before = memory[..., -end - 2 * self.swings * STATES : -end]
+        found = swings_seen(self.swing, self.swing_keep, before, load)
+        return load, swings_grown(self.swing_ahead, found, seen.weights), found
 
     def _plan(
         self, memory: Array, observation: Array, context: Array, leader: tuple[Any, ...]
@@ -269,7 +271,8 @@ class MultiModelLqg(NamedTuple):
         wanted = within(xp, far, tilt_limit) - gains[..., 2] * angles - gains[..., 3] * rates
         load, grown, _ = self._swinging(memory, seen)
         load = load + grown + context[..., 1:3] * soft * (vertical - led[..., 2])[..., None]
-        wanted = wanted - within(xp, load, load_limit)
+        load = within(xp, load, load_limit)
+        wanted = wanted - load
         own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
         rest, most = angles + damping * rates, xp.maximum(context[..., 3:] * soft, LEAST_ROOM)
         if float(self.held_room):

@@ -26,7 +26,7 @@ class Swinging(NamedTuple):
     weights: Array  # (..., 2, J) that sum to 1
 
 
-def seen(swing: Array, keep: Array, memory: Array, load: Array) -> Swinging:
+def swings_seen(swing: Array, keep: Array, memory: Array, load: Array) -> Swinging:
     """What is known once `load` (..., 2) [rad] is estimated; `memory` (..., 2 J 4) as predicted.
 
     `swing` (J, 5): cos, sin of the angle of a step, gains on the constant, in phase, in quadrature.
@@ -45,7 +45,7 @@ def seen(swing: Array, keep: Array, memory: Array, load: Array) -> Swinging:
     return Swinging(states, energy, odds / odds.sum(axis=-1, keepdims=True))
 
 
-def grown(ahead: Array, found: Swinging, models: Array) -> Array:
+def swings_grown(ahead: Array, found: Swinging, models: Array) -> Array:
     """What the swings will have grown by (..., 2) [rad].
 
     `ahead` (M, J, 2): the factor, as a complex number, from the swing of an estimate to what rotors must be told, less
@@ -57,7 +57,7 @@ def grown(ahead: Array, found: Swinging, models: Array) -> Array:
     return (found.weights * (along * found.states[..., 1] - across * found.states[..., 2])).sum(axis=-1)
 
 
-def advanced(swing: Array, found: Swinging) -> Array:
+def swings_advanced(swing: Array, found: Swinging) -> Array:
     """The memory (..., 2 J 4) a step later."""
     xp = found.energy.__array_namespace__()
     cos, sin = (xp.asarray(swing[:, k], dtype=found.energy.dtype) for k in (0, 1))

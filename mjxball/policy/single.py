@@ -18,16 +18,16 @@ from mjxball.control.multi_model_lqg import (
     ANGLE_STATES,
     AXES,
     CONTEXT,
-    FEATURES,
     HEIGHT_STATES,
     LEAST_ROOM,
     MultiModelLqg,
     is_pair,
 )
 from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
+from mjxball.control.swing import LEAST_ENERGY, SHARPNESS, STATES
 
 Array = Any
-TURNED = (0, 1), (2, 3), (5, 8), (6, 9), (7, 10), (15, 16)  # features about roll and pitch that are vectors
+TURNED = (0, 1), (2, 3), (5, 8), (6, 9), (7, 10), (15, 16), (20, 21)  # features about roll and pitch that are vectors
 LARGEST = 1e6  # sum of what is seen, and of what is made of it
 
 
@@ -36,7 +36,8 @@ class SingleFollower:
 
     def __init__(self, law: FollowerLaw, lqg: MultiModelLqg, network: tuple[Any, ...]):
         """Prepare `law`, with `lqg` in it, and `network`: the first four arguments of `policy.mean_action`."""
-        self._filters, self._network = _Filters(lqg), _Network(law, *network)
+        self._filters, self._network = _Filters(lqg), _Network(law, lqg.shown, *network)
+        self._swings, self._held_room = _Swings(lqg) if lqg.swings else None, float(lqg.held_room)
         self._height, self._height_gain = lqg.height.tolist(), lqg.height_gain.tolist()
         self._rise, self._limits, self._keep = lqg.rise.tolist(), lqg.limits.tolist(), float(lqg.keep[1])
         self._added_lift, self._pair_roll_room = float(lqg.added_lift), float(lqg.pair_roll_room)
@@ -48,20 +49,24 @@ class SingleFollower:
     def memory(self) -> Array:
         """(m,) float64, laid out as that of `FollowerLaw`."""
         filters, rest = self._filters, [*self._slow, *self._context]
-        parts = [self._network.history, filters.predicted.ravel(), self._rising, filters.scores.ravel(), rest]
+        swinging = self._swings.memory if self._swings else []
+        parts = [self._network.history, filters.predicted.ravel(), self._rising, filters.scores.ravel(), swinging, rest]
         return np.concatenate(parts)
 
     @memory.setter
     def memory(self, memory: Array) -> None:
         filters, history = self._filters, self._network.history
-        sizes = (history.size, filters.predicted.size, HEIGHT_STATES, filters.scores.size, 2, CONTEXT)
+        swinging = self._swings.memory.size if self._swings else 0
+        sizes = (history.size, filters.predicted.size, HEIGHT_STATES, filters.scores.size, swinging, 2, CONTEXT)
         parts = np.split(memory, np.cumsum(sizes)[:-1])
+        if self._swings:
+            self._swings.memory = parts[4]
         history[:], filters.predicted[:], filters.scores[:] = (
             parts[0],
             parts[1].reshape(AXES, -1),
             parts[3].reshape(2, -1),
         )
-        self._rising, self._slow, self._context = (part.tolist() for part in (parts[2], *parts[4:]))
+        self._rising, self._slow, self._context = (part.tolist() for part in (parts[2], *parts[5:]))
         share, roll, pitch, room = self._context
         pair, lever = float(is_pair(np.float64(share))), math.hypot(roll, pitch)
         # Where the filters' axes are in the mount frame, and the context as seen from these.
@@ -79,7 +84,7 @@ class SingleFollower:
         None, and nothing is remembered, if numbers are not finite or huge: Python's floats do not treat those as
         arrays do.
         """
-        seen, rising, slow = observation.tolist(), self._rising, self._slow
+        seen, rising = observation.tolist(), self._rising
         if not sum(map(abs, seen)) < LARGEST:
             return None
         (cos, sin), (share, roll_per_lift, pitch_per_lift, room) = self._frame, self._inside
@@ -99,6 +104,10 @@ class SingleFollower:
         features += [-vz - height, *roll_load, *pitch_load, lift, lift_error]
         features += [-0.5 * math.log(roll_mixed), -0.5 * math.log(pitch_mixed)]
         features += [roll_turn, pitch_turn, room * roll_mixed, room * pitch_mixed, share]
+        roll_grown = pitch_grown = 0.0
+        if self._swings:
+            roll_grown, pitch_grown = self._swings.update((roll_load[0], pitch_load[0]), self._filters.ahead)
+            features += [roll_grown, pitch_grown]
         action = self._network.act(features, observation)
         if not sum(map(abs, (*features, *action))) < LARGEST:
             return None
@@ -114,37 +123,53 @@ class SingleFollower:
         lifted = vertical - led_vertical
         roll_far, pitch_far = -r_error * y - r_velocity * vy, p_error * x + p_velocity * vx
         far = _within(roll_far, pitch_far, error_limit)
-        roll_held, pitch_held = roll_load[0] + roll_turn * lifted, pitch_load[0] + pitch_turn * lifted
+        roll_held = roll_load[0] + roll_grown + roll_turn * lifted
+        pitch_held = pitch_load[0] + pitch_grown + pitch_turn * lifted
         held = _within(roll_held, pitch_held, load_limit)
         roll_wanted = far * roll_far - r_angle * roll - r_rate * roll_rate - held * roll_held
         pitch_wanted = far * pitch_far - p_angle * pitch - p_rate * pitch_rate - held * pitch_held
-        roll_rest, roll_most = roll + roll_damping * roll_rate, max(roll_room, LEAST_ROOM) * self._wider
-        pitch_rest, pitch_most = pitch + pitch_damping * pitch_rate, max(pitch_room, LEAST_ROOM)
+        length = math.sqrt((held * roll_held) ** 2 + (held * pitch_held) ** 2 + 1e-12)
+        least = max(self._held_room * share * length, LEAST_ROOM)
+        roll_rest, roll_most = roll + roll_damping * roll_rate, max(roll_room, least) * self._wider
+        pitch_rest, pitch_most = pitch + pitch_damping * pitch_rate, max(pitch_room, least)
         roll_own = share * roll_wanted - (share - 1.0) * led_roll - roll_rest
         pitch_own = share * pitch_wanted - (share - 1.0) * led_pitch - pitch_rest
         reached = _within(roll_own / roll_most, pitch_own / pitch_most, 1.0)
         roll_own, pitch_own = roll_rest + reached * roll_own, pitch_rest + reached * pitch_own
-        (tilt_reach, vertical_reach), keep = self._reach, self._keep
+        tilt_reach, vertical_reach = self._reach
         command = [
             _clipped(cos * roll_own - sin * pitch_own + tilt_reach * action[0], tilt_limit),
             _clipped(sin * roll_own + cos * pitch_own + tilt_reach * action[1], tilt_limit),
             _clipped(vertical + vertical_reach * action[2], vertical_limit),
         ]
-        # What all drones command in the mean, as the filters take it.
-        roll_added, pitch_added = (
-            cos * command[0] + sin * command[1] - roll_own,
-            cos * command[1] - sin * command[0] - pitch_own,
-        )
-        slow = [keep * slow[0] + (1.0 - keep) * roll_added, keep * slow[1] + (1.0 - keep) * pitch_added]
-        roll_drive = (roll_own + roll_added - slow[0] + (share - 1.0) * led_roll) / share
-        pitch_drive = (pitch_own + pitch_added - slow[1] + (share - 1.0) * led_pitch) / share
-        up = height, lift, lift_error, (vertical + (share - 1.0) * led_vertical) / share
-        turned = self._told * (command[2] - vertical)
-        drives = (roll_drive, roll_per_lift * lifted), (pitch_drive, pitch_per_lift * lifted), (0.0, turned)
-        self._filters.advance(drives)
+        own, led = (roll_own, pitch_own, vertical), (led_roll, led_pitch, led_vertical)
+        self._advance(own, led, command, (height, lift, lift_error))
         self._network.remember(action)
-        self._rising, self._slow = [sum([a * b for a, b in zip(row, up, strict=True)]) for row in self._height], slow
         return action, command
+
+    def _advance(
+        self, own: tuple[float, ...], led: tuple[float, ...], command: list[float], rising: tuple[float, ...]
+    ) -> None:
+        """Move the filters on: all drones command in the mean what the law does, `own`, and what is added quickly."""
+        (cos, sin), (share, roll_per_lift, pitch_per_lift, _), keep = self._frame, self._inside, self._keep
+        roll_own, pitch_own, vertical = own
+        others, lifted = share - 1.0, vertical - led[2]
+        roll_added = cos * command[0] + sin * command[1] - roll_own
+        pitch_added = cos * command[1] - sin * command[0] - pitch_own
+        roll_slow, pitch_slow = self._slow
+        roll_slow = keep * roll_slow + (1.0 - keep) * roll_added
+        pitch_slow = keep * pitch_slow + (1.0 - keep) * pitch_added
+        roll_drive = (roll_own + roll_added - roll_slow + others * led[0]) / share
+        pitch_drive = (pitch_own + pitch_added - pitch_slow + others * led[1]) / share
+        up = *rising, (vertical + others * led[2]) / share
+        turned = self._told * (command[2] - vertical)
+        self._filters.advance(
+            ((roll_drive, roll_per_lift * lifted), (pitch_drive, pitch_per_lift * lifted), (0.0, turned))
+        )
+        if self._swings:
+            self._swings.advance()
+        self._slow = [roll_slow, pitch_slow]
+        self._rising = [sum([a * b for a, b in zip(row, up, strict=True)]) for row in self._height]
 
 
 class _Filters:
@@ -179,8 +204,10 @@ class _Filters:
         self._scored, self._next_scores = np.ones((2, 3 * models + 2)), np.zeros((2, models))
         self._scored[:, -1] = 0.0
         self.scores, self._distance = self._scored[:, :models], self._scored[:, models:-2]
-        # What is averaged: tilts, 1 / stiffness, damping, gains on error, velocity, angle, rate, and 1.
-        known = np.column_stack([1.0 / stiffness, lqg.damping, lqg.tilt, np.ones(models)])
+        # What is averaged: tilts, 1 / stiffness, damping, gains on error, velocity, angle, rate, and 1; and of swings.
+        ahead = np.zeros((models, 0, 2)) if lqg.swing_ahead is None else lqg.swing_ahead * [1.0, -1.0]
+        known = np.column_stack([1.0 / stiffness, lqg.damping, lqg.tilt, np.ones(models), *ahead.T.swapaxes(1, 2)])
+        self._means, self.ahead = ANGLE_STATES + 7, np.zeros((2, 1 + 2 * lqg.swings))
         self._known = np.concatenate([np.zeros((2, models, ANGLE_STATES)), np.stack([known] * 2)], axis=-1)
         self._odds, self._found = np.zeros((2, 1, models)), self._known[..., :ANGLE_STATES]
         self._drives, self._driven = np.zeros((AXES, 2)), np.zeros((AXES, states))
@@ -204,8 +231,9 @@ class _Filters:
         np.subtract(scores, np.maximum.reduce(scores, axis=1, keepdims=True), out=scores)
         np.exp(scores, out=self._odds[:, 0])
         self._found[:] = self._tilts
-        sums = np.matmul(self._odds, self._known)[:, 0].tolist()
-        return [[value / total for value in values] for *values, total in sums]
+        sums = np.matmul(self._odds, self._known)[:, 0]
+        self.ahead = sums[:, self._means - 1 :]
+        return [[value / total for value in values] for *values, total in sums[:, : self._means].tolist()]
 
     def advance(self, drives: tuple[tuple[float, float], ...]) -> None:
         """Predict the next states with `drives`: the mean command, and the angular acceleration of lifting apart.
@@ -236,10 +264,85 @@ def _known_of(lqg: MultiModelLqg, gain: Array, certainty: Array) -> Array:
     return np.concatenate([row.reshape(-1, states + 2) for row in rows]).T.copy()
 
 
+class _Swings:
+    """The swings of the load about roll and, behind them, about pitch: see `control.swing`."""
+
+    def __init__(self, lqg: MultiModelLqg):
+        swing, count = np.asarray(lqg.swing), lqg.swings
+        self._count, self._keep = count, np.array(float(lqg.swing_keep))
+        unit = np.eye(3 * count + 1)
+        before, load = np.split(unit[:-1], 3), unit[-1]
+        left = load - before[0] - before[1]
+        states = [state + gain[:, None] * left for state, gain in zip(before, swing.T[2:], strict=True)]
+        (constant, phase, across), cos, sin = states, swing[:, :1], swing[:, 1:2]
+        onward = np.concatenate([constant, cos * phase - sin * across, sin * phase + cos * across])
+        left = math.sqrt(1.0 - float(self._keep)) * np.concatenate([left, left])
+        # Predicted states, then the load, of both axes -> states a step on, root of what the energy gets, swing; the
+        # last two of in phase and of in quadrature.
+        rows = [_of_both(part) for part in (onward, left, np.concatenate([phase, across]))]
+        ends = np.cumsum([6 * count, 4 * count])
+        self._matrix = np.concatenate(rows).T.copy()
+        self._given, self._seen = np.zeros(6 * count + 2), np.zeros(len(self._matrix.T))
+        self._states, self._load = self._given[:-2], self._given[-2:]
+        self._onward, self._left, self._swing = np.split(self._seen, ends)
+        self._energy, self._next_energy, self._raised = (np.zeros(4 * count) for _ in range(3))
+        # Swings grown, times the odds, and the odds -> their sums about roll, about pitch.
+        self._weighed = np.zeros(8 * count)
+        self._grown, self._odds = np.split(self._weighed, 2)
+        self._sums = np.kron(np.eye(4), np.ones((2 * count, 1)))
+
+    @property
+    def memory(self) -> Array:
+        """(2 J 4,), see `swings_advanced`."""
+        states, energy = self._states.reshape(2, -1), self._energy.reshape(2, 2, -1)[:, 0]
+        return np.concatenate([states, energy], axis=1).ravel()
+
+    @memory.setter
+    def memory(self, memory: Array) -> None:
+        parts = memory.reshape(2, STATES, self._count)
+        self._states[:], self._energy[:] = parts[:, :3].ravel(), parts[:, [3, 3]].ravel()
+
+    def update(self, load: tuple[float, float], ahead: Array) -> tuple[float, float]:
+        """What the `load` will have grown by.
+
+        `ahead` (2, 1 + 2 J): sum of the models' odds, and sums of `swing_ahead` times odds, in quadrature negative.
+        """
+        self._load[:] = load
+        np.dot(self._given, self._matrix, out=self._seen)
+        np.multiply(self._left, self._left, out=self._left)
+        np.multiply(self._energy, self._keep, out=self._next_energy)
+        np.add(self._next_energy, self._left, out=self._next_energy)
+        np.add(self._next_energy, LEAST_ENERGY, out=self._raised)
+        np.power(self._raised, -(2.0**SHARPNESS), out=self._odds)
+        np.multiply(self._swing, ahead[:, 1:].ravel(), out=self._grown)
+        np.multiply(self._grown, self._odds, out=self._grown)
+        roll, pitch, roll_odds, pitch_odds = np.dot(self._weighed, self._sums).tolist()
+        roll_sum, pitch_sum = ahead[:, 0].tolist()
+        return 2.0 * roll / (roll_odds * roll_sum), 2.0 * pitch / (pitch_odds * pitch_sum)
+
+    def advance(self) -> None:
+        """Predict the next states."""
+        self._states[:], self._energy[:] = self._onward, self._next_energy
+
+
+def _of_both(rows: Array) -> Array:
+    """`rows` (R, S + 1) of one axis for both: (2 R, 2 S + 2), the last columns, of the load, at the end."""
+    every = np.kron(np.eye(2), rows[:, :-1])
+    return np.concatenate([every, np.kron(np.eye(2), rows[:, -1:])], axis=1)
+
+
 class _Network:
     """The network with the history that it sees. Every input ends or begins with a 1, for the biases."""
 
-    def __init__(self, law: FollowerLaw, weights: Sequence[Array], biases: Sequence[Array], mean: Array, scale: Array):
+    def __init__(
+        self,
+        law: FollowerLaw,
+        features: int,
+        weights: Sequence[Array],
+        biases: Sequence[Array],
+        mean: Array,
+        scale: Array,
+    ):
         history, size = law.history, OBSERVATION_SIZE + law.history.size
         unit = np.eye(size + ACTION_SIZE)
         observation, past, action = np.split(unit, [OBSERVATION_SIZE, size], axis=1)
@@ -247,23 +350,23 @@ class _Network:
         shown = history.network_input(observation[:size], past[:size])
         # Features, 1, observation, history -> the normalised input -> the first layer.
         count = shown.shape[1]
-        normal = np.zeros((FEATURES + 1 + size, count + FEATURES))
-        normal[:FEATURES, count:], normal[FEATURES], normal[FEATURES + 1 :, :count] = np.eye(FEATURES), -mean, shown
+        normal = np.zeros((features + 1 + size, count + features))
+        normal[:features, count:], normal[features], normal[features + 1 :, :count] = np.eye(features), -mean, shown
         first = normal * scale @ weights[0].astype(np.float64)
-        first[FEATURES] += biases[0]
-        self._first, self._of_features = first, first[:FEATURES].copy()
+        first[features] += biases[0]
+        self._first, self._of_features = first, first[:features].copy()
         rest = [np.vstack(layer).astype(np.float64) for layer in zip(weights[1:], biases[1:], strict=True)]
         *layers, self._last = first, *rest
         outputs = [np.ones(layer.shape[1] + 1) for layer in layers]
         self._layers = [(layer, output, output[:-1]) for layer, output in zip(layers, outputs, strict=True)]
-        seen = np.ones(FEATURES + 1 + size + ACTION_SIZE)
-        self._features, self._input, self._past = seen[:FEATURES], seen[:-ACTION_SIZE], seen[FEATURES + 1 :]
+        seen = np.ones(features + 1 + size + ACTION_SIZE)
+        self._features, self._input, self._past = seen[:features], seen[:-ACTION_SIZE], seen[features + 1 :]
         self._observation, self.history, self._action = np.split(self._past, [OBSERVATION_SIZE, size])
         self._zero = np.zeros(())
 
     def tell(self, cos: float, sin: float) -> None:
         """Take features about axes that are turned in the mount frame, of which the network has learnt."""
-        for one, other in TURNED:
+        for one, other in TURNED if len(self._features) > max(TURNED[-1]) else TURNED[:-1]:
             x, y = self._of_features[one], self._of_features[other]
             self._first[one], self._first[other] = cos * x + sin * y, cos * y - sin * x
 

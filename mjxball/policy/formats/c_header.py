@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control import multi_model_lqg, team_lqg
+from mjxball.control import multi_model_lqg, swing, team_lqg
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.multi_model_lqg import LEAST_ROOM, MultiModelLqg, is_pair
 from mjxball.control.observation import (
@@ -31,6 +31,7 @@ from mjxball.policy.quantize import Rows, rows_of
 FLOAT = 4  # bytes
 # Of `MultiModelLqg`: a pair's numbers about roll, and those of every team that they replace.
 PAIR_ROLL = {"pair_roll_gain": "axis_gain", "pair_roll_certainty": "certainty", "pair_roll_prior": "prior"}
+MACROS = {"pair_roll_room", "rig_axes", "held_room"}  # of `MultiModelLqg`, no arrays in a header
 LQG_TEXTS = {  # helpers, law
     type(None): ("", ""),
     OffsetFreeLqg: (c_texts.COSINE, c_texts.LQG),
@@ -58,7 +59,7 @@ def _pair(lqg: Any, context: Any) -> float:
 
 def _lqg_numbers(lqg: Any, context: Any) -> dict[str, Any]:
     """Arrays of the law that the header of a follower with `context` holds; those about a pair's roll for it alone."""
-    pair, left_out = _pair(lqg, context), {"pair_roll_room", "rig_axes", *([] if _lifts(lqg) else ["lifting"])}
+    pair, left_out = _pair(lqg, context), {*MACROS, *([] if _lifts(lqg) else ["lifting"])}
     if pair == 0:
         left_out |= PAIR_ROLL.keys()
     fields = {} if lqg is None else lqg._asdict()
@@ -70,11 +71,14 @@ def _lqg_numbers(lqg: Any, context: Any) -> dict[str, Any]:
 
 
 def _rooms_and_axes(lqg: MultiModelLqg, context: Any, numbers: dict[str, Any]) -> list[str]:
-    """Macros of the rooms, of the direction of the filters' axes, and of the arrays among `numbers` about roll."""
+    """Macros of rooms, swings, the direction of the filters' axes, and the arrays among `numbers` about roll."""
     wider = 1.0 + (float(lqg.pair_roll_room) - 1.0) * _pair(lqg, context)
     cos, sin = lqg.frame(np.array(context, np.float64)) or (1.0, 0.0)
     lines = [f"#define MJXBALL_RIG_{name} {_number(value)}" for name, value in (("COS", cos), ("SIN", sin))]
     lines += [f"#define MJXBALL_LEAST_ROOM {_number(LEAST_ROOM)}", f"#define MJXBALL_ROLL_ROOM {_number(wider)}"]
+    lines += [f"#define MJXBALL_SWINGS {lqg.swings}", f"#define MJXBALL_SHARPNESS {swing.SHARPNESS}"]
+    lines += [f"#define MJXBALL_LEAST_ENERGY {_number(swing.LEAST_ENERGY)}"]
+    lines += [f"#define MJXBALL_HELD_ROOM {_number(lqg.held_room)}"]
     for name, every in PAIR_ROLL.items():
         macro = name.removeprefix("pair_").upper()
         lines += [f"#define MJXBALL_{macro} mjxball_lqg_{name if name in numbers else every}"]

@@ -270,12 +270,14 @@ static inline void mjxball_lqg_next(mjxball_real *memory, const mjxball_real *le
 MULTI_MODEL_LQG = """
 /* LQG for loops of unknown speed; its memory: the filters' states about roll (5 of each model), about pitch, and what
  * the network's lift has turned of the latter, of the height (3), the models' scores about roll and about pitch, the
- * slow part of what is added (2), and what it is told of its team (4). */
+ * load's swings about roll (4 of each) and about pitch, the slow part of what is added (2), and what it is told of its
+ * team (4). */
 enum {
     MJXBALL_MODELS = sizeof mjxball_lqg_stiffness / sizeof *mjxball_lqg_stiffness,
     MJXBALL_HEIGHT = 15 * MJXBALL_MODELS,
     MJXBALL_SCORES = MJXBALL_HEIGHT + 3,
-    MJXBALL_SLOW = MJXBALL_SCORES + 2 * MJXBALL_MODELS,
+    MJXBALL_SWING = MJXBALL_SCORES + 2 * MJXBALL_MODELS,
+    MJXBALL_SLOW = MJXBALL_SWING + 8 * MJXBALL_SWINGS,
     MJXBALL_TOLD = MJXBALL_SLOW + 2
 };
 
@@ -303,6 +305,65 @@ static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *o
     for (int k = 0; k < 4; k++) memory[MJXBALL_TOLD + k] = mjxball_lqg_context[k];
 }
 
+/* The models' weights about an axis, and their mean of 1 over the loops' stiffness, which is returned. */
+static inline mjxball_real mjxball_lqg_weights(const mjxball_real *memory, int axis, mjxball_real *weights) {
+    const mjxball_real *scores = memory + MJXBALL_SCORES + axis * MJXBALL_MODELS;
+    mjxball_real sum = 0, soft = 0;
+    for (int model = 0; model < MJXBALL_MODELS; model++) sum += weights[model] = mjxball_decay(-scores[model]);
+    for (int model = 0; model < MJXBALL_MODELS; model++) {
+        weights[model] /= sum;
+        soft += weights[model] / mjxball_lqg_stiffness[model];
+    }
+    return soft;
+}
+
+#if MJXBALL_SWINGS
+/* Swings about an axis as they are once its `load` is known: constants, in phase, in quadrature, energies. */
+static inline void mjxball_swing_see(mjxball_real *memory, int axis, mjxball_real load) {
+    mjxball_real *state = memory + MJXBALL_SWING + 4 * MJXBALL_SWINGS * axis;
+    const float *row = mjxball_lqg_swing;
+    for (int j = 0; j < MJXBALL_SWINGS; j++, state++, row += 5) {
+        mjxball_real left = load - state[0] - state[MJXBALL_SWINGS], *energy = state + 3 * MJXBALL_SWINGS;
+        for (int k = 0; k < 3; k++) state[k * MJXBALL_SWINGS] += row[2 + k] * left;
+        *energy = mjxball_lqg_swing_keep[0] * *energy + (1 - mjxball_lqg_swing_keep[0]) * left * left;
+    }
+}
+
+/* What the load will have grown by when rotors act; `weights` of the models. */
+static inline mjxball_real mjxball_swing_grown(
+    const mjxball_real *memory, int axis, const mjxball_real *weights) {
+    const mjxball_real *state = memory + MJXBALL_SWING + 4 * MJXBALL_SWINGS * axis;
+    const mjxball_real *energy = state + 3 * MJXBALL_SWINGS;
+    mjxball_real least = energy[0], sum = 0, grown = 0;
+    for (int j = 1; j < MJXBALL_SWINGS; j++)
+        if (energy[j] < least) least = energy[j];
+    for (int j = 0; j < MJXBALL_SWINGS; j++, state++) {
+        mjxball_real odds = (least + MJXBALL_LEAST_ENERGY) / (energy[j] + MJXBALL_LEAST_ENERGY), along = 0, across = 0;
+        const float *ahead = mjxball_lqg_swing_ahead + 2 * j;
+        for (int k = 0; k < MJXBALL_SHARPNESS; k++) odds *= odds;
+        for (int model = 0; model < MJXBALL_MODELS; model++, ahead += 2 * MJXBALL_SWINGS) {
+            along += weights[model] * ahead[0];
+            across += weights[model] * ahead[1];
+        }
+        sum += odds;
+        grown += odds * (along * state[MJXBALL_SWINGS] - across * state[2 * MJXBALL_SWINGS]);
+    }
+    return grown / sum;
+}
+
+static inline void mjxball_swing_next(mjxball_real *memory) {
+    for (int axis = 0; axis < 2; axis++) {
+        mjxball_real *phase = memory + MJXBALL_SWING + (4 * axis + 1) * MJXBALL_SWINGS;
+        const float *row = mjxball_lqg_swing;
+        for (int j = 0; j < MJXBALL_SWINGS; j++, phase++, row += 5) {
+            mjxball_real *across = phase + MJXBALL_SWINGS, before = *phase;
+            *phase = row[0] * before - row[1] * *across;
+            *across = row[1] * before + row[0] * *across;
+        }
+    }
+}
+#endif
+
 static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
     mjxball_real *height = memory + MJXBALL_HEIGHT, off = -observation[17] - height[0];
     for (int row = 0; row < 3; row++) height[row] += off * mjxball_lqg_height_gain[row];
@@ -329,19 +390,17 @@ static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real
             if (model == 0 || scores[model] > most) most = scores[model];
         }
         for (int model = 0; model < MJXBALL_MODELS; model++) scores[model] -= most;
+#if MJXBALL_SWINGS
+        {
+            mjxball_real weights[MJXBALL_MODELS], load = 0;
+            const mjxball_real *state = memory + 5 * axis * MJXBALL_MODELS + 2;
+            mjxball_lqg_weights(memory, axis, weights);
+            for (int model = 0; model < MJXBALL_MODELS; model++, state += 5)
+                load += weights[model] * *state / mjxball_lqg_stiffness[model];
+            mjxball_swing_see(memory, axis, load);
+        }
+#endif
     }
-}
-
-/* The models' weights about an axis, and their mean of 1 over the loops' stiffness, which is returned. */
-static inline mjxball_real mjxball_lqg_weights(const mjxball_real *memory, int axis, mjxball_real *weights) {
-    const mjxball_real *scores = memory + MJXBALL_SCORES + axis * MJXBALL_MODELS;
-    mjxball_real sum = 0, soft = 0;
-    for (int model = 0; model < MJXBALL_MODELS; model++) sum += weights[model] = mjxball_decay(-scores[model]);
-    for (int model = 0; model < MJXBALL_MODELS; model++) {
-        weights[model] /= sum;
-        soft += weights[model] / mjxball_lqg_stiffness[model];
-    }
-    return soft;
 }
 
 /* Minus the natural logarithm of x, 1 over the stiffness of loops of 4 to 20 rad/s, by Halley. */
@@ -370,7 +429,13 @@ static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxbal
         to[2 + axis] = observation[9 + axis] - mean[1];
         mjxball_copy(to + 5 + 3 * axis, mean + 2, 3);
         to[15 + axis] *= soft[axis];
+#if MJXBALL_SWINGS
+        to[20 + axis] = mjxball_swing_grown(memory, axis, weights);
+#endif
     }
+#if MJXBALL_SWINGS
+    mjxball_turn(to + 20, to + 21, -MJXBALL_RIG_SIN);
+#endif
     mjxball_turn(to, to + 1, -MJXBALL_RIG_SIN);
     mjxball_turn(to + 2, to + 3, -MJXBALL_RIG_SIN);
     for (int k = 5; k < 8; k++) mjxball_turn(to + k, to + k + 3, -MJXBALL_RIG_SIN);
@@ -403,15 +468,26 @@ static inline void mjxball_lqg_command(
             damping += weights[model] * mjxball_lqg_damping[model];
             for (int k = 0; k < 4; k++) gains[i][k] += weights[model] * mjxball_lqg_tilts[4 * model + k];
         }
+#if MJXBALL_SWINGS
+        load[i] += mjxball_swing_grown(memory, i, weights);
+#endif
         rest[i] = observation[3 + i] + damping * observation[9 + i];
         most[i] = context[3] * soft;
         if (most[i] < MJXBALL_LEAST_ROOM) most[i] = MJXBALL_LEAST_ROOM;
     }
-    most[0] *= MJXBALL_ROLL_ROOM;
     far[0] = -(gains[0][0] * observation[13] + gains[0][1] * observation[16]);
     far[1] = gains[1][0] * observation[12] + gains[1][1] * observation[15];
     mjxball_within(far, mjxball_lqg_limits[0]);
     mjxball_within(load, mjxball_lqg_limits[2]);
+#if MJXBALL_SWINGS
+    {
+        mjxball_real held = mjxball_root(load[0] * load[0] + load[1] * load[1] + (mjxball_real)1e-12);
+        held *= MJXBALL_HELD_ROOM * share;
+        for (int i = 0; i < 2; i++)
+            if (most[i] < held) most[i] = held;
+    }
+#endif
+    most[0] *= MJXBALL_ROLL_ROOM;
     for (int i = 0; i < 2; i++) {
         mjxball_real wanted = far[i] - gains[i][2] * observation[3 + i] - gains[i][3] * observation[9 + i] - load[i];
         own[i] = share * wanted - (share - 1) * led[i];
@@ -427,6 +503,9 @@ static inline void mjxball_lqg_next(
     mjxball_real *slow = memory + MJXBALL_SLOW, *height = memory + MJXBALL_HEIGHT, drive, before[5], levers[2];
     mjxball_real turned[2] = {command[0], command[1]};
     const float *row = mjxball_lqg_height;
+#if MJXBALL_SWINGS
+    mjxball_swing_next(memory);
+#endif
     mjxball_turn(turned, turned + 1, MJXBALL_RIG_SIN);
     mjxball_lqg_levers(memory, levers);
     for (int axis = 0; axis < 3; axis++) {
