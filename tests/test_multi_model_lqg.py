@@ -4,28 +4,43 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Collection
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.random import default_rng
+from rig_laws import OLDEST, with_law
 
 from mjxball.baselines.multi_model_lqg import MODELS, MultiModelOffsetFree, multi_model_lqg
 from mjxball.baselines.team_lqg import TUNING, team_lqg
 from mjxball.config import Config, preset
 from mjxball.control import rotations
 from mjxball.control.followers import Baseline, copy_gains
-from mjxball.control.multi_model_lqg import CONTEXT, LEAST_ROOM, LEVER, MultiModelLqg, team_geometry
+from mjxball.control.multi_model_lqg import (
+    ANGLE_STATES,
+    AXES,
+    CONTEXT,
+    HEIGHT_STATES,
+    LEAST_ROOM,
+    LEVER,
+    MultiModelLqg,
+    team_geometry,
+)
 from mjxball.control.observation import mount_frames
 from mjxball.plant.teams import ring_config
 from mjxball.policy.container import PolicyFileError
-from mjxball.policy.export import _numbers
-from mjxball.policy.file import LATER_SHAPES, law_of, load_file, save_file, shipped_policy
+from mjxball.policy.file import LATER_SHAPES, SWING_SHAPES, law_of, load_file, save_file, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import CIRCLE, Scenario
 
 UNIVERSAL, TEAM = preset("universal"), preset("team")
+
+
+def still(law: MultiModelLqg) -> MultiModelLqg:
+    """`law` as files have it that know nothing of swings."""
+    return law._replace(**{name: MultiModelLqg._field_defaults[name] for name in SWING_SHAPES})
 
 
 def team4(frequency: float) -> Config:
@@ -47,7 +62,7 @@ def test_one_model_is_the_law_of_teams() -> None:
     config = dataclasses.replace(team4(frequency), plant=dataclasses.replace(ring_config(TEAM, 4).plant, rotor_lag=lag))
     attitude = dataclasses.replace(UNIVERSAL.attitude, natural_frequency=(7.0, 7.0, 4.0), damping=0.8)
     own = dataclasses.replace(UNIVERSAL, attitude=attitude, plant=dataclasses.replace(UNIVERSAL.plant, rotor_lag=lag))
-    unknown = multi_model_lqg(own, ((frequency, lag),), TUNING)._replace(rig_axes=0.0)
+    unknown = still(multi_model_lqg(own, ((frequency, lag),), TUNING))._replace(rig_axes=0.0)
     known, leader = team_lqg(config), copy_gains(config)
     lever, room = np.array([0.02, -0.05]), 0.3
     one = known.start(np.zeros((3, 18)), np.array([4 / 3, *lever, room, room]))
@@ -247,12 +262,21 @@ def test_a_pair_has_more_room_about_roll(axis: int, share: float, factor: float)
         ("rig_axes", 2),
         ("rig_axes", True),
         ("rig_axes", [1.0]),
+        ("swing", [[1.0, 0.0, 0.1, 0.1]] * 8),
+        ("swing", "none"),
+        ("swing_ahead", np.zeros((len(MODELS), 7, 2)).tolist()),
+        ("swing_ahead", None),
+        ("swing_keep", 1.0),
+        ("swing_keep", -0.1),
+        ("swing_keep", [0.9]),
+        ("held_room", -1.0),
+        ("held_room", True),
     ],
 )
 def test_later_numbers_that_do_not_fit_are_refused(field: str, wrong: object, tmp_path: Path) -> None:
-    contents = load_file(shipped_policy("universal"))
-    sound = {**contents.card, "lqg": _numbers(multi_model_lqg(UNIVERSAL))}
-    save_file(tmp_path / "sound.npz", dataclasses.replace(contents, card=sound))
+    contents = with_law()
+    sound = contents.card
+    save_file(tmp_path / "sound.npz", contents)
     card = {**sound, "lqg": {**sound["lqg"], field: wrong}}
     with pytest.raises(PolicyFileError, match=rf"card field lqg\.{field} must be [^\n]*\Z"):
         save_file(tmp_path / "odd.npz", dataclasses.replace(contents, card=card))
@@ -261,13 +285,19 @@ def test_later_numbers_that_do_not_fit_are_refused(field: str, wrong: object, tm
         save_file(tmp_path / "odd.npz", dataclasses.replace(contents, card=card))
 
 
-def test_a_file_without_later_numbers_flies_as_before(tmp_path: Path) -> None:
-    contents, law = load_file(shipped_policy("universal")), multi_model_lqg(UNIVERSAL)
-    for made in (law, without_own_roll(law)._replace(rig_axes=0.0)):
-        lqg = {name: value for name, value in _numbers(made).items() if made is law or name not in LATER_SHAPES}
-        save_file(tmp_path / "one.npz", dataclasses.replace(contents, card={**contents.card, "lqg": lqg}))
-        for name, value in law_of(load_file(tmp_path / "one.npz").card).lqg._asdict().items():
-            np.testing.assert_array_equal(value, getattr(made, name))
+def test_a_file_without_swings_is_refused_with_none(tmp_path: Path) -> None:
+    contents = with_law()
+    lqg = {**contents.card["lqg"], "swing": [], "swing_ahead": [[]] * len(MODELS)}
+    with pytest.raises(PolicyFileError, match=r"card field lqg\.swing"):
+        save_file(tmp_path / "odd.npz", dataclasses.replace(contents, card={**contents.card, "lqg": lqg}))
+
+
+@pytest.mark.parametrize("without", [(), SWING_SHAPES, OLDEST])
+def test_a_file_without_later_numbers_flies_as_before(without: Collection[str], tmp_path: Path) -> None:
+    law, default = multi_model_lqg(UNIVERSAL), MultiModelLqg._field_defaults
+    save_file(tmp_path / "one.npz", with_law(without))
+    for name, value in law_of(load_file(tmp_path / "one.npz").card).lqg._asdict().items():
+        np.testing.assert_array_equal(value, default[name] if name in without else getattr(law, name))
 
 
 class Ring:
@@ -318,13 +348,14 @@ def test_followers_that_see_the_same_rig_have_the_same_filters(axes: float) -> N
         np.testing.assert_allclose(memories[0], memory[:-CONTEXT], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(command, wanted, rtol=1e-9, atol=1e-9)
     else:
-        scores = slice(-2 - 2 * law.models, -2)
+        begin = law.models * AXES * ANGLE_STATES + HEIGHT_STATES
+        scores = slice(begin, begin + 2 * law.models)
         assert np.abs(memories[0][scores] - memories[1][scores]).max() > 1.0
 
 
 def test_of_one_model_commands_and_features_do_not_depend_on_the_axes_of_its_filters() -> None:
-    """As long as the leader's law, of which each axis has a limit, meets none."""
-    turned, leader, random = multi_model_lqg(UNIVERSAL, ((7.0, 0.05),)), copy_gains(UNIVERSAL), default_rng(7)
+    """As long as the leader's law, of which each axis has a limit, meets none; swings are found about each axis."""
+    turned, leader, random = still(multi_model_lqg(UNIVERSAL, ((7.0, 0.05),))), copy_gains(UNIVERSAL), default_rng(7)
     plain, context = turned._replace(rig_axes=0.0), Ring().context[0]
     one, other = turned.start(np.zeros(18), context), plain.start(np.zeros(18), context)
     for _ in range(40):
@@ -365,7 +396,7 @@ def test_the_networks_view_of_unlike_loops_is_of_its_mount_frame() -> None:
         turned = Ring._turned(seen, -np.pi / 2)  # the same rig seen from a frame whose -y is the other's x
         across = law.next(across, turned, Ring._turned(command, -np.pi / 2), leader)
     one, other = law.features(along, seen), law.features(across, turned)
-    vectors, sizes = [(0, 1), (2, 3), (5, 8), (6, 9), (7, 10), (15, 16)], [(13, 14), (17, 18)]
+    vectors, sizes = [(0, 1), (2, 3), (5, 8), (6, 9), (7, 10), (15, 16), (20, 21)], [(13, 14), (17, 18)]
     for roll, pitch in vectors:
         np.testing.assert_allclose([other[roll], other[pitch]], [one[pitch], -one[roll]], rtol=1e-9, atol=1e-9)
     for roll, pitch in sizes:

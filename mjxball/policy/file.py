@@ -28,6 +28,7 @@ CONTEXT = ("command_share", "roll_per_lift", "pitch_per_lift", "roll_room", "pit
 GEOMETRY = ("command_share", "roll_acceleration_per_lift", "pitch_acceleration_per_lift", "rotor_room")
 CONTEXTS = {3: CONTEXT, 4: GEOMETRY}  # by format
 MAX_MODELS = 16
+MAX_SWINGS = 32  # frequencies at which a load may swing
 FOLDER = "policies"  # of those that come with mjxball
 ARCHIVE = "archive"  # in it: earlier ones, which documents name
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
@@ -352,10 +353,12 @@ def _check_later(lqg: dict[str, Any], name: str) -> None:
         raise PolicyFileError(f"{name}: card field lqg.pair_roll_room must be positive")
     if lqg.get("rig_axes", 0) not in (0, 1):
         raise PolicyFileError(f"{name}: card field lqg.rig_axes must be 0 or 1")
-    if not 1 <= len(lqg.get("swing", [0])) <= MAX_MODELS:
-        raise PolicyFileError(f"{name}: card field lqg.swing must be 1 to {MAX_MODELS} rows")
-    if not 0 <= lqg.get("swing_keep", 0) < 1 or not lqg.get("held_room", 0) >= 0:
-        raise PolicyFileError(f"{name}: card field lqg.swing_keep must be a share below 1, held_room not negative")
+    if not 1 <= len(lqg.get("swing", [0])) <= MAX_SWINGS:
+        raise PolicyFileError(f"{name}: card field lqg.swing must be 1 to {MAX_SWINGS} rows")
+    if not 0 <= lqg.get("swing_keep", 0) < 1:
+        raise PolicyFileError(f"{name}: card field lqg.swing_keep must be a share below 1")
+    if not lqg.get("held_room", 0) >= 0:
+        raise PolicyFileError(f"{name}: card field lqg.held_room must be a factor that is not negative")
 
 
 def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, ...]]:
