@@ -32,7 +32,7 @@ TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=500.0, tilt_limit=0.3)  
 # about roll as much more, and rotors hold as much more of a tilt. Across the pair the CG goes half as far in the mean.
 PAIR_INERTIA_RATIO, ACROSS = 13.0, 0.5
 SCORE_TIME = 8.0  # [s] in which a model's score is forgotten
-HELD_ROOM = 1.0  # over the load that is held: rotors that hold it have room for as much
+HELD_ROOM = 1.0  # over the load that more than two drones hold: rotors that hold it have room for as much
 
 
 def multi_model_lqg(

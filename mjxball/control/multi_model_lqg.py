@@ -61,7 +61,7 @@ class MultiModelLqg(NamedTuple):
     swing: Array | None = None  # (J, 5)
     swing_ahead: Array | None = None  # (M, J, 2)
     swing_keep: Array | float = 0.0  # () share that a step leaves of the energies
-    held_room: Array | float = 0.0  # () what rotors hold as a tilt, at least, over what all hold of the load
+    held_room: Array | float = 0.0  # () what rotors of more than two hold as a tilt, at least, over what is held now
 
     @property
     def models(self) -> int:
@@ -276,8 +276,8 @@ class MultiModelLqg(NamedTuple):
         own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
         rest, most = angles + damping * rates, xp.maximum(context[..., 3:] * soft, LEAST_ROOM)
         if float(self.held_room):
-            held = xp.sqrt((load * load).sum(axis=-1, keepdims=True) + 1e-12)
-            most = xp.maximum(most, float(self.held_room) * share[..., None] * held)
+            held = xp.sqrt((load * load).sum(axis=-1) + 1e-12)
+            most = xp.maximum(most, (float(self.held_room) * (1.0 - is_pair(share)) * share * held)[..., None])
         wider = 1.0 + (float(self.pair_roll_room) - 1.0) * is_pair(share)
         most = most * joined([wider, xp.ones_like(wider)])
         own = rest + most * within(xp, (own - rest) / most, 1.0)

@@ -75,7 +75,7 @@ class SingleFollower:
         self._inside = tuple(self._context) if frame is None else (share, 0.0, lever, room)
         self._network.tell(*self._frame)
         self._told = self._added_lift * pair * lever
-        self._wider = 1.0 + (self._pair_roll_room - 1.0) * pair
+        self._wider, self._held = 1.0 + (self._pair_roll_room - 1.0) * pair, self._held_room * (1.0 - pair)
         filters.tell(pair)
 
     def answer(self, observation: Array) -> tuple[list[float], list[float]] | None:
@@ -129,7 +129,7 @@ class SingleFollower:
         roll_wanted = far * roll_far - r_angle * roll - r_rate * roll_rate - held * roll_held
         pitch_wanted = far * pitch_far - p_angle * pitch - p_rate * pitch_rate - held * pitch_held
         length = math.sqrt((held * roll_held) ** 2 + (held * pitch_held) ** 2 + 1e-12)
-        least = max(self._held_room * share * length, LEAST_ROOM)
+        least = max(self._held * share * length, LEAST_ROOM)
         roll_rest, roll_most = roll + roll_damping * roll_rate, max(roll_room, least) * self._wider
         pitch_rest, pitch_most = pitch + pitch_damping * pitch_rate, max(pitch_room, least)
         roll_own = share * roll_wanted - (share - 1.0) * led_roll - roll_rest

@@ -78,7 +78,7 @@ def _rooms_and_axes(lqg: MultiModelLqg, context: Any, numbers: dict[str, Any]) -
     lines += [f"#define MJXBALL_LEAST_ROOM {_number(LEAST_ROOM)}", f"#define MJXBALL_ROLL_ROOM {_number(wider)}"]
     lines += [f"#define MJXBALL_SWINGS {lqg.swings}", f"#define MJXBALL_SHARPNESS {swing.SHARPNESS}"]
     lines += [f"#define MJXBALL_LEAST_ENERGY {_number(swing.LEAST_ENERGY)}"]
-    lines += [f"#define MJXBALL_HELD_ROOM {_number(lqg.held_room)}"]
+    lines += [f"#define MJXBALL_HELD_ROOM {_number(float(lqg.held_room) * (1.0 - _pair(lqg, context)))}"]
     for name, every in PAIR_ROLL.items():
         macro = name.removeprefix("pair_").upper()
         lines += [f"#define MJXBALL_{macro} mjxball_lqg_{name if name in numbers else every}"]
