@@ -5,12 +5,15 @@
     python benchmarks/rigs_law.py --cases delay --sizes 2 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases told --sizes 2 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases axes --sizes 2 3 --seed 77 --policy policies/universal.npz
+    python benchmarks/rigs_law.py --cases swings --sizes 2 3 5 --seed 77 --rigs 100 --policy policies/universal.npz
 
 As `benchmarks/rigs.py`, of rigs of three drones, or of others that neither a training nor a judgement draws (`--seed`).
-The law flies alone, or under the network of `--policy` as it is, which was trained with another. A model is a natural
+The law flies alone, or under the network of `--policy` as it is, which was trained with another; of a law without
+swings it is not shown them, of one that it was not trained with it sees nothing new. A model is a natural
 frequency of the loops [rad/s] and a lag of the rotors [s], see `mjxball.baselines.multi_model_lqg`. `told`: one
 model, of the rig's own loops and rotors; and the LQGs that know the rig, each against the better of both. `axes`: a
-pair's own filters and room about roll, and all of it about the rig's axes.
+pair's own filters and room about roll, and all of it about the rig's axes. `swings`: room for what is held, and loads
+that swing held against ahead of time.
 """
 
 from __future__ import annotations
@@ -76,6 +79,8 @@ class Case(NamedTuple):
     added_lift: float = 0.0  # share of the lift that the network adds whose torque a pair's scores are told
     pair_roll: bool = False  # whether a pair has its own filters and room about roll
     rig_axes: bool = False  # whether all this is about the rig's axes, not those of the mount frame
+    held_room: bool = False  # whether more than two drones have room for what they hold
+    swings: bool = False  # whether loads that swing are held against ahead of time
     delay: float | None = None  # [s] added to the lag of the rig's own rotors, if its own loop is the only model
 
     def law(self, config: Config) -> MultiModelLqg:
@@ -94,6 +99,11 @@ class Case(NamedTuple):
         if not self.pair_roll:
             common |= dict.fromkeys(("pair_roll_gain", "pair_roll_certainty", "pair_roll_prior"), None)
             common["pair_roll_room"] = np.array(1.0)
+        if self.swings:
+            common["swing_ahead"] = np.concatenate([law.swing_ahead for law in laws])
+        else:
+            common |= {"swing": None, "swing_ahead": None, "swing_keep": np.array(0.0)}
+        common["held_room"] = np.array(laws[0].held_room if self.held_room else 0.0)
         return laws[0]._replace(**numbers, **common)
 
     def of_rigs(self, config: Config, rigs: RigTable) -> MultiModelLqg:
@@ -105,7 +115,9 @@ class Case(NamedTuple):
 
 
 LIFT_TOLD = Case("12 pairs, lift told", MODELS, TUNING.torque_walk, position=TUNING.position, added_lift=1.0)
-AS_IT_IS = LIFT_TOLD._replace(name="as it is", pair_roll=True, rig_axes=True)
+RIG_AXES = LIFT_TOLD._replace(name="about the rig's axes", pair_roll=True, rig_axes=True)
+HELD = RIG_AXES._replace(name="room for what is held", held_room=True)
+AS_IT_IS = HELD._replace(name="as it is", swings=True)
 OF_MODELS = ("axis", "axis_gain", "certainty", "tilt", "stiffness", "damping")
 CASES = {
     "first": [
@@ -129,7 +141,8 @@ CASES = {
         *(Case("12 pairs", MODELS, walk, position=position) for walk, position in ((1000.0, 0.17), (500.0, 0.2))),
         LIFT_TOLD,
     ],
-    "axes": [LIFT_TOLD, LIFT_TOLD._replace(name="a pair's own roll", pair_roll=True), AS_IT_IS],
+    "axes": [LIFT_TOLD, LIFT_TOLD._replace(name="a pair's own roll", pair_roll=True), RIG_AXES],
+    "swings": [RIG_AXES, HELD, AS_IT_IS],
     "told": [
         *(Case("9 pairs", torque_walk=walk, position=position) for walk, position in ((300.0, 0.2), (1000.0, 0.17))),
         *(Case("the rig's own loop", delay=delay) for delay in (0.0, 0.025)),
@@ -171,7 +184,15 @@ class UnderNetwork(AnyRigLaw):
 
     def __init__(self, policy: Policy, law: MultiModelLqg):
         super().__init__(policy)
-        self._law = self._law._replace(lqg=law)
+        (first, *weights), biases, mean, scale = self._parts
+        more = law.shown - self._law.lqg.shown  # the swings are the last that a network sees
+        first, mean, scale = (
+            part[: len(part) + more]
+            if more < 0
+            else np.concatenate([part, np.zeros((more, *part.shape[1:]), part.dtype)])
+            for part in (first, mean, scale)
+        )
+        self._parts, self._law = ((first, *weights), biases, mean, scale), self._law._replace(lqg=law)
 
 
 class ToldLaw(UnderNetwork):

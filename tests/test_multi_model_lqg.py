@@ -247,6 +247,21 @@ def test_a_pair_has_more_room_about_roll(axis: int, share: float, factor: float)
     np.testing.assert_allclose(np.abs(command[:2]), factor * LEAST_ROOM * (np.arange(2) == axis), atol=1e-9)
 
 
+@pytest.mark.parametrize(("share", "reached"), [(1.5, 1.0), (1.2, 1.0), (2.0, 0.15 / 0.6), (1.75, 0.5)])
+def test_more_than_two_drones_have_room_for_what_they_hold(share: float, reached: float) -> None:
+    """A load of 0.3 rad about pitch, with no room else; a pair has `LEAST_ROOM`."""
+    law, leader, level = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL), np.zeros(18)
+    law = still(law)._replace(held_room=law.held_room)
+    memory = law.start(level, np.array([share, 0.0, 0.0, 1e-3]))
+    begin, states = ANGLE_STATES * law.models, memory.copy()
+    for model, stiffness in enumerate(law.stiffness):
+        states[begin + ANGLE_STATES * model + 2] = 0.3 * stiffness
+    command = law.command(np.zeros(3), states, level, leader)
+    np.testing.assert_allclose(command[:2], [0.0, -0.3 * share * reached], atol=1e-6)
+    less = law._replace(held_room=0.0).command(np.zeros(3), states, level, leader)
+    np.testing.assert_allclose(less[:2], [0.0, -LEAST_ROOM], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("field", "wrong"),
     [
