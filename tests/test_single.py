@@ -141,13 +141,16 @@ def test_one_model_is_enough(plant: str) -> None:
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize("size", [0.03, 0.3])
 def test_of_newer_and_of_older_files(count: int, without: Collection[str], size: float) -> None:
-    """With and without swings, filters of a pair's own about roll and all about the rig's axes; limits are met, too."""
+    """With and without swings, filters of a pair's own about roll and all about the rig's axes; limits are met, too.
+
+    Of swings the eighth power of energies is taken, of which large steps make sums that round differently.
+    """
     plant, made = ring_config(preset("team"), count).plant, with_law(without)
     mounts = np.array([drone.mount for drone in plant.drones])
     context = np.atleast_2d(team_geometry(plant, mounts, np.float64(count)))[-1].tolist()
     card = {**made.card, "team": {"drone": count - 1, "mount_angle": 0.0, "context": context}}
     policy = Policy(dataclasses.replace(made, card=card), "ring", np.float64)
-    agree(policy, Reference(policy), walk(200, size=size), remembered=1e-7)
+    agree(policy, Reference(policy), walk(200, size=size), 1e-9 if size < 0.1 else 1e-7, 1e-7)
     assert policy._ahead
     newer = "rig_axes" not in without
     assert (policy._single._filters._roll_matrix is not None) == (newer and count == 2)

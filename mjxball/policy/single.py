@@ -104,13 +104,11 @@ class SingleFollower:
         features += [-vz - height, *roll_load, *pitch_load, lift, lift_error]
         features += [-0.5 * math.log(roll_mixed), -0.5 * math.log(pitch_mixed)]
         features += [roll_turn, pitch_turn, room * roll_mixed, room * pitch_mixed, share]
-        roll_grown = pitch_grown = 0.0
-        if self._swings:
-            roll_grown, pitch_grown = self._swings.update((roll_load[0], pitch_load[0]), self._filters.ahead)
-            features += [roll_grown, pitch_grown]
-        action = self._network.act(features, observation)
-        if not sum(map(abs, (*features, *action))) < LARGEST:
+        if not sum(map(abs, features)) < LARGEST:
             return None
+        grown = self._swings.update((roll_load[0], pitch_load[0]), self._filters.ahead) if self._swings else ()
+        roll_grown, pitch_grown = grown or (0.0, 0.0)
+        action = self._network.act([*features, *grown], observation)
         # What the leader does.
         (gravity, kp_x, kp_y, kp_z, kd_x, kd_y, kd_z), (tilt_limit, vertical_limit) = self._leader, self._clip
         led_roll = _clipped(-(kp_y * y + kd_y * vy) / gravity, tilt_limit)
