@@ -147,10 +147,15 @@ def flown(contents: PolicyFile, dtype: Any) -> Flight:
 
 
 def assert_remembered(found: np.ndarray, flight: Flight, contents: PolicyFile, tolerance: float) -> None:
-    """Memories agree; scores of models, the differences of large numbers, as well as these are rounded."""
+    """Memories agree; scores of models, the differences of large numbers, as well as these are rounded.
+
+    So are the rotors' parts, of which commands and angles times the stiffness nearly cancel.
+    """
     wanted, law = flight.next_memory, law_of(contents.card)
     least = np.full(wanted.shape[1], 1e-6 + tolerance)
     if isinstance(law.lqg, MultiModelLqg):
+        states = slice(law.history.size, law.history.size + 15 * law.lqg.models)
+        least[states] += 2e-7 * np.max(law.lqg.stiffness)
         last = -CONTEXT - 2 - 2 * law.lqg.swings * swing.STATES
         scores = slice(last - 2 * law.lqg.models, last)
         least[scores] += max(np.spacing(np.abs(wanted[:, scores]).max().astype(found.dtype)), SCORES)
@@ -226,9 +231,10 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert f"Flash: {cost.flash} bytes" in text
     assert f"RAM: {cost.state} bytes" in text
     size, widest = map(int, re.search(r"mjxball_real input\[(\d+)\], hidden\[2\]\[(\d+)\];", text).groups())
-    turned = 18 * isinstance(law_of(contents.card).lqg, MultiModelLqg)
-    assert ("mjxball_real seen[18];" in text) == bool(turned)
-    assert 4 * (size + 2 * widest + turned) == cost.stack
+    lqg = law_of(contents.card).lqg
+    own = 18 + 2 * lqg.models + 4 if isinstance(lqg, MultiModelLqg) else 0
+    assert ("mjxball_real seen[18];" in text) == ("mjxball_known known;" in text) == bool(own)
+    assert 4 * (size + 2 * widest + own) == cost.stack
     assert f"{cost.stack} bytes of arrays on the stack" in text
     assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
 

@@ -102,8 +102,8 @@ def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     lqg, told = law_of(policy.card).lqg, policy.card.get("team")
     constants = 2 * ACTION_SIZE + sum(np.size(value) for value in _lqg_numbers(lqg, told and told["context"]).values())
     constants += {TeamLqg: team_lqg.CONTEXT, MultiModelLqg: multi_model_lqg.CONTEXT}.get(type(lqg), 0)
-    turned = OBSERVATION_SIZE if isinstance(lqg, MultiModelLqg) else 0
-    state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest + turned)
+    own = OBSERVATION_SIZE + 2 * lqg.models + 4 if isinstance(lqg, MultiModelLqg) else 0  # `seen`, `known`
+    state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest + own)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
         return Footprint(flash, state + FLOAT, stack + 2 * (max(size, widest) + 7))
@@ -240,10 +240,12 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
         place = OBSERVATION_SIZE + older + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
     if law.lqg is not None:
+        known = _known(law)
         lines = ["    mjxball_real led[3];", f"    mjxball_copy_law({seen}, led);", *lines]
-        lines += [f"    mjxball_lqg_estimate(memory + {history.size}, {seen});"]
+        lines = ["    mjxball_known known;", *lines] if known else lines
+        lines += [f"    mjxball_lqg_estimate(memory + {history.size}, {seen}{known});"]
         features = f"input + {OBSERVATION_SIZE + history.size}"
-        lines += [f"    mjxball_lqg_features(memory + {history.size}, {seen}, {features});"]
+        lines += [f"    mjxball_lqg_features(memory + {history.size}, {seen}{known}, {features});"]
     if seen != "observation":
         turned = (
             f"for (i = 3; i < {OBSERVATION_SIZE}; i += 3) mjxball_turn({seen} + i, {seen} + i + 1, MJXBALL_RIG_SIN);"
@@ -251,6 +253,11 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
         head = [f"mjxball_real {seen}[{OBSERVATION_SIZE}];", f"mjxball_copy({seen}, observation, {OBSERVATION_SIZE});"]
         lines = [*(f"    {line}" for line in (*head, turned)), *lines]
     return "\n".join(lines)
+
+
+def _known(law: FollowerLaw) -> str:
+    """The argument of what is known at an observation, for laws that pass it on."""
+    return ", &known" if isinstance(law.lqg, MultiModelLqg) else ""
 
 
 def _history_update(law: FollowerLaw) -> str:
@@ -400,7 +407,7 @@ def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
     if law.needs_context:
         lifts = _lifts(law.lqg)
         lines = [f"    mjxball_real own[{6 if lifts else 3}];"]
-        lines += [f"    mjxball_lqg_command(memory + {law.history.size}, {_seen(law)}, led, own);"]
+        lines += [f"    mjxball_lqg_command(memory + {law.history.size}, {_seen(law)}{_known(law)}, led, own);"]
         base = "own[i] + (i == 2 ? own[3] : 0)" if lifts else "own[i]"
         if isinstance(law.lqg, MultiModelLqg):
             lines += ["    mjxball_copy(command, own, 3);"]

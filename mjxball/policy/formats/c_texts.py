@@ -281,6 +281,12 @@ enum {
     MJXBALL_TOLD = MJXBALL_SLOW + 2
 };
 
+/* What is known at an observation, about roll and pitch: the models' weights, their mean of 1 over the stiffness,
+ * what the load will have grown by when rotors act. */
+typedef struct {
+    mjxball_real weights[2][MJXBALL_MODELS], soft[2], grown[2];
+} mjxball_known;
+
 /* (x, y) in the mount frame as seen from the axes of the filters, with sin = MJXBALL_RIG_SIN; back with minus that. */
 static inline void mjxball_turn(mjxball_real *x, mjxball_real *y, mjxball_real sin) {
     mjxball_real along = MJXBALL_RIG_COS * *x + sin * *y;
@@ -315,6 +321,15 @@ static inline mjxball_real mjxball_lqg_weights(const mjxball_real *memory, int a
         soft += weights[model] / mjxball_lqg_stiffness[model];
     }
     return soft;
+}
+
+/* The load about an axis as a tilt. */
+static inline mjxball_real mjxball_lqg_load(const mjxball_real *memory, int axis, const mjxball_real *weights) {
+    const mjxball_real *state = memory + 5 * axis * MJXBALL_MODELS + 2;
+    mjxball_real load = 0;
+    for (int model = 0; model < MJXBALL_MODELS; model++, state += 5)
+        load += weights[model] * *state / mjxball_lqg_stiffness[model];
+    return load;
 }
 
 #if MJXBALL_SWINGS
@@ -364,7 +379,8 @@ static inline void mjxball_swing_next(mjxball_real *memory) {
 }
 #endif
 
-static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
+static inline void mjxball_lqg_estimate(
+    mjxball_real *memory, const mjxball_real *observation, mjxball_known *known) {
     mjxball_real *height = memory + MJXBALL_HEIGHT, off = -observation[17] - height[0];
     for (int row = 0; row < 3; row++) height[row] += off * mjxball_lqg_height_gain[row];
     for (int axis = 0; axis < 2; axis++) {
@@ -390,15 +406,11 @@ static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real
             if (model == 0 || scores[model] > most) most = scores[model];
         }
         for (int model = 0; model < MJXBALL_MODELS; model++) scores[model] -= most;
+        known->soft[axis] = mjxball_lqg_weights(memory, axis, known->weights[axis]);
+        known->grown[axis] = 0;
 #if MJXBALL_SWINGS
-        {
-            mjxball_real weights[MJXBALL_MODELS], load = 0;
-            const mjxball_real *state = memory + 5 * axis * MJXBALL_MODELS + 2;
-            mjxball_lqg_weights(memory, axis, weights);
-            for (int model = 0; model < MJXBALL_MODELS; model++, state += 5)
-                load += weights[model] * *state / mjxball_lqg_stiffness[model];
-            mjxball_swing_see(memory, axis, load);
-        }
+        mjxball_swing_see(memory, axis, mjxball_lqg_load(memory, axis, known->weights[axis]));
+        known->grown[axis] = mjxball_swing_grown(memory, axis, known->weights[axis]);
 #endif
     }
 }
@@ -413,13 +425,13 @@ static inline mjxball_real mjxball_depth(mjxball_real x) {
     return depth;
 }
 
-static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
-    const mjxball_real *context = memory + MJXBALL_TOLD, *height = memory + MJXBALL_HEIGHT;
-    mjxball_real soft[2];
+static inline void mjxball_lqg_features(
+    const mjxball_real *memory, const mjxball_real *observation, const mjxball_known *known, mjxball_real *to) {
+    const mjxball_real *context = memory + MJXBALL_TOLD, *height = memory + MJXBALL_HEIGHT, *soft = known->soft;
     mjxball_lqg_levers(memory, to + 15);
     for (int axis = 0; axis < 2; axis++) {
-        mjxball_real weights[MJXBALL_MODELS], mean[5] = {0};
-        soft[axis] = mjxball_lqg_weights(memory, axis, weights);
+        const mjxball_real *weights = known->weights[axis];
+        mjxball_real mean[5] = {0};
         for (int model = 0; model < MJXBALL_MODELS; model++) {
             const mjxball_real *state = memory + 5 * (axis * MJXBALL_MODELS + model);
             mjxball_real softer = weights[model] / mjxball_lqg_stiffness[model];
@@ -430,7 +442,7 @@ static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxbal
         mjxball_copy(to + 5 + 3 * axis, mean + 2, 3);
         to[15 + axis] *= soft[axis];
 #if MJXBALL_SWINGS
-        to[20 + axis] = mjxball_swing_grown(memory, axis, weights);
+        to[20 + axis] = known->grown[axis];
 #endif
     }
 #if MJXBALL_SWINGS
@@ -452,7 +464,8 @@ static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxbal
 
 /* own: the law's command about the axes of the filters, to which the network's is added. */
 static inline void mjxball_lqg_command(
-    const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *own) {
+    const mjxball_real *memory, const mjxball_real *observation, const mjxball_known *known, const mjxball_real *led,
+    mjxball_real *own) {
     const mjxball_real *context = memory + MJXBALL_TOLD, share = context[0];
     mjxball_real levers[2], far[2], load[2], room[2], rest[2], most[2], gains[2][4] = {{0}};
     mjxball_real rise = mjxball_lqg_rise[0] * observation[14] + mjxball_lqg_rise[1] * observation[17];
@@ -460,17 +473,13 @@ static inline void mjxball_lqg_command(
     own[2] = mjxball_clip(share * rise - (share - 1) * led[2], mjxball_limit[2]);
     mjxball_lqg_levers(memory, levers);
     for (int i = 0; i < 2; i++) {
-        mjxball_real weights[MJXBALL_MODELS], soft = mjxball_lqg_weights(memory, i, weights), damping = 0;
-        load[i] = levers[i] * soft * (own[2] - led[2]);
+        const mjxball_real *weights = known->weights[i], soft = known->soft[i];
+        mjxball_real damping = 0;
+        load[i] = mjxball_lqg_load(memory, i, weights) + known->grown[i] + levers[i] * soft * (own[2] - led[2]);
         for (int model = 0; model < MJXBALL_MODELS; model++) {
-            const mjxball_real *state = memory + 5 * (i * MJXBALL_MODELS + model);
-            load[i] += weights[model] * state[2] / mjxball_lqg_stiffness[model];
             damping += weights[model] * mjxball_lqg_damping[model];
             for (int k = 0; k < 4; k++) gains[i][k] += weights[model] * mjxball_lqg_tilts[4 * model + k];
         }
-#if MJXBALL_SWINGS
-        load[i] += mjxball_swing_grown(memory, i, weights);
-#endif
         rest[i] = observation[3 + i] + damping * observation[9 + i];
         most[i] = context[3] * soft;
         if (most[i] < MJXBALL_LEAST_ROOM) most[i] = MJXBALL_LEAST_ROOM;
