@@ -95,7 +95,8 @@ class SingleFollower:
             (pitch_mean, pitch_rate_mean, *pitch_load, pitch_soft, pitch_damping, p_error, p_velocity, p_angle, p_rate),
         ) = self._filters.update(((roll, roll_rate), (pitch, pitch_rate)))
         left = -vz - rising[0]
-        height, lift, lift_error = (state + gain * left for state, gain in zip(rising, self._height_gain, strict=True))
+        by_height, by_lift, by_error = self._height_gain
+        height, lift, lift_error = rising[0] + by_height * left, rising[1] + by_lift * left, rising[2] + by_error * left
         roll_turn, pitch_turn = roll_per_lift * roll_soft, pitch_per_lift * pitch_soft
         roll_room, pitch_room = room * roll_soft, room * pitch_soft
         across = sin * sin * (pitch_soft - roll_soft)
@@ -159,7 +160,7 @@ class SingleFollower:
         pitch_slow = keep * pitch_slow + (1.0 - keep) * pitch_added
         roll_drive = (roll_own + roll_added - roll_slow + others * led[0]) / share
         pitch_drive = (pitch_own + pitch_added - pitch_slow + others * led[1]) / share
-        up = *rising, (vertical + others * led[2]) / share
+        (height, lift, lift_error), up = rising, (vertical + others * led[2]) / share
         turned = self._told * (command[2] - vertical)
         self._filters.advance(
             ((roll_drive, roll_per_lift * lifted), (pitch_drive, pitch_per_lift * lifted), (0.0, turned))
@@ -167,7 +168,7 @@ class SingleFollower:
         if self._swings:
             self._swings.advance()
         self._slow = [roll_slow, pitch_slow]
-        self._rising = [sum([a * b for a, b in zip(row, up, strict=True)]) for row in self._height]
+        self._rising = [a * height + b * lift + c * lift_error + d * up for a, b, c, d in self._height]
 
 
 class _Filters:
@@ -231,7 +232,7 @@ class _Filters:
         self._found[:] = self._tilts
         sums = np.matmul(self._odds, self._known)[:, 0]
         self.ahead = sums[:, self._means - 1 :]
-        return [[value / total for value in values] for *values, total in sums[:, : self._means].tolist()]
+        return np.divide(sums[:, : self._means - 1], self.ahead[:, :1]).tolist()
 
     def advance(self, drives: tuple[tuple[float, float], ...]) -> None:
         """Predict the next states with `drives`: the mean command, and the angular acceleration of lifting apart.
