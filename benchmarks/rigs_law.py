@@ -5,7 +5,7 @@
     python benchmarks/rigs_law.py --cases delay --sizes 2 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases told --sizes 2 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases axes --sizes 2 3 --seed 77 --policy policies/universal.npz
-    python benchmarks/rigs_law.py --cases swings --sizes 2 3 5 --seed 77 --rigs 100 --policy policies/universal.npz
+    python benchmarks/rigs_law.py --cases swings --sizes 3 --seed 77 --rigs 100 --policy policies/universal.npz
 
 As `benchmarks/rigs.py`, of rigs of three drones, or of others that neither a training nor a judgement draws (`--seed`).
 The law flies alone, or under the network of `--policy` as it is, which was trained with another; of a law without

@@ -9,9 +9,11 @@ import numpy as np
 
 from mjxball.baselines.multi_model_lqg import MODELS, multi_model_lqg
 from mjxball.config import preset
+from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.policy import PolicyFile, load_file
 from mjxball.policy.export import _numbers
-from mjxball.policy.file import LATER_SHAPES, SWING_SHAPES, law_of, shipped_policy
+from mjxball.policy.file import law_of, shipped_policy
+from mjxball.policy.law_fields import LATER_SHAPES, SWING_SHAPES
 
 OLDEST = {*LATER_SHAPES, *SWING_SHAPES}  # what the first files do not have
 
@@ -32,3 +34,8 @@ def with_law(without: Collection[str] = (), models: Sequence[tuple[float, float]
         observation_scale=fitting(universal.observation_scale),
         card=card,
     )
+
+
+def still(law: MultiModelLqg) -> MultiModelLqg:
+    """`law` as files have it that know nothing of swings."""
+    return law._replace(**{name: MultiModelLqg._field_defaults[name] for name in SWING_SHAPES})

@@ -23,9 +23,10 @@ from mjxball.control import swing
 from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import LATER_SHAPES, SWING_SHAPES, law_of, save_file, shipped_policy
+from mjxball.policy.file import law_of, save_file, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
+from mjxball.policy.law_fields import LATER_SHAPES, SWING_SHAPES
 
 STEPS = 60
 # Of one step's action in [-1, 1] by C, against NumPy in the same dtype: what docs/policy-file.md promises of float32.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.random import default_rng
-from rig_laws import OLDEST, with_law
+from rig_laws import OLDEST, still, with_law
 
 from mjxball.baselines.multi_model_lqg import MODELS, MultiModelOffsetFree, multi_model_lqg
 from mjxball.baselines.team_lqg import TUNING, team_lqg
@@ -31,16 +31,12 @@ from mjxball.control.multi_model_lqg import (
 from mjxball.control.observation import mount_frames
 from mjxball.plant.teams import ring_config
 from mjxball.policy.container import PolicyFileError
-from mjxball.policy.file import LATER_SHAPES, SWING_SHAPES, law_of, load_file, save_file, shipped_policy
+from mjxball.policy.file import law_of, load_file, save_file, shipped_policy
+from mjxball.policy.law_fields import LATER_SHAPES, SWING_SHAPES
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import CIRCLE, Scenario
 
 UNIVERSAL, TEAM = preset("universal"), preset("team")
-
-
-def still(law: MultiModelLqg) -> MultiModelLqg:
-    """`law` as files have it that know nothing of swings."""
-    return law._replace(**{name: MultiModelLqg._field_defaults[name] for name in SWING_SHAPES})
 
 
 def team4(frequency: float) -> Config:

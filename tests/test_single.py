@@ -21,7 +21,8 @@ from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.plant.teams import ring_config
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import LATER_SHAPES, SWING_SHAPES, law_of, shipped_policy
+from mjxball.policy.file import law_of, shipped_policy
+from mjxball.policy.law_fields import LATER_SHAPES, SWING_SHAPES
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario

@@ -120,9 +120,19 @@ def innovation_filter(
     for state, intensity in walks.items():
         process_noise[state, state] = intensity * period
     measured, measurement_noise = np.eye(len(a))[list(noise)], np.diag([value**2 for value in noise.values()])
+    return transition, drive, *kalman_gain(transition, measured, process_noise, measurement_noise)
+
+
+def kalman_gain(
+    transition: np.ndarray, measured: np.ndarray, process_noise: np.ndarray, measurement_noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(K (n, k), covariance (k, k) of what is measured less what is predicted) of a steady-state Kalman filter.
+
+    Of x <- A x, `transition` (n, n), of which `measured` (k, n) x is seen; covariances of both noises in a step.
+    """
     predicted = solve_discrete_are(transition.T, measured.T, process_noise, measurement_noise)
     innovation = measured @ predicted @ measured.T + measurement_noise
-    return transition, drive, predicted @ measured.T @ np.linalg.inv(innovation), innovation
+    return predicted @ measured.T @ np.linalg.inv(innovation), innovation
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

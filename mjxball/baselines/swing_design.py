@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
+
+from mjxball.baselines.lqg_design import kalman_gain
 
 Array = Any
 FREQUENCIES = (0.7, 0.95, 1.28, 1.73, 2.3, 3.1, 4.2, 5.7)  # [rad/s]
@@ -15,20 +15,19 @@ CHANGE, CONSTANT_CHANGE = 0.1, 0.3
 ENERGY_TIME = 4.0  # [s] in which the energies are forgotten
 
 
-def observers(period: float, frequencies: Sequence[float] = FREQUENCIES, change: float = CHANGE) -> Array:
+def observers(period: float) -> Array:
     """(J, 5), see `swings_seen`: steady-state Kalman gains, of a measurement with a deviation of 1."""
     rows = []
-    for frequency in frequencies:
+    for frequency in FREQUENCIES:
         cos, sin = np.cos(frequency * period), np.sin(frequency * period)
         transition, sees = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]), np.array([[1.0, 1.0, 0.0]])
-        walks = np.array([CONSTANT_CHANGE, change * frequency, change * frequency]) * period
-        covariance = solve_discrete_are(transition.T, sees.T, np.diag(walks**2), np.eye(1))
-        gain = covariance @ sees.T / (sees @ covariance @ sees.T + 1.0)
+        walks = np.array([CONSTANT_CHANGE, CHANGE * frequency, CHANGE * frequency]) * period
+        gain, _ = kalman_gain(transition, sees, np.diag(walks**2), np.eye(1))
         rows.append([cos, sin, *gain[:, 0]])
     return np.array(rows)
 
 
-def ahead(axis: Array, gain: Array, lag: float, period: float, frequencies: Sequence[float] = FREQUENCIES) -> Array:
+def ahead(axis: Array, gain: Array, lag: float, period: float) -> Array:
     """(J, 2), see `swings_grown`: of a filter `axis` (5, 6), `gain` (5, 2) of loops behind rotors with a `lag` [s].
 
     A torque that swings reaches the loops through the filter's own model; what the filter then makes of their angle and
@@ -37,7 +36,7 @@ def ahead(axis: Array, gain: Array, lag: float, period: float, frequencies: Sequ
     found = []
     transition, sees = axis[:, :5], np.eye(2, 5)
     loop = [0, 1, 4]  # angle, rate, rotors
-    for frequency in frequencies:
+    for frequency in FREQUENCIES:
         turn = np.exp(1j * frequency * period)
         swung = np.linalg.solve(turn * np.eye(3) - transition[np.ix_(loop, loop)], transition[loop, 2])[:2]
         onward = transition @ (np.eye(5) - gain @ sees)

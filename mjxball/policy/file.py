@@ -15,27 +15,21 @@ import numpy as np
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, ObservationHistory
-from mjxball.control.offset_free import DRIVES, MEASURED, STATES, OffsetFreeLqg
+from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
 from mjxball.errors import InputError
 from mjxball.policy.container import PolicyFileError, read_arrays
+from mjxball.policy.law_fields import LQG_SHAPES, MAX_NUMBER, check_lqg, is_finite
 
 # 2: with the numbers of an offset-free LQG of a pair, card field `lqg`; 3: of a team, and what a follower has to know
 # of its team before a flight, card field `context`; 4: of attitude loops that nobody knows.
 FORMAT_VERSIONS = (1, 2, 3, 4)
-# `control.team_lqg.team_context`, `control.multi_model_lqg.ring_context`.
-CONTEXT = ("command_share", "roll_per_lift", "pitch_per_lift", "roll_room", "pitch_room")
-GEOMETRY = ("command_share", "roll_acceleration_per_lift", "pitch_acceleration_per_lift", "rotor_room")
-CONTEXTS = {3: CONTEXT, 4: GEOMETRY}  # by format
-MAX_MODELS = 16
-MAX_SWINGS = 32  # frequencies at which a load may swing
 FOLDER = "policies"  # of those that come with mjxball
 ARCHIVE = "archive"  # in it: earlier ones, which documents name
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
 MAX_CARD = 2**20  # characters
 # Metrics that a card may bound, all of them the better the smaller.
 BOUNDED = ("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "max_tilt", "action_error")
-MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
 CARD_FIELDS: dict[str, type] = {
     "format_version": int,
     "observation": list,
@@ -68,62 +62,6 @@ class PolicyFile:
     observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for a slot that is not used
     action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
     card: dict[str, Any]
-
-
-LQG_SHAPES: dict[str, tuple[int, ...]] = {
-    "transition": (STATES, STATES + DRIVES),
-    "gain": (STATES, MEASURED),
-    "tilt": (2, 4),
-    "height": (2,),
-    "limits": (3,),
-    "stiffness": (),
-    "half_length": (),
-    "carried": (2,),
-}
-TEAM_LQG_SHAPES: dict[str, tuple[int, ...]] = {
-    "axis": (5, 6),
-    "axis_gain": (5, 2),
-    "height": (3, 4),
-    "height_gain": (3,),
-    "tilt": (4,),
-    "rise": (2,),
-    "limits": (3,),
-    "stiffness": (),
-    "damping": (),
-}
-LATER_LQG_SHARES = {3: "lifting", 4: "added_lift"}  # a share that is absent from a format's first files
-
-
-MULTI_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # behind an axis of models
-    "axis": (5, 6),
-    "axis_gain": (5, 2),
-    "certainty": (3,),
-    "prior": (),
-    "tilt": (4,),
-    "stiffness": (),
-    "damping": (),
-}
-# Absent, all of a group, from earlier files; "M" for the models, "J" for the swings.
-LATER_SHAPES: dict[str, tuple[Any, ...]] = {
-    "pair_roll_gain": ("M", 5, 2),
-    "pair_roll_certainty": ("M", 3),
-    "pair_roll_prior": ("M",),
-    "pair_roll_room": (),
-    "rig_axes": (),
-}
-SWING_SHAPES: dict[str, tuple[Any, ...]] = {
-    "swing": ("J", 5),
-    "swing_ahead": ("M", "J", 2),
-    "swing_keep": (),
-    "held_room": (),
-}
-MULTI_MODEL_COMMON: dict[str, tuple[int, ...]] = {
-    "height": (3, 4),
-    "height_gain": (3,),
-    "rise": (2,),
-    "limits": (3,),
-    "keep": (2,),
-}
 
 
 def law_of(card: dict[str, Any]) -> FollowerLaw:
@@ -292,112 +230,22 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     if not 1 <= card["history"] <= 100:
         raise PolicyFileError(f"{name}: history must be 1 to 100, not {card['history']}")
     filters = card.get("filters", [])
-    if not isinstance(filters, list) or len(filters) > 10 or not all(_is_finite(t) and t >= 1e-3 for t in filters):
+    if not isinstance(filters, list) or len(filters) > 10 or not all(is_finite(t) and t >= 1e-3 for t in filters):
         raise PolicyFileError(f"{name}: filters must be up to 10 time constants of at least 1 ms")
     lengths = {"action_reach": 2, "command_limits": 2, "leader_kp": 3, "leader_kd": 3}
     for field, length in lengths.items():
         numbers = card[field]
-        if len(numbers) != length or not all(_is_finite(value) and value >= 0 for value in numbers):
+        if len(numbers) != length or not all(is_finite(value) and value >= 0 for value in numbers):
             raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
-    _check_lqg(card, name)
+    check_lqg(card, name)
     for field in ("control_period", "gravity"):
-        if not (_is_finite(card[field]) and card[field] >= 1e-6):
+        if not (is_finite(card[field]) and card[field] >= 1e-6):
             raise PolicyFileError(f"{name}: card field {field} must be positive")
-    if not all(_is_finite(value) for value in card["bounds"].values()):
+    if not all(is_finite(value) for value in card["bounds"].values()):
         raise PolicyFileError(f"{name}: card field bounds must hold finite numbers")
     odd = sorted(set(card["bounds"]) - set(BOUNDED))
     if odd:
         raise PolicyFileError(f"{name}: card field bounds names {odd[0]!r}; known are {', '.join(BOUNDED)}")
-
-
-def _check_lqg(card: dict[str, Any], name: str) -> None:
-    """Raise PolicyFileError unless later formats have the numbers of their LQG and format 1 has none."""
-    lqg, version = card.get("lqg"), card["format_version"]
-    in_team, shapes = version in CONTEXTS, {2: LQG_SHAPES, 3: TEAM_LQG_SHAPES}.get(version, {})
-    if version == 1:
-        if lqg is not None:
-            raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 to 4, not 1")
-        return
-    if version == 4:
-        stiffness = lqg.get("stiffness") if isinstance(lqg, dict) else None
-        models = len(stiffness) if isinstance(stiffness, list) else 0
-        if not 1 <= models <= MAX_MODELS:
-            raise PolicyFileError(f"{name}: card field lqg.stiffness must be 1 to {MAX_MODELS} numbers")
-        every = {field: (models, *shape) for field, shape in MULTI_MODEL_SHAPES.items()}
-        shapes = {**every, **MULTI_MODEL_COMMON}
-    later = LATER_LQG_SHARES.get(version)
-    if isinstance(lqg, dict):
-        shapes = {**shapes, **_optional_shapes(lqg, version)}
-    positive = ("stiffness", "limits", "damping" if in_team else "carried")
-    if not isinstance(lqg, dict) or lqg.keys() != shapes.keys() or card["action_mode"] != "residual":
-        raise PolicyFileError(
-            f"{name}: a residual policy of format {version} needs card field lqg: {', '.join(shapes)}"
-        )
-    if in_team and card.get("context") != list(CONTEXTS[version]):
-        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(CONTEXTS[version])}")
-    for field, shape in shapes.items():
-        _check_numbers(name, f"lqg.{field}", lqg[field], shape)
-    if in_team and "team" in card:
-        _check_team(card["team"], name, CONTEXTS[version])
-    if min(np.min(lqg[field]) for field in positive) <= 0:
-        raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
-    if version == 4:
-        _check_later(lqg, name)
-    if later and not 0 <= lqg.get(later, 0) <= 1:
-        raise PolicyFileError(f"{name}: card field lqg.{later} must be a share from 0 to 1")
-
-
-def _check_later(lqg: dict[str, Any], name: str) -> None:
-    """Raise PolicyFileError unless what the first files of format 4 do not have is sound, or absent."""
-    if not lqg.get("pair_roll_room", 1.0) > 0:
-        raise PolicyFileError(f"{name}: card field lqg.pair_roll_room must be positive")
-    if lqg.get("rig_axes", 0) not in (0, 1):
-        raise PolicyFileError(f"{name}: card field lqg.rig_axes must be 0 or 1")
-    if not 1 <= len(lqg.get("swing", [0])) <= MAX_SWINGS:
-        raise PolicyFileError(f"{name}: card field lqg.swing must be 1 to {MAX_SWINGS} rows")
-    if not 0 <= lqg.get("swing_keep", 0) < 1:
-        raise PolicyFileError(f"{name}: card field lqg.swing_keep must be a share below 1")
-    if not lqg.get("held_room", 0) >= 0:
-        raise PolicyFileError(f"{name}: card field lqg.held_room must be a factor that is not negative")
-
-
-def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, ...]]:
-    """Shapes of the numbers that the first files of a format do not have, as far as `lqg` has them."""
-    later = LATER_LQG_SHARES.get(version)
-    shapes: dict[str, tuple[int, ...]] = {}
-    if later and later in lqg:
-        shapes[later] = ()
-    swings = lqg.get("swing")
-    counts = {"M": len(lqg["stiffness"]) if version == 4 else 0, "J": len(swings) if isinstance(swings, list) else 0}
-    for group in (LATER_SHAPES, SWING_SHAPES) if version == 4 else ():
-        if lqg.keys() & group.keys():
-            shapes |= {field: tuple(counts.get(size, size) for size in shape) for field, shape in group.items()}
-    return shapes
-
-
-def _check_team(team: Any, name: str, context: tuple[str, ...]) -> None:
-    """Raise PolicyFileError unless `team` says in which team, and as which of its drones, a policy flies."""
-    if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
-        raise PolicyFileError(f"{name}: card field team must hold drone, mount_angle and context")
-    for field, shape in (("drone", ()), ("mount_angle", ()), ("context", (len(context),))):
-        _check_numbers(name, f"team.{field}", team[field], shape)
-    share, _, _, *room = team["context"]
-    if share <= 1 or min(room) <= 0:
-        raise PolicyFileError(f"{name}: card field team.context: command_share must be above 1 and both rooms positive")
-
-
-def _check_numbers(name: str, field: str, value: Any, shape: tuple[int, ...]) -> None:
-    """Raise PolicyFileError unless `value` of a card is numbers of `shape`, none of them a string or out of bounds."""
-    try:
-        array = np.array(value)
-    except ValueError:
-        array = np.array("ragged")
-    if array.shape != shape or array.dtype.kind not in "iuf" or not (np.abs(array) <= MAX_NUMBER).all():
-        raise PolicyFileError(f"{name}: card field {field} must be finite numbers of shape {shape}")
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER
 
 
 def shipped_policies() -> list[Path]:

@@ -25,6 +25,7 @@ from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
+from mjxball.policy.formats.c_multi_model import MULTI_MODEL_LQG
 from mjxball.policy.policy import known_context
 from mjxball.policy.quantize import Rows, rows_of
 
@@ -36,7 +37,7 @@ LQG_TEXTS = {  # helpers, law
     type(None): ("", ""),
     OffsetFreeLqg: (c_texts.COSINE, c_texts.LQG),
     TeamLqg: (c_texts.ROOT + c_texts.WITHIN, c_texts.TEAM_LQG),
-    MultiModelLqg: (c_texts.ROOT + c_texts.WITHIN, c_texts.MULTI_MODEL_LQG),
+    MultiModelLqg: (c_texts.ROOT + c_texts.WITHIN, MULTI_MODEL_LQG),
 }
 
 
