@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -63,6 +64,7 @@ class PipelineState(NamedTuple):
     command: Float[Array, "... 3"]  # the followers' last, roll, pitch [rad], vertical acceleration [m/s2]
     steps: Int[Array, ""]  # control steps since the reset
     rig: Any = ()  # its own `plant.PlantParameters`; () if all worlds have the plant's
+    known: Any = ()  # what the follower makes of the observation, see `FollowerLaw.known`; () if nothing
 
     @property
     def plant(self) -> PlantState:
@@ -85,6 +87,8 @@ class TransportEnv:
     def __init__(self, config: Config, physics: str = "mjx"):
         if physics not in TRAINING_ENGINES:
             raise ValueError(f"physics must be one of {TRAINING_ENGINES}, not {physics!r}")
+        if "brax.envs.base" in sys.modules:  # who has not imported Brax does not ask whether this is an `Env` of its
+            sys.modules["brax.envs.base"].Env.register(type(self))
         self.config = config
         self._backend = physics
         self._disturbances = RandomDisturbances(config)
@@ -95,8 +99,8 @@ class TransportEnv:
         self._law = law = follower_law(config)
         # Calls of their own, which `algorithms.scalar_form` leaves as they are if their arrays are large. A law has no
         # hash, as `jax.jit` wants; `partial` has.
-        jitted = (jax.jit(functools.partial(part)) for part in (law.network_input, law.command, law.next))
-        self._network_input, self._law_command, self._law_next = jitted
+        parts = self._seen, self._answer, law.next if law.size else lambda *_: ()
+        self._law_seen, self._answered, self._remembered = (jax.jit(functools.partial(part)) for part in parts)
         self._cg = make_cg_offset(config)
         self._commanded = np.array(layout.commanded(config.follower.load_axis_only, config.plant.cg_axis))
         self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # of roll and pitch the one that no load turns
@@ -163,20 +167,22 @@ class TransportEnv:
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
         reward = jnp.zeros(self._followers)
-        return State(world, self._input(observation, world), reward, zero, metrics, {"truncation": zero})
+        world, seen = self.seeing(world, observation)
+        return State(world, seen, reward, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Float[Array, "... 3"], physics: ControlStep | None = None) -> State:
         """Apply the network's `action` in [-1, 1] for one control period, with `physics` in place of the engine."""
         world: PipelineState = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
-        command = self._law_command(action, self._observed(state), world.history)
-        return self._step(state, command, action, ~finite | world.loop.diverged, 1.0, physics)
+        command, memory = self._answered(action, self._observed(state), world.history, world.known)
+        return self._step(state, command, memory, action, ~finite | world.loop.diverged, 1.0, physics)
 
     def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
         """`step` of a follower that is no network: `follower_command` is flown as it is."""
-        diverged = state.pipeline_state.loop.diverged
-        return self._step(state, follower_command, jnp.zeros_like(follower_command), diverged, 0.0)
+        world, action = state.pipeline_state, jnp.zeros_like(follower_command)
+        memory = self._remembered(world.history, self._observed(state), action, follower_command, world.known)
+        return self._step(state, follower_command, memory, action, world.loop.diverged, 0.0)
 
     def commands(self, state: State, action: Float[Array, "... 3"]) -> tuple[Float[Array, "drones 3"], Load]:
         """What the physics is given for one control period at the network's `action`; see `step`."""
@@ -196,12 +202,13 @@ class TransportEnv:
         self,
         state: State,
         command: Float[Array, "... 3"],
+        memory: Any,
         action: Float[Array, "... 3"],
         diverged: Bool[Array, ""],
         on_pid: float,
         physics: ControlStep | None = None,
     ) -> State:
-        """The next state at the followers' `command`; `on_pid`: see `ClosedLoop.step`."""
+        """The next state at the followers' `command`, who then have that `memory`; `on_pid`: see `ClosedLoop.step`."""
         world: PipelineState = state.pipeline_state
         observation = self._observed(state)
         load = world.load
@@ -214,7 +221,7 @@ class TransportEnv:
         moved = world._replace(
             loop=loop,
             disturbances=disturbances,
-            history=self._law_next(world.history, observation, action, command) if self._law.size else (),
+            history=memory,
             action=action,
             command=command,
             steps=world.steps + 1,
@@ -226,9 +233,10 @@ class TransportEnv:
         truncated = jnp.logical_and(moved.steps >= self.config.timing.episode_steps, ~terminated) & (not wrapped)
         steady = (loop.plant.time > STEADY_IN_TRAINING_AFTER).astype(jnp.float32)
         difference = commands.follower - commands.leader
+        moved, seen = self.seeing(moved, after)
         return state.replace(
             pipeline_state=moved,
-            obs=self._input(after, moved),
+            obs=seen,
             reward=rewards.reward(self.config.reward, self._transition(world, moved, commands, terminated)),
             done=jnp.logical_or(terminated, truncated).astype(jnp.float32),
             metrics={
@@ -290,12 +298,36 @@ class TransportEnv:
         numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
         return team_context(jax.tree.map(jnp.float32, numbers), plant, mass)
 
-    def _input(self, observation: Float[Array, "... 18"], world: PipelineState) -> Float[Array, "... input"]:
-        """The networks' input: what the follower sees and remembers, and behind it what only critics are given."""
-        shown = self._network_input(observation, world.history) if self._law.size else observation
-        if not self.config.follower.privileged_critic:
-            return shown
-        return jnp.concatenate([shown, self._privileged(world)], axis=-1)
+    def seeing(
+        self, world: PipelineState, observation: Float[Array, "... 18"]
+    ) -> tuple[PipelineState, Float[Array, "... input"]]:
+        """(`world` once its followers have seen `observation`, the networks' input).
+
+        The input: what followers see and remember, and behind it what only critics are given.
+        """
+        shown = observation
+        if self._law.size:
+            shown, known = self._law_seen(observation, world.history)
+            world = world._replace(known=known)
+        if self.config.follower.privileged_critic:
+            shown = jnp.concatenate([shown, self._privileged(world)], axis=-1)
+        return world, shown
+
+    def _seen(self, observation: Float[Array, "... 18"], memory: Float[Array, "... m"]) -> tuple[Array, Any]:
+        """(input of the network, `FollowerLaw.known`)."""
+        law, told = self._law, self._law.told
+        if told:  # nothing is learnt from what never changes: its derivatives need not be carried through an episode
+            memory = jnp.concatenate([memory[..., :-told], jax.lax.stop_gradient(memory[..., -told:])], axis=-1)
+        known = law.known(observation, memory)
+        return law.network_input(observation, memory, known), () if known is None else known
+
+    def _answer(
+        self, action: Float[Array, "... 3"], observation: Float[Array, "... 18"], memory: Any, known: Any
+    ) -> tuple[Float[Array, "... 3"], Any]:
+        """(command, memory of the next step) of the network's `action`."""
+        law = self._law
+        command = law.command(action, observation, memory, known)
+        return command, law.next(memory, observation, action, command, known) if law.size else ()
 
     def _first_privileged(self, rng: Array) -> Float[Array, "... privileged"]:
         return self._privileged(self._fresh_world(rng, 1.0)[0])

@@ -102,7 +102,7 @@ def test_numpy_and_jax_agree_and_models_share_one_weight(share: float) -> None:
         for mine, other in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(other, mine, rtol=2e-4, atol=2e-4)
         memory = ours[0]
-    weights = law._estimate(memory, observation).weights
+    weights = law.known(memory, observation, None).seen.weights
     np.testing.assert_allclose(weights.sum(axis=-1), 1.0)
     assert law.models == len(MODELS)
 
@@ -161,7 +161,7 @@ def test_scores_are_those_of_filters_that_are_told_what_the_network_lifts() -> N
         observation = 0.05 * random.standard_normal(18)
         told = memory.copy()
         told[pitch], told[turned] = memory[pitch] + memory[turned], 0.0
-        seen, known = law._estimate(memory, observation), law._estimate(told, observation)
+        seen, known = (law.known(one, observation, None).seen for one in (memory, told))
         np.testing.assert_allclose(seen.scores, known.scores, atol=1e-9)
         np.testing.assert_allclose(seen.turning[1] + seen.turning[2], known.turning[1], atol=1e-9)
         own = law.command(np.zeros(3), memory, observation, leader)
@@ -225,7 +225,7 @@ def test_about_pitch_a_pair_has_the_filters_of_every_team() -> None:
     memory = own.start(np.zeros(18), np.array([2.0, 0.0, 6.0, 40.0]))
     for _ in range(10):
         observation = 0.1 * random.standard_normal(18)
-        mine, other = (law._estimate(memory, observation) for law in (own, without_own_roll(own)))
+        mine, other = (law.known(memory, observation, None).seen for law in (own, without_own_roll(own)))
         for part, same in ((mine.turning, other.turning), (mine.scores, other.scores)):
             np.testing.assert_array_equal(part[1:], same[1:])
             assert np.abs(part[0] - same[0]).max() > 1e-3
@@ -428,7 +428,7 @@ def test_unlike_loops_are_found_about_the_rigs_axes(axes: float, follower: int) 
         body[[3, 4]], body[[9, 10]] = states[:, 0], states[:, 1]
         seen = ring.seen(body, follower)
         command = law.command(0.05 * random.standard_normal(3) * [1, 1, 0], memory, seen, leader)
-        weights = law._estimate(memory, ring.seen(body, follower) if not axes else body).weights
+        weights = law.known(memory, seen, None).seen.weights
         memory = law.next(memory, seen, command, leader)
         mean = ring.commanded(command, follower)[:2, None] / share
         states = (loops @ np.concatenate([states, mean], axis=1)[..., None])[..., 0]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from mjxball.control import leader
-from mjxball.control.multi_model_lqg import MultiModelLqg
+from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg
 from mjxball.control.observation import ObservationHistory, copy_command, scale_action
 from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
@@ -58,32 +58,49 @@ class FollowerLaw(NamedTuple):
         known = {"context": context} if self.needs_context else {}
         return observation.__array_namespace__().concat([remembered, self.lqg.start(observation, **known)], axis=-1)
 
-    def network_input(self, observation: Array, memory: Array) -> Array:
-        """Input of the network (..., 18 + s)."""
+    @property
+    def told(self) -> int:
+        """How many of the last numbers of the memory never change."""
+        return CONTEXT if isinstance(self.lqg, MultiModelLqg) else 0
+
+    def known(self, observation: Array, memory: Array) -> Any:
+        """What `network_input`, `command` and `next` have in common at `observation`, so that it is found once."""
+        if not isinstance(self.lqg, MultiModelLqg):
+            return None
+        return self.lqg.known(memory[..., self.history.size :], observation, self._leader)
+
+    def network_input(self, observation: Array, memory: Array, known: Any = None) -> Array:
+        """Input of the network (..., 18 + s); here and below `known` may be given."""
         seen = self.history.network_input(observation, memory[..., : self.history.size])
         if self.lqg is None:
             return seen
-        features = self.lqg.features(memory[..., self.history.size :], observation)
+        features = self.lqg.features(memory[..., self.history.size :], observation, *_if_any(known))
         return observation.__array_namespace__().concat([seen, features], axis=-1)
 
-    def command(self, scaled: Array, observation: Array, memory: Array) -> Array:
+    def command(self, scaled: Array, observation: Array, memory: Array, known: Any = None) -> Array:
         """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18)."""
         command = scale_action(scaled, *self.action_scale)
         if self.lqg is not None:
-            command = self.lqg.command(command, memory[..., self.history.size :], observation, self._leader)
+            own = memory[..., self.history.size :]
+            command = self.lqg.command(command, own, observation, self._leader, *_if_any(known))
         elif self.residual:
             command = command + copy_command(observation, *self._leader)
         return leader.clip_command(command, *self.limits)
 
-    def next(self, memory: Array, observation: Array, scaled: Array, command: Array) -> Array:
+    def next(self, memory: Array, observation: Array, scaled: Array, command: Array, known: Any = None) -> Array:
         """Memory for the next step, after `observation` was answered by `scaled`, which made `command`."""
         remembered = self.history.next(memory[..., : self.history.size], observation, scaled)
         if self.lqg is None:
             return remembered
-        estimated = self.lqg.next(memory[..., self.history.size :], observation, command, self._leader)
+        own = memory[..., self.history.size :]
+        estimated = self.lqg.next(own, observation, command, self._leader, *_if_any(known))
         return observation.__array_namespace__().concat([remembered, estimated], axis=-1)
 
     @property
     def _leader(self) -> tuple[Any, ...]:
         """Arguments of `copy_command` after the observation."""
         return self.kp, self.kd, self.gravity, *self.limits
+
+
+def _if_any(known: Any) -> tuple[Any, ...]:
+    return (known,) if known else ()

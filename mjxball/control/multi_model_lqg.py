@@ -99,17 +99,27 @@ class MultiModelLqg(NamedTuple):
         rest = joined([climb, *[zero] * zeros])
         return xp.concat([*turning, rest, known], axis=-1)
 
-    def features(self, memory: Array, observation: Array) -> Array:
+    def known(self, memory: Array, observation: Array, leader: tuple[Any, ...] | None) -> Known:
+        """What a follower with that `memory` (..., m) makes of `observation` (..., 18): common to what follows.
+
+        `leader`: the arguments of `copy_command` after the observation; None: without the law's own command.
+        """
+        context, frame = self._told(memory)
+        observation = _turned(observation, frame)
+        seen = self._estimate(memory, context, observation)
+        load, grown, swings = self._swinging(memory, seen)
+        own = None if leader is None else self._plan(context, observation, seen, load + grown, leader)
+        return Known(context, frame, observation, seen, grown, swings, own)
+
+    def features(self, memory: Array, observation: Array, known: Known | None = None) -> Array:
         """(..., 20), of a law with swings (..., 22), for a network, in the mount frame.
 
         The measured less its estimate (5), of both axes the load, its rate and the rotors' part as tilts [rad] (6), the
         other estimates of the height (2), log frequencies (2), what lifting turns and what rotors hold as tilts (4),
         N / (N - 1), what the load will have grown by as a tilt (2).
         """
+        context, frame, observation, seen, grown, _, _ = known or self.known(memory, observation, None)
         xp = observation.__array_namespace__()
-        context, frame = self._told(memory, observation)
-        observation = _turned(observation, frame)
-        seen = self._estimate(memory, observation)
         turning, soft = seen.turning[..., :2, :, :], self._each(seen.weights, 1.0 / self.stiffness)
         middle = (seen.weights[..., None] * turning[..., :2]).sum(axis=-2)
         inverse = (seen.weights / self._like(self.stiffness, observation))[..., None]
@@ -126,33 +136,29 @@ class MultiModelLqg(NamedTuple):
         parts = [joined([*angles, *rates, left[4]]), *(joined([load[axis] for load in every]) for axis in (0, 1))]
         parts += [seen.rising[..., 1:], speed, joined(lever), context[..., 3:] * soft, context[..., :1]]
         if self.swings:
-            grown = self._swinging(memory, seen)[1]
             parts += [joined(_turned_back([grown[..., 0], grown[..., 1]], frame))]
         return xp.concat(parts, axis=-1)
 
-    def command(self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...]) -> Array:
-        """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it.
-
-        `leader`: the arguments of `copy_command` after the observation.
-        """
-        context, frame = self._told(memory, observation)
-        own = self._plan(memory, _turned(observation, frame), context, leader)[0]
+    def command(
+        self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...], known: Known | None = None
+    ) -> Array:
+        """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it; `leader` as for `known`."""
+        _, frame, _, _, _, _, own = known or self.known(memory, observation, leader)
         if frame is None:
             return own + added
-        roll, pitch = _turned_back([own[..., 0], own[..., 1]], frame)
-        return joined([roll, pitch, own[..., 2]]) + added
+        return joined([*_turned_back([own[..., 0], own[..., 1]], frame), own[..., 2]]) + added
 
-    def next(self, memory: Array, observation: Array, command: Array, leader: tuple[Any, ...]) -> Array:
+    def next(
+        self, memory: Array, observation: Array, command: Array, leader: tuple[Any, ...], known: Known | None = None
+    ) -> Array:
         """Memory of the next step, after `observation` was answered by `command`.
 
         The drones are taken to be commanded what the law itself says and the fast part of what the network adds: of
         its slow part each follower would expect another mean, and the difference would drift unseen. What its network
         lifts more turns a pair about pitch; of more drones others lift too, which a follower does not know.
         """
-        xp, models = observation.__array_namespace__(), self.models
-        context, frame = self._told(memory, observation)
-        observation, command = _turned(observation, frame), _turned(command, frame)
-        own, seen = self._plan(memory, observation, context, leader)
+        context, frame, observation, seen, _, swings, own = known or self.known(memory, observation, leader)
+        xp, command = observation.__array_namespace__(), _turned(command, frame)
         led = copy_command(observation, *leader)
         slow, share = memory[..., -CONTEXT - 2 : -CONTEXT], context[..., :1]
         added = command[..., :2] - own[..., :2]
@@ -166,14 +172,14 @@ class MultiModelLqg(NamedTuple):
         turns = xp.concat([lifted, turned], axis=-1)[..., None] / self._like(self.stiffness, observation)
         drive = xp.concat([mean[..., :2], 0.0 * turned], axis=-1)[..., None] + turns
         axis, height = self._like(self.axis, observation), self._like(self.height, observation)
-        turning = (axis[..., :ANGLE_STATES] * seen.turning[..., None, :]).sum(axis=-1)
+        turning = axis[..., 0] * seen.turning[..., :1]
+        for state in range(1, ANGLE_STATES):
+            turning = turning + axis[..., state] * seen.turning[..., state : state + 1]
         turning = turning + axis[..., ANGLE_STATES] * drive[..., None]
         climbing = xp.concat([seen.rising, mean[..., 2:]], axis=-1) @ height.T
-        flat = [turning[..., k, m, :] for k in range(AXES) for m in range(models)]
-        scores = [seen.scores[..., k, :] for k in (0, 1)]
-        found = self._swinging(memory, seen)[2]
-        swinging = [] if found is None else [swings_advanced(self.swing, found)]
-        return xp.concat([*flat, climbing, *scores, *swinging, slow, memory[..., -CONTEXT:]], axis=-1)
+        parts = [_flat(turning, 3), climbing, _flat(seen.scores, 2)]
+        parts += [] if swings is None else [swings_advanced(self.swing, swings)]
+        return xp.concat([*parts, slow, memory[..., -CONTEXT:]], axis=-1)
 
     def _like(self, numbers: Array, observation: Array) -> Array:
         return observation.__array_namespace__().asarray(numbers, dtype=observation.dtype)
@@ -186,15 +192,14 @@ class MultiModelLqg(NamedTuple):
         lever = context.__array_namespace__().sqrt(roll * roll + pitch * pitch)
         return Frame((pitch + NO_LEVER) / (lever + NO_LEVER), -roll / (lever + NO_LEVER))
 
-    def _told(self, memory: Array, observation: Array) -> tuple[Array, Frame | None]:
+    def _told(self, memory: Array) -> tuple[Array, Frame | None]:
         """(context as seen from the filters' axes, where these are)."""
         context = memory[..., -CONTEXT:]
         frame = self.frame(context)
         if frame is None:
             return context, None
-        context, frame = self._like(context, observation), Frame(*(self._like(part, observation) for part in frame))
         lever = context[..., 2] * frame.cos - context[..., 1] * frame.sin
-        zero = observation.__array_namespace__().zeros_like(lever)
+        zero = memory.__array_namespace__().zeros_like(lever)
         return joined([context[..., 0], zero, lever, context[..., 3]]), frame
 
     def _about_axes(self, numbers: Array, of_pair: Array | None, pair: Array, axes: int = 2) -> Array:
@@ -205,35 +210,35 @@ class MultiModelLqg(NamedTuple):
         every = self._like(numbers, pair)
         if of_pair is None:
             return every[None]
-        xp = pair.__array_namespace__()
-        roll = every + pair[(..., *(None,) * every.ndim)] * (self._like(of_pair, pair) - every)
-        return xp.stack([roll, *[every + xp.zeros_like(roll)] * (axes - 1)], axis=-1 - every.ndim)
+        roll = pair.__array_namespace__().asarray([1.0, 0.0, 0.0][:axes], dtype=pair.dtype)
+        share = (pair[..., None] * roll)[(..., *(None,) * every.ndim)]
+        return every + share * (self._like(of_pair, pair) - every)
 
     def _each(self, weights: Array, numbers: Array) -> Array:
         """Weighted mean (..., 2) of a number (M,) of each model."""
         return (weights * self._like(numbers, weights)).sum(axis=-1)
 
-    def _estimate(self, memory: Array, observation: Array) -> Estimate:
+    def _estimate(self, memory: Array, context: Array, observation: Array) -> Estimate:
         """What is known at `observation`."""
         xp, models = observation.__array_namespace__(), self.models
-        pair = self._like(is_pair(memory[..., -CONTEXT]), observation)
+        pair = is_pair(context[..., 0])
         ends = AXES * models * ANGLE_STATES
-        rows = [memory[..., k * ANGLE_STATES : (k + 1) * ANGLE_STATES] for k in range(AXES * models)]
-        predicted = xp.stack([joined(rows[k * models : (k + 1) * models], axis=-2) for k in range(AXES)], axis=-3)
+        predicted = xp.reshape(memory[..., :ends], (*memory.shape[:-1], AXES, models, ANGLE_STATES))
         rising, found = memory[..., ends : ends + HEIGHT_STATES], measured(observation)
         zero = xp.zeros_like(found[0])
         angle, rate = (joined([found[k], found[k + 1], zero])[..., None] for k in (0, 2))
-        left = joined([angle - predicted[..., 0], rate - predicted[..., 1]])
+        angle, rate = angle - predicted[..., 0], rate - predicted[..., 1]  # (..., 3, M)
         gain = self._about_axes(self.axis_gain, self.pair_roll_gain, pair, AXES)
         certainty = self._about_axes(self.certainty, self.pair_roll_certainty, pair)
         prior = self._about_axes(self.prior, self.pair_roll_prior, pair)
-        turning = predicted + (gain * left[..., None, :]).sum(axis=-1)
-        told = xp.stack([left[..., 0, :, :], left[..., 1, :, :] + left[..., 2, :, :]], axis=-3)
-        first, second = told[..., 0], told[..., 1]
+        turning = predicted + (gain[..., 0] * angle[..., None] + gain[..., 1] * rate[..., None])
+        first, second = (
+            joined([left[..., 0, :], left[..., 1, :] + left[..., 2, :]], axis=-2) for left in (angle, rate)
+        )
         own, mixed, other = certainty[..., 0], certainty[..., 1], certainty[..., 2]
         distance = own * first * first + 2.0 * mixed * first * second + other * second * second
         begin = ends + HEIGHT_STATES
-        scores = joined([memory[..., begin + k * models : begin + (k + 1) * models] for k in (0, 1)], axis=-2)
+        scores = xp.reshape(memory[..., begin : begin + 2 * models], (*memory.shape[:-1], 2, models))
         scores = self.keep[0] * scores + prior - 0.5 * distance
         scores = scores - xp.max(scores, axis=-1, keepdims=True)
         odds = xp.exp(scores)
@@ -245,19 +250,15 @@ class MultiModelLqg(NamedTuple):
         """(load as a tilt (..., 2), what it will have grown by when the rotors act (..., 2), its swings)."""
         load = (seen.weights * seen.turning[..., :2, :, 2] / self._like(self.stiffness, memory)).sum(axis=-1)
         if self.swing is None:
-            return load, 0.0, None
+            return load, 0.0 * load, None
         end = CONTEXT + 2
         before = memory[..., -end - 2 * self.swings * STATES : -end]
         found = swings_seen(self.swing, self.swing_keep, before, load)
         return load, swings_grown(self.swing_ahead, found, seen.weights), found
 
-    def _plan(
-        self, memory: Array, observation: Array, context: Array, leader: tuple[Any, ...]
-    ) -> tuple[Array, Estimate]:
-        """(the law's own command, only its vertical part clipped, what is known), all about the filters' axes."""
-        xp = observation.__array_namespace__()
-        seen = self._estimate(memory, observation)
-        weights, share = seen.weights, context[..., 0]
+    def _plan(self, context: Array, observation: Array, seen: Estimate, load: Array, leader: tuple[Any, ...]) -> Array:
+        """The law's own command (..., 3), only its vertical part clipped, against `load` (..., 2) [rad]."""
+        xp, weights, share = observation.__array_namespace__(), seen.weights, context[..., 0]
         led, error, rate = copy_command(observation, *leader), observation[..., ERROR], observation[..., ERROR_RATE]
         tilt_limit, rise_limit, load_limit = (float(limit) for limit in self.limits)
         k_error, k_velocity = (float(gain) for gain in self.rise)
@@ -269,8 +270,7 @@ class MultiModelLqg(NamedTuple):
         far = gains[..., 0] * _crossed(xp, error) + gains[..., 1] * _crossed(xp, rate)
         angles, rates = observation[..., 3:5], observation[..., 9:11]
         wanted = within(xp, far, tilt_limit) - gains[..., 2] * angles - gains[..., 3] * rates
-        load, grown, _ = self._swinging(memory, seen)
-        load = load + grown + context[..., 1:3] * soft * (vertical - led[..., 2])[..., None]
+        load = load + context[..., 1:3] * soft * (vertical - led[..., 2])[..., None]
         load = within(xp, load, load_limit)
         wanted = wanted - load
         own = share[..., None] * wanted - (share - 1.0)[..., None] * led[..., :2]
@@ -281,7 +281,7 @@ class MultiModelLqg(NamedTuple):
         wider = 1.0 + (float(self.pair_roll_room) - 1.0) * is_pair(share)
         most = most * joined([wider, xp.ones_like(wider)])
         own = rest + most * within(xp, (own - rest) / most, 1.0)
-        return xp.concat([own, vertical[..., None]], axis=-1), seen
+        return xp.concat([own, vertical[..., None]], axis=-1)
 
 
 class Frame(NamedTuple):
@@ -298,6 +298,18 @@ class Estimate(NamedTuple):
     scores: Array  # (..., 2, M) log odds of the models
     weights: Array  # (..., 2, M) that sum to 1
     rising: Array  # (..., 3) of the height
+
+
+class Known(NamedTuple):
+    """What a follower makes of an observation, all about the filters' axes."""
+
+    context: Array  # (..., 4)
+    frame: Frame | None  # where the axes are
+    observation: Array  # (..., 18)
+    seen: Estimate
+    grown: Array  # (..., 2) by when the rotors act, of the load as a tilt [rad]
+    swings: Swinging | None
+    own: Any  # (..., 3) the law's own command, only its vertical part clipped
 
 
 def team_geometry(plant: Plant, mounts: Array, count: Array) -> Array:
@@ -324,6 +336,11 @@ def ring_context(count: Array, leader: Array) -> Array:
     lever = LEVER / ((x * x + y * y) * count * spread)
     room = ROOM * 2.0 * xp.sin(math.pi / count) / (spread * xp.sqrt(x * x + y * y))
     return joined([count / (count - 1.0), -y * lever, x * lever, room])
+
+
+def _flat(array: Array, axes: int) -> Array:
+    """`array` with its last `axes` axes as one."""
+    return array.__array_namespace__().reshape(array, (*array.shape[:-axes], -1))
 
 
 def is_pair(share: Array) -> Array:

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from mjxball.plant.parts import joined
-
 Array = Any
 STATES = 4  # of each swing about an axis: constant, in phase, in quadrature [rad], energy of what is left [rad2]
 SHARPNESS = 3  # weights go with the energies to the power -2^3
@@ -21,7 +19,9 @@ LEAST_ENERGY = 1e-6  # [rad2]
 class Swinging(NamedTuple):
     """What observers know, of J swings about roll and about pitch."""
 
-    states: Array  # (..., 2, J, 3)
+    constant: Array  # (..., 2, J)
+    phase: Array  # (..., 2, J) the swing
+    across: Array  # (..., 2, J) in quadrature
     energy: Array  # (..., 2, J)
     weights: Array  # (..., 2, J) that sum to 1
 
@@ -31,18 +31,18 @@ def swings_seen(swing: Array, keep: Array, memory: Array, load: Array) -> Swingi
 
     `swing` (J, 5): cos, sin of the angle of a step, gains on the constant, in phase, in quadrature.
     """
-    xp, count = memory.__array_namespace__(), len(swing)
+    xp = memory.__array_namespace__()
     gains = xp.asarray(swing[:, 2:], dtype=memory.dtype)
-    parts = [memory[..., k * count : (k + 1) * count] for k in range(2 * STATES)]
-    before = [joined(parts[k::STATES], axis=-2) for k in range(STATES)]
-    left = load[..., None] - before[0] - before[1]
-    states = joined(before[:3]) + gains * left[..., None]
-    energy = float(keep) * before[3] + (1.0 - float(keep)) * left * left
+    before = xp.reshape(memory, (*memory.shape[:-1], 2, STATES, len(swing)))
+    constant, phase, across, energy = (before[..., k, :] for k in range(STATES))
+    left = load[..., None] - constant - phase
+    energy = float(keep) * energy + (1.0 - float(keep)) * left * left
     odds = 1.0 / (energy + LEAST_ENERGY)
     odds = odds / xp.max(odds, axis=-1, keepdims=True)
     for _ in range(SHARPNESS):
         odds = odds * odds
-    return Swinging(states, energy, odds / odds.sum(axis=-1, keepdims=True))
+    constant, phase, across = (state + gains[:, k] * left for k, state in enumerate((constant, phase, across)))
+    return Swinging(constant, phase, across, energy, odds / odds.sum(axis=-1, keepdims=True))
 
 
 def swings_grown(ahead: Array, found: Swinging, models: Array) -> Array:
@@ -54,13 +54,13 @@ def swings_grown(ahead: Array, found: Swinging, models: Array) -> Array:
     xp = models.__array_namespace__()
     ahead = xp.asarray(ahead, dtype=models.dtype)
     along, across = (models @ ahead[..., k] for k in (0, 1))
-    return (found.weights * (along * found.states[..., 1] - across * found.states[..., 2])).sum(axis=-1)
+    return (found.weights * (along * found.phase - across * found.across)).sum(axis=-1)
 
 
 def swings_advanced(swing: Array, found: Swinging) -> Array:
     """The memory (..., 2 J 4) a step later."""
     xp = found.energy.__array_namespace__()
     cos, sin = (xp.asarray(swing[:, k], dtype=found.energy.dtype) for k in (0, 1))
-    constant, phase, across = (found.states[..., k] for k in range(3))
-    every = constant, cos * phase - sin * across, sin * phase + cos * across, found.energy
-    return xp.concat([part[..., axis, :] for axis in (0, 1) for part in every], axis=-1)
+    turned = cos * found.phase - sin * found.across, sin * found.phase + cos * found.across
+    every = xp.stack([found.constant, *turned, found.energy], axis=-2)
+    return xp.reshape(every, (*every.shape[:-3], -1))

@@ -157,11 +157,12 @@ class Policy:
             if alone is not None:
                 return alone
         self._memory, self._ahead = self.memory, False
-        full = law.network_input(observation, self._memory) if remembers else observation
+        known = law.known(observation, self._memory) if remembers else None
+        full = law.network_input(observation, self._memory, known) if remembers else observation
         action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
-        command = law.command(action, observation, self._memory)
+        command = law.command(action, observation, self._memory, known)
         if remembers:
-            self._memory = law.next(self._memory, observation, action, command)
+            self._memory = law.next(self._memory, observation, action, command, known)
         return action, command
 
     def _answer_alone(self, observation: Array, lqg: MultiModelLqg) -> tuple[Array, Array] | None:
@@ -203,10 +204,11 @@ class NetworkLaw:
         weights, biases, mean, scale = self._parts
         mean, scale = (xp.asarray(part, dtype=observation.dtype) for part in (mean, scale))
         weights, biases = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
-        seen = self._law.network_input(observation, memory)
+        known = self._law.known(observation, memory)
+        seen = self._law.network_input(observation, memory, known)
         scaled = mean_action(weights, biases, mean, scale, seen)
-        command = self._law.command(scaled, observation, memory)
-        return scaled, command, self._law.next(memory, observation, scaled, command)
+        command = self._law.command(scaled, observation, memory, known)
+        return scaled, command, self._law.next(memory, observation, scaled, command, known)
 
 
 def _known(name: str, law: FollowerLaw, context: Array | None) -> Array | None:

@@ -192,6 +192,13 @@ class Namespace:
         return value.binary("Min", value.binary("Max", value, low), high)
 
     @staticmethod
+    def reshape(value: TracedArray, shape: tuple[Any, ...]) -> TracedArray:
+        """The flights stay the first axis; one of the others may be -1."""
+        sizes = np.zeros(value.sizes).reshape(shape[1:]).shape
+        name = value.graph.add("Reshape", value, np.array([0, *sizes], np.int64))
+        return TracedArray(value.graph, name, *sizes)
+
+    @staticmethod
     def concat(values: Sequence[TracedArray], axis: int) -> TracedArray:
         """Join along the last axis; empty parts are left out."""
         parts = [value for value in values if value.sizes[-1]] or list(values[:1])
