@@ -186,7 +186,7 @@ NARROW = ["--gradient.policy_layers", "8"]
 
 @pytest.mark.slow
 def test_a_run_by_gradient_writes_a_policy_and_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_verdict: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_verdict: None, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.chdir(tmp_path)
     flags = ["--gradient.gradient_steps", "2", "--gradient.num_envs", "4", "--gradient.horizon", "20"]
@@ -205,6 +205,15 @@ def test_a_run_by_gradient_writes_a_policy_and_resumes(
     np.testing.assert_allclose(after.observation_mean, before.observation_mean, atol=1e-6)
     np.testing.assert_allclose(after.observation_scale, before.observation_scale, rtol=1e-3)
     assert after.card["start_from"]["policy"] == "run/policy.npz"
+    assert main([*flags, "--start-from", "run", "--seed", "5", "--out", "each"]) == 0
+    for seed in (0, 1):
+        paths = f"run/members/seed{seed}.npz", f"each/members/seed{5 + seed}.npz"
+        before, after = (load_file(Path(path)) for path in paths)
+        for one, other in zip(layers_of(before, seen), layers_of(after, seen), strict=True):
+            np.testing.assert_allclose(other, one, atol=1e-6)
+        assert after.card["start_from"]["policy"] == f"run/members/seed{seed}.npz"
+    assert main([*flags, "--num-seeds", "3", "--start-from", "run", "--out", "other"]) == 2
+    assert "say --num-seeds 2" in capsys.readouterr().err
 
 
 def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:

@@ -38,6 +38,7 @@ from mjxball.train.run_directory import (
     commit,
     differences,
     file_hash,
+    members_of,
     read_sweep,
     source_hash,
     start_policy,
@@ -65,7 +66,12 @@ def parser() -> cli.Parser:
     result.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
     result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
-    result.add_argument("--start-from", type=Path, metavar="POLICY", help="begin with the weights of a policy file")
+    result.add_argument(
+        "--start-from",
+        type=Path,
+        metavar="POLICY",
+        help="begin with the weights of a policy file, or each member with those of a run's",
+    )
     result.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
     result.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state), your own")
     result.add_argument(
@@ -214,26 +220,37 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
         "versions": versions(),
     }
     if options.start_from is not None:
-        origin["start_from"] = _start_from(options, settings)
+        origin["start_from"] = _start_from(options, settings, members)
     if extensions:
         origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
     return settings, origin, out
 
 
-def _start_from(options: argparse.Namespace, settings: config.Config) -> dict[str, str]:
-    """Which policy file the run starts from, for `run_directory.start_policy`, which it passes."""
+def _start_from(options: argparse.Namespace, settings: config.Config, members: int) -> Any:
+    """Which policy file the run, or each of `members`, starts from, for `run_directory.start_policy`, which it passes."""
     if (options.algorithm or "sac") != "gradient" or options.env:
         raise InputError(
             "--start-from needs --algorithm gradient and no --env: the others begin with more than a policy"
         )
+    if not options.start_from.is_dir():
+        return _start(options.start_from, settings)
+    files = members_of(options.start_from)
+    if len(files) != members:
+        raise InputError(
+            f"{options.start_from} has {len(files)} members and the run {members}; say --num-seeds {len(files)}"
+        )
+    return [_start(path, settings) for path in files]
+
+
+def _start(path: Path, settings: config.Config) -> dict[str, str]:
     try:
-        start = {"policy": str(options.start_from), "sha256": file_hash(options.start_from)}
+        start = {"policy": str(path), "sha256": file_hash(path)}
     except OSError as error:
-        raise InputError(f"{options.start_from}: {error.strerror}") from None
+        raise InputError(f"{path}: {error.strerror}") from None
     sizes = [len(bias) for bias in start_policy(start, settings).biases[:-1]]
     if sizes != list(settings.gradient.policy_layers):
         layers = ",".join(map(str, sizes))
-        raise InputError(f"{options.start_from} has hidden layers {layers}; say --gradient.policy_layers {layers}")
+        raise InputError(f"{path} has hidden layers {layers}; say --gradient.policy_layers {layers}")
     return start
 
 

@@ -162,11 +162,14 @@ class Population:
         """`create(seed)` with a compiled program."""
         return executables.create(*self._starts(seed))
 
-    def start_from(self, state: TrainState, policy: PolicyFile) -> TrainState:
-        """`state` with the network of `policy` in every member; see `FirstOrderGradient.start_from`."""
+    def start_from(self, state: TrainState, policies: Sequence[PolicyFile]) -> TrainState:
+        """`state` with the network of one of `policies` in every member; see `FirstOrderGradient.start_from`."""
         algorithm: Any = self.program.algorithm  # of its kind
         known = processes.gather(state.algorithm)
-        begun = [algorithm.start_from(self.member(known, number), policy) for number in range(self.members)]
+        begun = [
+            algorithm.start_from(self.member(known, number), policies[number % len(policies)])
+            for number in range(self.members)
+        ]
         known = begun[0] if self._single else jax.tree.map(lambda *leaves: np.stack(leaves), *begun)
         return state._replace(algorithm=self.place(known, self._whole))
 

@@ -29,7 +29,7 @@ from mjxball.train.extensions import Extensions, is_pair, resolve
 from mjxball.train.population import Population
 from mjxball.train.program import Mode, Statistics, TrainState
 from mjxball.train.progress import Progress, Row, columns
-from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, write_config
+from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
 
 CHUNKS = 50  # rows of metrics.csv in a run, at most
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
@@ -79,11 +79,11 @@ class Run:
         """`resumed` is None for a run that starts.
 
         `origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name. A run that
-        starts takes the network of the policy `origin["start_from"]`, if that is there.
+        starts takes the network of the policy `origin["start_from"]`, if that is there; each member its own of a list.
         """
         self.config, self.out = config, out
-        start = origin.get("start_from") if resumed is None else None
-        self._policy = start_policy(start, config) if start else None
+        self._starts = starts_of(origin)
+        self._policies = [start_policy(start, config) for start in self._starts] if resumed is None else []
         extensions = resolve(Extensions(**(origin.get("extensions") or {})))
         self.population = Population(config, origin["physics"], origin["seeds"], origin["sweep"], extensions=extensions)
         self._schedule = self.population.program.schedule
@@ -159,8 +159,8 @@ class Run:
         self._compiled = self.population.compile(creating)
         if creating:
             self.state = self.population.start(self._compiled, self.origin["seed"])
-            if self._policy:
-                self.state = self.population.start_from(self.state, self._policy)
+            if self._policies:
+                self.state = self.population.start_from(self.state, self._policies)
             self._export()
         else:
             self.state = self.population.place_state(self.state)
@@ -282,6 +282,8 @@ class Run:
             learnt = self.population.policy(state, member)
             seed = self.origin["seed"] + member
             origin = {**self.origin, "seed": seed, **training_summary(self.out, seed)}
+            if self._starts:
+                origin["start_from"] = self._starts[member % len(self._starts)]
             config = self.population.member_config(member)
             if not is_pair(self.population.program.env):  # no policy file: its observation is another
                 exported |= network_file(self._network_path(member), learnt, steps, origin)

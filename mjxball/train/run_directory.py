@@ -92,6 +92,20 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     return contents
 
 
+def starts_of(origin: Mapping[str, Any]) -> list[dict[str, str]]:
+    """What a run with that `origin` starts from, each for `start_policy`: one file for all members or one for each."""
+    start = origin.get("start_from") or []
+    return start if isinstance(start, list) else [start]
+
+
+def members_of(run: Path) -> list[Path]:
+    """The policies of all members of a population, by their seeds; InputError if there are none."""
+    found = [(int(path.stem[4:]), path) for path in (run / "members").glob("seed*.npz") if path.stem[4:].isdigit()]
+    if not found:
+        raise InputError(f"{run} holds no policies of a population (members/seed*.npz)")
+    return [path for _, path in sorted(found)]
+
+
 def file_hash(path: Path) -> str:
     """SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
