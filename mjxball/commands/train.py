@@ -227,7 +227,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
 
 
 def _start_from(options: argparse.Namespace, settings: config.Config, members: int) -> Any:
-    """Which policy file the run, or each of `members`, starts from, for `run_directory.start_policy`, which it passes."""
+    """Which policy file the run, or each of `members`, starts from, see `run_directory.start_policy`."""
     if (options.algorithm or "sac") != "gradient" or options.env:
         raise InputError(
             "--start-from needs --algorithm gradient and no --env: the others begin with more than a policy"
