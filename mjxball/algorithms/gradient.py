@@ -40,9 +40,7 @@ class FirstOrderGradient:
     `collect` flies a window and differentiates its mean reward with respect to the policy's weights; `update` takes
     the step. Windows follow one another in an episode of `gradient.windows_per_episode`; the environments begin theirs
     in turn, so that every window has flights towards the goal and flights at it. `gradient.gradient_decay` multiplies
-    the gradient that passes from one control step to the one before. With `gradient.gradient_decay_at_start` what is
-    lost there, 1 less the factor, changes by the same factor from window to window: rewards that come late are noise to
-    a policy that flies badly.
+    the gradient that passes from one control step to the one before.
     """
 
     metrics = ("loss", "gradient_norm")
@@ -122,18 +120,9 @@ class FirstOrderGradient:
         known = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), known, state)
         return known, envs
 
-    def _decay(self, windows: Array) -> Any:
-        """What multiplies the gradient from one control step to the one before, after so many `windows`."""
-        start: Any = self._config.gradient_decay_at_start
-        end: Any = self._config.gradient_decay
-        if isinstance(start, float) and start == 0:
-            return end
-        share = jnp.clip((windows - 1) / self._config.gradient_steps, 0.0, 1.0)  # of the first one nothing is learnt
-        return 1.0 - (1.0 - start) ** (1.0 - share) * (1.0 - end) ** share
-
     def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
         policy = self.policy(state._replace(layers=layers))
-        decay = self._decay(state.windows)
+        decay: Any = self._config.gradient_decay
         plain = isinstance(decay, float) and decay == 1  # not where a sweep traces it
 
         def step(carry: tuple[Any, Array], _: None) -> tuple[Any, tuple[Array, Array]]:

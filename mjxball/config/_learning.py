@@ -92,9 +92,6 @@ class Gradient:
     gradient_decay: float = setting(
         1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1
     )
-    gradient_decay_at_start: float = setting(
-        0.0, "that factor at the start, from which it nears gradient_decay; 0: the same throughout", low=0, high=0.9999
-    )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
     until_termination: bool = setting(
         False,
