@@ -4,8 +4,8 @@
     python benchmarks/rigs_own.py policies/universal.npz --sizes 2 3 4 --rigs 100 --worlds 24 --steps 500     # a GPU's
 
 The first held-out rigs of each size. Every rig has weights of its own, which begin as the policy's and take steps of
-Adam by first-order gradients (`algorithms.gradient`) on flights of that rig alone; all rigs of a size are one program.
-They are judged as in `benchmarks/rigs.py`, on flights that training does not fly.
+Adam by first-order gradients (`algorithms.gradient`) on flights of that rig alone, paid as the policy's card says; all
+rigs of a size are one program. They are judged as in `benchmarks/rigs.py`, on flights that training does not fly.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import rigs as judge
 from mjxball import cli
 from mjxball.algorithms.base import Phase
 from mjxball.algorithms.gradient import FirstOrderGradient
-from mjxball.config import Config, preset, replace
+from mjxball.config import Config, from_dict, preset, replace
 from mjxball.env import TransportEnv
 from mjxball.evaluate.rigs import AnyRigLaw, fly
 from mjxball.policy import Policy, PolicyFile, load_file
@@ -66,16 +66,19 @@ class OwnWeights(AnyRigLaw):
 
 def train(config: Config, rigs: RigTable, policy: PolicyFile, options: Any) -> list[PolicyFile]:
     """`policy` after `options.steps` gradients on flights of each of `rigs`, which are of one size."""
-    size = int(rigs.size[0])
+    size, trained = int(rigs.size[0]), from_dict(policy.card["config"])
     learning = dataclasses.replace(
         config.gradient,
+        gradient_decay=trained.gradient.gradient_decay,
         num_envs=options.worlds * (size - 1),
         gradient_steps=options.steps,
         learning_rate=options.rate,
         policy_layers=tuple(len(bias) for bias in policy.biases[:-1]),
     )
     one_rig = dataclasses.replace(config.rigs, number=1)
-    own = dataclasses.replace(rig_config(config, rigs, 0), attitude=config.attitude, rigs=one_rig, gradient=learning)
+    own = dataclasses.replace(
+        rig_config(config, rigs, 0), attitude=config.attitude, rigs=one_rig, reward=trained.reward, gradient=learning
+    )
     tables = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), rigs)
 
     def parts(rig: RigTable) -> tuple[Environments, FirstOrderGradient]:

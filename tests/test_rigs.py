@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -132,6 +133,28 @@ def test_a_padded_rig_flies_as_it_does_alone() -> None:
         flown.append(state)
     np.testing.assert_allclose(flown[0].obs[:2], flown[1].obs, atol=2e-4)
     assert float(jnp.abs(flown[1].obs[:, 6:9]).max()) > 0.05  # it moves
+
+
+@pytest.mark.slow
+def test_training_differentiates_what_followers_remember() -> None:
+    """The slope of what is commanded later in the first action, of which the filters know: against a difference."""
+    rigs, scenario = (
+        dataclasses.replace(UNIVERSAL.rigs, number=2),
+        replace(UNIVERSAL, "scenario.delay", (0.0, 0.0)).scenario,
+    )
+    config = dataclasses.replace(UNIVERSAL, scenario=dataclasses.replace(scenario, team_sizes=(2,)), rigs=rigs)
+    env = TransportEnv(config, "newton-euler")
+    start, first = env.reset(jax.random.key(1)), jnp.zeros((20, 3, 3)).at[0].set(jnp.array([0.3, -0.5, 0.2]))
+
+    def cost(push: Any) -> Any:
+        states = lambda state, action: (env.step(state, action), state.pipeline_state.command)  # noqa: E731
+        _, commands = jax.lax.scan(states, start, push * first)
+        return (commands[2:, 0] * jnp.array([1.0, 1.0, 0.1])).sum()
+
+    slope, cost = jax.jit(jax.grad(cost)), jax.jit(cost)
+    difference = (cost(0.02) - cost(-0.02)) / 0.04
+    assert abs(difference) > 0.1
+    np.testing.assert_allclose(slope(0.0), difference, rtol=0.02)
 
 
 def test_thrust_falls_as_the_battery_empties() -> None:
