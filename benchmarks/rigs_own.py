@@ -26,7 +26,7 @@ import rigs as judge
 from mjxball import cli
 from mjxball.algorithms.base import Phase
 from mjxball.algorithms.gradient import FirstOrderGradient
-from mjxball.config import Config, from_dict, preset, replace
+from mjxball.config import Config, from_record, preset, replace
 from mjxball.env import TransportEnv
 from mjxball.evaluate.rigs import AnyRigLaw, fly
 from mjxball.policy import Policy, PolicyFile, load_file
@@ -66,7 +66,7 @@ class OwnWeights(AnyRigLaw):
 
 def train(config: Config, rigs: RigTable, policy: PolicyFile, options: Any) -> list[PolicyFile]:
     """`policy` after `options.steps` gradients on flights of each of `rigs`, which are of one size."""
-    size, trained = int(rigs.size[0]), from_dict(policy.card["config"])
+    size, trained = int(rigs.size[0]), from_record(policy.card["config"])
     learning = dataclasses.replace(
         config.gradient,
         gradient_decay=trained.gradient.gradient_decay,
