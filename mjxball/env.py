@@ -87,7 +87,7 @@ class TransportEnv:
     def __init__(self, config: Config, physics: str = "mjx"):
         if physics not in TRAINING_ENGINES:
             raise ValueError(f"physics must be one of {TRAINING_ENGINES}, not {physics!r}")
-        if "brax.envs.base" in sys.modules:  # who has not imported Brax does not ask whether this is an `Env` of its
+        if "brax.envs.base" in sys.modules:  # Brax's trainers ask whether it is an `Env` of Brax's
             sys.modules["brax.envs.base"].Env.register(type(self))
         self.config = config
         self._backend = physics

@@ -249,6 +249,11 @@ class TestBraxWrappers:
         np.testing.assert_array_equal(steps.info["truncation"][self.EPISODE - 1], 1.0)
 
 
+def test_brax_takes_it_for_its_own(transport):
+    base = import_brax_env()[0]
+    assert isinstance(TransportEnv(transport, "newton-euler"), base)
+
+
 @pytest.mark.release
 class TestStockBrax:
     """Brax's own trainers run on the environment, given the function that JAX has removed."""

@@ -138,11 +138,9 @@ def test_a_padded_rig_flies_as_it_does_alone() -> None:
 @pytest.mark.slow
 def test_training_differentiates_what_followers_remember() -> None:
     """The slope of what is commanded later in the first action, of which the filters know: against a difference."""
-    rigs, scenario = (
-        dataclasses.replace(UNIVERSAL.rigs, number=2),
-        replace(UNIVERSAL, "scenario.delay", (0.0, 0.0)).scenario,
-    )
-    config = dataclasses.replace(UNIVERSAL, scenario=dataclasses.replace(scenario, team_sizes=(2,)), rigs=rigs)
+    config = UNIVERSAL
+    for setting, value in (("rigs.number", 2), ("scenario.team_sizes", (2,)), ("scenario.delay", (0.0, 0.0))):
+        config = replace(config, setting, value)
     env = TransportEnv(config, "newton-euler")
     start, first = env.reset(jax.random.key(1)), jnp.zeros((20, 3, 3)).at[0].set(jnp.array([0.3, -0.5, 0.2]))
 
@@ -154,7 +152,7 @@ def test_training_differentiates_what_followers_remember() -> None:
     slope, cost = jax.jit(jax.grad(cost)), jax.jit(cost)
     difference = (cost(0.02) - cost(-0.02)) / 0.04
     assert abs(difference) > 0.1
-    np.testing.assert_allclose(slope(0.0), difference, rtol=0.02)
+    np.testing.assert_allclose(slope(0.0), difference, rtol=2e-3)  # float32 and the curvature leave 2e-4
 
 
 def test_thrust_falls_as_the_battery_empties() -> None:

@@ -210,7 +210,10 @@ def test_a_copy_goes_on_by_itself(duplicate: Any) -> None:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e7])
 def test_what_is_not_finite_or_huge_is_left_to_the_law_of_arrays(value: float, dtype: type) -> None:
-    """After huge numbers both round what is left of them, in float32 to some 1e-4 of a command; of 1e30 to nothing."""
+    """After huge numbers both round what is left of them, in float32 to some 1e-4 of a command.
+
+    Of 1e30 float32 leaves numbers of 1e5, of which the last digit is a hundredth of a command: only limits are kept.
+    """
     for slot, first in itertools.product(range(18), (0, 3)):
         (policy, reference), flight = told("team4", dtype), walk(6).astype(dtype)
         flight[first, slot] = value
