@@ -62,6 +62,9 @@ class MultiModelLqg(NamedTuple):
     swing_ahead: Array | None = None  # (M, J, 2)
     swing_keep: Array | float = 0.0  # () share that a step leaves of the energies
     held_room: Array | float = 0.0  # () what rotors of more than two hold as a tilt, at least, over what is held now
+    # Of two, three, ... drones, and of more the last: factors on the feedback of error and of velocity, on tilts that
+    # are added and on the lift that is; None: 1.
+    by_size: Array | None = None  # (S, 4)
 
     @property
     def models(self) -> int:
@@ -143,7 +146,10 @@ class MultiModelLqg(NamedTuple):
         self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...], known: Known | None = None
     ) -> Array:
         """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it; `leader` as for `known`."""
-        _, frame, _, _, _, _, own = known or self.known(memory, observation, leader)
+        context, frame, _, _, _, _, own = known or self.known(memory, observation, leader)
+        if self.by_size is not None:
+            factors = self.of_size(context[..., 0])
+            added = added * joined([factors[..., 2], factors[..., 2], factors[..., 3]])
         if frame is None:
             return own + added
         return joined([*_turned_back([own[..., 0], own[..., 1]], frame), own[..., 2]]) + added
@@ -183,6 +189,14 @@ class MultiModelLqg(NamedTuple):
 
     def _like(self, numbers: Array, observation: Array) -> Array:
         return observation.__array_namespace__().asarray(numbers, dtype=observation.dtype)
+
+    def of_size(self, share: Array) -> Array:
+        """Row (..., 4) of `by_size` for a team with N / (N - 1) = `share` (...), between two rows a mean of both."""
+        xp = share.__array_namespace__()
+        factors = self._like(self.by_size, share)
+        rows = xp.arange(len(factors), dtype=share.dtype)
+        above = clipped(share / (share - 1.0) - 2.0, 0.0, len(factors) - 1.0)[..., None] - rows
+        return clipped(1.0 - xp.maximum(above, -above), 0.0, 1.0) @ factors
 
     def frame(self, context: Array) -> Frame | None:
         """Where the filters' axes are for a follower with `context` (..., 4); None: as those of its mount frame."""
@@ -266,6 +280,9 @@ class MultiModelLqg(NamedTuple):
         rise = rise - seen.rising[..., 2]
         vertical = clipped(share * rise - (share - 1.0) * led[..., 2], -leader[-1], leader[-1])
         gains = weights @ self._like(self.tilt, observation)
+        if self.by_size is not None:
+            factors = self.of_size(share)
+            gains = xp.concat([gains[..., :2] * factors[..., None, :2], gains[..., 2:]], axis=-1)
         soft, damping = self._each(weights, 1.0 / self.stiffness), self._each(weights, self.damping)
         far = gains[..., 0] * _crossed(xp, error) + gains[..., 1] * _crossed(xp, rate)
         angles, rates = observation[..., 3:5], observation[..., 9:11]

@@ -15,6 +15,7 @@ GEOMETRY = ("command_share", "roll_acceleration_per_lift", "pitch_acceleration_p
 CONTEXTS = {3: CONTEXT, 4: GEOMETRY}  # by format
 MAX_MODELS = 16
 MAX_SWINGS = 32  # frequencies at which a load may swing
+MAX_SIZES = 16  # of a team, from two drones on, that have factors of their own
 MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
 
 LQG_SHAPES: dict[str, tuple[int, ...]] = {
@@ -50,7 +51,7 @@ MULTI_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # behind an axis of models
     "stiffness": (),
     "damping": (),
 }
-# Absent, all of a group, from earlier files; "M" for the models, "J" for the swings.
+# Absent, all of a group, from earlier files; "M" for the models, "J" for the swings, "S" for sizes of a team.
 LATER_SHAPES: dict[str, tuple[Any, ...]] = {
     "pair_roll_gain": ("M", 5, 2),
     "pair_roll_certainty": ("M", 3),
@@ -64,6 +65,7 @@ SWING_SHAPES: dict[str, tuple[Any, ...]] = {
     "swing_keep": (),
     "held_room": (),
 }
+SIZE_SHAPES: dict[str, tuple[Any, ...]] = {"by_size": ("S", 4)}
 MULTI_MODEL_COMMON: dict[str, tuple[int, ...]] = {
     "height": (3, 4),
     "height_gain": (3,),
@@ -120,6 +122,8 @@ def _check_later(lqg: dict[str, Any], name: str) -> None:
         raise PolicyFileError(f"{name}: card field lqg.swing must be 1 to {MAX_SWINGS} rows")
     if not 0 <= lqg.get("swing_keep", 0) < 1:
         raise PolicyFileError(f"{name}: card field lqg.swing_keep must be a share below 1")
+    if not 1 <= len(lqg.get("by_size", [0])) <= MAX_SIZES or np.min(lqg.get("by_size", 1.0)) <= 0:
+        raise PolicyFileError(f"{name}: card field lqg.by_size must be 1 to {MAX_SIZES} rows of positive factors")
     if not lqg.get("held_room", 0) >= 0:
         raise PolicyFileError(f"{name}: card field lqg.held_room must be a factor that is not negative")
 
@@ -130,9 +134,11 @@ def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, 
     shapes: dict[str, tuple[int, ...]] = {}
     if later and later in lqg:
         shapes[later] = ()
-    swings = lqg.get("swing")
-    counts = {"M": len(lqg["stiffness"]) if version == 4 else 0, "J": len(swings) if isinstance(swings, list) else 0}
-    for group in (LATER_SHAPES, SWING_SHAPES) if version == 4 else ():
+    counts = {
+        letter: len(lqg[field]) if isinstance(lqg.get(field), list) else 0
+        for letter, field in (("M", "stiffness"), ("J", "swing"), ("S", "by_size"))
+    }
+    for group in (LATER_SHAPES, SWING_SHAPES, SIZE_SHAPES) if version == 4 else ():
         if lqg.keys() & group.keys():
             shapes |= {field: tuple(counts.get(size, size) for size in shape) for field, shape in group.items()}
     return shapes

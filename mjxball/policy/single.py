@@ -41,7 +41,7 @@ class SingleFollower:
         self._height, self._height_gain = lqg.height.tolist(), lqg.height_gain.tolist()
         self._rise, self._limits, self._keep = lqg.rise.tolist(), lqg.limits.tolist(), float(lqg.keep[1])
         self._added_lift, self._pair_roll_room = float(lqg.added_lift), float(lqg.pair_roll_room)
-        self._frame_of = lqg.frame
+        self._frame_of, self._of_size = lqg.frame, None if lqg.by_size is None else lqg.of_size
         self._reach, self._clip = law.action_scale, law.limits
         self._leader = law.gravity, *law.kp, *law.kd
 
@@ -75,6 +75,9 @@ class SingleFollower:
         self._inside = tuple(self._context) if frame is None else (share, 0.0, lever, room)
         self._network.tell(*self._frame)
         self._told = self._added_lift * pair * lever
+        factors = [1.0] * 4 if self._of_size is None else self._of_size(np.array(share)).tolist()
+        self._firmness = factors[:2]
+        self._added = [factor * reach for factor, reach in zip(factors[2:], self._reach, strict=True)]
         self._wider, self._held = 1.0 + (self._pair_roll_room - 1.0) * pair, self._held_room * (1.0 - pair)
         filters.tell(pair)
 
@@ -120,7 +123,9 @@ class SingleFollower:
         rise = _clipped(self._rise[0] * z + self._rise[1] * vz, rise_limit) - lift_error
         vertical = _clipped(share * rise - (share - 1.0) * led_vertical, vertical_limit)
         lifted = vertical - led_vertical
-        roll_far, pitch_far = -r_error * y - r_velocity * vy, p_error * x + p_velocity * vx
+        by_far, by_fast = self._firmness
+        roll_far = -by_far * r_error * y - by_fast * r_velocity * vy
+        pitch_far = by_far * p_error * x + by_fast * p_velocity * vx
         far = _within(roll_far, pitch_far, error_limit)
         roll_held = roll_load[0] + roll_grown + roll_turn * lifted
         pitch_held = pitch_load[0] + pitch_grown + pitch_turn * lifted
@@ -135,7 +140,7 @@ class SingleFollower:
         pitch_own = share * pitch_wanted - (share - 1.0) * led_pitch - pitch_rest
         reached = _within(roll_own / roll_most, pitch_own / pitch_most, 1.0)
         roll_own, pitch_own = roll_rest + reached * roll_own, pitch_rest + reached * pitch_own
-        tilt_reach, vertical_reach = self._reach
+        tilt_reach, vertical_reach = self._added
         command = [
             _clipped(cos * roll_own - sin * pitch_own + tilt_reach * action[0], tilt_limit),
             _clipped(sin * roll_own + cos * pitch_own + tilt_reach * action[1], tilt_limit),

@@ -32,7 +32,7 @@ from mjxball.policy.quantize import Rows, rows_of
 FLOAT = 4  # bytes
 # Of `MultiModelLqg`: a pair's numbers about roll, and those of every team that they replace.
 PAIR_ROLL = {"pair_roll_gain": "axis_gain", "pair_roll_certainty": "certainty", "pair_roll_prior": "prior"}
-MACROS = {"pair_roll_room", "rig_axes", "held_room"}  # of `MultiModelLqg`, no arrays in a header
+MACROS = {"pair_roll_room", "rig_axes", "held_room", "by_size"}  # of `MultiModelLqg`, no arrays in a header
 LQG_TEXTS = {  # helpers, law
     type(None): ("", ""),
     OffsetFreeLqg: (c_texts.COSINE, c_texts.LQG),
@@ -68,7 +68,16 @@ def _lqg_numbers(lqg: Any, context: Any) -> dict[str, Any]:
     for name in numbers.keys() & PAIR_ROLL.keys():
         every = numbers[PAIR_ROLL[name]]
         numbers[name] = every + pair * (numbers[name] - every)
+    if isinstance(lqg, MultiModelLqg):
+        numbers["tilt"] = numbers["tilt"] * [*_of_size(lqg, context)[:2], 1.0, 1.0]
     return numbers
+
+
+def _of_size(lqg: Any, context: Any) -> Any:
+    """Factors (4,) of `MultiModelLqg.by_size` for a follower with `context`; ones for other laws."""
+    if not isinstance(lqg, MultiModelLqg) or lqg.by_size is None or context is None:
+        return np.ones(4)
+    return lqg.of_size(np.float64(context[0]))
 
 
 def _rooms_and_axes(lqg: MultiModelLqg, context: Any, numbers: dict[str, Any]) -> list[str]:
@@ -125,7 +134,11 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
     sizes = [len(policy.observation_mean), *map(len, mean_layers(policy)[1])]
     arrays = _float_arrays(policy) if not int8 else []
     tilt, vertical = card["command_limits"]
-    arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
+    *_, tilts, lift = _of_size(law.lqg, context)
+    arrays += [
+        _array("action_scale", policy.action_scale * [tilts, tilts, lift]),
+        _array("limit", [tilt, tilt, vertical]),
+    ]
     numbers = _lqg_numbers(law.lqg, context)
     arrays += [
         _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
