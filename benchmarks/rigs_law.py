@@ -6,6 +6,7 @@
     python benchmarks/rigs_law.py --cases told --sizes 2 4 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases axes --sizes 2 3 --seed 77 --policy policies/universal.npz
     python benchmarks/rigs_law.py --cases swings --sizes 3 --seed 77 --rigs 100 --policy policies/universal.npz
+    python benchmarks/rigs_law.py --cases sizes --sizes 2 3 4 5 6 --seed 77 --policy policies/universal.npz
 
 As `benchmarks/rigs.py`, of rigs of three drones, or of others that neither a training nor a judgement draws (`--seed`).
 The law flies alone, or under the network of `--policy` as it is, which was trained with another; of a law without
@@ -13,7 +14,8 @@ swings it is not shown them, of one that it was not trained with it sees nothing
 frequency of the loops [rad/s] and a lag of the rotors [s], see `mjxball.baselines.multi_model_lqg`. `told`: one
 model, of the rig's own loops and rotors; and the LQGs that know the rig, each against the better of both. `axes`: a
 pair's own filters and room about roll, and all of it about the rig's axes. `swings`: room for what is held, and loads
-that swing held against ahead of time.
+that swing held against ahead of time. `sizes`: factors on the feedback of the error and on what the network adds, and
+those of each size that `universal` has.
 """
 
 from __future__ import annotations
@@ -81,6 +83,7 @@ class Case(NamedTuple):
     rig_axes: bool = False  # whether all this is about the rig's axes, not those of the mount frame
     held_room: bool = False  # whether more than two drones have room for what they hold
     swings: bool = False  # whether loads that swing are held against ahead of time
+    by_size: tuple[tuple[float, ...], ...] = ()  # rows of `MultiModelLqg.by_size`; (): none
     delay: float | None = None  # [s] added to the lag of the rig's own rotors, if its own loop is the only model
 
     def law(self, config: Config) -> MultiModelLqg:
@@ -103,6 +106,7 @@ class Case(NamedTuple):
             common["swing_ahead"] = np.concatenate([law.swing_ahead for law in laws])
         else:
             common |= {"swing": None, "swing_ahead": None, "swing_keep": np.array(0.0)}
+        common["by_size"] = np.array(self.by_size) if self.by_size else None
         common["held_room"] = np.array(laws[0].held_room if self.held_room else 0.0)
         return laws[0]._replace(**numbers, **common)
 
@@ -118,6 +122,8 @@ LIFT_TOLD = Case("12 pairs, lift told", MODELS, TUNING.torque_walk, position=TUN
 RIG_AXES = LIFT_TOLD._replace(name="about the rig's axes", pair_roll=True, rig_axes=True)
 HELD = RIG_AXES._replace(name="room for what is held", held_room=True)
 AS_IT_IS = HELD._replace(name="as it is", swings=True)
+FACTORS = ((1.2, 1.1, 0.7, 0.7), (1.35, 1.17, 0.6, 0.6), (1.35, 1.17, 0.8, 1.0), (1.5, 1.25, 0.8, 1.0))  # `universal`
+FIRMER, ADDED = ((1.0, 1.0), (1.2, 1.1), (1.35, 1.17), (1.5, 1.25)), (1.0, 0.8, 0.6, 0.45)
 OF_MODELS = ("axis", "axis_gain", "certainty", "tilt", "stiffness", "damping")
 CASES = {
     "first": [
@@ -143,6 +149,14 @@ CASES = {
     ],
     "axes": [LIFT_TOLD, LIFT_TOLD._replace(name="a pair's own roll", pair_roll=True), RIG_AXES],
     "swings": [RIG_AXES, HELD, AS_IT_IS],
+    "sizes": [
+        *(
+            AS_IT_IS._replace(name=f"firmer {firm[0]}, added {part}", by_size=((*firm, part, part),))
+            for part in ADDED
+            for firm in FIRMER
+        ),
+        AS_IT_IS._replace(name="by size", by_size=FACTORS),
+    ],
     "told": [
         *(Case("9 pairs", torque_walk=walk, position=position) for walk, position in ((300.0, 0.2), (1000.0, 0.17))),
         *(Case("the rig's own loop", delay=delay) for delay in (0.0, 0.025)),

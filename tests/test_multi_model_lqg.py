@@ -28,7 +28,7 @@ from mjxball.control.multi_model_lqg import (
     MultiModelLqg,
     team_geometry,
 )
-from mjxball.control.observation import mount_frames
+from mjxball.control.observation import copy_command, mount_frames
 from mjxball.plant.teams import ring_config
 from mjxball.policy.container import PolicyFileError
 from mjxball.policy.file import law_of, load_file, save_file, shipped_policy
@@ -256,6 +256,54 @@ def test_more_than_two_drones_have_room_for_what_they_hold(share: float, reached
     np.testing.assert_allclose(command[:2], [0.0, -0.3 * share * reached], atol=1e-6)
     less = law._replace(held_room=0.0).command(np.zeros(3), states, level, leader)
     np.testing.assert_allclose(less[:2], [0.0, -LEAST_ROOM], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("drones", "factors"),
+    [(2, [2.0, 3.0, 0.5, 0.25]), (3, [1.5, 2.0, 0.75, 0.5]), (4, [1.0, 1.0, 1.0, 0.75]), (9, [1.0, 1.0, 1.0, 0.75])],
+)
+def test_factors_are_those_of_the_size(drones: int, factors: list[float]) -> None:
+    """On the feedback of error and velocity, near the goal and level, and on what is added."""
+    table = np.array([[2.0, 3.0, 0.5, 0.25], [1.5, 2.0, 0.75, 0.5], [1.0, 1.0, 1.0, 0.75]])
+    law, leader = multi_model_lqg(UNIVERSAL), copy_gains(UNIVERSAL)
+    own = law._replace(by_size=table)
+    context = np.array([drones / (drones - 1), 0.0, 0.0, 40.0])
+    np.testing.assert_allclose(own.of_size(context[0]), factors, rtol=1e-12)
+
+    def pushed(law: MultiModelLqg, slot: int, added: np.ndarray) -> np.ndarray:
+        """What being off by 1 mm or 1 mm/s changes, and what is added to it."""
+        level, off = np.zeros(18), 1e-3 * np.eye(18)[slot]
+        memory = law.start(level, context)
+        off_goal, at_goal = (law.command(added, memory, seen, leader) for seen in (off, level))
+        led = copy_command(off, *leader)
+        return off_goal - at_goal + led / (drones - 1)
+
+    for slot, factor in ((12, factors[0]), (15, factors[1])):
+        plain, found = (pushed(one, slot, np.zeros(3))[1] for one in (law, own))
+        assert plain > 1e-4
+        np.testing.assert_allclose(found, factor * plain, rtol=1e-9)
+    memory, added = law.start(np.zeros(18), context), np.array([0.1, 0.2, 3.0])
+    np.testing.assert_allclose(
+        own.command(added, memory, np.zeros(18), leader) - own.command(np.zeros(3), memory, np.zeros(18), leader),
+        added * np.array([factors[2], factors[2], factors[3]]),
+        rtol=1e-12,
+    )
+
+
+def test_between_two_sizes_factors_are_a_mean() -> None:
+    law = multi_model_lqg(UNIVERSAL)._replace(by_size=np.array([[2.0, 3.0, 0.5, 1.0], [1.0, 2.0, 1.0, 2.0]]))
+    share = 2.25 / 1.25
+    np.testing.assert_allclose(law.of_size(np.array([share, 2.0])), [[1.75, 2.75, 0.625, 1.25], [2.0, 3.0, 0.5, 1.0]])
+
+
+@pytest.mark.parametrize("wrong", [[], [[1.0, 1.0, 1.0]], [[1.0, 1.0, 1.0, 0.0]], [[1.0] * 4] * 17, None, 1.0])
+def test_factors_of_sizes_that_do_not_fit_are_refused(wrong: object, tmp_path: Path) -> None:
+    contents = with_law()
+    sound = {**contents.card["lqg"], "by_size": [[1.2, 1.1, 0.7, 0.7]]}
+    save_file(tmp_path / "sound.npz", dataclasses.replace(contents, card={**contents.card, "lqg": sound}))
+    card = {**contents.card, "lqg": {**sound, "by_size": wrong}}
+    with pytest.raises(PolicyFileError, match=r"card field lqg\.by_size must be [^\n]*\Z"):
+        save_file(tmp_path / "odd.npz", dataclasses.replace(contents, card=card))
 
 
 @pytest.mark.parametrize(

@@ -76,10 +76,9 @@ class SingleFollower:
         self._network.tell(*self._frame)
         self._told = self._added_lift * pair * lever
         factors = [1.0] * 4 if self._of_size is None else self._of_size(np.array(share)).tolist()
-        self._firmness = factors[:2]
         self._added = [factor * reach for factor, reach in zip(factors[2:], self._reach, strict=True)]
         self._wider, self._held = 1.0 + (self._pair_roll_room - 1.0) * pair, self._held_room * (1.0 - pair)
-        filters.tell(pair)
+        filters.tell(pair, factors[:2])
 
     def answer(self, observation: Array) -> tuple[list[float], list[float]] | None:
         """(action in [-1, 1] (3), command (3)) for `observation` (18,), which is remembered.
@@ -123,9 +122,7 @@ class SingleFollower:
         rise = _clipped(self._rise[0] * z + self._rise[1] * vz, rise_limit) - lift_error
         vertical = _clipped(share * rise - (share - 1.0) * led_vertical, vertical_limit)
         lifted = vertical - led_vertical
-        by_far, by_fast = self._firmness
-        roll_far = -by_far * r_error * y - by_fast * r_velocity * vy
-        pitch_far = by_far * p_error * x + by_fast * p_velocity * vx
+        roll_far, pitch_far = -r_error * y - r_velocity * vy, p_error * x + p_velocity * vx
         far = _within(roll_far, pitch_far, error_limit)
         roll_held = roll_load[0] + roll_grown + roll_turn * lifted
         pitch_held = pitch_load[0] + pitch_grown + pitch_turn * lifted
@@ -213,12 +210,17 @@ class _Filters:
         known = np.column_stack([1.0 / stiffness, lqg.damping, lqg.tilt, np.ones(models), *ahead.T.swapaxes(1, 2)])
         self._means, self.ahead = ANGLE_STATES + 7, np.zeros((2, 1 + 2 * lqg.swings))
         self._known = np.concatenate([np.zeros((2, models, ANGLE_STATES)), np.stack([known] * 2)], axis=-1)
+        self._firmness, self._gains = lqg.tilt[:, :2], self._known[..., ANGLE_STATES + 2 : ANGLE_STATES + 4]
         self._odds, self._found = np.zeros((2, 1, models)), self._known[..., :ANGLE_STATES]
         self._drives, self._driven = np.zeros((AXES, 2)), np.zeros((AXES, states))
         self._drive = np.stack([lqg.axis[..., -1], lqg.axis[..., -1] / stiffness[:, None]]).reshape(2, -1)
 
-    def tell(self, pair: float) -> None:
-        """Filter about roll as a pair does where `pair` is 1, as every team where it is 0."""
+    def tell(self, pair: float, factors: list[float]) -> None:
+        """Filter about roll as a pair does where `pair` is 1, as every team where it is 0.
+
+        `factors` on the feedback of the error and of the velocity.
+        """
+        self._gains[:] = self._firmness * factors
         own = self._of_pair is not None and pair > 0
         self._roll_matrix = self._matrix + pair * self._of_pair if own else None
         self._scored[0, -1] = pair
