@@ -192,10 +192,9 @@ class MultiModelLqg(NamedTuple):
 
     def of_size(self, share: Array) -> Array:
         """Row (..., 4) of `by_size` for a team with N / (N - 1) = `share` (...), between two rows a mean of both."""
-        xp = share.__array_namespace__()
-        factors = self._like(self.by_size, share)
-        rows = xp.arange(len(factors), dtype=share.dtype)
-        above = clipped(share / (share - 1.0) - 2.0, 0.0, len(factors) - 1.0)[..., None] - rows
+        xp, count = share.__array_namespace__(), len(self.by_size)  # type: ignore[arg-type]
+        factors, rows = self._like(self.by_size, share), self._like(list(range(count)), share)
+        above = clipped(share / (share - 1.0) - 2.0, 0.0, count - 1.0)[..., None] - rows
         return clipped(1.0 - xp.maximum(above, -above), 0.0, 1.0) @ factors
 
     def frame(self, context: Array) -> Frame | None:
