@@ -122,7 +122,7 @@ LIFT_TOLD = Case("12 pairs, lift told", MODELS, TUNING.torque_walk, position=TUN
 RIG_AXES = LIFT_TOLD._replace(name="about the rig's axes", pair_roll=True, rig_axes=True)
 HELD = RIG_AXES._replace(name="room for what is held", held_room=True)
 AS_IT_IS = HELD._replace(name="as it is", swings=True)
-FACTORS = ((1.2, 1.1, 0.7, 0.7), (1.35, 1.17, 0.6, 0.6), (1.35, 1.17, 0.8, 1.0), (1.5, 1.25, 0.8, 1.0))  # `universal`
+FACTORS = ((1.2, 1.1, 0.5, 0.5), (1.35, 1.17, 0.5, 0.65), (1.35, 1.17, 0.8, 1.0), (1.5, 1.25, 0.8, 1.0))  # `universal`
 FIRMER, ADDED = ((1.0, 1.0), (1.2, 1.1), (1.35, 1.17), (1.5, 1.25)), (1.0, 0.8, 0.6, 0.45)
 OF_MODELS = ("axis", "axis_gain", "certainty", "tilt", "stiffness", "damping")
 CASES = {

@@ -282,12 +282,11 @@ def test_factors_are_those_of_the_size(drones: int, factors: list[float]) -> Non
         plain, found = (pushed(one, slot, np.zeros(3))[1] for one in (law, own))
         assert plain > 1e-4
         np.testing.assert_allclose(found, factor * plain, rtol=1e-9)
-    memory, added = law.start(np.zeros(18), context), np.array([0.1, 0.2, 3.0])
-    np.testing.assert_allclose(
-        own.command(added, memory, np.zeros(18), leader) - own.command(np.zeros(3), memory, np.zeros(18), leader),
-        added * np.array([factors[2], factors[2], factors[3]]),
-        rtol=1e-12,
-    )
+    scaled = np.array([-1.0, 0.5, 0.2])
+    share = np.array([factors[2], factors[2], factors[3]])
+    counted = own.counted(scaled, own.start(np.zeros(18), context))
+    np.testing.assert_allclose(counted, scaled * (share + (1.0 - share) * np.abs(scaled)), rtol=1e-12)
+    assert counted[0] == -1.0  # in full
 
 
 def test_between_two_sizes_factors_are_a_mean() -> None:

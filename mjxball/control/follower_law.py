@@ -79,6 +79,8 @@ class FollowerLaw(NamedTuple):
 
     def command(self, scaled: Array, observation: Array, memory: Array, known: Any = None) -> Array:
         """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18)."""
+        if isinstance(self.lqg, MultiModelLqg):
+            scaled = self.lqg.counted(scaled, memory)
         command = scale_action(scaled, *self.action_scale)
         if self.lqg is not None:
             own = memory[..., self.history.size :]

@@ -62,8 +62,8 @@ class MultiModelLqg(NamedTuple):
     swing_ahead: Array | None = None  # (M, J, 2)
     swing_keep: Array | float = 0.0  # () share that a step leaves of the energies
     held_room: Array | float = 0.0  # () what rotors of more than two hold as a tilt, at least, over what is held now
-    # Of two, three, ... drones, and of more the last: factors on the feedback of error and of velocity, on tilts that
-    # are added and on the lift that is; None: 1.
+    # Of two, three, ... drones, and of more the last: factors on the feedback of error and of velocity, and by how much
+    # small actions of the network count, tilts and lift, of which one of 1 counts in full; None: 1.
     by_size: Array | None = None  # (S, 4)
 
     @property
@@ -146,10 +146,7 @@ class MultiModelLqg(NamedTuple):
         self, added: Array, memory: Array, observation: Array, leader: tuple[Any, ...], known: Known | None = None
     ) -> Array:
         """The law's command (..., 3), not yet clipped, with `added` (..., 3) to it; `leader` as for `known`."""
-        context, frame, _, _, _, _, own = known or self.known(memory, observation, leader)
-        if self.by_size is not None:
-            factors = self.of_size(context[..., 0])
-            added = added * joined([factors[..., 2], factors[..., 2], factors[..., 3]])
+        _, frame, _, _, _, _, own = known or self.known(memory, observation, leader)
         if frame is None:
             return own + added
         return joined([*_turned_back([own[..., 0], own[..., 1]], frame), own[..., 2]]) + added
@@ -196,6 +193,18 @@ class MultiModelLqg(NamedTuple):
         factors, rows = self._like(self.by_size, share), self._like(list(range(count)), share)
         above = clipped(share / (share - 1.0) - 2.0, 0.0, count - 1.0)[..., None] - rows
         return clipped(1.0 - xp.maximum(above, -above), 0.0, 1.0) @ factors
+
+    def counted(self, scaled: Array, memory: Array) -> Array:
+        """What of a network's action `scaled` in [-1, 1] (..., 3) counts in a team of the size that `memory` has.
+
+        a (k + (1 - k) |a|) with k of `by_size`: the smaller a team, the less small actions should do, but those that
+        hold what the law cannot must do all they can.
+        """
+        if self.by_size is None:
+            return scaled
+        factors = self.of_size(memory[..., -CONTEXT])
+        small = joined([factors[..., 2], factors[..., 2], factors[..., 3]])
+        return scaled * (small + (1.0 - small) * scaled.__array_namespace__().maximum(scaled, -scaled))
 
     def frame(self, context: Array) -> Frame | None:
         """Where the filters' axes are for a follower with `context` (..., 4); None: as those of its mount frame."""

@@ -76,7 +76,7 @@ class SingleFollower:
         self._network.tell(*self._frame)
         self._told = self._added_lift * pair * lever
         factors = [1.0] * 4 if self._of_size is None else self._of_size(np.array(share)).tolist()
-        self._added = [factor * reach for factor, reach in zip(factors[2:], self._reach, strict=True)]
+        self._small = factors[2], factors[2], factors[3]
         self._wider, self._held = 1.0 + (self._pair_roll_room - 1.0) * pair, self._held_room * (1.0 - pair)
         filters.tell(pair, factors[:2])
 
@@ -137,11 +137,12 @@ class SingleFollower:
         pitch_own = share * pitch_wanted - (share - 1.0) * led_pitch - pitch_rest
         reached = _within(roll_own / roll_most, pitch_own / pitch_most, 1.0)
         roll_own, pitch_own = roll_rest + reached * roll_own, pitch_rest + reached * pitch_own
-        tilt_reach, vertical_reach = self._added
+        tilt_reach, vertical_reach = self._reach
+        counted = [a * (k + (1.0 - k) * abs(a)) for a, k in zip(action, self._small, strict=True)]
         command = [
-            _clipped(cos * roll_own - sin * pitch_own + tilt_reach * action[0], tilt_limit),
-            _clipped(sin * roll_own + cos * pitch_own + tilt_reach * action[1], tilt_limit),
-            _clipped(vertical + vertical_reach * action[2], vertical_limit),
+            _clipped(cos * roll_own - sin * pitch_own + tilt_reach * counted[0], tilt_limit),
+            _clipped(sin * roll_own + cos * pitch_own + tilt_reach * counted[1], tilt_limit),
+            _clipped(vertical + vertical_reach * counted[2], vertical_limit),
         ]
         own, led = (roll_own, pitch_own, vertical), (led_roll, led_pitch, led_vertical)
         self._advance(own, led, command, (height, lift, lift_error))

@@ -68,16 +68,11 @@ def _lqg_numbers(lqg: Any, context: Any) -> dict[str, Any]:
     for name in numbers.keys() & PAIR_ROLL.keys():
         every = numbers[PAIR_ROLL[name]]
         numbers[name] = every + pair * (numbers[name] - every)
-    if isinstance(lqg, MultiModelLqg):
-        numbers["tilt"] = numbers["tilt"] * [*_of_size(lqg, context)[:2], 1.0, 1.0]
+    if isinstance(lqg, MultiModelLqg) and lqg.by_size is not None:
+        error, rate, tilts, lift = (1.0,) * 4 if context is None else lqg.of_size(np.float64(context[0]))
+        numbers["tilt"] = numbers["tilt"] * [error, rate, 1.0, 1.0]
+        numbers["small"] = np.array([tilts, tilts, lift])
     return numbers
-
-
-def _of_size(lqg: Any, context: Any) -> Any:
-    """Factors (4,) of `MultiModelLqg.by_size` for a follower with `context`; ones for other laws."""
-    if not isinstance(lqg, MultiModelLqg) or lqg.by_size is None or context is None:
-        return np.ones(4)
-    return lqg.of_size(np.float64(context[0]))
 
 
 def _rooms_and_axes(lqg: MultiModelLqg, context: Any, numbers: dict[str, Any]) -> list[str]:
@@ -134,11 +129,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
     sizes = [len(policy.observation_mean), *map(len, mean_layers(policy)[1])]
     arrays = _float_arrays(policy) if not int8 else []
     tilt, vertical = card["command_limits"]
-    *_, tilts, lift = _of_size(law.lqg, context)
-    arrays += [
-        _array("action_scale", policy.action_scale * [tilts, tilts, lift]),
-        _array("limit", [tilt, tilt, vertical]),
-    ]
+    arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
     numbers = _lqg_numbers(law.lqg, context)
     arrays += [
         _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
@@ -418,6 +409,9 @@ def _leader(card: dict[str, Any], to: str) -> list[str]:
 def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
     """Lines that make the command of `action`, which is added to a law unless it is direct."""
     added = "mjxball_action_scale[i] * action[i]"
+    if isinstance(law.lqg, MultiModelLqg) and law.lqg.by_size is not None:
+        size = "(action[i] < 0 ? -action[i] : action[i])"
+        added += f" * (mjxball_lqg_small[i] + (1 - mjxball_lqg_small[i]) * {size})"
     if law.needs_context:
         lifts = _lifts(law.lqg)
         lines = [f"    mjxball_real own[{6 if lifts else 3}];"]
