@@ -275,6 +275,25 @@ def test_a_pairs_header_has_its_numbers_about_roll(share: float, weight: float, 
     assert f"#define MJXBALL_ROLL_ROOM {room}\n" in text
 
 
+def test_a_header_has_the_factors_of_its_teams_size():
+    """Of the first sizes in the table, and of one beyond it."""
+    rows = [[1.5, 2.0, 0.5, 0.25], [1.25, 3.0, 0.75, 0.125]]
+    made = with_law()
+    sized = dataclasses.replace(made, card={**made.card, "lqg": {**made.card["lqg"], "by_size": rows}})
+    for plant, drone, row in (("pair", None, rows[0]), ("team3", 1, rows[1]), ("team4", 2, rows[1])):
+        text = c_header(in_team(sized, "follower", Path(plant), drone), "follower")
+        found = {
+            name: [
+                float(number.rstrip("f"))
+                for number in re.search(rf"mjxball_lqg_{name}\[\d+\] = {{([^}}]*)}}", text)[1].split(",")
+            ]
+            for name in ("tilts", "small")
+        }
+        wanted = np.array(made.card["lqg"]["tilt"]) * [row[0], row[1], 1.0, 1.0]
+        np.testing.assert_allclose(found["tilts"], wanted.ravel(), rtol=1e-6)
+        np.testing.assert_allclose(found["small"], [row[2], row[2], row[3]], rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_a_card_cannot_leave_the_comment(trained: Trained, tmp_path: Path):
     evil = '*/ #error "out" /* \\\n'
