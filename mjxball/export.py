@@ -22,7 +22,7 @@ from mjxball.control.motors import firmware
 from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of, load_file, save_file, write_whole
-from mjxball.policy.mean import mean_of_members
+from mjxball.policy.mean import mean_policy
 from mjxball.policy.policy import context_of, not_told
 
 
@@ -45,7 +45,9 @@ def policy_of_run(run: Path) -> PolicyFile:
 def contents_of(source: Path, mean: bool = False) -> PolicyFile:
     """The policy in `source`, a policy file or a run directory; with `mean` that of the run's population."""
     if mean:
-        return mean_of_members(source)
+        from mjxball.train.run_directory import members_of
+
+        return mean_policy([load_file(member) for member in members_of(source)])
     return load_file(source) if source.suffix == ".npz" else policy_of_run(source)
 
 

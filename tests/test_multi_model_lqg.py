@@ -270,16 +270,16 @@ def test_factors_are_those_of_the_size(drones: int, factors: list[float]) -> Non
     context = np.array([drones / (drones - 1), 0.0, 0.0, 40.0])
     np.testing.assert_allclose(own.of_size(context[0]), factors, rtol=1e-12)
 
-    def pushed(law: MultiModelLqg, slot: int, added: np.ndarray) -> np.ndarray:
-        """What being off by 1 mm or 1 mm/s changes, and what is added to it."""
+    def pushed(law: MultiModelLqg, slot: int) -> np.ndarray:
+        """What being off by 1 mm or 1 mm/s changes in the wanted command, apart from making up for the leader."""
         level, off = np.zeros(18), 1e-3 * np.eye(18)[slot]
         memory = law.start(level, context)
-        off_goal, at_goal = (law.command(added, memory, seen, leader) for seen in (off, level))
+        off_goal, at_goal = (law.command(np.zeros(3), memory, seen, leader) for seen in (off, level))
         led = copy_command(off, *leader)
         return off_goal - at_goal + led / (drones - 1)
 
     for slot, factor in ((12, factors[0]), (15, factors[1])):
-        plain, found = (pushed(one, slot, np.zeros(3))[1] for one in (law, own))
+        plain, found = (pushed(one, slot)[1] for one in (law, own))
         assert plain > 1e-4
         np.testing.assert_allclose(found, factor * plain, rtol=1e-9)
     scaled = np.array([-1.0, 0.5, 0.2])

@@ -4,22 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, load_file
+from mjxball.policy.file import PolicyFile
 
 OF_ONE = ("seed", "curve", "population")  # what a card says of one training alone
-
-
-def mean_of_members(run: Path) -> PolicyFile:
-    """The mean of the members of a population that `run` has trained, see `mean_policy`."""
-    files = sorted((run / "members").glob("*.npz"))
-    if len(files) < 2:
-        raise InputError(f"{run} has no population of which a mean could be taken: train.py --num-seeds makes one")
-    return mean_policy([load_file(file) for file in files])
 
 
 def mean_policy(policies: Sequence[PolicyFile]) -> PolicyFile:
@@ -27,8 +18,10 @@ def mean_policy(policies: Sequence[PolicyFile]) -> PolicyFile:
 
     Further training on random flights ends each time a little beside the best weights; the mean of several ends is
     nearer to these (Wortsman et al. 2022, model soups). Policies that began apart have hidden units in another order,
-    and their mean is none. Raises InputError unless layers and normalisation are the same.
+    and their mean is none. Raises InputError for one policy alone, and unless layers and normalisation are the same.
     """
+    if len(policies) < 2:
+        raise InputError("a mean is of two policies or more, and there is one")
     first = policies[0]
     for other in policies[1:]:
         if [one.shape for one in other.weights] != [one.shape for one in first.weights]:

@@ -102,7 +102,7 @@ def members_of(run: Path) -> list[Path]:
     """The policies of all members of a population, by their seeds; InputError if there are none."""
     found = [(int(path.stem[4:]), path) for path in (run / "members").glob("seed*.npz") if path.stem[4:].isdigit()]
     if not found:
-        raise InputError(f"{run} holds no policies of a population (members/seed*.npz); name a policy file")
+        raise InputError(f"{run} holds no population: train.py --num-seeds writes members/seed*.npz")
     return [path for _, path in sorted(found)]
 
 
