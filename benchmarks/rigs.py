@@ -253,33 +253,54 @@ def _quantile(values: np.ndarray, share: int) -> float | None:
 
 
 def steps(config: Config, options: Any) -> dict[str, Any]:
-    """Error after a step at 15 s, of the mass and of the CG: shares that are back within 2 % after 1.5 s."""
+    """Error after a step at 15 s, of the mass and of the CG, see `after_step`."""
     period, rows, curves = config.timing.control_period, [], {}
-    none, some = (
-        dataclasses.replace(config, rigs=dataclasses.replace(config.rigs, mass_step=most)) for most in (0.0, MASS_STEP)
-    )
-    for kind, made in CHANGES.items():
+    for kind in CHANGES:
         for size in options.sizes:
             rigs = rigs_of(config, size, options)
             for name, make in followers(options.policies):
-                found = fly(
-                    some if kind == "mass" else none, rigs, make(config, rigs), FLIGHTS, STEP + AFTER, 1, (STEP, made)
-                )
-                before, after = round(STEP / period), round((STEP + BACK) / period)
-                start = found.error[..., :1]
-                level = 0.02 * start + found.error[..., before - 100 : before].max(axis=-1, keepdims=True)
-                back = (found.error[..., after:] <= level).all(axis=-1) & ~found.failed
-                strict = (found.error[..., after:] <= 0.02 * start).all(axis=-1) & ~found.failed
-                row = {"step": kind, "drones": size, "follower": name, "failed": float(found.failed.mean())}
-                row |= {"back": float((np.median(back, axis=1) > 0).mean())}
-                rows.append({**row, "within_2_percent": float((np.median(strict, axis=1) > 0).mean())})
+                found = fly_step(kind, config, rigs, make(config, rigs))
+                rows.append({"step": kind, "drones": size, "follower": name, **after_step(found, period)})
                 print(json.dumps(rows[-1]))
                 sys.stdout.flush()
-                since = found.error[..., before - 50 :]
+                since = found.error[..., round(STEP / period) - 50 :]
                 curves.setdefault((kind, name), []).append(np.where(found.failed[..., None], np.inf, since))
     if options.figure:
         _draw(curves, period, options.figure)
     return {"rows": rows}
+
+
+def fly_step(kind: str, config: Config, rigs: RigTable, laws: Law | Sequence[Law]) -> Flown:
+    """Flights with a step of `kind` at 15 s, and none else."""
+    most = MASS_STEP if kind == "mass" else 0.0
+    flown = dataclasses.replace(config, rigs=dataclasses.replace(config.rigs, mass_step=most))
+    return fly(flown, rigs, laws, FLIGHTS, STEP + AFTER, 1, (STEP, CHANGES[kind]))
+
+
+def after_step(found: Flown, period: float) -> dict[str, float | None]:
+    """Share of flights that fail; shares of the rigs, by the median flight:
+
+    `back`: 1.5 s after the step and for the rest of 5 s not above what it was in the 2 s before by more than 2 % of the
+    first error; `within_2_percent`: within 2 % of the first error in that time; `stood`: so in the 2 s before, and
+    `stands_again`, of these rigs alone: in both.
+    """
+    before, after = round(STEP / period), round((STEP + BACK) / period)
+    level, calm = 0.02 * found.error[..., :1], found.error[..., before - 100 : before]
+    later = found.error[..., after:]
+
+    def most(flights: Any) -> np.ndarray:
+        return np.median(flights & ~found.failed, axis=1) > 0
+
+    back = most((later <= level + calm.max(axis=-1, keepdims=True)).all(axis=-1))
+    strict = most((later <= level).all(axis=-1))
+    stood = most((calm <= level).all(axis=-1))
+    return {
+        "failed": float(found.failed.mean()),
+        "back": float(back.mean()),
+        "within_2_percent": float(strict.mean()),
+        "stood": float(stood.mean()),
+        "stands_again": float(strict[stood].mean()) if stood.any() else None,
+    }
 
 
 CHANGES = {"mass": mass_changes, "CG": cg_jumps}

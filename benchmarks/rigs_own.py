@@ -5,7 +5,8 @@
 
 The first held-out rigs of each size. Every rig has weights of its own, which begin as the policy's and take steps of
 Adam by first-order gradients (`algorithms.gradient`) on flights of that rig alone, paid as the policy's card says; all
-rigs of a size are one program. They are judged as in `benchmarks/rigs.py`, on flights that training does not fly.
+rigs of a size are one program. They are judged as in `benchmarks/rigs.py`, on flights that training does not fly; with
+--after-steps by what follows a step of the mass and of the CG in flight as well.
 """
 
 from __future__ import annotations
@@ -128,24 +129,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--worlds", type=int, default=12, metavar="W", help="of each rig in training (default 12)")
     parser.add_argument("--steps", type=int, default=100, metavar="S", help="gradients (default 100)")
     parser.add_argument("--rate", type=float, default=2e-3, help="Adam's rate at the start (default 2e-3)")
+    parser.add_argument("--after-steps", action="store_true", help="fly steps of the mass and of the CG too")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args(arguments)
     config, contents, rows = replace(preset("universal"), "rigs.mass_step", 0.0), load_file(options.policy), []
+    period, stepped = config.timing.control_period, []
     for size in options.sizes:
         rigs = held_out(config, size).rows(slice(options.rigs))
-        flown, begun = {}, time.perf_counter()
-        for name, make in judge.followers([options.policy]):
-            if name in judge.KNOWING or name == options.policy.stem:
-                flown[name] = fly(config, rigs, make(config, rigs), judge.FLIGHTS)
-        laws = [OwnWeights(Policy(own, name="own")) for own in train(config, rigs, contents, options)]
-        flown["trained for it alone"] = fly(config, rigs, laws, judge.FLIGHTS)
+        begun, known = time.perf_counter(), (*judge.KNOWING, options.policy.stem)
+        laws = {name: make(config, rigs) for name, make in judge.followers([options.policy]) if name in known}
+        laws["trained for it alone"] = [
+            OwnWeights(Policy(own, name="own")) for own in train(config, rigs, contents, options)
+        ]
+        flown = {name: fly(config, rigs, law, judge.FLIGHTS) for name, law in laws.items()}
         for name in flown:
-            found = judge.row_of(flown, name, rigs, config.timing.control_period)
+            found = judge.row_of(flown, name, rigs, period)
             rows.append({"drones": size, "rigs": options.rigs, "follower": name, **found})
             print(json.dumps(rows[-1]))
+        for kind in judge.CHANGES if options.after_steps else ():
+            for name, law in laws.items():
+                found = judge.after_step(judge.fly_step(kind, config, rigs, law), period)
+                stepped.append({"step": kind, "drones": size, "rigs": options.rigs, "follower": name, **found})
+                print(json.dumps(stepped[-1]))
         print(f"{size} drones: {time.perf_counter() - begun:.0f} s", file=sys.stderr)
     if options.json:
         found = {"steps": options.steps, "worlds": options.worlds, "rate": options.rate, "rows": rows}
+        found |= {"after_steps": stepped} if stepped else {}
         options.json.write_text(json.dumps(found, indent=1) + "\n")
     return 0
 
