@@ -17,7 +17,6 @@ from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 
 Array = Any
-ADAM = optax.scale_by_adam()
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
 
 
@@ -54,6 +53,7 @@ class FirstOrderGradient:
         # Number by number a window's gradient takes a quarter of the time, and two thirds to compile.
         self._config, self._environments = own, environments.rewritten(scalar_form)
         self._shards = environments.shards
+        self._adam = optax.scale_by_adam(*own.adam_betas)
         self.steps_per_collect = own.horizon
         window = own.num_envs * own.horizon
         self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations, 0.0)
@@ -71,7 +71,7 @@ class FirstOrderGradient:
             layers[f"hidden_{number}"] = {"kernel": kernel * (0.01 if last else 1.0), "bias": jnp.zeros(columns)}
         zero, none = jnp.zeros(()), jnp.zeros(self._sizes[0])
         slope = jax.tree.map(jnp.zeros_like, layers)
-        return GradientState(layers, ADAM.init(layers), slope, zero, none, none, zero, jnp.zeros((), jnp.int32))
+        return GradientState(layers, self._adam.init(layers), slope, zero, none, none, zero, jnp.zeros((), jnp.int32))
 
     def start_from(self, state: GradientState, policy: PolicyFile) -> GradientState:
         """`state`, but with the network of `policy` and its normalisation, in NumPy.
@@ -151,7 +151,7 @@ class FirstOrderGradient:
         fall = own.learning_rate_final_ratio + (1.0 - own.learning_rate_final_ratio) * 0.5 * (
             1.0 + jnp.cos(jnp.pi * progress)
         )
-        direction, adam = ADAM.update(slope, state.adam)
+        direction, adam = self._adam.update(slope, state.adam)
         rate = own.learning_rate * fall
         moved = state._replace(
             layers=jax.tree.map(lambda value, along: value - rate * along, state.layers, direction), adam=adam

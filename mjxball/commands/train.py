@@ -44,6 +44,7 @@ from mjxball.train.run_directory import (
     start_policy,
     versions,
 )
+from mjxball.xla import compile_small_loops_whole
 
 
 def parser() -> cli.Parser:
@@ -97,6 +98,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     meeting, started = _meeting(options), time.monotonic()
     # To take three quarters of a large GPU's memory at once takes 1.6 s; taken as it is needed it is as fast.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    compile_small_loops_whole()
     if options.resume is not None:
         _refuse_with_resume(options)
         out, (settings, origin) = options.resume, _recorded(options.resume)

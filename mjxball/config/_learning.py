@@ -88,6 +88,9 @@ class Gradient:
     learning_rate_final_ratio: float = setting(
         0.02, "rate at the end of the run over the rate at its start", above=0, high=1
     )
+    adam_betas: tuple[float, float] = setting(
+        (0.9, 0.999), "what Adam keeps in a step of its means of gradients and of their squares", low=0, high=0.99999
+    )
     max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
     gradient_decay: float = setting(
         1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1

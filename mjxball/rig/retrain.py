@@ -30,6 +30,7 @@ from mjxball.fly.supervisor import GUIDED
 from mjxball.policy import Policy, PolicyFile, load_file, save_file
 from mjxball.rig.load import IdentifiedLoad, LoadWatch
 from mjxball.sim.laws import BodyState, Laws
+from mjxball.xla import compile_small_loops_whole
 
 NICE = 15
 POLL = 0.02  # [s] between two looks at the log
@@ -61,6 +62,7 @@ def retrain(options: argparse.Namespace) -> int:
     flown = load_file(options.policy)
     config = config_of(flown.card)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    compile_small_loops_whole()
     _say(text="retraining: loading JAX")
     try:
         from mjxball.cache import enable_compilation_cache
