@@ -19,7 +19,7 @@ from command_line import REPOSITORY, environment
 FLOORS = (
     {"errors"},
     {"config"},
-    {"cli", "cache", "quiet", "plotting"},
+    {"cli", "cache", "quiet", "plotting", "xla"},
     {"plant"},
     {"control"},
     {"policy", "baselines"},
