@@ -24,7 +24,7 @@ Main = Callable[[list[str]], int]
 HASTY = "--xla_backend_optimization_level=1 --xla_llvm_disable_expensive_passes=true"
 if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):  # a later XLA ends a process that is given it
     HASTY += " --xla_cpu_use_fusion_emitters=false"
-HASTY += f" {SMALL_LOOPS}"  # as train.py
+HASTY += f" {SMALL_LOOPS}"  # as train.py --algorithm gradient
 # Training for seconds: closed-form physics, tiny networks, two updates a step. One program for all tests that train so:
 # the number of steps, which are seconds of training, so that a signal arrives in the middle, is a part of it.
 STEPS = 48_000

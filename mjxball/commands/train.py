@@ -98,7 +98,6 @@ def _train(options: argparse.Namespace, command: str) -> int:
     meeting, started = _meeting(options), time.monotonic()
     # To take three quarters of a large GPU's memory at once takes 1.6 s; taken as it is needed it is as fast.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    compile_small_loops_whole()
     if options.resume is not None:
         _refuse_with_resume(options)
         out, (settings, origin) = options.resume, _recorded(options.resume)
@@ -302,7 +301,10 @@ def _choose_processor(algorithm: Any) -> None:
     """Train on the CPU what is done there before a GPU has compiled it, unless JAX_PLATFORMS says otherwise."""
     import jax
 
-    if getattr(algorithm, "prefers_cpu", False) and not os.environ.get("JAX_PLATFORMS"):
+    if not getattr(algorithm, "prefers_cpu", False):
+        return
+    compile_small_loops_whole()
+    if not os.environ.get("JAX_PLATFORMS"):
         settings: Any = jax.config
         settings.update("jax_platforms", "cpu")
 

@@ -55,7 +55,7 @@ def _transport() -> Config:
         ),
         reward=Reward(error_scale=0.05),
         # The loss is nearly without noise: with less momentum two thirds of the steps do.
-        gradient=Gradient(gradient_steps=80, adam_betas=(0.6, 0.99)),
+        gradient=Gradient(gradient_steps=80, learning_rate=2.5e-2, adam_betas=(0.7, 0.99)),
         sac=Sac(
             total_steps=768_000,
             num_envs=512,
