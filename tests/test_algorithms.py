@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +149,26 @@ def returns(config: Config, name: str, env: Any, seed: int = 0) -> np.ndarray:
         state, *_ = advance(state, mode)
         found.append(float(advance(state._replace(envs=fresh), evaluate)[1].reward) / 80)
     return np.array(found)
+
+
+@pytest.mark.parametrize(("slow", "square"), [(0.9, 0.999), (0.7, 0.99), (0.0, 0.0)])
+def test_adam_keeps_what_the_settings_say(slow: float, square: float, transport: Config) -> None:
+    own = dataclasses.replace(
+        transport.gradient, adam_betas=(slow, square), learning_rate=1.0, learning_rate_final_ratio=1.0, max_grad_norm=9
+    )
+    environments = Environments(LinearQuadratic(), 4)
+    algorithm = FirstOrderGradient(dataclasses.replace(transport, gradient=own), environments)
+    state = algorithm.init(jax.random.key(0))
+    first, bias = 3.0, "hidden_0"
+    expected, mean, mean_square = np.asarray(state.layers[bias]["bias"])[0], 0.0, 0.0
+    for step, slope in enumerate((first, -1.0), 1):
+        slopes = jax.tree.map(jnp.zeros_like, state.layers)
+        slopes[bias]["bias"] = slopes[bias]["bias"].at[0].set(slope)
+        state, _ = algorithm.update(state._replace(slope=slopes), [], jnp.zeros(()), TRAIN)
+        mean, mean_square = slow * mean + (1 - slow) * slope, square * mean_square + (1 - square) * slope**2
+        unbiased = mean / (1 - slow**step), mean_square / (1 - square**step)
+        expected -= unbiased[0] / (math.sqrt(unbiased[1]) + 1e-8)
+    np.testing.assert_allclose(state.layers[bias]["bias"][0], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["ppo", "gradient"])

@@ -1,0 +1,36 @@
+"""XLA's flag for small loops on CPUs."""
+
+from __future__ import annotations
+
+import os
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from mjxball import xla
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("", xla.SMALL_LOOPS),
+        ("--xla_dump_to=here", f"--xla_dump_to=here {xla.SMALL_LOOPS}"),
+        ("--xla_backend_extra_options=other=1", "--xla_backend_extra_options=other=1"),
+    ],
+)
+def test_the_flag_is_added_once(before: str, after: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XLA_FLAGS", before)
+    for _ in range(2):
+        xla.compile_small_loops_whole()
+        assert os.environ["XLA_FLAGS"] == after
+
+
+def test_a_loop_becomes_one_function() -> None:
+    """The tests run with the flag; without it XLA does so with loops of a kilobyte at most."""
+
+    def loop(numbers: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, 10, lambda _, kept: jnp.sin(jnp.roll(kept, 1)) + numbers, numbers)
+
+    text = jax.jit(loop).lower(jnp.zeros(1000)).compile().as_text()
+    assert "xla_cpu_small_call" in (text or "")
