@@ -298,7 +298,10 @@ def _check_extensions(names: dict[str, str], settings: config.Config, wanted: st
 
 
 def _choose_processor(algorithm: Any) -> None:
-    """Train on the CPU what is done there before a GPU has compiled it, unless JAX_PLATFORMS says otherwise."""
+    """Train on the CPU, its small loops compiled whole, what is done there before a GPU has compiled it.
+
+    Where JAX_PLATFORMS says otherwise it stays so.
+    """
     import jax
 
     if not getattr(algorithm, "prefers_cpu", False):
