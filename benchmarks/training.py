@@ -197,11 +197,11 @@ def rate_of(members: int, devices: list[Any], options: argparse.Namespace) -> di
     population = Population(preset("transport"), options.physics, members, devices=devices)
     compiled = population.compile(creating=True)
     state = population.start(compiled, 0)
-    state, *_ = compiled.advance(state, population.mode(programs.warmup(100)))
+    state, *_ = compiled.advance(state, programs.warmup(100))
     steps, rates = options.chunk, []
     for _ in range(4):
         started = time.perf_counter()
-        state, *_ = compiled.advance(state, population.mode(programs.train(steps)))
+        state, *_ = compiled.advance(state, programs.train(steps))
         jax.block_until_ready(state)
         rates.append(members * population.config.sac.num_envs * steps / (time.perf_counter() - started))
     held = sum(leaf.nbytes for leaf in jax.tree.leaves(state)) / members

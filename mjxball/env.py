@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -252,7 +253,7 @@ class TransportEnv:
         )
 
     def _make_loop(self, rig: PlantParameters | None = None) -> ClosedLoop:
-        physics = make_physics(self.config, self._backend, rig)
+        physics = _made_when_called(functools.partial(make_physics, self.config, self._backend, rig))
         return ClosedLoop(self.config, physics, self._disturbances.sensors, rig)
 
     def _loop_of(self, rig: Any) -> ClosedLoop:
@@ -411,6 +412,20 @@ class TransportEnv:
 
 
 CoupledPairEnv = TransportEnv  # its former name
+
+
+def _made_when_called(make: Callable[[], ControlStep]) -> ControlStep:
+    """What `make` returns, made at the first call: programs that only reset worlds need no engine.
+
+    A call may be traced by JAX, and what is made is then no part of what is traced.
+    """
+
+    @functools.cache
+    def made() -> ControlStep:
+        with jax.ensure_compile_time_eval():
+            return make()
+
+    return lambda state, commands, load: made()(state, commands, load)
 
 
 def make_physics(config: Config, physics: str, rig: PlantParameters | None = None) -> ControlStep:

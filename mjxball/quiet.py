@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
+import importlib.metadata
+import importlib.util
 import io
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -52,6 +54,39 @@ def _postponed(name: str) -> Iterator[None]:
             del sys.modules[name]
 
 
+def _initialised_when_used(name: str) -> None:
+    """Have the package `name` without running its `__init__`, which happens when it is asked for what that defines."""
+    spec = importlib.util.find_spec(name)
+    if name in sys.modules or spec is None or spec.loader is None:
+        return
+    package, loader = importlib.util.module_from_spec(spec), spec.loader
+
+    def find(attribute: str) -> Any:
+        if attribute.startswith("__"):
+            raise AttributeError(attribute)
+        if package.__dict__.pop("__getattr__", None):
+            loader.exec_module(package)
+        return getattr(package, attribute)
+
+    package.__dict__["__getattr__"] = find  # PEP 562
+    sys.modules[name] = package
+
+
+def import_jax() -> ModuleType:
+    """JAX, which reads the description of every installed package in search of a plugin of ROCm's: 0.1 to 0.4 s.
+
+    It need not where no directory of that name is there.
+    """
+    if any(place.is_dir() and any(place.glob("jax_rocm*")) for place in map(Path, sys.path)):
+        return importlib.import_module("jax")
+    search = importlib.metadata.distributions
+    importlib.metadata.distributions = lambda **_: iter(())  # type: ignore[assignment]
+    try:
+        return importlib.import_module("jax")
+    finally:
+        importlib.metadata.distributions = search
+
+
 def import_mjx() -> ModuleType:
     """`mujoco.mjx`."""
     return quietly("mujoco.mjx")
@@ -86,7 +121,8 @@ class BraxTraining(NamedTuple):
 
 
 def import_brax_training() -> BraxTraining:
-    """Brax's networks, SAC losses, running statistics and types."""
+    """Brax's networks, SAC losses, running statistics and types; not its physics, which takes as long to import."""
+    _initialised_when_used("brax")
     names = ("networks", "agents.sac.losses", "acme.running_statistics", "acme.specs", "distribution", "types")
     return BraxTraining(*(quietly(f"brax.training.{name}") for name in names))
 

@@ -88,9 +88,9 @@ def test_the_pure_function_is_the_run(small: Config) -> None:
     """Same steps, same keys: the same policy as `train.py --seed 5`, evaluations left out."""
     tiny = with_settings(small, sac={**SMALL, "total_steps": 800})
     population = Population(tiny, "newton-euler", extensions=Extensions(toys.DoubleIntegrator))
-    program, advance = population.program, jax.jit(population.advance)
-    state, *_ = advance(population.create(5), programs.warmup(program.warmup_rounds))
-    state, *_ = advance(state, programs.train(program.total_rounds - program.warmup_rounds))
+    program, compiled = population.program, population.compile(creating=True)
+    state, *_ = compiled.advance(population.start(compiled, 5), programs.warmup(program.warmup_rounds))
+    state, *_ = compiled.advance(state, programs.train(program.total_rounds - program.warmup_rounds))
     policy, _ = jax.jit(lambda key: train(tiny, key, env=toys.DoubleIntegrator))(jax.random.PRNGKey(5))
     for a, b in zip(jax.tree.leaves(policy), jax.tree.leaves(population.policy(state, 0)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)  # two programs: XLA may fuse them differently

@@ -51,20 +51,21 @@ def small(transport: Config) -> Config:
 def together(small: Config) -> tuple[Population, Any, Any]:
     """Two members, and what they are after 5 and 20 steps of training."""
     population = Population(small, "newton-euler", 2)
-    advance = jax.jit(population.advance)
-    state, *_ = advance(population.create(5), programs.warmup(10))
-    early, *_ = advance(state, programs.train(5))
-    return population, early, advance(early, programs.train(15))[0]
+    compiled = population.compile(creating=True)
+    state, *_ = compiled.advance(population.start(compiled, 5), programs.warmup(10))
+    state, *_ = compiled.advance(state, programs.train(5))
+    early = jax.tree.map(np.array, state)  # its memory is given away
+    return population, early, compiled.advance(state, programs.train(15))[0]
 
 
 @pytest.mark.slow
 def test_members_are_the_runs_of_their_seeds(small: Config, together: tuple[Population, Any, Any]) -> None:
     population, _, late = together
     single = Population(small, "newton-euler")
-    advance = jax.jit(single.advance)
+    compiled = single.compile(creating=True)
     for member in range(2):
-        state, *_ = advance(single.create(5 + member), programs.warmup(10))
-        alone, *_ = advance(state, programs.train(20))
+        state, *_ = compiled.advance(single.start(compiled, 5 + member), programs.warmup(10))
+        alone, *_ = compiled.advance(state, programs.train(20))
         mine = population.member(late, member)
         for a, b in zip(
             jax.tree.leaves(mine.algorithm.learner.policy), jax.tree.leaves(alone.algorithm.learner.policy), strict=True
@@ -86,8 +87,8 @@ def test_swept_settings_differ_between_members_and_between_traced_programs(
         compiled = population.compile(creating=True)
         state = population.start(compiled, 5)
         before = np.asarray(jax.tree.leaves(state.algorithm.learner.policy)[-1])
-        state, *_ = compiled.advance(state, population.mode(programs.warmup(10)))
-        state, *_ = compiled.advance(state, population.mode(programs.train(20)))
+        state, *_ = compiled.advance(state, programs.warmup(10))
+        state, *_ = compiled.advance(state, programs.train(20))
         moved.append(np.abs(np.asarray(jax.tree.leaves(state.algorithm.learner.policy)[-1]) - before).max(axis=(1, 2)))
     # No traced program says which files of Python made it: XLA would print them all.
     assert not any(b".py" in path.read_bytes() for path in tmp_path.iterdir())
@@ -95,7 +96,7 @@ def test_swept_settings_differ_between_members_and_between_traced_programs(
     assert max(still, still_too) < 1e-4  # 20 steps of 1e-6
     assert min(quick, quick_too) > 1e-2  # 20 steps of 1e-2
     np.testing.assert_array_equal(moved[1], moved[2])  # the third comes from the cache
-    assert len(list(tmp_path.glob("advance-*"))) == 2
+    assert len(list(tmp_path.glob("update-*"))) == 2
 
 
 @pytest.mark.parametrize(
@@ -173,8 +174,8 @@ for name, value in {SMALL!r}.items():
 population = Population(config, "newton-euler", 2)
 assert population.devices == jax.local_device_count() == 2
 compiled = population.compile(creating=True)
-state, *_ = compiled.advance(population.start(compiled, 5), population.mode(P.warmup(10)))
-state, *_ = compiled.advance(state, population.mode(P.train(5)))
+state, *_ = compiled.advance(population.start(compiled, 5), P.warmup(10))
+state, *_ = compiled.advance(state, P.train(5))
 leaves = jax.tree.leaves(state.algorithm.learner.policy)
 assert len(leaves[0].sharding.device_set) == 2
 assert Population(config, "newton-euler", 2, devices=jax.local_devices()[:1]).devices == 1

@@ -23,14 +23,14 @@ class Phase(NamedTuple):
     evaluate: Bool[Array | np.ndarray, ""]  # act with the policy's mean; nothing is recorded or learnt
 
     @property
-    def recording(self) -> Bool[Array, ""]:
+    def recording(self) -> Bool[Array | np.ndarray, ""]:
         """Whether what happens is remembered."""
-        return jnp.logical_not(self.evaluate)
+        return ~self.evaluate
 
     @property
-    def learning(self) -> Bool[Array, ""]:
+    def learning(self) -> Bool[Array | np.ndarray, ""]:
         """Whether the algorithm updates what it has learnt."""
-        return jnp.logical_not(jnp.logical_or(self.random, self.evaluate))
+        return ~(self.random | self.evaluate)
 
 
 class Schedule(NamedTuple):

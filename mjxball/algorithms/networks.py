@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
@@ -44,18 +45,31 @@ def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = N
             hidden_layer_sizes=config.policy_layers,
             activation=jax.nn.relu,
         ),
-        q_network=brax.networks.make_q_network(
-            observation_size,
-            action_size,
-            preprocess_observations_fn=normalise_all,
-            hidden_layer_sizes=config.critic_layers,
-            activation=jax.nn.relu,
-            layer_norm=config.critic_layer_norm,
-            n_critics=config.num_critics,
-        ),
+        q_network=_critics(config, observation_size, action_size, normalise_all),
         value_network=value_network if config.state_value else None,
         parametric_action_distribution=distribution,
     )
+
+
+def _critics(config: Sac, observation_size: int, action_size: int, normalise: Callable[[Array, Any], Array]) -> Any:
+    """Brax's critics, their parameters stacked: one product a layer for all of them, not one for each."""
+    layout: dict[str, Any] = {"activation": jax.nn.relu, "layer_norm": config.critic_layer_norm}
+    separate = brax.networks.make_q_network(
+        observation_size, action_size, hidden_layer_sizes=config.critic_layers, n_critics=config.num_critics, **layout
+    )
+    critic = brax.networks.MLP(layer_sizes=[*config.critic_layers, 1], **layout)
+
+    def init(key: Array) -> Any:
+        parts = separate.init(key)["params"]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(parts[name] for name in sorted(parts)))
+
+    def apply(statistics: Any, critics: Any, observation: Array, action: Array) -> Array:
+        """(..., critics)"""
+        seen = jnp.concatenate([normalise(observation, statistics), action], axis=-1)
+        found = jax.vmap(lambda parameters: critic.apply({"params": parameters}, seen))(critics)
+        return jnp.moveaxis(found[..., 0], 0, -1)
+
+    return brax.networks.FeedForwardNetwork(init, apply)
 
 
 class TanhGaussian(brax.distribution.NormalTanhDistribution):  # type: ignore[name-defined]

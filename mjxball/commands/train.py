@@ -27,6 +27,7 @@ from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
 from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
+from mjxball.quiet import import_jax
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
 from mjxball.train.run_directory import (
@@ -96,6 +97,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _train(options: argparse.Namespace, command: str) -> int:
     meeting, started = _meeting(options), time.monotonic()
+    import_jax()
     # To take three quarters of a large GPU's memory at once takes 1.6 s; taken as it is needed it is as fast.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if options.resume is not None:

@@ -6,27 +6,30 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+from jax import Array
 from jax.sharding import Mesh
 
 from mjxball.cache import traced_directory
 
 OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
-# Kernels of this size gain nothing from being tuned and optimised further, and it costs a third of the compile time.
+# One follower's kernels gain nothing from being tuned and optimised further, and it costs a third of the compile time.
 # (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/archive.)
 GPU_OPTIONS: dict[str, Any] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
-# Batches of thousands gain a third of the run from tuned products (PPO of `ant`: docs/archive/training.md).
+# Batches of thousands gain a third of the run from tuned products (PPO of `ant`: docs/archive/training.md), and so do
+# the products of many followers at once, of which one takes half as long (64 of SAC: docs/archive/training.md).
 TUNED_GPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
 # For algorithms that are done sooner than XLA, which then compiles twice as fast what runs a quarter slower.
 CPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
 if jax.__version_info__ < (0, 11):
     CPU_OPTIONS["xla_cpu_use_fusion_emitters"] = False
 # One follower's products of layers of 64 are small enough for plain loops, which spare XLA a kernel in Triton for each
-# (2 - 5 s to compile). For many followers at once Triton's are faster (64: by a quarter).
+# (2 - 5 s to compile).
 PLAIN_PRODUCTS = {"xla_gpu_gemm_rewrite_size_threshold": 70_000}  # numbers in both matrices
 
 
@@ -37,9 +40,9 @@ def compiler_options(algorithm: Any = None, members: int = 1) -> dict[str, Any] 
     the class of the algorithm if it is not SAC.
     """
     if jax.default_backend() == "gpu":
-        if getattr(algorithm, "worth_tuning", False):
+        if members > 1 or getattr(algorithm, "worth_tuning", False):
             return TUNED_GPU_OPTIONS
-        return GPU_OPTIONS | (PLAIN_PRODUCTS if members == 1 else {})
+        return GPU_OPTIONS | PLAIN_PRODUCTS
     return CPU_OPTIONS if getattr(algorithm, "prefers_cpu", False) else None
 
 
@@ -65,37 +68,89 @@ def jax_setting(name: str, value: Any) -> Iterator[None]:
 
 
 class TracedProgram:
-    """One function of arrays, traced or found in the cache. `lower(donate)` readies it for compilation."""
+    """One function of arrays, traced or found in the cache. `lower` readies it for compilation.
+
+    Its first `carried` arrays are the first that it returns, perhaps changed.
+    """
 
     def __init__(
-        self, name: str, key: Mapping[str, Any] | None, function: Callable[..., Any], shapes: Any, result: Any
+        self,
+        name: str,
+        key: Mapping[str, Any] | None,
+        function: Callable[..., Any],
+        shapes: Any,
+        result: Any = None,
+        carried: int = 0,
     ):
         """`shapes` are the arguments' `ShapeDtypeStruct`s, `result` any tree with the structure of what it returns.
 
         `key` must hold everything that the traced program depends on; None: it is not kept.
         """
-        self._name = name
-        self._shapes, self._structure = shapes, jax.tree.structure(result)
+        self._name, self._shapes, self._carried = name, shapes, carried
+        self._structure = jax.tree.structure(result)
         path = _path(name, key)
-        exported = _read(path)
+        exported, unchanged = _read(path)
         if exported is None:
             leaves, structure = jax.tree.flatten(shapes)
 
             def flat(*arrays: Any) -> Any:
-                return jax.tree.leaves(function(*jax.tree.unflatten(structure, arrays)))
+                found = jax.tree.leaves(function(*jax.tree.unflatten(structure, arrays)))
+                unchanged[:] = [k for k in range(carried) if found[k] is arrays[k]]
+                return [one for k, one in enumerate(found) if k not in unchanged]
 
             exported = jax.export.export(jax.jit(flat))(*leaves)
-            _write(path, exported)
-        self._exported = exported
+            _write(path, exported, unchanged)
+        self._exported, self._unchanged = exported, unchanged
 
-    def lower(self, donate: int | None = None) -> Any:
-        """`jax.stages.Lowered`; argument number `donate` gives its memory away."""
+    def lower(self) -> Any:
+        """`jax.stages.Lowered` of the function, of which nothing is carried."""
 
         def call(*arguments: Any) -> Any:
             return jax.tree.unflatten(self._structure, self._exported.call(*jax.tree.leaves(arguments)))
 
         call.__name__ = self._name  # what profiles and the compilation cache call it
-        return jax.jit(call, donate_argnums=() if donate is None else donate).lower(*self._shapes)
+        return jax.jit(call).lower(*self._shapes)
+
+    def lower_carrying(self) -> Carrying:
+        """The function of what it reads, which returns what it changes: the rest does not pass through the device."""
+        leaves, writes = jax.tree.leaves(self._shapes), [k for k in range(self._carried) if k not in self._unchanged]
+        special = [k for k, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jax.dtypes.extended)]
+        reads = sorted({*self._exported.module_kept_var_idx, *special})
+
+        def call(*arrays: Any) -> Any:
+            given = dict(zip(reads, arrays, strict=True))
+            nothing = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)  # noqa: E731
+            return self._exported.call(*[given[k] if k in given else nothing(leaf) for k, leaf in enumerate(leaves)])
+
+        call.__name__ = self._name
+        donated = [place for place, k in enumerate(reads) if k in writes]
+        lowered = jax.jit(call, donate_argnums=donated).lower(*[leaves[k] for k in reads])
+        return Carrying(lowered, self._carried, reads, writes)
+
+
+class Carrying(NamedTuple):
+    """A lowered function that carries arrays on; `compile` makes `run(carried, *others)` of it."""
+
+    lowered: Any
+    carried: int
+    reads: Sequence[int]  # which of the carried arrays and, behind them, of the others it takes
+    writes: Sequence[int]  # which of the carried arrays it returns, before other results
+
+    def compile(self, compiler_options: Mapping[str, Any] | None) -> Callable[..., list[Array]]:
+        """`run` changes the list `carried`, whose first arrays are those of the function, and returns other results.
+
+        Arrays that are replaced lose their memory.
+        """
+        compiled = self.lowered.compile(compiler_options=compiler_options)
+
+        def run(carried: list[Array], *others: Any) -> list[Array]:
+            given = [*carried[: self.carried], *others]
+            found = compiled(*[given[k] for k in self.reads])
+            for k, array in zip(self.writes, found, strict=False):
+                carried[k] = array
+            return found[len(self.writes) :]
+
+        return run
 
 
 def _path(name: str, key: Mapping[str, Any] | None) -> Path | None:
@@ -107,23 +162,24 @@ def _path(name: str, key: Mapping[str, Any] | None) -> Path | None:
     return place / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:32]}.stablehlo"
 
 
-def _read(path: Path | None) -> Any:
-    """The exported program in `path`, None if there is none that can be read."""
+def _read(path: Path | None) -> tuple[Any, list[int]]:
+    """The exported program in `path` and which carried arrays it leaves unchanged; (None, []) if it cannot be read."""
     if path is None:
-        return None
+        return None, []
     try:
-        return jax.export.deserialize(bytearray(path.read_bytes()))
+        first, _, program = path.read_bytes().partition(b"\n")
+        return jax.export.deserialize(bytearray(program)), json.loads(first)
     except Exception:  # absent, cut short, or of another JAX: traced anew
-        return None
+        return None, []
 
 
-def _write(path: Path | None, exported: Any) -> None:
+def _write(path: Path | None, exported: Any, unchanged: list[int]) -> None:
     if path is None:
         return
     partial = path.with_suffix(f".{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(exported.serialize())
+        partial.write_bytes(json.dumps(unchanged).encode() + b"\n" + exported.serialize())
         partial.replace(path)
     except OSError:  # a full or read-only cache is no reason not to train
         partial.unlink(missing_ok=True)

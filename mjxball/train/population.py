@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,27 +15,28 @@ from jax import Array
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from mjxball import config as configs
-from mjxball.algorithms.base import PolicyNetwork, Shards
+from mjxball.algorithms.base import Phase, PolicyNetwork, Shards
 from mjxball.config import Config
 from mjxball.policy import PolicyFile
 from mjxball.train import processes
 from mjxball.train.compilation import (
+    Carrying,
     TracedProgram,
     compiler_options,
     jax_setting,
     partitioned_by_gspmd,
 )
 from mjxball.train.extensions import DEFAULTS, Extensions
-from mjxball.train.program import Mode, Program, Statistics, TrainState, report, warmup
+from mjxball.train.program import Mode, Program, Statistics, TrainState, report, train, warmup
 from mjxball.train.run_directory import Sweep, source_hash, versions
 
 
 class Executables(NamedTuple):
     """A population's compiled functions."""
 
-    create: Callable[[Any, Any], TrainState]  # (swept values, keys) -> state
+    begin: Callable[[Any, Any], TrainState]  # (swept values, keys) -> `Program.begin`
+    episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `Program.episodes`
     advance: Callable[[TrainState, Mode], tuple[TrainState, Statistics, Any]]  # gives away the state's memory
-    evaluation_envs: Callable[[Any, Array], Any]  # (swept values, `_first_key()`) -> environments
 
 
 class Population:
@@ -90,27 +92,14 @@ class Population:
         array = np.asarray(value)
         return array[None] if self._single else array
 
-    def create(self, seed: int) -> TrainState:
-        """Fresh training states."""
-        return jax.jit(self._create)(*self._starts(seed))
-
     def template(self) -> TrainState:
-        """Shapes of what `create` returns, without computing it."""
+        """Shapes of a state, without computing one."""
         if self._template is None:
             self._template = jax.eval_shape(self._create, self._values, self._keys(0))
         return self._template
 
-    def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Array]]:
-        """See `Program.advance`."""
-
-        def one(program: Program, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Array]]:
-            return program.advance(state, mode)
-
-        results = (self._state_spec, self._statistics_spec, self._whole)
-        return self._on_mesh(one, (self._state_spec, PartitionSpec()), results, (0, None))(self._values, state, mode)
-
     def compile(self, creating: bool) -> Executables:
-        """Compile everything a run needs, side by side; `create` only if `creating`."""
+        """Compile everything a run needs, side by side; `begin` only if `creating`."""
         options = compiler_options(self.program.algorithm, self.members)
         # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
         # end a process that shares GPUs with others by a segfault.
@@ -118,49 +107,84 @@ class Population:
             partitioned_by_gspmd(self.mesh),
             # Lines of Python in what is lowered are for profiles; XLA sorts and prints them all, a second's work.
             jax_setting("jax_traceback_in_locations_limit", 0),
-            ThreadPoolExecutor(3 if jax.process_count() == 1 else 1) as pool,
+            ThreadPoolExecutor(4 if jax.process_count() == 1 else 1) as pool,
         ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
             pending = [pool.submit(work.compile, compiler_options=options) for work in lowered]
-            advance, fresh, *create = (work.result() for work in pending)
-        return Executables(create[0] if create else self._create, advance, fresh)
+            collect, update, episodes, *begin = (work.result() for work in pending)
+        advance = functools.partial(self._advance, collect, update)
+        return Executables(begin[0] if begin else self._begin, episodes, advance)
+
+    def _advance(
+        self, collect: Callable[..., Any], update: Callable[..., Any], state: TrainState, mode: Mode
+    ) -> tuple[TrainState, Statistics, dict[str, Any]]:
+        """See `Program.advance`; the devices are given their work and not waited for."""
+        phase = self.place(mode.phase, PartitionSpec())
+        carried, structure = jax.tree.flatten((state, self._no_statistics()))
+        metrics = jax.tree.leaves(self._no_metrics())
+        for _ in range(-(-int(mode.steps) // self.program.algorithm.steps_per_collect)):
+            (keys,) = collect(carried, *phase)
+            if mode.phase.learning:
+                metrics = update(carried, keys)
+        state, statistics = jax.tree.unflatten(structure, carried)
+        return state, statistics, dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True))
 
     def _lower_here(self, creating: bool) -> Iterator[Any]:
-        """advance, fresh worlds and, if `creating`, create on one device; traced programs come from the cache."""
+        """collect, update, episodes and, if `creating`, begin on one device; traced programs come from the cache."""
         key: dict[str, Any] | None = {
             "config": configs.to_dict(self.config),
             "physics": self._physics,
             "algorithm": type(self.program.algorithm).__name__,
             "members": self.members,
-            "swept": {name: values.tolist() for name, values in self._values.items()},  # constants in `advance`
+            "swept": {name: values.tolist() for name, values in self._values.items()},  # constants in what is traced
             "source": source_hash(),
             "versions": versions(),
         }
-        values, keys = jax.tree.map(_shape, self._starts(0))
         if not self._extensions.ours():
             key = None  # nobody knows all that they depend on
-        mode, state = jax.tree.map(_shape, warmup(1)), self.template()
-        result = (state, *self._result_structure(state))
-        yield TracedProgram("advance", key, self.advance, (state, mode), result).lower(donate=0)
-        yield TracedProgram("fresh", key, self._fresh, (values, _shape(_first_key())), state.envs).lower()
+        shapes = lambda tree: jax.tree.map(_shape, tree)  # noqa: E731
+        values, keys, phase = shapes((*self._starts(0), warmup(1).phase))
+        state, statistics = self.template(), shapes(self._no_statistics())
+        drawn = shapes(self._drawn())
+        known, counted = len(jax.tree.leaves(state)), len(jax.tree.leaves(statistics))
+        given = (state, statistics, phase)
+        yield TracedProgram("collect", key, self._collect, given, carried=known + counted).lower_carrying()
+        yield TracedProgram("update", key, self._update, (state, drawn), carried=known).lower_carrying()
+        yield TracedProgram("episodes", key, self._episodes, (values, keys, phase.random), state.envs).lower()
         if creating:
-            yield TracedProgram("create", key, self._create, (values, keys), state).lower()
+            yield TracedProgram("begin", key, self._begin, (values, keys), state._replace(envs=())).lower()
 
     def _lower_on_mesh(self, creating: bool) -> Iterator[Any]:
         """The same on several devices."""
         values, keys = self._starts(0)
-        key = self._as_argument(_first_key(), PartitionSpec())
-        state = self._placed_shapes(self.template(), self._state_spec)
-        mode = self.mode(warmup(1))
-        results = self._results(self._state_spec, self._statistics_spec, self._whole)
-        yield jax.jit(self.advance, donate_argnums=0, **results).lower(state, mode)
-        yield jax.jit(self._fresh, **self._results(self._split)).lower(values, key)
+        state, statistics = self._placed_shapes(self.template(), self._state_spec), self._no_statistics()
+        phase, drawn = self._as_argument(warmup(1).phase, PartitionSpec()), self._as_argument(self._drawn(), self._whole)
+        carried = (self._state_spec, self._statistics_spec)
+        yield self._carrying(self._collect, (state, statistics, phase), (*carried, self._whole), 2)
+        yield self._carrying(self._update, (state, drawn), (self._state_spec, self._whole), 1)
+        yield jax.jit(self._episodes, **self._results(self._split)).lower(values, keys, phase.random)
         if creating:
-            yield jax.jit(self._create, **self._results(self._state_spec)).lower(values, keys)
+            begun = self._results(self._state_spec._replace(envs=()))
+            yield jax.jit(self._begin, **begun).lower(values, keys)
+
+    def _carrying(self, function: Callable[..., Any], arguments: Any, results: Any, carried: int) -> Carrying:
+        """`function` lowered on several devices; of its arguments it carries the first so many on."""
+        leaves, structure = jax.tree.flatten(arguments)
+        count = len(jax.tree.leaves(arguments[:carried]))
+        shapes = jax.eval_shape(function, *arguments)
+        places = jax.tree.leaves(self._placed_shapes(shapes, results))
+
+        def flat(*arrays: Any) -> list[Any]:
+            return jax.tree.leaves(function(*jax.tree.unflatten(structure, arrays)))
+
+        compiled = jax.jit(flat, donate_argnums=range(count), out_shardings=[place.sharding for place in places])
+        return Carrying(compiled.lower(*leaves), count, range(len(leaves)), range(count))
 
     def start(self, executables: Executables, seed: int) -> TrainState:
-        """`create(seed)` with a compiled program."""
-        return executables.create(*self._starts(seed))
+        """Fresh training states."""
+        values, keys = self._starts(seed)
+        training = self._as_argument(np.asarray(True), PartitionSpec())
+        return executables.begin(values, keys)._replace(envs=executables.episodes(values, keys, training))
 
     def start_from(self, state: TrainState, policies: Sequence[PolicyFile]) -> TrainState:
         """`state` with the network of one of `policies` in every member; see `FirstOrderGradient.start_from`."""
@@ -175,8 +199,9 @@ class Population:
 
     def evaluation_envs(self, executables: Executables) -> Any:
         """Newly reset environments, the same for every member and every evaluation."""
-        values, key = self._as_argument(self._values, self._whole), self._as_argument(_first_key(), PartitionSpec())
-        return executables.evaluation_envs(values, key)
+        values, keys = self._starts(0)
+        first = self._as_argument(np.broadcast_to(_first_key(), keys.shape), self._whole)
+        return executables.episodes(values, first, self._as_argument(np.asarray(False), PartitionSpec()))
 
     def policy(self, state: TrainState, member: int) -> PolicyNetwork:
         """The policy of one member of a state of NumPy arrays."""
@@ -190,31 +215,22 @@ class Population:
 
     def metric_names(self) -> tuple[list[str], list[str]]:
         """Names of what `report` says of training and of evaluation."""
-        statistics, _ = self._result_structure(self.template())
-        zeros = Statistics(*(jax.tree.map(lambda leaf: np.zeros((self.members, 1)), part) for part in statistics))
-        found = [
-            report(self.program.env, {k: v[:, 0] for k, v in zeros.totals.items()}, zeros.peaks, 1, evaluation)
-            for evaluation in (False, True)
-        ]
+        names = self.template().envs.metrics
+        totals, peaks = dict.fromkeys(names, np.zeros(self.members)), dict.fromkeys(names, np.zeros((self.members, 1)))
+        found = [report(self.program.env, totals, peaks, 1, evaluation) for evaluation in (False, True)]
         return list(found[0]), list(found[1])
-
-    def _result_structure(self, state: TrainState) -> tuple[Statistics, dict[str, int]]:
-        """The structure of the statistics and of the algorithm's metrics."""
-        leaf: Any = 0
-        names = dict.fromkeys(state.envs.metrics, leaf)
-        return Statistics(leaf, leaf, names, names), dict.fromkeys(self.program.algorithm.metrics, 0)
 
     def place_state(self, state: TrainState) -> TrainState:
         """A whole state of NumPy arrays, the same in every process, spread over the devices."""
         return jax.tree.map(lambda spec, part: self.place(part, spec), self._state_spec, state, is_leaf=_is_spec)
 
+    def _placed(self, tree: Any, specs: Any) -> Any:
+        """`_as_argument` of the parts of a tree."""
+        return jax.tree.map(lambda spec, part: self._as_argument(part, spec), specs, tree, is_leaf=_is_spec)
+
     def place_keys(self, keys: np.ndarray) -> Array:
         """The members' keys, the same in every process, on their devices."""
         return self.place(keys, self._whole)
-
-    def mode(self, mode: Mode) -> Mode:
-        """`mode` where every device sees it."""
-        return self._as_argument(mode, PartitionSpec())
 
     def place(self, tree: Any, spec: PartitionSpec) -> Any:
         """Arrays that every process holds alike, cut over the devices as `spec` says."""
@@ -240,13 +256,46 @@ class Population:
         return self._as_argument(self._values, self._whole), self._as_argument(self._keys(seed), self._whole)
 
     def _create(self, values: Any, keys: Array) -> TrainState:
-        return self._on_mesh(lambda program, key: program.create(key), (self._whole,), self._state_spec, (0,))(
-            values, keys
-        )
+        begun, training = self._begin(values, keys), np.asarray(True)
+        return begun._replace(envs=self._episodes(values, keys, training))
 
-    def _fresh(self, values: Any, key: Array) -> Any:
-        draw = lambda program, key: program.evaluation_envs(key)  # noqa: E731
-        return self._on_mesh(draw, (PartitionSpec(),), self._split, (None,))(values, key)
+    def _begin(self, values: Any, keys: Array) -> TrainState:
+        begin, result = lambda program, key: program.begin(key), self._state_spec._replace(envs=())  # noqa: E731
+        return self._on_mesh(begin, (self._whole,), result, (0,))(values, keys)
+
+    def _episodes(self, values: Any, keys: Array, training: Array | np.ndarray) -> Any:
+        draw = lambda program, key, training: program.episodes(key, training)  # noqa: E731
+        return self._on_mesh(draw, (self._whole, PartitionSpec()), self._split, (0, None))(values, keys, training)
+
+    def _collect(self, state: TrainState, statistics: Statistics, phase: Phase) -> tuple[TrainState, Statistics, Array]:
+        collect = lambda program, *arguments: program.collect(*arguments)  # noqa: E731
+        given = (self._state_spec, self._statistics_spec, PartitionSpec())
+        results = (self._state_spec, self._statistics_spec, self._whole)
+        return self._on_mesh(collect, given, results, (0, 0, None))(self._values, state, statistics, phase)
+
+    def _update(self, state: TrainState, keys: Array) -> tuple[TrainState, dict[str, Array]]:
+        learning = train(1).phase
+        update = lambda program, state, keys: program.update(state, keys, learning)  # noqa: E731
+        specs = self._state_spec, self._whole
+        return self._on_mesh(update, specs, specs, (0, 0))(self._values, state, keys)
+
+    def _no_statistics(self) -> Statistics:
+        """Of no steps."""
+        each = () if self._single else (self.members,)
+        zero, peak = np.zeros(each, np.float32), np.zeros((*each, self.program.schedule.num_envs), np.float32)
+        names = self.template().envs.metrics
+        statistics = Statistics(zero, zero, dict.fromkeys(names, zero), dict.fromkeys(names, peak))
+        return self._placed(statistics, self._statistics_spec)
+
+    def _no_metrics(self) -> dict[str, Any]:
+        """Of no update."""
+        return dict.fromkeys(self.program.algorithm.metrics, self._no_statistics().reward)
+
+    def _drawn(self) -> np.ndarray:
+        """Something like the keys that a collection leaves for the update."""
+        algorithm = self.program.algorithm
+        count = algorithm.collect_keys + algorithm.update_keys + 1
+        return np.zeros((*(() if self._single else (self.members,)), count, 2), np.uint32)
 
     def _on_mesh(self, one: Callable[..., Any], specs: Any, results: Any, axes: tuple[int | None, ...]) -> Any:
         """`one(program, *arguments)` for all members over the mesh, as a function of (values, *arguments)."""

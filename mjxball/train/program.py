@@ -21,7 +21,7 @@ from mjxball.errors import InputError
 from mjxball.train.extensions import DEFAULTS, Extensions, find, is_pair, make_env
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float, Int, UInt
 
 MATMUL_PRECISION = "highest"  # float32 throughout: GPUs would else round products to TF32
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
@@ -35,6 +35,16 @@ class Statistics(NamedTuple):
     ended: Float[Array, ""]  # episodes terminated
     totals: dict[str, Float[Array, ""]]  # each of the environment's metrics, summed over environments and steps
     peaks: dict[str, Float[Array, " envs"]]  # the largest of each
+
+
+def joined(first: Statistics, second: Statistics) -> Statistics:
+    """Statistics of the steps of both."""
+    return Statistics(
+        reward=first.reward + second.reward,
+        ended=first.ended + second.ended,
+        totals={name: total + second.totals[name] for name, total in first.totals.items()},
+        peaks={name: jnp.maximum(peak, second.peaks[name]) for name, peak in first.peaks.items()},
+    )
 
 
 class Envs(NamedTuple):
@@ -198,12 +208,9 @@ class Environments:
         else:
             after = self._step(before, action)
         terminated = after.done * (1 - after.info["truncation"])
-        statistics, metrics = envs.statistics, after.metrics
-        statistics = Statistics(
-            reward=statistics.reward + after.reward.mean(),
-            ended=statistics.ended + terminated.sum(),
-            totals={name: total + metrics[name].sum() for name, total in statistics.totals.items()},
-            peaks={name: jnp.maximum(peak, metrics[name]) for name, peak in statistics.peaks.items()},
+        totals = {name: values.sum() for name, values in after.metrics.items()}
+        statistics = joined(
+            envs.statistics, Statistics(after.reward.mean(), terminated.sum(), totals, after.metrics)
         )
         transition = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
         stepped = Envs(after, statistics, envs.difficulty)
@@ -285,15 +292,24 @@ class Program:
         self.schedule = schedule
 
     def create(self, key: Array) -> TrainState:
-        """A fresh training state; the episodes are staggered so that they do not end together."""
-        learner_key, env_key, stagger_key, key = jax.random.split(key, 4)
-        envs = self.environments.reset(env_key, self._difficulty(jnp.zeros((), jnp.int32), jnp.ones((), bool)))
-        return TrainState(
-            algorithm=self.algorithm.init(learner_key),
-            envs=self.environments.staggered(envs, stagger_key, self.config.timing.episode_steps),
-            key=key,
-            steps=jnp.zeros((), jnp.int32),
-        )
+        """A fresh training state."""
+        return self.begin(key)._replace(envs=self.episodes(key, np.asarray(True)))
+
+    def begin(self, key: Array) -> TrainState:
+        """A fresh training state but for its environments."""
+        learner_key, _, _, key = jax.random.split(key, 4)
+        return TrainState(algorithm=self.algorithm.init(learner_key), envs=(), key=key, steps=jnp.zeros((), jnp.int32))
+
+    def episodes(self, key: Array, training: Bool[Array | np.ndarray, ""]) -> Any:
+        """Newly reset environments: those that `create(key)` trains on, else those of every evaluation with `key`.
+
+        Episodes of training are staggered, so that they do not end together.
+        """
+        _, env_key, stagger_key, _ = jax.random.split(key, 4)
+        own_key = jnp.where(training, env_key, jax.random.fold_in(key, EVALUATION_DRAW))
+        envs = self.environments.reset(own_key, self._difficulty(jnp.zeros((), jnp.int32), training))
+        staggered = self.environments.staggered(envs, stagger_key, self.config.timing.episode_steps)
+        return jax.tree.map(lambda new, old: jnp.where(training, new, old), staggered, envs)
 
     def _difficulty(self, steps: Int[Array, ""], recording: Bool[Array, ""]) -> Float[Array, ""] | float:
         """How hard the drawn environments are after so many `steps`, 0 to 1; in evaluation as hard as can be."""
@@ -306,35 +322,49 @@ class Program:
     def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Float[Array, ""]]]:
         """Step all environments `mode.steps` times (rounded up to whole collections), and learn.
 
-        Returns the state, sums over all steps, and the metrics of the algorithm's last update.
+        Returns the state, sums over all steps, and the metrics of the algorithm's last update. One function of all,
+        which `Population` spares XLA: `collect` and `update` apart compile sooner, side by side.
         """
-        algorithm, first = self.algorithm, self.algorithm.collect_keys
-        taken = self.schedule.num_envs * algorithm.steps_per_collect
-        recording = mode.phase.recording
 
         def body(_: Array, carry: Any) -> Any:
             state, statistics, _ = carry
-            # One draw for many keys: each draw is kernels to compile and to launch.
-            *keys, key = jax.random.split(state.key, first + algorithm.update_keys + 1)
-            envs = self.environments.begin(state.envs, self._difficulty(state.steps, recording))._replace(
-                statistics=statistics
-            )
-            known, envs = algorithm.collect(state.algorithm, envs, keys[:first], mode.phase)
-            steps = state.steps + jnp.where(recording, taken, 0)
-            progress = jnp.minimum(steps / self.schedule.total_steps, 1.0)
-            known, metrics = algorithm.update(known, keys[first:], progress, mode.phase)
-            return TrainState(known, envs.states, key, steps), envs.statistics, metrics
+            state, statistics, keys = self.collect(state, statistics, mode.phase)
+            state, metrics = self.update(state, keys, mode.phase)
+            return state, statistics, metrics
 
-        statistics = self.environments.begin(state.envs, 1.0).statistics
-        metrics = dict.fromkeys(algorithm.metrics, jnp.zeros(()))
-        rounds = -(-mode.steps // algorithm.steps_per_collect)
+        metrics = dict.fromkeys(self.algorithm.metrics, jnp.zeros(()))
+        start = (state, self.environments.begin(state.envs, 1.0).statistics, metrics)
+        rounds = -(-mode.steps // self.algorithm.steps_per_collect)
+        return jax.lax.fori_loop(0, rounds, body, start)
+
+    def collect(
+        self, state: TrainState, statistics: Statistics, phase: Phase
+    ) -> tuple[TrainState, Statistics, UInt[Array, "keys 2"]]:
+        """One collection of the algorithm: the state, `statistics` with it, and keys for the `update` that follows."""
+        algorithm = self.algorithm
+        # One draw for many keys: each draw is kernels to compile and to launch.
+        keys = jax.random.split(state.key, algorithm.collect_keys + algorithm.update_keys + 1)
+        envs = self.environments.begin(state.envs, self._difficulty(state.steps, phase.recording))
         with jax.default_matmul_precision(MATMUL_PRECISION):
-            state, statistics, metrics = jax.lax.fori_loop(0, rounds, body, (state, statistics, metrics))
-        return state, self.environments.over_shards(statistics), self._shards.mean(metrics)
+            known, envs = algorithm.collect(state.algorithm, envs, list(keys[: algorithm.collect_keys]), phase)
+        taken = self.schedule.num_envs * algorithm.steps_per_collect
+        steps = state.steps + jnp.where(phase.recording, taken, 0)
+        seen = self.environments.over_shards(envs.statistics)
+        return TrainState(known, envs.states, keys[-1], steps), joined(statistics, seen), keys
+
+    def update(
+        self, state: TrainState, keys: UInt[Array, "keys 2"], phase: Phase
+    ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
+        """The algorithm's update after a `collect`, which gave the `keys`: the state and the algorithm's metrics."""
+        progress = jnp.minimum(state.steps / self.schedule.total_steps, 1.0)
+        own = list(keys[self.algorithm.collect_keys : -1])
+        with jax.default_matmul_precision(MATMUL_PRECISION):
+            known, metrics = self.algorithm.update(state.algorithm, own, progress, phase)
+        return state._replace(algorithm=known), self._shards.mean(metrics)
 
     def evaluation_envs(self, key: Array) -> Any:
         """Newly reset environments, the same at every evaluation with `key`."""
-        return self.environments.reset(jax.random.fold_in(key, EVALUATION_DRAW))
+        return self.episodes(key, np.asarray(False))
 
     def policy(self, state: TrainState) -> PolicyNetwork:
         """The policy to evaluate and export."""

@@ -31,7 +31,7 @@ from mjxball.train.program import Mode, Statistics, TrainState
 from mjxball.train.progress import Progress, Row, columns
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
 
-CHUNKS = 50  # rows of metrics.csv in a run, at most
+CHUNKS = 25  # rows of metrics.csv in a run, at most
 SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
 
 
@@ -67,6 +67,17 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
         yield stop
     finally:
         restore()
+
+
+@dataclass
+class Chunk:
+    """Training that the devices were given, and what it will have brought: a row of metrics.csv."""
+
+    steps: int  # of every environment
+    reached: int  # environment steps of the run at its end
+    began: float  # [s] on the run's clock
+    statistics: Statistics  # on the devices
+    metrics: Any
 
 
 class Run:
@@ -106,7 +117,7 @@ class Run:
         self._checkpoints: Future[Any] | None = None
         self._pending: Future[None] | None = None
         self._state = resumed
-        self._saved_at = self._saving = 0.0  # [s]
+        self._saved_at = self._saving = self._looked_at = 0.0  # [s]
         self._saved_steps = -1
 
     @property
@@ -170,7 +181,7 @@ class Run:
 
     def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Any]]:
         """See `Program.advance`; statistics and metrics come back whole, as NumPy."""
-        state, *results = self._compiled.advance(state, self.population.mode(mode))
+        state, *results = self._compiled.advance(state, mode)
         return state, *processes.gather(results)
 
     def _loop(self, stop: Stop) -> None:
@@ -179,43 +190,59 @@ class Run:
         done = self._steps() // self._schedule.num_envs
         (ended,) = processes.any_of((stop.requested,))
         if done < first and not ended:
-            self.state, *_ = self._advance(self.state, programs.warmup(first - done))
+            self.state, *_ = self._compiled.advance(self.state, programs.warmup(first - done))
             done = first
         window = self.population.program.algorithm.steps_per_collect
         chunk = math.ceil(total / CHUNKS / window) * window
         chunks = math.ceil(total / chunk)
+        flying: Chunk | None = None  # the devices are at it, or done with it
         while done < total and not ended:
             number = done // chunk + 1
-            steps = min(number * chunk, total) - done
-            row = self._chunk(steps)
-            done += steps
+            begun = self._begin_chunk(min(number * chunk, total) - done, flying)
+            done = min(number * chunk, total)
+            if flying:  # looked at while the devices are at the next one, so that they need not wait
+                self.progress.show(self._row(flying))
+            flying = begun
             late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
             # All processes act on what they agreed on here, whenever a signal reaches one of them.
             ended, late = processes.any_of((stop.requested, late))
-            due = number * evaluations // chunks > (number - 1) * evaluations // chunks
-            if due or done >= total:
+            due = number * evaluations // chunks > (number - 1) * evaluations // chunks or done >= total
+            if not (due or late or ended):
+                continue
+            row, flying = self._row(flying), None
+            if due:
                 row |= self._evaluated()
             self.progress.show(row)
-            if due or late or done >= total:
+            if due or late:
                 self._save()
         self._ended = ended
 
     def _steps(self) -> int:
         return _count(self.state)
 
-    def _chunk(self, steps: int) -> Row:
-        before = self.progress.elapsed()
-        self.state, statistics, metrics = self._advance(self.state, programs.train(steps))
-        after = self.progress.elapsed()
-        each, members = self.population.each, self.population.members
+    def _begin_chunk(self, steps: int, before: Chunk | None) -> Chunk:
+        """Give the devices a chunk of training, behind that `before` it."""
+        window = self.population.program.algorithm.steps_per_collect
+        taken = math.ceil(steps / window) * window * self._schedule.num_envs
+        reached = (before.reached if before else self._steps()) + taken
+        began = self.progress.elapsed()
+        self.state, statistics, metrics = self._compiled.advance(self.state, programs.train(steps))
+        return Chunk(steps, reached, began, statistics, metrics)
+
+    def _row(self, chunk: Chunk) -> Row:
+        """What there is to say of a chunk, once the devices are done with it."""
+        statistics, metrics = processes.gather((chunk.statistics, chunk.metrics))
+        now = self.progress.elapsed()
+        began, self._looked_at = max(chunk.began, self._looked_at), now
+        each, members, steps = self.population.each, self.population.members, chunk.steps
         learnt = {name: _median(each(value)) for name, value in metrics.items()}
         broken = [name for name, value in learnt.items() if not math.isfinite(value)]
         if broken:
-            raise TrainingDivergedError(f"{broken[0]} is not finite after {self._steps():,} steps")
+            raise TrainingDivergedError(f"{broken[0]} is not finite after {chunk.reached:,} steps")
         return {
-            "steps": self._steps(),
+            "steps": chunk.reached,
             "seconds": round(self.progress.seconds(), 3),
-            "rate": round(steps * self._schedule.num_envs * members / max(after - before, 1e-9), 1),
+            "rate": round(steps * self._schedule.num_envs * members / max(now - began, 1e-9), 1),
             "episode_return": _median(each(statistics.reward)) / steps * self.config.timing.episode_steps,
             **{
                 name: _median_or_none(values)
