@@ -38,8 +38,8 @@ SHORT = {
     "gradient": "--gradient.gradient_steps 1",
 }
 ON_GPU = {
-    "sac": "--sac.total_steps 384000 --sac.replay_size 384000 --sac.learning_rate 3e-3 --sac.num_envs 512 "
-    "--sac.updates_per_step 16 --sac.batch_size 512 --sac.tau 0.02 --sac.num_evaluations 1",
+    "sac": "--sac.total_steps 384000 --sac.replay_size 384000 --sac.learning_rate 5e-3 --sac.num_envs 512 "
+    "--sac.updates_per_step 16 --sac.batch_size 256 --sac.tau 0.03 --sac.num_evaluations 1",
     "ppo": "--ppo.num_evaluations 1",
     "gradient": "",
 }

@@ -10,7 +10,8 @@ steps. PPO is not evaluated while the clock runs. Brax publishes PPO for both en
 walker2d, the nearest that it publishes.
 
 One process, trainers in turn, each with an empty compilation cache of its own for the first seed (cold), which
-the other seeds find filled (warm). Seconds are those of the whole call: tracing, compiling, training. Every policy
+the other seeds find filled (warm). Seconds are those of the whole call: tracing, compiling, training. Ours is a pure
+function of the seed, compiled at its first call; Brax's trainer traces anew at every call. Every policy
 then flies the same 128 episodes of 1000 steps, without noise, up to its first termination.
 """
 
@@ -117,39 +118,47 @@ def our_config(algorithm: str, given: dict[str, Any]) -> configs.Config:
 Policy = tuple[Callable[[Any, Any], Any], Any]  # action of (parameters, observation), and the parameters
 
 
-def ours(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Policy:
-    """Train."""
+def ours(env: Any, algorithm: str, given: dict[str, Any]) -> Callable[[int], Policy]:
+    """Training of a seed, a function that is compiled at its first call."""
     config = our_config(algorithm, given)
     kind = {"sac": SoftActorCritic, "ppo": ProximalPolicyOptimization}[algorithm]
     whole = jax.jit(
         lambda key: train(config, key, env=env, algorithm=kind, evaluate=algorithm == "sac"),
         compiler_options=compiler_options(kind),
     )
-    policy, _ = whole(jax.random.PRNGKey(seed))
-    return lambda network, observation: network(observation), jax.block_until_ready(policy)
+
+    def one(seed: int) -> Policy:
+        policy, _ = whole(jax.random.PRNGKey(seed))
+        return lambda network, observation: network(observation), jax.block_until_ready(policy)
+
+    return one
 
 
-def stock(env: Any, algorithm: str, given: dict[str, Any], seed: int) -> Policy:
-    """The same with Brax's trainer."""
+def stock(env: Any, algorithm: str, given: dict[str, Any]) -> Callable[[int], Policy]:
+    """The same with Brax's trainer, which is called for every seed."""
     from brax.training.agents.ppo import train as ppo
     from brax.training.agents.sac import train as sac
 
     jax.device_put_replicated = replicated  # which JAX has removed
-    make_policy, parameters, _ = {"sac": sac, "ppo": ppo}[algorithm].train(
-        environment=env,
-        episode_length=EPISODE,
-        normalize_observations=True,
-        seed=seed,
-        num_evals=1,
-        max_devices_per_host=1,
-        **({"run_evals": False} if algorithm == "ppo" else {}),
-        **given,
-    )
 
-    def act(known: Any, observation: Any) -> Any:
-        return make_policy(known, deterministic=True)(observation, jax.random.PRNGKey(0))[0]
+    def one(seed: int) -> Policy:
+        make_policy, parameters, _ = {"sac": sac, "ppo": ppo}[algorithm].train(
+            environment=env,
+            episode_length=EPISODE,
+            normalize_observations=True,
+            seed=seed,
+            num_evals=1,
+            max_devices_per_host=1,
+            **({"run_evals": False} if algorithm == "ppo" else {}),
+            **given,
+        )
 
-    return act, jax.block_until_ready(parameters)
+        def act(known: Any, observation: Any) -> Any:
+            return make_policy(known, deterministic=True)(observation, jax.random.PRNGKey(0))[0]
+
+        return act, jax.block_until_ready(parameters)
+
+    return one
 
 
 def mean_return(env: Any, policy: Policy) -> float:
@@ -216,11 +225,12 @@ def main() -> None:
             unit *= 1 if algorithm == "sac" else given["batch_size"]
             given["num_timesteps"] = math.ceil(given["num_timesteps"] * options.scale / unit) * unit
             env = envs.get_environment(env_name, backend=options.backend)
+            train_with = {name: trainers[name](env, algorithm, given) for name in options.trainers}
             for seed, trainer in itertools.product(range(options.seeds), options.trainers):
                 settings.update("jax_compilation_cache_dir", f"{place}/{env_name}-{algorithm}-{trainer}")
                 compilation_cache.reset_cache()
                 started = time.perf_counter()
-                policy = trainers[trainer](env, algorithm, given, seed)
+                policy = train_with[trainer](seed)
                 seconds = time.perf_counter() - started
                 row = {"env": env_name, "algorithm": algorithm, "trainer": trainer, "seed": seed}
                 row |= {"steps": given["num_timesteps"], "seconds": seconds, "return": mean_return(env, policy)}

@@ -425,7 +425,10 @@ def _made_when_called(make: Callable[[], ControlStep]) -> ControlStep:
         with jax.ensure_compile_time_eval():
             return make()
 
-    return lambda state, commands, load: made()(state, commands, load)
+    def control_step(state: PlantState, commands: Float[Array, "... drones 3"], load: Load) -> PlantState:
+        return made()(state, commands, load)
+
+    return control_step
 
 
 def make_physics(config: Config, physics: str, rig: PlantParameters | None = None) -> ControlStep:

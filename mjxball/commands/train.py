@@ -109,7 +109,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
     with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
         if meeting:
             processes.join(meeting)
-        writes = processes.is_writer()
+        writes = not meeting or processes.is_writer()  # to ask wakes the devices, and waits
         with ThreadPoolExecutor(1) as beside:
 
             def prepare() -> None:
@@ -143,8 +143,11 @@ def _run(
     `beside` is called when everything is compiled and the device begins to train.
     """
     _wake_devices()
+    # The algorithm's libraries are imported meanwhile, before anything asks for devices.
+    from mjxball.train.extensions import find
     from mjxball.train.run import Run
 
+    find((origin.get("extensions") or {}).get("algorithm") or "sac", "--algorithm")
     state = None
     if resume:
         from mjxball.train.checkpoint import restore_state

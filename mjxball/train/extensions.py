@@ -128,8 +128,13 @@ class TracedOnce:
 
     @functools.cached_property
     def observation_size(self) -> Any:
-        """Brax's are measured by a reset."""
-        return self.env.observation_size
+        """Brax's are measured by a reset, which need not be computed, operation by operation, to know a size."""
+        found: list[Any] = []
+        try:
+            jax.eval_shape(lambda: found.append(self.env.observation_size))
+        except jax.errors.JAXTypeError:  # it looks at numbers
+            return self.env.observation_size
+        return found[0]
 
 
 class Rewarded:

@@ -158,7 +158,10 @@ class Population:
         """The same on several devices."""
         values, keys = self._starts(0)
         state, statistics = self._placed_shapes(self.template(), self._state_spec), self._no_statistics()
-        phase, drawn = self._as_argument(warmup(1).phase, PartitionSpec()), self._as_argument(self._drawn(), self._whole)
+        phase, drawn = (
+            self._as_argument(warmup(1).phase, PartitionSpec()),
+            self._as_argument(self._drawn(), self._whole),
+        )
         carried = (self._state_spec, self._statistics_spec)
         yield self._carrying(self._collect, (state, statistics, phase), (*carried, self._whole), 2)
         yield self._carrying(self._update, (state, drawn), (self._state_spec, self._whole), 1)
@@ -260,7 +263,7 @@ class Population:
         return begun._replace(envs=self._episodes(values, keys, training))
 
     def _begin(self, values: Any, keys: Array) -> TrainState:
-        begin, result = lambda program, key: program.begin(key), self._state_spec._replace(envs=())  # noqa: E731
+        begin, result = lambda program, key: program.begin(key), self._state_spec._replace(envs=())
         return self._on_mesh(begin, (self._whole,), result, (0,))(values, keys)
 
     def _episodes(self, values: Any, keys: Array, training: Array | np.ndarray) -> Any:

@@ -209,9 +209,7 @@ class Environments:
             after = self._step(before, action)
         terminated = after.done * (1 - after.info["truncation"])
         totals = {name: values.sum() for name, values in after.metrics.items()}
-        statistics = joined(
-            envs.statistics, Statistics(after.reward.mean(), terminated.sum(), totals, after.metrics)
-        )
+        statistics = joined(envs.statistics, Statistics(after.reward.mean(), terminated.sum(), totals, after.metrics))
         transition = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
         stepped = Envs(after, statistics, envs.difficulty)
         if fresh is not None:
