@@ -88,7 +88,7 @@ def our_command(options: argparse.Namespace, seed: int, out: Path, steps: int) -
     replay = math.ceil(steps / options.worlds) * options.worlds
     flags = ["--sac.total_steps", steps, "--sac.replay_size", replay, "--sac.num_evaluations", 1]
     flags += ["--sac.learning_rate", options.learning_rate, "--sac.num_envs", options.worlds]
-    flags += ["--sac.updates_per_step", options.updates, "--sac.batch_size", options.batch, "--sac.tau", 0.02]
+    flags += ["--sac.updates_per_step", options.updates, "--sac.batch_size", options.batch, "--sac.tau", options.tau]
     command = ["train.py", "transport", "--seed", seed, "--out", out, "--physics", options.physics, *flags]
     return [str(word) for word in command]
 
@@ -301,6 +301,7 @@ def main() -> None:
     parser.add_argument("--num-envs", "--worlds", dest="worlds", metavar="N", type=int, default=128)
     parser.add_argument("--updates-per-step", "--updates", dest="updates", metavar="N", type=int, default=4)
     parser.add_argument("--batch-size", "--batch", dest="batch", metavar="N", type=int, default=256)
+    parser.add_argument("--tau", type=float, default=0.02)
     parser.add_argument("--snapshots", type=int, default=1, help="policies of each stock run that are evaluated")
     parser.add_argument("--stock", nargs=argparse.REMAINDER, default=[], help="flags for stock_sac.py; must come last")
     parser.add_argument("--together", type=int, default=4, help="stock runs at once, after the first")

@@ -80,7 +80,7 @@ def import_jax() -> ModuleType:
     if any(place.is_dir() and any(place.glob("jax_rocm*")) for place in map(Path, sys.path)):
         return importlib.import_module("jax")
     search = importlib.metadata.distributions
-    importlib.metadata.distributions = lambda **_: iter(())  # type: ignore[assignment]
+    importlib.metadata.distributions = lambda **_: iter(())
     try:
         return importlib.import_module("jax")
     finally:

@@ -232,6 +232,22 @@ def test_two_halves_of_a_batch_make_the_update_of_the_whole():
     assert largest_difference(first, before.critic) > 1e-3
 
 
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_stacked_critics_are_brax_critics(layer_norm: bool):
+    config = dataclasses.replace(SMALL, critic_layer_norm=layer_norm, num_critics=2, critic_layers=(8, 8))
+    network, brax = sac.make_networks(config, [1.0] * 4, 3).q_network, sac.brax
+    separate = brax.networks.make_q_network(
+        4, 3, hidden_layer_sizes=(8, 8), activation=jax.nn.relu, layer_norm=layer_norm
+    )
+    key, seen, action = jax.random.key(0), jax.random.normal(jax.random.key(1), (5, 4)), jnp.full((5, 3), 0.3)
+    statistics = brax.running_statistics.init_state(brax.specs.Array((4,), jnp.dtype("float32")))
+    found = network.apply(statistics, network.init(key), seen, action)
+    assert found.shape == (5, 2)
+    expected = separate.apply(statistics, separate.init(key), seen, action)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)  # float32
+    assert np.ptp(found, axis=-1).min() > 1e-3  # two critics, not one twice
+
+
 def test_mask_hides_its_slots_from_policy_and_critic():
     networks = sac.make_networks(SMALL, (0.0, 1.0, 0.0, 1.0), 1)
     learner = sac.create(networks, SMALL, 4, jax.random.key(0))

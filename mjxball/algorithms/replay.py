@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def create(capacity: int, num_envs: int, observation_size: int, action_size: int
     return Replay(jnp.zeros((capacity + num_envs, width), jnp.float32), jnp.zeros((), jnp.int32))
 
 
-def insert(replay: Replay, transitions: Transitions, record: Bool[Array, ""]) -> Replay:
+def insert(replay: Replay, transitions: Transitions, record: Bool[Array | np.ndarray, ""]) -> Replay:
     """Write one step of all worlds (worlds, ...) over the oldest rows, or to scratch unless `record`."""
     columns = [column if column.ndim == 2 else column[:, None] for column in transitions]
     rows = jnp.concatenate(columns, axis=-1)

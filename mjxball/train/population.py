@@ -285,7 +285,8 @@ class Population:
     def _no_statistics(self) -> Statistics:
         """Of no steps."""
         each = () if self._single else (self.members,)
-        zero, peak = np.zeros(each, np.float32), np.zeros((*each, self.program.schedule.num_envs), np.float32)
+        zero: Any = np.zeros(each, np.float32)
+        peak: Any = np.zeros((*each, self.program.schedule.num_envs), np.float32)
         names = self.template().envs.metrics
         statistics = Statistics(zero, zero, dict.fromkeys(names, zero), dict.fromkeys(names, peak))
         return self._placed(statistics, self._statistics_spec)

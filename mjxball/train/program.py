@@ -309,7 +309,7 @@ class Program:
         staggered = self.environments.staggered(envs, stagger_key, self.config.timing.episode_steps)
         return jax.tree.map(lambda new, old: jnp.where(training, new, old), staggered, envs)
 
-    def _difficulty(self, steps: Int[Array, ""], recording: Bool[Array, ""]) -> Float[Array, ""] | float:
+    def _difficulty(self, steps: Int[Array, ""], recording: Bool[Array | np.ndarray, ""]) -> Float[Array, ""] | float:
         """How hard the drawn environments are after so many `steps`, 0 to 1; in evaluation as hard as can be."""
         share = self.schedule.curriculum
         if share == 0:

@@ -1,0 +1,113 @@
+"""Traced programs: arrays that are carried on, the cache, and what is told to XLA."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjxball.train.compilation import TracedProgram, compiler_options
+from mjxball.train.extensions import TracedOnce
+
+
+def rolling(state: dict[str, Any], step: Any) -> tuple[dict[str, Any], Any]:
+    """`total` changes, `kept` is read, `far` and the random key are not even that."""
+    return {**state, "total": state["total"] + step * state["kept"]}, step + 1
+
+
+def shapes(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), tree)
+
+
+@pytest.mark.parametrize("cached", [False, True])
+def test_only_what_a_program_reads_and_changes_passes_through_it(
+    cached: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mjxball.train.compilation.traced_directory", lambda: tmp_path)
+    state = {"far": jnp.ones(3), "key": jax.random.key(1), "kept": jnp.full(2, 5.0), "total": jnp.zeros(2)}
+    step, calls = jnp.float32(2.0), []
+
+    def function(*arguments: Any) -> Any:
+        calls.append(1)
+        return rolling(*arguments)
+
+    for _ in range(1 + cached):
+        program = TracedProgram("rolling", {"test": 1}, function, shapes((state, step)), carried=len(state))
+    assert len(calls) == 1  # the second one is the file's
+    lowered = program.lower_carrying()
+    names = sorted(state)
+    assert [names[k] for k in lowered.writes] == ["total"]
+    assert {names[k] for k in lowered.reads if k < len(state)} == {"key", "kept", "total"}  # a key has no zeros
+    run, carried = lowered.compile(None), jax.tree.leaves(state)
+    before = list(carried)
+    for count in (1, 2):
+        (after,) = run(carried, step)
+        assert float(after) == 3.0
+        np.testing.assert_array_equal(carried[3], np.full(2, 10.0 * count))
+    assert all(one is other for one, other in zip(carried[:3], before[:3], strict=True))
+    np.testing.assert_array_equal(carried[0], np.ones(3))  # its memory was not given away
+
+
+def test_many_followers_products_are_tuned_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    tuned = "xla_gpu_autotune_level"
+    alone, together = compiler_options(members=1), compiler_options(members=64)
+    assert alone is not None
+    assert together is not None
+    assert alone[tuned] == 0
+    assert tuned not in together
+
+
+class Measured:
+    """An environment that measures its observation by a reset, as Brax's do."""
+
+    def __init__(self, looks: bool):
+        self.looks, self.computed = looks, 0
+
+    @property
+    def observation_size(self) -> int:
+        found = jnp.arange(4.0) + 1.0
+        self.computed += not isinstance(found, jax.core.Tracer)
+        return int(found.sum()) if self.looks else found.shape[0]
+
+
+@pytest.mark.parametrize(("looks", "size", "computed"), [(False, 4, 0), (True, 10, 1)])
+def test_a_size_is_known_without_computing_a_reset(looks: bool, size: int, computed: int) -> None:
+    """Unless the environment looks at numbers."""
+    env = Measured(looks)
+    once = TracedOnce(env)
+    assert [once.observation_size, once.observation_size] == [size, size]
+    assert env.computed == computed
+
+
+def test_a_state_is_known_without_the_physics_engine_or_brax_physics() -> None:
+    """In a process of its own; Brax is whole for whoever asks for more of it."""
+    code = """
+import importlib.metadata, sys
+search = importlib.metadata.distributions
+from mjxball.quiet import import_jax
+import_jax()
+assert importlib.metadata.distributions is search
+from mjxball.config import preset
+from mjxball.train.population import Population
+population = Population(preset("transport"), "mjx")
+assert population.template().envs.obs.shape == (512, 18), population.template().envs.obs.shape
+assert "mujoco" not in sys.modules
+import jax
+state = population.template().envs
+one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), state)
+jax.eval_shape(population.program.env.step, one, jax.ShapeDtypeStruct((3,), "float32"))
+assert "mujoco.mjx" in sys.modules
+import brax
+from brax import envs
+assert brax.System.__module__ == "brax.base" and envs.Env.__module__ == "brax.envs.base"
+"""
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
