@@ -5,9 +5,9 @@
 
 Ours is `mjxball.train.train(config, key, env=..., algorithm=...)`, compiled with the options of `train.py`; stock is
 `brax.training.agents.{sac,ppo}.train`. Both get Brax's published hyper-parameters (notebooks/training.ipynb) but for
-those of `OWN`, and backend (`positional`, as there), the same network sizes and steps. Both SACs evaluate once, at the end, in 128 000
-steps. PPO is not evaluated while the clock runs. Brax publishes PPO for both environments; its SAC has those of
-walker2d, the nearest that it publishes.
+those of `OWN`, and backend (`positional`, as there), the same network sizes and steps. Both SACs evaluate once, at the
+end, in 128 000 steps. PPO is not evaluated while the clock runs. Brax publishes PPO for both environments; its SAC has
+those of walker2d, the nearest that it publishes.
 
 One process, trainers in turn, each with an empty compilation cache of its own for the first seed (cold), which
 the other seeds find filled (warm). Seconds are those of the whole call: tracing, compiling, training. Ours is a pure
@@ -68,7 +68,7 @@ TASKS: dict[tuple[str, str], dict[str, Any]] = {
     ("ant", "sac"): {"num_timesteps": 393_216, **SAC},
     ("ant", "ppo"): {"num_timesteps": 10_000_000, **PPO, "num_envs": 4096, "batch_size": 2048},
 }
-# What ours takes instead: half as many updates, longer ones, found by one run of seed 10 on two cores (return 3722).
+# What ours takes instead: half as many updates, longer ones, as one run of seed 10 had a return of 3722 with them.
 OWN: dict[tuple[str, str], dict[str, Any]] = {("ant", "sac"): {"grad_updates_per_step": 16, "learning_rate": 1e-3}}
 # What Brax's trainers take where nothing is said.
 SAC_LAYERS, PPO_POLICY, PPO_VALUE = (256, 256), (32,) * 4, (256,) * 5
