@@ -3,21 +3,22 @@
 `python benchmarks/transfer.py [--envs inverted_pendulum ant] [--algorithms sac ppo] [--trainers ours stock]
 [--seeds K] [--backend NAME] [--scale S] [--json FILE]`
 
-Ours is `mjxball.train.train(config, key, env=..., algorithm=...)`, compiled with the options of `train.py`; stock is
+Ours is what `train.py --env` runs, without its files (`mjxball.train.population`); stock is
 `brax.training.agents.{sac,ppo}.train`. Both get Brax's published hyper-parameters (notebooks/training.ipynb) but for
 those of `OWN`, and backend (`positional`, as there), the same network sizes and steps. Both SACs evaluate once, at the
 end, in 128 000 steps. PPO is not evaluated while the clock runs. Brax publishes PPO for both environments; its SAC has
 those of walker2d, the nearest that it publishes.
 
 One process, trainers in turn, each with an empty compilation cache of its own for the first seed (cold), which
-the other seeds find filled (warm). Seconds are those of the whole call: tracing, compiling, training. Ours is a pure
-function of the seed, compiled at its first call; Brax's trainer traces anew at every call. Every policy
+the other seeds find filled (warm). Seconds are those of the whole call: tracing, compiling, training. Ours traces and
+compiles for the first seed alone, Brax's trainer traces anew at every call. Every policy
 then flies the same 128 episodes of 1000 steps, without noise, up to its first termination.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import json
 import math
@@ -36,8 +37,9 @@ from mjxball import config as configs
 from mjxball.algorithms.ppo import ProximalPolicyOptimization
 from mjxball.algorithms.sac import SoftActorCritic
 from mjxball.quiet import import_brax_env
-from mjxball.train import train
-from mjxball.train.compilation import compiler_options
+from mjxball.train import program as programs
+from mjxball.train.extensions import Extensions
+from mjxball.train.population import Executables, Population
 from stock_sac import replicated
 from training import say, versions
 
@@ -121,17 +123,25 @@ Policy = tuple[Callable[[Any, Any], Any], Any]  # action of (parameters, observa
 
 
 def ours(env: Any, algorithm: str, given: dict[str, Any]) -> Callable[[int], Policy]:
-    """Training of a seed, a function that is compiled at its first call."""
+    """Training of a seed, by programs that are compiled for the first."""
     config = our_config(algorithm, given)
     kind = {"sac": SoftActorCritic, "ppo": ProximalPolicyOptimization}[algorithm]
-    whole = jax.jit(
-        lambda key: train(config, key, env=env, algorithm=kind, evaluate=algorithm == "sac"),
-        compiler_options=compiler_options(kind),
-    )
+
+    @functools.cache
+    def made() -> tuple[Population, Executables]:
+        population = Population(config, "none", devices=jax.devices()[:1], extensions=Extensions(env, None, kind))
+        return population, population.compile(creating=True)
 
     def one(seed: int) -> Policy:
-        policy, _ = whole(jax.random.PRNGKey(seed))
-        return lambda network, observation: network(observation), jax.block_until_ready(policy)
+        population, compiled = made()
+        program = population.program
+        state, total = population.start(compiled, seed), program.total_rounds
+        for mode in (programs.warmup(program.warmup_rounds), programs.train(total - program.warmup_rounds)):
+            state, *_ = compiled.advance(state, mode)
+        if algorithm == "sac":  # as Brax's does, which cannot do without
+            evaluating = state._replace(envs=population.evaluation_envs(compiled))
+            state, *_ = compiled.advance(evaluating, programs.evaluate(program.evaluation_steps))
+        return lambda network, observation: network(observation), jax.block_until_ready(program.policy(state))
 
     return one
 

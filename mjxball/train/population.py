@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -37,6 +37,7 @@ class Executables(NamedTuple):
     begin: Callable[[Any, Any], TrainState]  # (swept values, keys) -> `Program.begin`
     episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `Program.episodes`
     advance: Callable[[TrainState, Mode], tuple[TrainState, Statistics, Any]]  # gives away the state's memory
+    wait: Callable[[], Any]  # until all of them are compiled; raises what went wrong
 
 
 class Population:
@@ -99,21 +100,27 @@ class Population:
         return self._template
 
     def compile(self, creating: bool) -> Executables:
-        """Compile everything a run needs, side by side; `begin` only if `creating`."""
+        """Compile everything a run needs, side by side; `begin` only if `creating`.
+
+        On one device what is compiled already can be called while the rest still is.
+        """
         options = compiler_options(self.program.algorithm, self.members)
         # XLA compiles outside Python's lock: the longest is traced first, the others while it is compiled. Two at once
         # end a process that shares GPUs with others by a segfault.
+        pool = ThreadPoolExecutor(4 if jax.process_count() == 1 else 1)
         with (
             partitioned_by_gspmd(self.mesh),
             # Lines of Python in what is lowered are for profiles; XLA sorts and prints them all, a second's work.
             jax_setting("jax_traceback_in_locations_limit", 0),
-            ThreadPoolExecutor(4 if jax.process_count() == 1 else 1) as pool,
         ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
             pending = [pool.submit(work.compile, compiler_options=options) for work in lowered]
-            collect, update, episodes, *begin = (work.result() for work in pending)
+            pool.shutdown(wait=self.mesh is not None)
+        collect, update, episodes, *begin = map(_when_ready, pending)
         advance = functools.partial(self._advance, collect, update)
-        return Executables(begin[0] if begin else self._begin, episodes, advance)
+        return Executables(
+            begin[0] if begin else self._begin, episodes, advance, lambda: [*map(Future.result, pending)]
+        )
 
     def _advance(
         self, collect: Callable[..., Any], update: Callable[..., Any], state: TrainState, mode: Mode
@@ -342,6 +349,13 @@ class Population:
         if not values:
             return self.program
         return Program(self.config, self._physics, values, self._shards, self._extensions)
+
+
+def _when_ready(pending: Future[Callable[..., Any]]) -> Callable[..., Any]:
+    def call(*arguments: Any) -> Any:
+        return pending.result()(*arguments)
+
+    return call
 
 
 def _first_key() -> np.ndarray:

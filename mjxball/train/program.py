@@ -1,4 +1,4 @@
-"""The training program: environments side by side, collect and update in one compiled function."""
+"""The training program: environments side by side, collect and update, apart or as one compiled function."""
 
 from __future__ import annotations
 

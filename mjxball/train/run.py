@@ -175,6 +175,7 @@ class Run:
             self._export()
         else:
             self.state = self.population.place_state(self.state)
+        self._compiled.wait()
         if self._writes:  # Orbax takes a second to load: while the device trains, not before
             self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
