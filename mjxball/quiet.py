@@ -65,7 +65,11 @@ def _initialised_when_used(name: str) -> None:
         if attribute.startswith("__"):
             raise AttributeError(attribute)
         if package.__dict__.pop("__getattr__", None):
-            loader.exec_module(package)
+            try:
+                loader.exec_module(package)
+            except BaseException:
+                package.__dict__["__getattr__"] = find
+                raise
         return getattr(package, attribute)
 
     package.__dict__["__getattr__"] = find  # PEP 562

@@ -161,9 +161,8 @@ def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 def test_interrupted_run_keeps_policy_and_checkpoint(interrupted: Path) -> None:
-    steps = int(rows_of(interrupted)[-1]["steps"])
-    assert steps < STEPS
-    assert checkpoint_steps(interrupted)[-1] == steps
+    steps = checkpoint_steps(interrupted)[-1]  # it need not wait for the row's end
+    assert int(rows_of(interrupted)[-1]["steps"]) <= steps < STEPS
     assert load_arrays(interrupted / "policy.npz")[1]["training_steps"] == steps
     assert np.isfinite(command_of(interrupted / "policy.npz")).all()
     names = {path.name for path in interrupted.iterdir()}

@@ -52,6 +52,7 @@ def test_only_what_a_program_reads_and_changes_passes_through_it(
         np.testing.assert_array_equal(carried[3], np.full(2, 10.0 * count))
     assert all(one is other for one, other in zip(carried[:3], before[:3], strict=True))
     np.testing.assert_array_equal(carried[0], np.ones(3))  # its memory was not given away
+    assert before[3].is_deleted()
 
 
 def test_many_followers_products_are_tuned_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:

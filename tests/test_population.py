@@ -75,6 +75,22 @@ def test_members_are_the_runs_of_their_seeds(small: Config, together: tuple[Popu
 
 
 @pytest.mark.slow
+def test_training_that_pauses_goes_on_bit_for_bit(together: tuple[Population, Any, Any]) -> None:
+    population, early, late = together
+    compiled, asked = population.compile(creating=False), []
+
+    def pause() -> bool:
+        asked.append(1)
+        return len(asked) == 4
+
+    state, _, _, taken = compiled.advance(early, programs.train(15), pause)
+    assert taken == len(asked) == 4
+    state, _, _, taken = compiled.advance(state, programs.train(11), lambda: False)
+    assert taken == 11
+    jax.tree.map(np.testing.assert_array_equal, state, late)
+
+
+@pytest.mark.slow
 def test_swept_settings_differ_between_members_and_between_traced_programs(
     small: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

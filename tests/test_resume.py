@@ -126,7 +126,7 @@ def test_changed_program_is_refused_with_the_differences(
 @pytest.mark.slow
 def test_compilation_cache_is_filled(whole: Path) -> None:
     assert whole.is_dir()
-    assert any(path.name.startswith("jit_advance") for path in Path(os.environ["MJXBALL_CACHE"]).iterdir())
+    assert any(path.name.startswith("jit_collect") for path in Path(os.environ["MJXBALL_CACHE"]).iterdir())
 
 
 def test_the_source_hash_covers_what_the_training_program_imports() -> None:

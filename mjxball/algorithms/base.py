@@ -163,7 +163,10 @@ class Algorithm(Protocol):
     def update(
         self, state: Any, keys: Any, progress: Float[Array, ""], phase: Phase
     ) -> tuple[Any, dict[str, Float[Array, ""]]]:
-        """Learn, if `phase.learning`: (state, `metrics`). `progress` is the share of training done, 0 to 1."""
+        """Learn, if `phase.learning`: (state, `metrics`). `progress` is the share of training done, 0 to 1.
+
+        `train.py` calls it then alone; in a whole program (`mjxball.train.train`) it must leave `state` as it is else.
+        """
         ...
 
     def policy(self, state: Any) -> PolicyNetwork:

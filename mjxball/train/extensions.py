@@ -134,7 +134,7 @@ class TracedOnce:
             jax.eval_shape(lambda: found.append(self.env.observation_size))
         except jax.errors.JAXTypeError:  # it looks at numbers
             return self.env.observation_size
-        return found[0]
+        return self.env.observation_size if isinstance(found[0], jax.core.Tracer) else found[0]
 
 
 class Rewarded:

@@ -1,4 +1,4 @@
-"""Several followers trained in one program: seeds, and optionally hyper-parameters that differ between members."""
+"""Several followers trained at once: seeds, and optionally hyper-parameters that differ between members."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Executables(NamedTuple):
 
     begin: Callable[[Any, Any], TrainState]  # (swept values, keys) -> `Program.begin`
     episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `Program.episodes`
-    advance: Callable[[TrainState, Mode], tuple[TrainState, Statistics, Any]]  # gives away the state's memory
+    advance: Callable[..., tuple[TrainState, Statistics, Any, int]]  # (state, mode[, pause]), see `Population._advance`
     wait: Callable[[], Any]  # until all of them are compiled; raises what went wrong
 
 
@@ -114,8 +114,10 @@ class Population:
             jax_setting("jax_traceback_in_locations_limit", 0),
         ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
-            pending = [pool.submit(work.compile, compiler_options=options) for work in lowered]
-            pool.shutdown(wait=self.mesh is not None)
+            try:
+                pending = [pool.submit(work.compile, compiler_options=options) for work in lowered]
+            finally:
+                pool.shutdown(wait=self.mesh is not None)
         collect, update, episodes, *begin = map(_when_ready, pending)
         advance = functools.partial(self._advance, collect, update)
         return Executables(
@@ -123,18 +125,29 @@ class Population:
         )
 
     def _advance(
-        self, collect: Callable[..., Any], update: Callable[..., Any], state: TrainState, mode: Mode
-    ) -> tuple[TrainState, Statistics, dict[str, Any]]:
-        """See `Program.advance`; the devices are given their work and not waited for."""
-        phase = self.place(mode.phase, PartitionSpec())
+        self,
+        collect: Callable[..., Any],
+        update: Callable[..., Any],
+        state: TrainState,
+        mode: Mode,
+        pause: Callable[[], bool] = lambda: False,
+    ) -> tuple[TrainState, Statistics, dict[str, Any], int]:
+        """See `Program.advance`; also how many steps were taken before `pause` said to stop.
+
+        Results are there before the devices are done with them, unless they are CPUs.
+        """
+        phase, window = self.place(mode.phase, PartitionSpec()), self.program.algorithm.steps_per_collect
         carried, structure = jax.tree.flatten((state, self._no_statistics()))
-        metrics = jax.tree.leaves(self._no_metrics())
-        for _ in range(-(-int(mode.steps) // self.program.algorithm.steps_per_collect)):
+        metrics, taken = jax.tree.leaves(self._no_metrics()), 0
+        while taken < int(mode.steps):
             (keys,) = collect(carried, *phase)
             if mode.phase.learning:
                 metrics = update(carried, keys)
+            taken += window
+            if pause():
+                break
         state, statistics = jax.tree.unflatten(structure, carried)
-        return state, statistics, dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True))
+        return state, statistics, dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True)), taken
 
     def _lower_here(self, creating: bool) -> Iterator[Any]:
         """collect, update, episodes and, if `creating`, begin on one device; traced programs come from the cache."""
@@ -306,7 +319,8 @@ class Population:
         """Something like the keys that a collection leaves for the update."""
         algorithm = self.program.algorithm
         count = algorithm.collect_keys + algorithm.update_keys + 1
-        return np.zeros((*(() if self._single else (self.members,)), count, 2), np.uint32)
+        *members, width = self.template().key.shape
+        return np.zeros((*members, count, width), np.uint32)
 
     def _on_mesh(self, one: Callable[..., Any], specs: Any, results: Any, axes: tuple[int | None, ...]) -> Any:
         """`one(program, *arguments)` for all members over the mesh, as a function of (values, *arguments)."""

@@ -225,7 +225,7 @@ class Environments:
 
 
 class Mode(NamedTuple):
-    """What a call of `Program.advance` does; all traced, so that one executable serves every phase."""
+    """What a call of `Program.advance` does. The phase is traced, so that one executable serves all of them."""
 
     steps: Int[Array | np.ndarray, ""]  # of every environment
     phase: Phase

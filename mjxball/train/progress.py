@@ -50,12 +50,12 @@ class Progress:
         self._live = self._stream.isatty()
         self._start = time.monotonic()
         self._width = 0
-        self._before = 0.0
+        self.before = 0.0  # [s] what the run took before it was resumed
         self._silent = path is None
         if path is None:
             return
         kept = _rows_until(path, names, resumed_at)
-        self._before = float(kept[-1]["seconds"]) if kept else 0.0
+        self.before = float(kept[-1]["seconds"]) if kept else 0.0
         partial = path.with_name(f".{path.name}.partial")
         with partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, names)
@@ -69,10 +69,6 @@ class Progress:
     def elapsed(self) -> float:
         """Seconds since this object was made."""
         return time.monotonic() - self._start
-
-    def seconds(self) -> float:
-        """The same, and what the run took before it was resumed."""
-        return self._before + self.elapsed()
 
     def say(self, text: str) -> None:
         """Print a line of its own."""

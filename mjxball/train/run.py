@@ -27,7 +27,7 @@ from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
 from mjxball.train.extensions import Extensions, is_pair, resolve
 from mjxball.train.population import Population
-from mjxball.train.program import Mode, Statistics, TrainState
+from mjxball.train.program import Statistics, TrainState
 from mjxball.train.progress import Progress, Row, columns
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
 
@@ -37,7 +37,7 @@ SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
 
 @dataclass
 class Stop:
-    """Set by the first Ctrl-C; training then ends after the chunk in flight."""
+    """Set by the first Ctrl-C; training then ends after the collection in flight, of several processes the chunk."""
 
     requested: bool = False
     begun: bool = False  # there is something to save
@@ -76,6 +76,7 @@ class Chunk:
     steps: int  # of every environment
     reached: int  # environment steps of the run at its end
     began: float  # [s] on the run's clock
+    ended: Future[float]  # [s] when the devices are done
     statistics: Statistics  # on the devices
     metrics: Any
 
@@ -114,10 +115,11 @@ class Run:
         )
         self.members = MemberLog(out if self._writes else None, origin["seed"], done)
         self._writer = ThreadPoolExecutor(1)  # writes checkpoints
+        self._clock = ThreadPoolExecutor(1)  # sees when the devices are done
         self._checkpoints: Future[Any] | None = None
         self._pending: Future[None] | None = None
         self._state = resumed
-        self._saved_at = self._saving = self._looked_at = 0.0  # [s]
+        self._saved_at = self._saving = self._chunk_ended = 0.0  # [s]
         self._saved_steps = -1
 
     @property
@@ -148,7 +150,7 @@ class Run:
 
     def close(self) -> None:
         """Wait until every checkpoint is on disk."""
-        with self._writer:
+        with self._clock, self._writer:
             try:
                 if self._pending:
                     self._pending.result()
@@ -180,11 +182,6 @@ class Run:
             self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
 
-    def _advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Any]]:
-        """See `Program.advance`; statistics and metrics come back whole, as NumPy."""
-        state, *results = self._compiled.advance(state, mode)
-        return state, *processes.gather(results)
-
     def _loop(self, stop: Stop) -> None:
         total, first = self.population.program.total_rounds, self.population.program.warmup_rounds
         evaluations = self._schedule.num_evaluations
@@ -196,45 +193,48 @@ class Run:
         window = self.population.program.algorithm.steps_per_collect
         chunk = math.ceil(total / CHUNKS / window) * window
         chunks = math.ceil(total / chunk)
+        late = lambda: self.progress.elapsed() - self._saved_at > SAVE_EVERY  # noqa: E731
+        # Several processes must stop at the same step, and agree on that between chunks alone.
+        pause = (lambda: stop.requested or late()) if jax.process_count() == 1 else lambda: False
         flying: Chunk | None = None  # the devices are at it, or done with it
         while done < total and not ended:
             number = done // chunk + 1
-            begun = self._begin_chunk(min(number * chunk, total) - done, flying)
-            done = min(number * chunk, total)
+            goal = min(number * chunk, total)
+            begun = self._begin_chunk(goal - done, flying, pause)
+            done = min(done + begun.steps, goal)
             if flying:  # looked at while the devices are at the next one, so that they need not wait
                 self.progress.show(self._row(flying))
-            flying = begun
-            late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
+            flying = begun if done == goal else None  # of a chunk that was cut short the rest has a row
             # All processes act on what they agreed on here, whenever a signal reaches one of them.
-            ended, late = processes.any_of((stop.requested, late))
-            due = number * evaluations // chunks > (number - 1) * evaluations // chunks or done >= total
-            if not (due or late or ended):
+            ended, saving = processes.any_of((stop.requested, late()))
+            due = done == goal and number * evaluations // chunks > (number - 1) * evaluations // chunks
+            due = due or done >= total
+            if not (due or saving or ended):
                 continue
-            row, flying = self._row(flying), None
-            if due:
-                row |= self._evaluated()
-            self.progress.show(row)
-            if due or late:
+            if flying:
+                row, flying = self._row(flying), None
+                if due:
+                    row |= self._evaluated()
+                self.progress.show(row)
+            if due or saving:
                 self._save()
         self._ended = ended
 
     def _steps(self) -> int:
         return _count(self.state)
 
-    def _begin_chunk(self, steps: int, before: Chunk | None) -> Chunk:
-        """Give the devices a chunk of training, behind that `before` it."""
-        window = self.population.program.algorithm.steps_per_collect
-        taken = math.ceil(steps / window) * window * self._schedule.num_envs
-        reached = (before.reached if before else self._steps()) + taken
-        began = self.progress.elapsed()
-        self.state, statistics, metrics = self._compiled.advance(self.state, programs.train(steps))
-        return Chunk(steps, reached, began, statistics, metrics)
+    def _begin_chunk(self, steps: int, before: Chunk | None, pause: Callable[[], bool]) -> Chunk:
+        """Give the devices a chunk of training, behind that `before` it, or part of it if there is to be a `pause`."""
+        reached, began = before.reached if before else self._steps(), self.progress.elapsed()
+        self.state, statistics, metrics, taken = self._compiled.advance(self.state, programs.train(steps), pause)
+        ended = self._clock.submit(lambda: (jax.block_until_ready(statistics), self.progress.elapsed())[1])
+        return Chunk(taken, reached + taken * self._schedule.num_envs, began, ended, statistics, metrics)
 
     def _row(self, chunk: Chunk) -> Row:
         """What there is to say of a chunk, once the devices are done with it."""
         statistics, metrics = processes.gather((chunk.statistics, chunk.metrics))
-        now = self.progress.elapsed()
-        began, self._looked_at = max(chunk.began, self._looked_at), now
+        ended = chunk.ended.result()
+        began, self._chunk_ended = max(chunk.began, self._chunk_ended), ended
         each, members, steps = self.population.each, self.population.members, chunk.steps
         learnt = {name: _median(each(value)) for name, value in metrics.items()}
         broken = [name for name, value in learnt.items() if not math.isfinite(value)]
@@ -242,8 +242,8 @@ class Run:
             raise TrainingDivergedError(f"{broken[0]} is not finite after {chunk.reached:,} steps")
         return {
             "steps": chunk.reached,
-            "seconds": round(self.progress.seconds(), 3),
-            "rate": round(steps * self._schedule.num_envs * members / max(now - began, 1e-9), 1),
+            "seconds": round(self.progress.before + ended, 3),
+            "rate": round(steps * self._schedule.num_envs * members / max(ended - began, 1e-9), 1),
             "episode_return": _median(each(statistics.reward)) / steps * self.config.timing.episode_steps,
             **{
                 name: _median_or_none(values)
@@ -261,7 +261,8 @@ class Run:
         keys = processes.gather(kept.key)
         envs = population.evaluation_envs(self._compiled)
         lent = kept._replace(envs=envs, key=population.place_keys(keys))
-        after, statistics, _ = self._advance(lent, programs.evaluate(steps))
+        after, statistics, *_ = self._compiled.advance(lent, programs.evaluate(steps))
+        statistics = processes.gather(statistics)
         self.state = after._replace(envs=kept.envs, key=population.place_keys(keys))
         reward, ended = population.each(statistics.reward), population.each(statistics.ended)
         found = {"eval_return": population.program.evaluated_return(reward, ended)}
