@@ -21,7 +21,7 @@ from mjxball.errors import InputError
 from mjxball.train.extensions import DEFAULTS, Extensions, find, is_pair, make_env
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int, UInt
+    from jaxtyping import Bool, Float, Int
 
 MATMUL_PRECISION = "highest"  # float32 throughout: GPUs would else round products to TF32
 EVALUATION_SECONDS = 16.0  # of which the last half counts as steady state
@@ -335,9 +335,7 @@ class Program:
         rounds = -(-mode.steps // self.algorithm.steps_per_collect)
         return jax.lax.fori_loop(0, rounds, body, start)
 
-    def collect(
-        self, state: TrainState, statistics: Statistics, phase: Phase
-    ) -> tuple[TrainState, Statistics, UInt[Array, "keys 2"]]:
+    def collect(self, state: TrainState, statistics: Statistics, phase: Phase) -> tuple[TrainState, Statistics, Array]:
         """One collection of the algorithm: the state, `statistics` with it, and keys for the `update` that follows."""
         algorithm = self.algorithm
         # One draw for many keys: each draw is kernels to compile and to launch.
@@ -350,9 +348,7 @@ class Program:
         seen = self.environments.over_shards(envs.statistics)
         return TrainState(known, envs.states, keys[-1], steps), joined(statistics, seen), keys
 
-    def update(
-        self, state: TrainState, keys: UInt[Array, "keys 2"], phase: Phase
-    ) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
+    def update(self, state: TrainState, keys: Array, phase: Phase) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
         """The algorithm's update after a `collect`, which gave the `keys`: the state and the algorithm's metrics."""
         progress = jnp.minimum(state.steps / self.schedule.total_steps, 1.0)
         own = list(keys[self.algorithm.collect_keys : -1])
