@@ -32,7 +32,7 @@ from mjxball.train.progress import Progress, Row, columns
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
 
 CHUNKS = 25  # rows of metrics.csv in a run, at most
-SAVE_EVERY = 60.0  # [s] at least, besides the checkpoint at every evaluation
+SAVE_EVERY = 60.0  # [s] after which the next row brings a checkpoint, besides those of evaluations
 
 
 @dataclass
@@ -193,9 +193,8 @@ class Run:
         window = self.population.program.algorithm.steps_per_collect
         chunk = math.ceil(total / CHUNKS / window) * window
         chunks = math.ceil(total / chunk)
-        late = lambda: self.progress.elapsed() - self._saved_at > SAVE_EVERY  # noqa: E731
         # Several processes must stop at the same step, and agree on that between chunks alone.
-        pause = (lambda: stop.requested or late()) if jax.process_count() == 1 else lambda: False
+        pause = (lambda: stop.requested) if jax.process_count() == 1 else lambda: False
         flying: Chunk | None = None  # the devices are at it, or done with it
         while done < total and not ended:
             number = done // chunk + 1
@@ -204,19 +203,22 @@ class Run:
             done = min(done + begun.steps, goal)
             if flying:  # looked at while the devices are at the next one, so that they need not wait
                 self.progress.show(self._row(flying))
-            flying = begun if done == goal else None  # of a chunk that was cut short the rest has a row
+            flying = (
+                begun if done == goal else None
+            )  # one that is cut short has no row: who resumes has one of the rest
+            late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
             # All processes act on what they agreed on here, whenever a signal reaches one of them.
-            ended, saving = processes.any_of((stop.requested, late()))
+            ended, late = processes.any_of((stop.requested, late))
             due = done == goal and number * evaluations // chunks > (number - 1) * evaluations // chunks
             due = due or done >= total
-            if not (due or saving or ended):
+            if not (due or late or ended):
                 continue
             if flying:
                 row, flying = self._row(flying), None
                 if due:
                     row |= self._evaluated()
                 self.progress.show(row)
-            if due or saving:
+            if due or late:
                 self._save()
         self._ended = ended
 
