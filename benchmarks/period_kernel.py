@@ -60,7 +60,11 @@ def by_numbers(function: Callable[..., Any], *shapes: Any) -> Callable[[Numbers]
             values.append(parts.reshape(leaf.shape))
             rest = rest[parts.size :]
         found = _evaluate(closed.jaxpr, [np.asarray(one) for one in closed.consts], values)
-        return [jnp.asarray(number).astype(jnp.float32) for value in found for number in _parts(value).ravel()]
+        return [
+            jnp.asarray(number).astype(jnp.float32)
+            for value, variable in zip(found, closed.jaxpr.outvars, strict=True)
+            for number in _parts(value, variable.aval).ravel()
+        ]
 
     return jax.vmap(one)
 

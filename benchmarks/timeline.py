@@ -53,7 +53,7 @@ FUNCTIONS = {
         "draw_training",
         "_evaluate",
     ),
-    "mjxball.train.run": ("Run.__init__", "Run._start", "Run._advance", "Run._evaluated", "Run._save", "Run._export"),
+    "mjxball.train.run": ("Run.__init__", "Run._start", "Run._row", "Run._evaluated", "Run._save", "Run._export"),
     "mjxball.train.population": (
         "Population.__init__",
         "Population.template",
@@ -61,7 +61,13 @@ FUNCTIONS = {
         "Population.start",
         "Population.metric_names",
     ),
-    "mjxball.train.compilation": ("TracedProgram.__init__", "TracedProgram.lower", "_read", "_write"),
+    "mjxball.train.compilation": (
+        "TracedProgram.__init__",
+        "TracedProgram.lower",
+        "Carrying.compile",
+        "_read",
+        "_write",
+    ),
     "mjxball.train.checkpoint": ("Checkpoints.__init__", "Checkpoints.save"),
 }
 VARIABLE = "MJXBALL_TIMELINE"

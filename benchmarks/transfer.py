@@ -173,9 +173,8 @@ def stock(env: Any, algorithm: str, given: dict[str, Any]) -> Callable[[int], Po
     return one
 
 
-def mean_return(env: Any, policy: Policy) -> float:
-    """Mean return of the same episodes for every policy."""
-    act, known = policy
+def flights(env: Any, act: Callable[[Any, Any], Any]) -> Callable[[Any], float]:
+    """Mean return of the same episodes for every policy, as a function of its parameters."""
 
     @jax.jit
     def fly(known: Any, keys: Any) -> Any:
@@ -187,7 +186,7 @@ def mean_return(env: Any, policy: Policy) -> float:
         start = (jax.vmap(env.reset)(keys), jnp.ones(EPISODES), jnp.zeros(EPISODES))
         return jax.lax.scan(step, start, length=EPISODE)[0][2].mean()
 
-    return float(fly(known, jax.random.split(jax.random.PRNGKey(1), EPISODES)))
+    return lambda known: float(fly(known, jax.random.split(jax.random.PRNGKey(1), EPISODES)))
 
 
 def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -240,14 +239,16 @@ def main() -> None:
             env = envs.get_environment(env_name, backend=options.backend)
             settings_of = {"ours": given | OWN.get((env_name, algorithm), {}), "stock": given}
             train_with = {name: trainers[name](env, algorithm, settings_of[name]) for name in options.trainers}
+            judges: dict[str, Callable[[Any], float]] = {}  # one a trainer: its seeds have the same network
             for seed, trainer in itertools.product(range(options.seeds), options.trainers):
                 settings.update("jax_compilation_cache_dir", f"{place}/{env_name}-{algorithm}-{trainer}")
                 compilation_cache.reset_cache()
                 started = time.perf_counter()
-                policy = train_with[trainer](seed)
+                act, known = train_with[trainer](seed)
                 seconds = time.perf_counter() - started
+                judge = judges.setdefault(trainer, flights(env, act))
                 row = {"env": env_name, "algorithm": algorithm, "trainer": trainer, "seed": seed}
-                row |= {"steps": given["num_timesteps"], "seconds": seconds, "return": mean_return(env, policy)}
+                row |= {"steps": given["num_timesteps"], "seconds": seconds, "return": judge(known)}
                 rows.append(row)
                 say(row)
                 if options.json:  # what is measured stays, whatever ends the rest

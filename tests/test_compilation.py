@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjxball.algorithms.ppo import ProximalPolicyOptimization
 from mjxball.train.compilation import TracedProgram, compiler_options
 from mjxball.train.extensions import TracedOnce
 
@@ -38,9 +39,10 @@ def test_only_what_a_program_reads_and_changes_passes_through_it(
         return rolling(*arguments)
 
     for _ in range(1 + cached):
-        program = TracedProgram("rolling", {"test": 1}, function, shapes((state, step)), carried=len(state))
+        program = TracedProgram("rolling", {"test": 1}, function, lambda: shapes((state, step)), others=1)
+        assert program.found == bool(calls)
+        lowered = program.lower_carrying()
     assert len(calls) == 1  # the second one is the file's
-    lowered = program.lower_carrying()
     names = sorted(state)
     assert [names[k] for k in lowered.writes] == ["total"]
     assert {names[k] for k in lowered.reads if k < len(state)} == {"key", "kept", "total"}  # a key has no zeros
@@ -63,6 +65,10 @@ def test_many_followers_products_are_tuned_on_a_gpu(monkeypatch: pytest.MonkeyPa
     assert together is not None
     assert alone[tuned] == 0
     assert tuned not in together
+    large = compiler_options(ProximalPolicyOptimization)
+    assert large is not None
+    assert tuned not in large
+    assert not large["xla_gpu_enable_triton_gemm"]  # hundreds of kernels to compile and try
 
 
 class Measured:

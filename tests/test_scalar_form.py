@@ -62,20 +62,37 @@ def test_values_and_gradients_are_those_of_the_function(function: Any) -> None:
         outputs = jax.tree.leaves(form(x))
         return sum((leaf * jnp.arange(1.0, leaf.size + 1).reshape(leaf.shape)).sum() for leaf in outputs)
 
-    form = scalar_form(function)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
-        jax.vmap(form)(points),
-        jax.vmap(function)(points),
-    )
-    gradients = [jax.vmap(jax.grad(lambda x, own=own: loss(own, x)))(points) for own in (form, function)]
+    form, whole = scalar_form(function), jax.vmap(function)
+    found, expected = form(points), whole(points)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), found, expected)
+    assert jax.tree.map(jnp.shape, found) == jax.tree.map(jnp.shape, expected)
+    gradients = [jax.grad(lambda x, own=own: loss(own, x))(points) for own in (form, whole)]
     np.testing.assert_allclose(*gradients, rtol=1e-4, atol=1e-5)
-    assert jax.tree.structure(form(points[0])) == jax.tree.structure(function(points[0]))
+
+
+def test_what_is_the_same_for_all_of_a_batch_stays_so() -> None:
+    """A traced number outside the function, and results that no argument has a part in."""
+
+    def step(x: Any, scale: Any) -> Any:
+        grown = jax.lax.fori_loop(0, 3, lambda i, y: y * scale[0] + i, x)
+        return {
+            "a": grown * scale.sum(),
+            "b": scale * 2.0,
+            "c": jnp.arange(3.0),
+            "d": jnp.sort(scale),
+            "e": jnp.float32(1.0),
+        }
+
+    points, scales = np.ones((5, 4), np.float32), jnp.array([[0.5, 2.0], [1.5, -1.0]])
+    found = jax.vmap(lambda scale: scalar_form(lambda x: step(x, scale))(points))(scales)
+    expected = jax.vmap(lambda scale: jax.vmap(lambda x: step(x, scale))(points))(scales)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), found, expected)
+    assert jax.tree.map(jnp.shape, found) == jax.tree.map(jnp.shape, expected)
 
 
 def test_products_with_known_zeros_vanish() -> None:
     matrix = jnp.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 3.0, 1.0]])
-    program = jax.make_jaxpr(jax.vmap(scalar_form(lambda x: matrix @ x)))(np.ones((7, 3), np.float32))
+    program = jax.make_jaxpr(scalar_form(lambda x: matrix @ x))(np.ones((7, 3), np.float32))
     names = [equation.primitive.name for equation in program.eqns]
     assert "dot_general" not in names
     assert names.count("mul") == 2  # by 2 and by 3
@@ -88,7 +105,7 @@ def test_a_step_of_an_environment_is_the_same(name: str) -> None:
     env = TransportEnv(configs.preset(name), "newton-euler")
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 3))
     actions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (3, 3)), jnp.float32)
-    whole, form = (jax.jit(jax.vmap(step)) for step in (env.step, scalar_form(env.step)))
+    whole, form = map(jax.jit, (jax.vmap(env.step), scalar_form(env.step)))
     expected, found = whole(whole(states, actions), actions), form(form(states, actions), actions)
     assert jax.tree.structure(expected) == jax.tree.structure(found)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5), found, expected)
@@ -96,7 +113,7 @@ def test_a_step_of_an_environment_is_the_same(name: str) -> None:
 
 def test_a_call_with_a_large_array_stays_one_call() -> None:
     def names(form: Any) -> list[str]:
-        return [str(one.params.get("name")) for one in jax.make_jaxpr(form)(jnp.zeros(4)).eqns]
+        return [str(one.params.get("name")) for one in jax.make_jaxpr(form)(jnp.zeros((2, 4))).eqns]
 
     assert names(scalar_form(calling)).count("wide_call") == 1
     assert all(one == "None" for one in names(scalar_form(jax.jit(lambda x: x * 2.0 + x[0]))))

@@ -119,7 +119,7 @@ class Environments(Protocol):
         ...
 
     def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
-        """The same environments with `transform` applied to the step of a single one."""
+        """The same environments, which `transform` of the step of a single one steps instead of its `jax.vmap`."""
         ...
 
     def drawn(self, envs: Any, key: Array) -> Any:
@@ -140,7 +140,7 @@ class Algorithm(Protocol):
     """A learning algorithm. All its functions are pure, and can be jitted and vmapped.
 
     One that is done on a CPU before it could be compiled well, or at all for a GPU, may say so: `prefers_cpu = True`.
-    One whose products of matrices are large enough to be worth XLA's tuning on a GPU: `worth_tuning = True`.
+    One whose products of matrices are large enough for a GPU's cuBLAS: `large_products = True`.
     """
 
     schedule: Schedule

@@ -104,7 +104,9 @@ class FirstOrderGradient:
         own = self._environments
         turn = (own.turn + state.windows) % self._config.windows_per_episode == 0
         envs = own.restart(envs, keys[0], turn & phase.recording)
-        (loss, (envs, mean, square)), slope = jax.value_and_grad(self._window, has_aux=True)(state.layers, state, envs)
+        # Also by the first states, for nobody: JAX then sees at its first look what the loop carries a gradient of.
+        differentiated = jax.value_and_grad(self._window, (0, 2), has_aux=True, allow_int=True)
+        (loss, (envs, mean, square)), (slope, _) = differentiated(state.layers, state, envs)
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
         first = (phase.random & phase.recording).astype(jnp.float32) * (1 - state.seen)
         known = GradientState(

@@ -38,7 +38,7 @@ class ProximalPolicyOptimization:
 
     metrics = ("loss", "policy_loss", "value_loss", "deviation")
     engines = ("mjx", "newton-euler")
-    worth_tuning = True
+    large_products = True
     collect_keys = 2
     update_keys = 1
 

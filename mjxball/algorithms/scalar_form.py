@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -34,7 +36,7 @@ REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
 
 
 def scalar_form(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` of pytrees of arrays, computed number by number; for use under `jax.vmap`.
+    """`jax.vmap(function)` for a `function` of pytrees of arrays, computed number by number for all of the batch.
 
     Slices, stacks and transposes of small arrays vanish, products with constants that are 0 as well (0 times infinity
     then is 0), and sums are added in order. A `lax.scan` without inputs and outputs for each step, as `fori_loop` of a
@@ -44,15 +46,57 @@ def scalar_form(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def transformed(*arguments: Any) -> Any:
         leaves, structure = jax.tree.flatten(arguments)
-        shapes = [jax.ShapeDtypeStruct(jnp.shape(leaf), jax.dtypes.result_type(leaf)) for leaf in leaves]
+        shapes = [jax.ShapeDtypeStruct(jnp.shape(leaf)[1:], jax.dtypes.result_type(leaf)) for leaf in leaves]
         closed, result = jax.make_jaxpr(
             lambda *leaves: function(*jax.tree.unflatten(structure, leaves)), return_shape=True
         )(*shapes)
-        values = _evaluate(closed.jaxpr, closed.consts, leaves)
+        values = _evaluate(closed.jaxpr, closed.consts, _apart(leaves))
+        count = jnp.shape(leaves[0])[:1]
         outputs = [_array(value, v.aval) for value, v in zip(values, closed.jaxpr.outvars, strict=True)]
-        return jax.tree.unflatten(jax.tree.structure(result), outputs)
+        whole = [
+            one if jnp.ndim(one) > len(v.aval.shape) else jnp.broadcast_to(one, (*count, *v.aval.shape))
+            for one, v in zip(outputs, closed.jaxpr.outvars, strict=True)
+        ]
+        return jax.tree.unflatten(jax.tree.structure(result), whole)
 
     return transformed
+
+
+def _apart(leaves: Sequence[Any]) -> list[Value]:
+    """`leaves` with the numbers of small arrays apart, whose gradients are put together array by array."""
+    small = [
+        k
+        for k, leaf in enumerate(leaves)
+        if jnp.ndim(leaf) > 1 and leaf[0].size <= LARGEST and jnp.issubdtype(leaf.dtype, jnp.floating)
+    ]
+    shapes = [leaves[k].shape for k in small]
+
+    @jax.custom_vjp
+    def numbers(*arrays: Any) -> list[list[Any]]:
+        return [_numbers(array, 1) for array in arrays]
+
+    def together(_: None, slopes: list[list[Any]]) -> tuple[Any, ...]:
+        return tuple(jnp.stack(slope, 1).reshape(shape) for slope, shape in zip(slopes, shapes, strict=True))
+
+    numbers.defvjp(lambda *arrays: (numbers(*arrays), None), together)
+    found: list[Value] = list(leaves)
+    for k, shape, flat in zip(small, shapes, numbers(*(leaves[k] for k in small)), strict=True):
+        found[k] = _shaped(flat, shape[1:])
+    return found
+
+
+def _numbers(array: Any, batched: int) -> list[Any]:
+    """The numbers of an array, in order; with 1 for `batched` its first axis is the batch."""
+    flat = jax.lax.reshape(array, (*array.shape[:batched], math.prod(array.shape[batched:])))
+    each = range(flat.shape[-1])
+    return [jax.lax.squeeze(jax.lax.slice_in_dim(flat, k, k + 1, axis=batched), (batched,)) for k in each]
+
+
+def _shaped(numbers: Sequence[Any], shape: tuple[int, ...]) -> Parts:
+    parts = np.empty(shape, object)
+    for index, number in zip(np.ndindex(shape), numbers, strict=True):
+        parts[index] = number
+    return parts
 
 
 def _evaluate(jaxpr: Any, constants: Sequence[Any], arguments: Sequence[Value]) -> list[Value]:
@@ -85,7 +129,7 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     keys = any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals)
     if keys or not rewritten or max(aval.size for aval in avals) > LARGEST:
         return _as_it_is(equation, inputs)
-    parts = [_parts(value) for value in inputs]
+    parts = [_parts(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
     if name in REARRANGED:
         result = REARRANGED[name](parameters, shape, parts)
         return result if equation.primitive.multiple_results else [result]
@@ -101,7 +145,10 @@ def _apply(equation: Any, inputs: list[Value]) -> Sequence[Value]:
 def _as_it_is(equation: Any, inputs: list[Value]) -> Sequence[Value]:
     """What `equation` makes of `inputs`, on arrays."""
     arrays = [_array(value, variable.aval) for value, variable in zip(inputs, equation.invars, strict=True)]
-    outputs = equation.primitive.bind(*arrays, **equation.params)
+    pairs = zip(arrays, equation.invars, strict=True)
+    axes = tuple(0 if jnp.ndim(array) > len(variable.aval.shape) else None for array, variable in pairs)
+    bind = functools.partial(equation.primitive.bind, **equation.params)
+    outputs = jax.vmap(bind, axes)(*arrays) if 0 in axes else bind(*arrays)
     return outputs if equation.primitive.multiple_results else [outputs]
 
 
@@ -127,26 +174,24 @@ def _repeats(scan: Any) -> bool:
 def _scan(body: Any, length: int, inputs: list[Value]) -> list[Value]:
     """`length` times `body`, whose last inputs are what it returns."""
     count = len(inputs) - len(body.out_avals)
-    fixed, shapes = inputs[:count], body.out_avals
+    shapes = body.out_avals
+    parts = [_parts(value, aval) for value, aval in zip(inputs, body.in_avals, strict=True)]
+    batch = _batch([one for part in parts for one in part.flat])
 
     def numbers(values: Sequence[Value]) -> list[Any]:
-        return [
-            jnp.asarray(one, aval.dtype) for v, aval in zip(values, shapes, strict=True) for one in _parts(v).ravel()
-        ]
+        every = [(one, aval.dtype) for v, aval in zip(values, shapes, strict=True) for one in _parts(v, aval).flat]
+        return [jnp.broadcast_to(jnp.asarray(one, kind), batch) for one, kind in every]
 
     def values(flat: Sequence[Any]) -> list[Parts]:
         found, rest = [], list(flat)
         for aval in shapes:
-            parts = np.empty(aval.size, object)
-            for number in range(aval.size):
-                parts[number] = rest[number]
-            found.append(parts.reshape(aval.shape))
+            found.append(_shaped(rest[: aval.size], aval.shape))
             rest = rest[aval.size :]
         return found
 
     # What stays the same: the traced numbers among it are differentiated, too.
-    same = [_parts(value) for value in fixed]
-    traced = [one for part in same for one in part.ravel() if not _known(one)]
+    same = parts[:count]
+    traced = [one for part in same for one in part.flat if not _known(one)]
 
     def step(traced: list[Any], flat: list[Any]) -> list[Any]:
         rest = iter(traced)
@@ -156,7 +201,7 @@ def _scan(body: Any, length: int, inputs: list[Value]) -> list[Value]:
                 part[index] = own[index] if _known(own[index]) else next(rest)
         return numbers(_evaluate(body.jaxpr, body.consts, [*filled, *values(flat)]))
 
-    return values(_repeated(step, length)(traced, numbers(inputs[count:])))
+    return values(_repeated(step, length)(traced, numbers(parts[count:])))
 
 
 def _repeated(step: Callable[[list[Any], list[Any]], list[Any]], length: int) -> Callable[..., list[Any]]:
@@ -190,14 +235,13 @@ def _repeated(step: Callable[[list[Any], list[Any]], list[Any]], length: int) ->
     return repeat
 
 
-def _parts(value: Value) -> Parts:
+def _parts(value: Value, aval: Any) -> Parts:
     if isinstance(value, np.ndarray) and value.dtype == object:
         return value
-    parts = np.empty(np.shape(value), object)
-    known = value if isinstance(value, jax.core.Tracer) else np.asarray(value)
-    for index in np.ndindex(parts.shape):
-        parts[index] = known[index]
-    return parts
+    batched = jnp.ndim(value) - len(aval.shape)
+    if batched or isinstance(value, jax.core.Tracer):
+        return _shaped(_numbers(value, batched), aval.shape)
+    return _shaped(list(np.asarray(value).ravel()), aval.shape)
 
 
 def _array(value: Value, aval: Any) -> Any:
@@ -205,11 +249,20 @@ def _array(value: Value, aval: Any) -> Any:
         return value
     if all(map(_known, value.flat)):
         return np.array(value.tolist(), aval.dtype)
-    return jnp.stack([jnp.asarray(number, aval.dtype) for number in value.flat]).reshape(value.shape)
+    batch = _batch(value.flat)
+    if not aval.shape:
+        return jnp.asarray(value[()], aval.dtype)
+    numbers = [jnp.broadcast_to(jnp.asarray(number, aval.dtype), batch) for number in value.flat]
+    return jnp.stack(numbers, len(batch)).reshape(batch + aval.shape)
 
 
 def _known(number: Any) -> bool:
-    return not isinstance(number, jax.core.Tracer)
+    return isinstance(number, np.generic)
+
+
+def _batch(numbers: Iterable[Any]) -> tuple[int, ...]:
+    """Shape of what all of `numbers` are together: that of the batch, or () if none of them is of one."""
+    return np.broadcast_shapes(*(np.shape(number) for number in numbers))
 
 
 def _is(number: Any, constant: float) -> bool:
@@ -247,7 +300,8 @@ def _compute(equation: Any, numbers: list[Any]) -> Any:
         return SHORTENED[name](*numbers)
     if name == "select_n" and _known(numbers[0]):
         return numbers[1 + int(numbers[0])]
-    return equation.primitive.bind(*map(jnp.asarray, numbers), **equation.params)
+    batch = _batch(numbers)
+    return equation.primitive.bind(*(jnp.broadcast_to(number, batch) for number in numbers), **equation.params)
 
 
 def _reduce(combine: Callable[[Any, Any], Any], parts: Parts, axes: Sequence[int]) -> Parts:

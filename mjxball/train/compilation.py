@@ -21,8 +21,10 @@ OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionabl
 # One follower's kernels gain nothing from being tuned and optimised further, and it costs a third of the compile time.
 # (cuBLAS instead of Triton's products compiles 2 s sooner and then takes 4 s to load and run: docs/archive.)
 GPU_OPTIONS: dict[str, Any] = {"xla_gpu_autotune_level": 0, "xla_backend_optimization_level": 1}
-# Batches of thousands gain a third of the run from tuned products (PPO of `ant`: docs/archive/training.md), and so do
-# the products of many followers at once, of which one takes half as long (64 of SAC: docs/archive/training.md).
+# Products of batches of thousands: of cuBLAS's kernels XLA tries a few, of Triton's it first compiles hundreds, which
+# are hardly faster (PPO of `ant`: docs/archive/training.md).
+CUBLAS_GPU_OPTIONS: dict[str, Any] = {"xla_gpu_enable_triton_gemm": False, "xla_backend_optimization_level": 1}
+# The small products of many followers at once take half as long when tuned (64 of SAC: docs/archive/training.md).
 TUNED_GPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
 # For algorithms that are done sooner than XLA, which then compiles twice as fast what runs a quarter slower.
 CPU_OPTIONS: dict[str, Any] = {"xla_backend_optimization_level": 1}
@@ -40,8 +42,10 @@ def compiler_options(algorithm: Any = None, members: int = 1) -> dict[str, Any] 
     the class of the algorithm if it is not SAC.
     """
     if jax.default_backend() == "gpu":
-        if members > 1 or getattr(algorithm, "worth_tuning", False):
+        if members > 1:
             return TUNED_GPU_OPTIONS
+        if getattr(algorithm, "large_products", False):
+            return CUBLAS_GPU_OPTIONS
         return GPU_OPTIONS | PLAIN_PRODUCTS
     return CPU_OPTIONS if getattr(algorithm, "prefers_cpu", False) else None
 
@@ -70,7 +74,7 @@ def jax_setting(name: str, value: Any) -> Iterator[None]:
 class TracedProgram:
     """One function of arrays, traced or found in the cache. `lower` readies it for compilation.
 
-    Its first `carried` arrays are the first that it returns, perhaps changed.
+    All of its arrays but the last few, `others`, are the first that it returns, perhaps changed.
     """
 
     def __init__(
@@ -78,54 +82,73 @@ class TracedProgram:
         name: str,
         key: Mapping[str, Any] | None,
         function: Callable[..., Any],
-        shapes: Any,
+        shapes: Callable[[], Any],
         result: Any = None,
-        carried: int = 0,
+        others: int | None = None,
     ):
-        """`shapes` are the arguments' `ShapeDtypeStruct`s, `result` any tree with the structure of what it returns.
+        """`shapes` makes the arguments' `ShapeDtypeStruct`s, `result` is any tree with the structure of the result.
 
-        `key` must hold everything that the traced program depends on; None: it is not kept.
+        `key` must hold everything that the traced program depends on; None: it is not kept. `others` is None if all
+        arrays are such.
         """
-        self._name, self._shapes, self._carried = name, shapes, carried
+        self._name, self._function, self._shapes, self._others = name, function, shapes, others
         self._structure = jax.tree.structure(result)
-        path = _path(name, key)
-        exported, unchanged = _read(path)
-        if exported is None:
-            leaves, structure = jax.tree.flatten(shapes)
+        self._path = _path(name, key)
+        self._kept = _read(self._path)
+
+    @property
+    def found(self) -> bool:
+        """Whether it need not be traced."""
+        return self._kept is not None
+
+    def _traced(self) -> tuple[Any, list[int]]:
+        """The exported program and which of the carried arrays it leaves unchanged."""
+        if self._kept is None:
+            leaves, structure = jax.tree.flatten(self._shapes())
+            carried, unchanged = self._carried(leaves), list[int]()
 
             def flat(*arrays: Any) -> Any:
-                found = jax.tree.leaves(function(*jax.tree.unflatten(structure, arrays)))
+                found = jax.tree.leaves(self._function(*jax.tree.unflatten(structure, arrays)))
                 unchanged[:] = [k for k in range(carried) if found[k] is arrays[k]]
                 return [one for k, one in enumerate(found) if k not in unchanged]
 
             exported = jax.export.export(jax.jit(flat))(*leaves)
-            _write(path, exported, unchanged)
-        self._exported, self._unchanged = exported, unchanged
+            _write(self._path, exported, unchanged)
+            self._kept = exported, unchanged
+        return self._kept
+
+    def _carried(self, leaves: Sequence[Any]) -> int:
+        return 0 if self._others is None else len(leaves) - self._others
 
     def lower(self) -> Any:
         """`jax.stages.Lowered` of the function, of which nothing is carried."""
 
+        exported, _ = self._traced()
+
         def call(*arguments: Any) -> Any:
-            return jax.tree.unflatten(self._structure, self._exported.call(*jax.tree.leaves(arguments)))
+            return jax.tree.unflatten(self._structure, exported.call(*jax.tree.leaves(arguments)))
 
         call.__name__ = self._name  # what profiles and the compilation cache call it
-        return jax.jit(call).lower(*self._shapes)
+        return jax.jit(call).lower(*self._shapes())
 
     def lower_carrying(self) -> Carrying:
         """The function of what it reads, which returns what it changes: the rest does not pass through the device."""
-        leaves, writes = jax.tree.leaves(self._shapes), [k for k in range(self._carried) if k not in self._unchanged]
+        exported, unchanged = self._traced()
+        leaves = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in exported.in_avals]
+        carried = self._carried(leaves)
+        writes = [k for k in range(carried) if k not in unchanged]
         special = [k for k, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jax.dtypes.extended)]
-        reads = sorted({*self._exported.module_kept_var_idx, *special})
+        reads = sorted({*exported.module_kept_var_idx, *special})
 
         def call(*arrays: Any) -> Any:
             given = dict(zip(reads, arrays, strict=True))
             nothing = lambda leaf: jnp.zeros(leaf.shape, leaf.dtype)  # noqa: E731
-            return self._exported.call(*[given[k] if k in given else nothing(leaf) for k, leaf in enumerate(leaves)])
+            return exported.call(*[given[k] if k in given else nothing(leaf) for k, leaf in enumerate(leaves)])
 
         call.__name__ = self._name
         donated = [place for place, k in enumerate(reads) if k in writes]
         lowered = jax.jit(call, donate_argnums=donated).lower(*[leaves[k] for k in reads])
-        return Carrying(lowered, self._carried, reads, writes)
+        return Carrying(lowered, carried, reads, writes)
 
 
 class Carrying(NamedTuple):
@@ -162,15 +185,15 @@ def _path(name: str, key: Mapping[str, Any] | None) -> Path | None:
     return place / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:32]}.stablehlo"
 
 
-def _read(path: Path | None) -> tuple[Any, list[int]]:
-    """The exported program in `path` and which carried arrays it leaves unchanged; (None, []) if it cannot be read."""
+def _read(path: Path | None) -> tuple[Any, list[int]] | None:
+    """The exported program in `path` and which carried arrays it leaves unchanged; None if it cannot be read."""
     if path is None:
-        return None, []
+        return None
     try:
         first, _, program = path.read_bytes().partition(b"\n")
         return jax.export.deserialize(bytearray(program)), json.loads(first)
     except Exception:  # absent, cut short, or of another JAX: traced anew
-        return None, []
+        return None
 
 
 def _write(path: Path | None, exported: Any, unchanged: list[int]) -> None:

@@ -8,6 +8,7 @@ differentiated. Everything is compiled beforehand (`FineTuner.compile`); load an
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import time
@@ -193,7 +194,7 @@ class FineTuner:
         }
         # Traced one after the other, or found in the cache, and compiled side by side.
         lowered = {
-            name: TracedProgram(name, known, function, jax.tree.map(_shape, given), result).lower()
+            name: TracedProgram(name, known, function, functools.partial(jax.tree.map, _shape, given), result).lower()
             for name, (function, given, result) in asked.items()
         }
         with ThreadPoolExecutor(len(lowered)) as pool:

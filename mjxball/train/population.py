@@ -61,6 +61,7 @@ class Population:
         self._sweep = dict(sweep or {})
         self._single = members == 1 and not self._sweep
         self._template: TrainState | None = None
+        self._ahead: Future[Any] | None = None
         self._values = {name: np.asarray(values, np.float32) for name, values in self._sweep.items()}
         if devices is None:
             devices = jax.devices() if jax.process_count() > 1 else jax.local_devices()
@@ -99,6 +100,14 @@ class Population:
             self._template = jax.eval_shape(self._create, self._values, self._keys(0))
         return self._template
 
+    def read_ahead(self) -> None:
+        """Have the longest program loaded meanwhile, if an earlier run left it in the cache of one device."""
+        if self.mesh is None:
+            with jax_setting("jax_traceback_in_locations_limit", 0):
+                if self._collection.found:
+                    options = compiler_options(self.program.algorithm, self.members)
+                    self._ahead = ThreadPoolExecutor(1).submit(self._collection.lower_carrying().compile, options)
+
     def compile(self, creating: bool) -> Executables:
         """Compile everything a run needs, side by side; `begin` only if `creating`.
 
@@ -115,7 +124,8 @@ class Population:
         ):
             lowered = self._lower_here(creating) if self.mesh is None else self._lower_on_mesh(creating)
             try:
-                pending = [pool.submit(work.compile, compiler_options=options) for work in lowered]
+                pending = [] if self._ahead is None else [self._ahead]
+                pending += [pool.submit(work.compile, compiler_options=options) for work in lowered]
             finally:
                 pool.shutdown(wait=self.mesh is not None)
         collect, update, episodes, *begin = map(_when_ready, pending)
@@ -150,8 +160,32 @@ class Population:
         return state, statistics, dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True)), taken
 
     def _lower_here(self, creating: bool) -> Iterator[Any]:
-        """collect, update, episodes and, if `creating`, begin on one device; traced programs come from the cache."""
-        key: dict[str, Any] | None = {
+        """collect, update, episodes and, if `creating`, begin on one device; `read_ahead` may have had the first."""
+        key, state = self._key, self.template()
+        values, keys, phase = jax.tree.map(_shape, (*self._starts(0), warmup(1).phase))
+        if self._ahead is None:
+            yield self._collection.lower_carrying()
+        update = lambda: (state, _shape(self._drawn()))  # noqa: E731
+        yield TracedProgram("update", key, self._update, update, others=1).lower_carrying()
+        episodes = lambda: (values, keys, phase.random)  # noqa: E731
+        yield TracedProgram("episodes", key, self._episodes, episodes, state.envs).lower()
+        if creating:
+            begin = lambda: (values, keys)  # noqa: E731
+            yield TracedProgram("begin", key, self._begin, begin, state._replace(envs=())).lower()
+
+    @functools.cached_property
+    def _collection(self) -> TracedProgram:
+        def shapes() -> Any:
+            return self.template(), *jax.tree.map(_shape, (self._no_statistics(), warmup(1).phase))
+
+        return TracedProgram("collect", self._key, self._collect, shapes, others=len(warmup(1).phase))
+
+    @functools.cached_property
+    def _key(self) -> dict[str, Any] | None:
+        """All that the traced programs depend on; None if nobody knows all of that."""
+        if not self._extensions.ours():
+            return None
+        return {
             "config": configs.to_dict(self.config),
             "physics": self._physics,
             "algorithm": type(self.program.algorithm).__name__,
@@ -160,19 +194,6 @@ class Population:
             "source": source_hash(),
             "versions": versions(),
         }
-        if not self._extensions.ours():
-            key = None  # nobody knows all that they depend on
-        shapes = lambda tree: jax.tree.map(_shape, tree)  # noqa: E731
-        values, keys, phase = shapes((*self._starts(0), warmup(1).phase))
-        state, statistics = self.template(), shapes(self._no_statistics())
-        drawn = shapes(self._drawn())
-        known, counted = len(jax.tree.leaves(state)), len(jax.tree.leaves(statistics))
-        given = (state, statistics, phase)
-        yield TracedProgram("collect", key, self._collect, given, carried=known + counted).lower_carrying()
-        yield TracedProgram("update", key, self._update, (state, drawn), carried=known).lower_carrying()
-        yield TracedProgram("episodes", key, self._episodes, (values, keys, phase.random), state.envs).lower()
-        if creating:
-            yield TracedProgram("begin", key, self._begin, (values, keys), state._replace(envs=())).lower()
 
     def _lower_on_mesh(self, creating: bool) -> Iterator[Any]:
         """The same on several devices."""

@@ -163,7 +163,7 @@ class Environments:
     def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
         """See `mjxball.algorithms.base.Environments`."""
         other = copy.copy(self)
-        other._step = jax.vmap(transform(self.env.step))
+        other._step = transform(self.env.step)
         return other
 
     def drawn(self, envs: Envs, key: Array) -> Any:
