@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from mjxball.cli import collect_seldom, quit_on_interrupt, run_command
+from mjxball.cli import collect_seldom, quit_on_interrupt, run_command, switch_often
 
 
 def train() -> int:
     """Run `train.py`; return its exit code."""
     quit_on_interrupt()  # until training starts there is nothing to save
     collect_seldom()
+    switch_often()
 
     def command() -> int:
         from mjxball.commands.train import main

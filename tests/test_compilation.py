@@ -12,9 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjxball import config as configs
+from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.algorithms.ppo import ProximalPolicyOptimization
+from mjxball.train import program as programs
 from mjxball.train.compilation import TracedProgram, compiler_options
-from mjxball.train.extensions import TracedOnce
+from mjxball.train.extensions import Extensions, TracedOnce
+from mjxball.train.population import Population
 
 
 def rolling(state: dict[str, Any], step: Any) -> tuple[dict[str, Any], Any]:
@@ -118,3 +122,24 @@ assert brax.System.__module__ == "brax.base" and envs.Env.__module__ == "brax.en
     command = [sys.executable, "-W", "ignore", "-c", code]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_longest_program_is_loaded_ahead_if_it_was_traced_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mjxball.train.compilation.traced_directory", lambda: tmp_path)
+    config = configs.replace(configs.preset("transport"), "gradient.num_envs", 2)
+    config = configs.replace(config, "gradient.horizon", 2)
+    rewards, ahead = [], []
+    for _ in range(2):
+        population = Population(config, "newton-euler", extensions=Extensions(None, None, FirstOrderGradient))
+        population.read_ahead()
+        ahead.append(population._ahead is not None)
+        executables = population.compile(creating=True)
+        state = population.start(executables, 0)
+        for mode in (programs.warmup(2), programs.train(4)):
+            state, statistics, *_ = executables.advance(state, mode)
+        rewards.append(float(statistics.reward))
+        assert int(state.steps) == 12
+    assert ahead == [False, True]
+    assert rewards[0] == rewards[1] != 0.0
