@@ -124,6 +124,27 @@ class Standing(LinearQuadratic):
         return state
 
 
+class Pursuing(LinearQuadratic):
+    """Its cost has a target, which a loop of unknown length moves: nothing goes backwards through that."""
+
+    def reset(self, rng: Any) -> Any:
+        return super().reset(rng).replace(pipeline_state={"target": jnp.ones(()), "nothing": jnp.zeros(0)})
+
+    def step(self, state: Any, action: Any) -> Any:
+        world, moved = state.pipeline_state, super().step(state, action)
+        target = jax.lax.while_loop(lambda value: value > 0.5, lambda value: 0.9 * value, world["target"])
+        return moved.replace(reward=-((moved.obs[0] - target) ** 2), pipeline_state=world | {"target": target})
+
+
+def test_what_no_action_reaches_needs_no_gradient(transport: Config) -> None:
+    environments = Environments(Pursuing(), 32, Shards())
+    algorithm = FirstOrderGradient(transport, environments)
+    states = environments.reset(jax.random.PRNGKey(0))
+    begun = environments.begin(states, 1.0)
+    known, _ = algorithm.collect(algorithm.init(jax.random.PRNGKey(1)), begun, [jax.random.PRNGKey(2)], TRAIN)
+    assert all(np.abs(slope["bias"]).max() > 0 for slope in known.slope.values())
+
+
 def test_the_first_window_normalises_the_observations(transport: Config) -> None:
     environments = Environments(Standing(), 32, Shards())
     algorithm = FirstOrderGradient(transport, environments)

@@ -70,6 +70,13 @@ def test_values_and_gradients_are_those_of_the_function(function: Any) -> None:
     np.testing.assert_allclose(*gradients, rtol=1e-4, atol=1e-5)
 
 
+def test_an_array_of_nothing_has_a_gradient_of_nothing() -> None:
+    form, nothing = scalar_form(lambda x, none: (x * 2.0, none)), jnp.zeros((5, 0))
+    slopes = jax.grad(lambda x, none: sum(leaf.sum() for leaf in form(x, none)), (0, 1))(jnp.ones((5, 4)), nothing)
+    np.testing.assert_array_equal(slopes[0], np.full((5, 4), 2.0))
+    assert slopes[1].shape == (5, 0)
+
+
 def test_what_is_the_same_for_all_of_a_batch_stays_so() -> None:
     """A traced number outside the function, and results that no argument has a part in."""
 

@@ -113,6 +113,7 @@ class Environments(Protocol):
     critic_mask: Any  # (n,) the same for what is needed in training only
     turn: Any  # (count,) in which of several turns, again and again, each is to start anew where all do so in turn
     shards: Shards
+    smooth: bool  # whether all of a step has a gradient backwards, also what no action has a part in
 
     def restart(self, envs: Any, key: Array, others: Bool[Array, " envs"] | None = None) -> Any:
         """Those of `envs` whose episode ended start anew, at states drawn with `key`, and so do `others`."""

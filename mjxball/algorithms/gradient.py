@@ -104,9 +104,10 @@ class FirstOrderGradient:
         own = self._environments
         turn = (own.turn + state.windows) % self._config.windows_per_episode == 0
         envs = own.restart(envs, keys[0], turn & phase.recording)
-        # Also by the first states, for nobody: JAX then sees at its first look what the loop carries a gradient of.
-        differentiated = jax.value_and_grad(self._window, (0, 2), has_aux=True, allow_int=True)
-        (loss, (envs, mean, square)), (slope, _) = differentiated(state.layers, state, envs)
+        # Also by the first states, where they allow it: JAX then sees at once what the loop carries a gradient of.
+        arguments = (0, 2) if own.smooth else (0,)
+        differentiated = jax.value_and_grad(self._window, arguments, has_aux=True, allow_int=True)
+        (loss, (envs, mean, square)), (slope, *_) = differentiated(state.layers, state, envs)
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
         first = (phase.random & phase.recording).astype(jnp.float32) * (1 - state.seen)
         known = GradientState(

@@ -42,6 +42,7 @@ def scalar_form(function: Callable[..., Any]) -> Callable[..., Any]:
     then is 0), and sums are added in order. A `lax.scan` without inputs and outputs for each step, as `fori_loop` of a
     fixed count becomes, is computed again when its gradient is taken instead of remembering what happened in it. What
     is unknown here or larger than `LARGEST` stays as it is, and so does a call (`jax.jit`) with such an array in it.
+    It has gradients backwards alone (`jax.grad`, `jax.vjp`).
     """
 
     def transformed(*arguments: Any) -> Any:
@@ -67,7 +68,7 @@ def _apart(leaves: Sequence[Any]) -> list[Value]:
     small = [
         k
         for k, leaf in enumerate(leaves)
-        if jnp.ndim(leaf) > 1 and leaf[0].size <= LARGEST and jnp.issubdtype(leaf.dtype, jnp.floating)
+        if jnp.ndim(leaf) > 1 and 0 < leaf.size // len(leaf) <= LARGEST and jnp.issubdtype(leaf.dtype, jnp.floating)
     ]
     shapes = [leaves[k].shape for k in small]
 

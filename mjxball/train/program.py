@@ -121,6 +121,7 @@ class Environments:
         self.observation_size, self.action_size = env.observation_size, env.action_size
         self.policy_mask = getattr(env, "input_mask", None) or [1.0] * self.observation_size
         self.critic_mask = getattr(env, "critic_mask", None) or self.policy_mask
+        self.smooth = is_pair(env)
         self._graded = len(inspect.signature(env.reset).parameters) > 1
         self._step = jax.vmap(env.step)
         sizes = getattr(env, "team_sizes", None)
