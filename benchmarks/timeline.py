@@ -62,8 +62,9 @@ FUNCTIONS = {
         "Population.metric_names",
     ),
     "mjxball.train.compilation": (
-        "TracedProgram.__init__",
+        "TracedProgram._traced",
         "TracedProgram.lower",
+        "TracedProgram.lower_carrying",
         "Carrying.compile",
         "_read",
         "_write",

@@ -204,9 +204,8 @@ class Run:
             done = min(done + begun.steps, goal)
             if flying:  # looked at while the devices are at the next one, so that they need not wait
                 self.progress.show(self._row(flying))
-            flying = (
-                begun if done == goal else None
-            )  # one that is cut short has no row: who resumes has one of the rest
+            # One that is cut short has no row: who resumes has one of the rest.
+            flying = begun if done == goal else None
             late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
             # All processes act on what they agreed on here, whenever a signal reaches one of them.
             ended, late = processes.any_of((stop.requested, late))
