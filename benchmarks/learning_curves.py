@@ -74,7 +74,7 @@ def judge(found: list[tuple[float, Path]]) -> list[dict[str, Any]]:
     from mjxball.evaluate.results import fly_scenarios
     from mjxball.evaluate.scenarios import REFERENCE
     from mjxball.policy.file import load_file
-    from mjxball.policy.policy import mean_action
+    from mjxball.policy.network import Network
     from mjxball.train.program import Program
 
     settings = preset("transport")
@@ -84,7 +84,7 @@ def judge(found: list[tuple[float, Path]]) -> list[dict[str, Any]]:
     @jax.jit
     def reward(weights: Any, biases: Any, mean: Any, scale: Any) -> Any:
         def step(envs: Any, key: Any) -> tuple[Any, None]:
-            action = mean_action(weights, biases, mean, scale, envs.states.obs)
+            action = Network(weights, biases, mean, scale)(envs.states.obs)
             return environments.step(envs, action, key)[0], None
 
         envs = environments.begin(program.evaluation_envs(jax.random.PRNGKey(0)), 1.0)

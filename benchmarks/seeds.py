@@ -39,7 +39,8 @@ from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy
-from mjxball.policy.policy import NetworkLaw, mean_action
+from mjxball.policy.network import Network
+from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.scenario import Scenario
 
 Array = Any
@@ -57,7 +58,7 @@ class Stacked:
 
     def __init__(self, policies: Sequence[Policy]):
         self._law = NetworkLaw(policies[0])._law
-        networks = [NetworkLaw(policy)._parts for policy in policies]
+        networks = [NetworkLaw(policy)._network for policy in policies]
         self.networks = jax.tree.map(lambda *parts: np.stack(parts), *networks)
 
     def start(self, observation: Array) -> Array:
@@ -68,8 +69,9 @@ class Stacked:
         """(memory, command (n k, 3)) at `observation` (n k, 18)."""
         networks = jax.tree.map(lambda part: jnp.asarray(part, observation.dtype), self.networks)
         seen = self._law.network_input(observation, memory)
-        parts = seen.reshape(len(networks[2]), -1, seen.shape[-1])
-        scaled = jax.vmap(mean_action)(*networks, parts).reshape(-1, 3)
+        parts = seen.reshape(len(networks.mean), -1, seen.shape[-1])
+        scaled = jax.vmap(Network.__call__)(networks, parts)
+        scaled = scaled.reshape(-1, scaled.shape[-1])
         command = self._law.command(scaled, observation, memory)
         return self._law.next(memory, observation, scaled, command), command
 

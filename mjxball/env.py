@@ -103,7 +103,8 @@ class TransportEnv:
         parts = self._seen, self._answer, law.next if law.size else lambda *_: ()
         self._law_seen, self._answered, self._remembered = (jax.jit(functools.partial(part)) for part in parts)
         self._cg = make_cg_offset(config)
-        self._commanded = np.array(layout.commanded(config.follower.load_axis_only, config.plant.cg_axis))
+        commanded = layout.commanded(config.follower.load_axis_only, config.plant.cg_axis)
+        self._commanded = np.append(commanded, np.ones(law.units))
         self._unloaded = 1 if config.plant.cg_axis == "y" else 0  # of roll and pitch the one that no load turns
         self._in_plane = len(config.plant.directions) == 2
         self._privileged_size = 0
@@ -137,8 +138,13 @@ class TransportEnv:
 
     @property
     def action_size(self) -> int:
-        """Roll, pitch, vertical acceleration."""
-        return layout.ACTION_SIZE
+        """Roll, pitch, vertical acceleration, and behind them the next state of a recurrent network."""
+        return layout.ACTION_SIZE + self._law.units
+
+    @property
+    def recurrent_slots(self) -> slice:
+        """Where the observation holds the state of a recurrent network; empty without one."""
+        return slice(self.policy_input_size - self._law.units, self.policy_input_size)
 
     @property
     def backend(self) -> str:
@@ -171,8 +177,12 @@ class TransportEnv:
         world, seen = self.seeing(world, observation)
         return State(world, seen, reward, zero, metrics, {"truncation": zero})
 
-    def step(self, state: State, action: Float[Array, "... 3"], physics: ControlStep | None = None) -> State:
-        """Apply the network's `action` in [-1, 1] for one control period, with `physics` in place of the engine."""
+    def step(self, state: State, action: Float[Array, "... actions"], physics: ControlStep | None = None) -> State:
+        """Apply the network's `action` in [-1, 1] for one control period, with `physics` in place of the engine.
+
+        What a recurrent network remembers is part of the state as it is of the observation: a network is then a function
+        without memory, whose answer (..., 3 + H) ends with its next state.
+        """
         world: PipelineState = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
@@ -181,7 +191,8 @@ class TransportEnv:
 
     def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
         """`step` of a follower that is no network: `follower_command` is flown as it is."""
-        world, action = state.pipeline_state, jnp.zeros_like(follower_command)
+        world = state.pipeline_state
+        action = jnp.zeros((*follower_command.shape[:-1], self.action_size))
         memory = self._remembered(world.history, self._observed(state), action, follower_command, world.known)
         return self._step(state, follower_command, memory, action, world.loop.diverged, 0.0)
 
@@ -204,7 +215,7 @@ class TransportEnv:
         state: State,
         command: Float[Array, "... 3"],
         memory: Any,
-        action: Float[Array, "... 3"],
+        action: Float[Array, "... actions"],
         diverged: Bool[Array, ""],
         on_pid: float,
         physics: ControlStep | None = None,
@@ -223,7 +234,7 @@ class TransportEnv:
             loop=loop,
             disturbances=disturbances,
             history=memory,
-            action=action,
+            action=action[..., : layout.ACTION_SIZE],
             command=command,
             steps=world.steps + 1,
         )
@@ -323,7 +334,7 @@ class TransportEnv:
         return law.network_input(observation, memory, known), () if known is None else known
 
     def _answer(
-        self, action: Float[Array, "... 3"], observation: Float[Array, "... 18"], memory: Any, known: Any
+        self, action: Float[Array, "... actions"], observation: Float[Array, "... 18"], memory: Any, known: Any
     ) -> tuple[Float[Array, "... 3"], Any]:
         """(command, memory of the next step) of the network's `action`."""
         law = self._law

@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from mjxball.config import Config
+from mjxball.policy.network import Network
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -65,6 +66,41 @@ class PolicyNetwork(NamedTuple):
         return jax.nn.relu(value)
 
 
+class RecurrentNetwork(PolicyNetwork):
+    """A GRU below the ReLU layers; `layers` holds it as "gru": {"kernel", "recurrent", "bias"}.
+
+    An observation holds the GRU's state behind the network's inputs, and an answer the next state behind the action
+    (`mjxball.policy.network.Network`, which computes it).
+    """
+
+    def __call__(self, observation: Float[Array, "... n"]) -> Float[Array, "... answer"]:
+        """Mean action in [-1, 1] at `observation`, and the GRU's next state."""
+        return self.network()(observation[..., : self.inputs + self.units])
+
+    @property
+    def inputs(self) -> int:
+        """Of the network, the GRU's state not counted."""
+        return self.layers["gru"]["kernel"].shape[-2]
+
+    @property
+    def units(self) -> int:
+        """Of the GRU."""
+        return self.layers["gru"]["recurrent"].shape[-2]
+
+    def network(self) -> Network:
+        """As a policy file has it, without the deviations of the action."""
+        names = sorted(self.layers.keys() - {"gru"}, key=lambda name: int(name.rsplit("_", 1)[1]))
+        weights, biases = ([self.layers[name][part] for name in names] for part in ("kernel", "bias"))
+        half, own, gru = weights[-1].shape[-1] // 2, slice(self.inputs), self.layers["gru"]
+        return Network(
+            weights=(*weights[:-1], weights[-1][..., :half]),
+            biases=(*biases[:-1], biases[-1][..., :half]),
+            mean=self.mean[..., own],
+            scale=(self.mask[..., own] / self.deviation[..., own]),
+            gru=(gru["kernel"], gru["recurrent"], gru["bias"]),
+        )
+
+
 class SwishNetwork(PolicyNetwork):
     """The same with swish units, for which there is no policy file."""
 
@@ -108,7 +144,8 @@ class Environments(Protocol):
 
     count: int  # of this shard
     observation_size: int
-    action_size: int
+    action_size: int  # with the next state of a recurrent policy
+    recurrent_slots: slice  # of an observation: the state of a recurrent policy; empty if it has none
     policy_mask: Any  # (n,) 1 for what the policy may use of an observation, else 0
     critic_mask: Any  # (n,) the same for what is needed in training only
     turn: Any  # (count,) in which of several turns, again and again, each is to start anew where all do so in turn

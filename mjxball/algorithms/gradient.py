@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
 from mjxball.algorithms.scalar_form import scalar_form
 from mjxball.config import Config
 from mjxball.errors import InputError
@@ -18,12 +18,14 @@ from mjxball.policy.file import PolicyFile
 
 Array = Any
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
+SHORTEST_MEMORY, LONGEST_MEMORY = 1.5, 150.0  # control steps that units of a GRU keep their state for at the start
+RECURRENT_GAIN = 0.7  # of a GRU's orthogonal recurrent weights at the start
 
 
 class GradientState(NamedTuple):
     """What the algorithm knows."""
 
-    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}
+    layers: Any  # Flax's names: {"hidden_0": {"kernel", "bias"}, ...}, and "gru" (`RecurrentNetwork`)
     adam: Any
     slope: Any  # gradient of the last window's loss, a pytree like `layers`
     loss: Array  # () minus the mean reward of the last window
@@ -39,7 +41,8 @@ class FirstOrderGradient:
     `collect` flies a window and differentiates its mean reward with respect to the policy's weights; `update` takes
     the step. Windows follow one another in an episode of `gradient.windows_per_episode`; the environments begin theirs
     in turn, so that every window has flights towards the goal and flights at it. `gradient.gradient_decay` multiplies
-    the gradient that passes from one control step to the one before.
+    the gradient that passes from one control step to the one before, and `gradient.state_gradient_clip` limits it in
+    each environment. A recurrent network's own state passes it whole: that is what it is to learn to remember by.
     """
 
     metrics = ("loss", "gradient_norm")
@@ -57,15 +60,24 @@ class FirstOrderGradient:
         self.steps_per_collect = own.horizon
         window = own.num_envs * own.horizon
         self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations, 0.0)
-        self._sizes = (environments.observation_size, *own.policy_layers, 2 * environments.action_size)
+        self._slots = environments.recurrent_slots
+        self._units = self._slots.stop - self._slots.start
+        actions = environments.action_size - self._units
+        self._sizes = (environments.observation_size, *own.policy_layers, 2 * actions)
         self._mask: Any = np.asarray(environments.policy_mask, np.float32)
 
     def init(self, key: Array) -> GradientState:
         """Weights as Flax draws them (LeCun's), near 0 in the last layer: the first policy adds hardly anything."""
         layers = {}
+        if self._units:
+            key, own = jax.random.split(key)
+            layers["gru"] = _fresh_gru(own, self._slots.start, self._units)
         pairs = list(zip(self._sizes[:-1], self._sizes[1:], strict=True))
         for number, (rows, columns) in enumerate(pairs):
             key, own = jax.random.split(key)
+            if self._units:
+                rows = self._slots.stop if number == 0 else rows  # what is seen, and the state
+                rows += self._units if number == len(pairs) - 1 else 0
             kernel = jax.nn.initializers.lecun_uniform()(own, (rows, columns))
             last = number == len(pairs) - 1
             layers[f"hidden_{number}"] = {"kernel": kernel * (0.01 if last else 1.0), "bias": jnp.zeros(columns)}
@@ -125,12 +137,9 @@ class FirstOrderGradient:
 
     def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
         policy = self.policy(state._replace(layers=layers))
-        decay: Any = self._config.gradient_decay
-        plain = isinstance(decay, float) and decay == 1  # not where a sweep traces it
-
         def step(carry: tuple[Any, Array], _: None) -> tuple[Any, tuple[Array, Array]]:
             envs, flies = carry
-            envs = envs if plain else envs._replace(states=_decayed(envs.states, decay))
+            envs = envs._replace(states=self._damped(envs.states))
             seen = envs.states.obs
             envs, after = self._environments.step(envs, policy(seen), None)
             reward = after.reward * flies if self._config.until_termination else after.reward
@@ -139,6 +148,20 @@ class FirstOrderGradient:
         start = envs, jnp.ones_like(envs.states.reward)
         (envs, _), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
+
+    def _damped(self, states: Any) -> Any:
+        """`states`; the gradient that passes them backwards is made smaller, that of a network's own state is not."""
+        decay: Any = self._config.gradient_decay
+        clip: Any = self._config.state_gradient_clip
+        if isinstance(clip, float) and clip == 0:  # neither is a number where a sweep traces it
+            damped = states if isinstance(decay, float) and decay == 1 else _decayed(states, decay)
+        else:
+            damped = _clipped(states, decay, clip / (self._config.horizon * self._environments.count))
+        if not self._units:
+            return damped
+        own, seen = self._slots, damped.obs
+        parts = [seen[..., : own.start], states.obs[..., own], seen[..., own.stop :]]
+        return damped.replace(obs=jnp.concatenate(parts, axis=-1))
 
     def update(
         self, state: GradientState, keys: Sequence[Array], progress: Array, phase: Phase
@@ -167,7 +190,8 @@ class FirstOrderGradient:
         xp = state.mean.__array_namespace__()  # NumPy's, when a policy file is written: nothing is compiled for that
         variance = state.square - state.mean**2
         deviation = xp.where(state.seen > 0, xp.sqrt(xp.maximum(variance, LEAST_DEVIATION**2)), 1.0)
-        return PolicyNetwork(state.layers, state.mean, deviation, self._mask)
+        network = RecurrentNetwork if self._units else PolicyNetwork
+        return network(state.layers, state.mean, deviation, self._mask)
 
     def partition(self, whole: Any, split: Any) -> Any:
         """Everything that is known is whole."""
@@ -180,6 +204,20 @@ class FirstOrderGradient:
                 f"gradient.num_envs = {self._config.num_envs} cannot be split over {parts} devices evenly; "
                 "make it a multiple"
             )
+
+
+def _fresh_gru(key: Array, inputs: int, units: int) -> dict[str, Array]:
+    """A GRU at the start: orthogonal recurrent weights, and units that forget within 1.5 to 150 control steps."""
+    kernel, recurrent, memory = jax.random.split(key, 3)
+    square = jax.nn.initializers.orthogonal(RECURRENT_GAIN)
+    blocks = [square(own, (units, units)) for own in jax.random.split(recurrent, 3)]
+    low, high = np.log(SHORTEST_MEMORY), np.log(LONGEST_MEMORY)
+    steps = jnp.exp(jax.random.uniform(memory, (units,), minval=low, maxval=high))
+    return {
+        "kernel": jax.nn.initializers.lecun_uniform()(kernel, (inputs, 3 * units)),
+        "recurrent": jnp.concatenate(blocks, axis=1),
+        "bias": jnp.concatenate([jnp.zeros(units), jnp.log(steps - 1.0), jnp.zeros(units)]),
+    }
 
 
 def _forget(envs: Any) -> Any:
@@ -198,3 +236,38 @@ def _decayed(tree: Any, factor: float) -> Any:
         return factor * leaf + (1.0 - factor) * jax.lax.stop_gradient(leaf)
 
     return jax.tree.map(one, tree)
+
+
+@jax.custom_vjp
+def _clip_backwards(leaves: list[Array], decay: Array, longest: Array) -> list[Array]:
+    """`leaves`, arrays (envs, ...); see `_clipped`."""
+    return leaves
+
+
+def _clip(factors: tuple[Array, Array], slopes: list[Array]) -> tuple[Any, ...]:
+    decay, longest = factors
+    slopes = [jnp.where(jnp.isfinite(one), one, 0.0) for one in slopes]
+    length = jnp.sqrt(sum((one.reshape(len(one), -1) ** 2).sum(axis=1) for one in slopes))
+    factor = decay * jnp.minimum(1.0, longest / (length + 1e-30))
+    factor = jnp.where(jnp.isfinite(factor), factor, 0.0)
+    kept = [one * factor.reshape((-1,) + (1,) * (one.ndim - 1)) for one in slopes]
+    return kept, jnp.zeros_like(decay), jnp.zeros_like(longest)
+
+
+_clip_backwards.defvjp(lambda leaves, decay, longest: (leaves, (decay, longest)), _clip)
+
+
+def _clipped(tree: Any, decay: Any, longest: Any) -> Any:
+    """`tree` as it is; a gradient that passes through its floats is at most `longest` in each environment, times `decay`.
+
+    Numbers of it that are not finite are 0. Leaves of other lengths, as those of worlds with several followers, are
+    limited apart. Without this a few environments that are about to diverge lead all others astray.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    floats = [k for k, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    for count in {len(leaves[k]) for k in floats}:
+        own = [k for k in floats if len(leaves[k]) == count]
+        passed = _clip_backwards([leaves[k] for k in own], jnp.float32(decay), jnp.float32(longest))
+        for k, leaf in zip(own, passed, strict=True):
+            leaves[k] = leaf
+    return jax.tree.unflatten(structure, leaves)

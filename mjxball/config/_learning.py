@@ -95,6 +95,12 @@ class Gradient:
     gradient_decay: float = setting(
         1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1
     )
+    state_gradient_clip: float = setting(
+        0.0,
+        "largest length of the gradient that passes through one environment's state from a control step to the one "
+        "before, in units of 1 / (horizon num_envs); 0: no limit",
+        low=0,
+    )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
     until_termination: bool = setting(
         False,

@@ -9,17 +9,28 @@ from typing import Any, NamedTuple
 
 from mjxball.control import leader
 from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg
-from mjxball.control.observation import ObservationHistory, copy_command, scale_action
+from mjxball.control.observation import (
+    ACTION_SIZE,
+    ERROR,
+    ERROR_RATE,
+    ObservationHistory,
+    copy_command,
+    scale_action,
+)
 from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
 
 Array = Any
+# What a recurrent network sees besides: tanh of the object's error and of its rate over these, so that millimetres at the
+# goal are not lost beside metres on the way to it.
+NEAR_ERROR, NEAR_ERROR_RATE = 0.03, 0.1  # [m], [m/s]
+SATURATED = 6  # such numbers
 
 
 class FollowerLaw(NamedTuple):
     """The laws around the network of one follower.
 
-    Its memory (..., m) holds that of `history` and, behind it, that of `lqg`.
+    Its memory (..., m) holds that of `history` and, behind it, that of `lqg` or the state of the network's GRU.
     """
 
     history: ObservationHistory
@@ -30,16 +41,18 @@ class FollowerLaw(NamedTuple):
     gravity: float  # [m/s2]
     residual: bool = True  # whether the action is added to a law: `lqg`, or the leader's PD law if that is None
     lqg: OffsetFreeLqg | TeamLqg | MultiModelLqg | None = None
+    units: int = 0  # H of the network's GRU; then there is no `lqg`, and the network's answer has its state behind it
 
     @property
     def size(self) -> int:
         """Length m of the memory."""
-        return self.history.size + (0 if self.lqg is None else self.lqg.size)
+        return self.history.size + (self.units if self.lqg is None else self.lqg.size)
 
     @property
     def shown(self) -> int:
         """How many numbers s `network_input` has behind an observation."""
-        return self.history.size + (0 if self.lqg is None else self.lqg.shown)
+        recurrent = SATURATED + self.units if self.units else 0
+        return self.history.size + (recurrent if self.lqg is None else self.lqg.shown)
 
     def mask(self, ignore_position: bool) -> list[float]:
         """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
@@ -53,10 +66,14 @@ class FollowerLaw(NamedTuple):
     def start(self, observation: Array, context: Array | None = None) -> Array:
         """Memory (..., m) before the first `observation` (..., 18); `context` (..., c) if `needs_context`."""
         remembered = self.history.start(observation)
+        xp = observation.__array_namespace__()
+        if self.units:
+            nothing = xp.zeros_like(observation[..., :1])
+            return xp.concat([remembered, *[nothing] * self.units], axis=-1)
         if self.lqg is None:
             return remembered
         known = {"context": context} if self.needs_context else {}
-        return observation.__array_namespace__().concat([remembered, self.lqg.start(observation, **known)], axis=-1)
+        return xp.concat([remembered, self.lqg.start(observation, **known)], axis=-1)
 
     @property
     def told(self) -> int:
@@ -72,16 +89,26 @@ class FollowerLaw(NamedTuple):
     def network_input(self, observation: Array, memory: Array, known: Any = None) -> Array:
         """Input of the network (..., 18 + s); here and below `known` may be given."""
         seen = self.history.network_input(observation, memory[..., : self.history.size])
+        if self.units:
+            xp = observation.__array_namespace__()
+            small = [
+                xp.tanh(observation[..., part] * (1 / scale))
+                for part, scale in ((ERROR, NEAR_ERROR), (ERROR_RATE, NEAR_ERROR_RATE))
+            ]
+            return xp.concat([seen, *small, memory[..., self.history.size :]], axis=-1)
         if self.lqg is None:
             return seen
         features = self.lqg.features(memory[..., self.history.size :], observation, *_if_any(known))
         return observation.__array_namespace__().concat([seen, features], axis=-1)
 
     def command(self, scaled: Array, observation: Array, memory: Array, known: Any = None) -> Array:
-        """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18)."""
+        """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18).
+
+        Here and below `scaled` has the GRU's next state behind it, (..., 3 + H), if there is one.
+        """
         if isinstance(self.lqg, MultiModelLqg):
             scaled = self.lqg.counted(scaled, memory)
-        command = scale_action(scaled, *self.action_scale)
+        command = scale_action(scaled[..., :ACTION_SIZE], *self.action_scale)
         if self.lqg is not None:
             own = memory[..., self.history.size :]
             command = self.lqg.command(command, own, observation, self._leader, *_if_any(known))
@@ -91,7 +118,9 @@ class FollowerLaw(NamedTuple):
 
     def next(self, memory: Array, observation: Array, scaled: Array, command: Array, known: Any = None) -> Array:
         """Memory for the next step, after `observation` was answered by `scaled`, which made `command`."""
-        remembered = self.history.next(memory[..., : self.history.size], observation, scaled)
+        remembered = self.history.next(memory[..., : self.history.size], observation, scaled[..., :ACTION_SIZE])
+        if self.units:
+            return observation.__array_namespace__().concat([remembered, scaled[..., ACTION_SIZE:]], axis=-1)
         if self.lqg is None:
             return remembered
         own = memory[..., self.history.size :]

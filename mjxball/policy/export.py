@@ -31,10 +31,12 @@ def policy_file(
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
     mask = np.array(law.mask(follower.ignore_position))
-    size = len(mask)  # behind it stands what only the critics saw; the policy's weights for it never moved
+    gru = _gru(learnt)
+    size = len(mask) - law.units  # behind it stand a GRU's state and what only critics saw, whose weights never moved
+    mask = mask[:size]
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
-    version = 1 if law.lqg is None else 2
+    version = 5 if law.units else 1 if law.lqg is None else 2
     if law.needs_context:
         version = 4 if isinstance(law.lqg, MultiModelLqg) else 3
     card = {
@@ -43,6 +45,7 @@ def policy_file(
         "history": follower.history,
         "previous_action": follower.previous_action,
         "filters": list(follower.observation_averages),
+        **({"recurrent_units": law.units} if law.units else {}),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
         **({} if law.lqg is None else {"lqg": _numbers(law.lqg)}),
@@ -67,12 +70,13 @@ def policy_file(
     keep = np.append(commanded(follower.load_axis_only, config.plant.cg_axis), np.ones(len(ACTION))).astype(np.float32)
     weights[-1], biases[-1] = weights[-1] * keep, biases[-1] * keep
     return PolicyFile(
-        weights=(weights[0][:size], *weights[1:]),
+        weights=(weights[0][: size + law.units], *weights[1:]),
         biases=tuple(biases),
         observation_mean=np.asarray(learnt.mean, np.float32)[:size],
         observation_scale=(mask / deviation).astype(np.float32),
         action_scale=np.array([action_scale[0], action_scale[0], action_scale[1]], np.float32),
         card=card,
+        gru=gru,
     )
 
 
@@ -87,14 +91,22 @@ def with_network(policy: PolicyFile, learnt: Any) -> PolicyFile:
         observation_scale=np.where(policy.observation_scale > 0, 1 / np.asarray(learnt.deviation), 0.0).astype(
             np.float32
         ),
+        gru=_gru(learnt),
     )
 
 
 def _layers(learnt: Any) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Weights (n_in, n_out) and biases (n_out,) of all layers, float32."""
-    names = sorted(learnt.layers, key=lambda name: int(name.rsplit("_", 1)[1]))
+    names = sorted(learnt.layers.keys() - {"gru"}, key=lambda name: int(name.rsplit("_", 1)[1]))
     layers = [learnt.layers[name] for name in names]
     return tuple([np.asarray(layer[part], np.float32) for layer in layers] for part in ("kernel", "bias"))  # type: ignore[return-value]
+
+
+def _gru(learnt: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Kernel, recurrent weights and bias of the GRU, float32; None if there is none."""
+    if "gru" not in learnt.layers:
+        return None
+    return tuple(np.asarray(learnt.layers["gru"][part], np.float32) for part in ("kernel", "recurrent", "bias"))  # type: ignore[return-value]
 
 
 def network_file(path: Path, learnt: Any, steps: int, origin: dict[str, Any]) -> bool:
@@ -123,7 +135,7 @@ def is_sound(policy: PolicyFile) -> bool:
     """True if every number of `policy` is finite."""
     return all(
         math.isfinite(float(np.abs(array).sum()))
-        for array in (*policy.weights, *policy.biases, policy.observation_mean, policy.observation_scale)
+        for array in (*policy.weights, *policy.biases, policy.observation_mean, policy.observation_scale, *(policy.gru or ()))
     )
 
 

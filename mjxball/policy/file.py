@@ -22,8 +22,11 @@ from mjxball.policy.container import PolicyFileError, read_arrays
 from mjxball.policy.law_fields import LQG_SHAPES, MAX_NUMBER, check_lqg, is_finite
 
 # 2: with the numbers of an offset-free LQG of a pair, card field `lqg`; 3: of a team, and what a follower has to know
-# of its team before a flight, card field `context`; 4: of attitude loops that nobody knows.
-FORMAT_VERSIONS = (1, 2, 3, 4)
+# of its team before a flight, card field `context`; 4: of attitude loops that nobody knows; 5: with a GRU below the
+# network, arrays GRU_ARRAYS, and no law inside.
+FORMAT_VERSIONS = (1, 2, 3, 4, 5)
+GRU_ARRAYS = ("gru_kernel", "gru_recurrent", "gru_bias")
+MAX_UNITS = 512
 FOLDER = "policies"  # of those that come with mjxball
 ARCHIVE = "archive"  # in it: earlier ones, which documents name
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
@@ -62,6 +65,7 @@ class PolicyFile:
     observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for a slot that is not used
     action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
     card: dict[str, Any]
+    gru: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # GRU_ARRAYS, float32: (n, 3 H), (H, 3 H), (3 H,)
 
 
 def law_of(card: dict[str, Any]) -> FollowerLaw:
@@ -76,6 +80,7 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
         gravity=card["gravity"],
         residual=card["action_mode"] == "residual",
         lqg=_lqg_of(card),
+        units=card.get("recurrent_units", 0),
     )
 
 
@@ -102,6 +107,8 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
     }
     for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         arrays[f"weight_{number}"], arrays[f"bias_{number}"] = weight, bias
+    if policy.gru is not None:
+        arrays |= dict(zip(GRU_ARRAYS, policy.gru, strict=True))
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     write_whole(path, stream.getvalue())
@@ -134,6 +141,8 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
         layers += 1
     expected = {"observation_mean", "observation_scale", "action_scale"}
     expected |= {f"{kind}_{i}" for kind in ("weight", "bias") for i in range(layers)}
+    recurrent = card.get("format_version") == 5
+    expected |= set(GRU_ARRAYS) if recurrent else set()
     odd = sorted(set(arrays) ^ expected)
     if odd or not layers:
         raise PolicyFileError(f"{name}: unexpected or missing array {odd[0] if odd else 'weight_0'!r}")
@@ -144,6 +153,7 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
         observation_scale=arrays["observation_scale"],
         action_scale=arrays["action_scale"],
         card=card,
+        gru=tuple(arrays[label] for label in GRU_ARRAYS) if recurrent else None,  # type: ignore[arg-type]
     )
     check(policy, name)
     return policy
@@ -166,7 +176,8 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
 def check(policy: PolicyFile, name: str) -> None:
     """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
     _check_card(policy.card, name)
-    size = OBSERVATION_SIZE + law_of(policy.card).shown
+    law = law_of(policy.card)
+    size = OBSERVATION_SIZE + law.shown - law.units
     vectors = [
         ("observation_mean", policy.observation_mean, size),
         ("observation_scale", policy.observation_scale, size),
@@ -178,13 +189,24 @@ def check(policy: PolicyFile, name: str) -> None:
         raise PolicyFileError(f"{name}: observation_scale must not be negative and action_scale must be positive")
     if not np.allclose(policy.action_scale, _action_scale(policy.card), rtol=1e-6, atol=0):
         raise PolicyFileError(f"{name}: action_scale differs from the card's action_reach")
-    width = size
+    _check_gru(policy, name, size, law.units)
+    width = size + law.units
     for number, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         last = number == len(policy.weights) - 1
+        width += law.units if last else 0
         out = 2 * ACTION_SIZE if last else (weight.shape[1] if weight.ndim == 2 else -1)
         _check_array(name, f"weight_{number}", weight, (width, out))
         _check_array(name, f"bias_{number}", bias, (out,))
         width = out
+
+
+def _check_gru(policy: PolicyFile, name: str, inputs: int, units: int) -> None:
+    if (policy.gru is None) != (units == 0):
+        raise PolicyFileError(f"{name}: card field recurrent_units and arrays gru_* do not belong together")
+    if policy.gru is not None:
+        shapes = (inputs, 3 * units), (units, 3 * units), (3 * units,)
+        for label, array, shape in zip(GRU_ARRAYS, policy.gru, shapes, strict=True):
+            _check_array(name, label, array, shape)
 
 
 def _action_scale(card: dict[str, Any]) -> list[float]:
@@ -238,6 +260,13 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
         if len(numbers) != length or not all(is_finite(value) and value >= 0 for value in numbers):
             raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
     check_lqg(card, name)
+    units = card.get("recurrent_units", 0)
+    if isinstance(units, bool) or not isinstance(units, int) or not (1 if card["format_version"] == 5 else 0) <= units <= (
+        MAX_UNITS if card["format_version"] == 5 else 0
+    ):
+        raise PolicyFileError(
+            f"{name}: card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
+        )
     for field in ("control_period", "gravity"):
         if not (is_finite(card[field]) and card[field] >= 1e-6):
             raise PolicyFileError(f"{name}: card field {field} must be positive")

@@ -79,9 +79,9 @@ def check_lqg(card: dict[str, Any], name: str) -> None:
     """Raise PolicyFileError unless later formats have the numbers of their LQG and format 1 has none."""
     lqg, version = card.get("lqg"), card["format_version"]
     in_team, shapes = version in CONTEXTS, {2: LQG_SHAPES, 3: TEAM_LQG_SHAPES}.get(version, {})
-    if version == 1:
+    if version in (1, 5):
         if lqg is not None:
-            raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 to 4, not 1")
+            raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 to 4, not {version}")
         return
     if version == 4:
         stiffness = lqg.get("stiffness") if isinstance(lqg, dict) else None

@@ -24,7 +24,7 @@ def mean_policy(policies: Sequence[PolicyFile]) -> PolicyFile:
         raise InputError("a mean is of two policies or more, and there is one")
     first = policies[0]
     for other in policies[1:]:
-        if [one.shape for one in other.weights] != [one.shape for one in first.weights]:
+        if [one.shape for one in _learned(other)] != [one.shape for one in _learned(first)]:
             raise InputError("the policies have other layers than each other, and no mean")
         for name in ("observation_mean", "observation_scale", "action_scale"):
             if not np.allclose(getattr(first, name), getattr(other, name), rtol=1e-5, atol=1e-7):
@@ -35,8 +35,13 @@ def mean_policy(policies: Sequence[PolicyFile]) -> PolicyFile:
         first,
         weights=tuple(_mean([policy.weights[layer] for policy in policies]) for layer in range(len(first.weights))),
         biases=tuple(_mean([policy.biases[layer] for policy in policies]) for layer in range(len(first.biases))),
+        gru=None if first.gru is None else tuple(_mean(list(parts)) for parts in zip(*(one.gru for one in policies))),
         card={**card, "mean_of_seeds": seeds},
     )
+
+
+def _learned(policy: PolicyFile) -> list[np.ndarray]:
+    return [*policy.weights, *(policy.gru or ())]
 
 
 def _mean(arrays: Sequence[np.ndarray]) -> np.ndarray:

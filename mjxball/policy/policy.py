@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import PolicyFile, law_of, load_file
+from mjxball.policy.network import Network
 from mjxball.policy.single import SingleFollower, remembers_one
 
 Array = Any
@@ -58,21 +58,6 @@ def known_context(card: dict[str, Any], name: str) -> np.ndarray | None:
     return _known(name, law_of(card), None if team is None else np.array(team["context"]))
 
 
-def mean_action(
-    weights: Sequence[Array], biases: Sequence[Array], mean: Array, scale: Array, observation: Array
-) -> Array:
-    """tanh of the network's mean output (..., 3) in [-1, 1] for an input `observation` (..., n).
-
-    ReLU layers on (seen - mean) * scale; the last layer's first half is the mean, its second half belongs
-    to the exploration noise and is not computed.
-    """
-    xp = observation.__array_namespace__()
-    hidden = (observation - mean) * scale
-    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
-        hidden = xp.maximum(hidden @ weight + bias, 0.0)
-    return xp.tanh(hidden @ weights[-1] + biases[-1])
-
-
 class Policy:
     """A follower from a policy file. It remembers past observations if the file asks for them.
 
@@ -93,6 +78,8 @@ class Policy:
         self._biases: list[np.ndarray] = [np.ascontiguousarray(bias, dtype) for bias in biases]
         self._mean: np.ndarray = contents.observation_mean.astype(dtype)
         self._scale: np.ndarray = contents.observation_scale.astype(dtype)
+        gru: Any = None if contents.gru is None else tuple(np.ascontiguousarray(part, dtype) for part in contents.gru)
+        self._network = Network(self._weights, self._biases, self._mean, self._scale, gru)
         self._law = law_of(card)
         told = self._law.needs_context and "team" in card
         self._context: Array | None = np.array(card["team"]["context"], dtype) if told else None
@@ -159,11 +146,11 @@ class Policy:
         self._memory, self._ahead = self.memory, False
         known = law.known(observation, self._memory) if remembers else None
         full = law.network_input(observation, self._memory, known) if remembers else observation
-        action = mean_action(self._weights, self._biases, self._mean, self._scale, full)
-        command = law.command(action, observation, self._memory, known)
+        answer = self._network(full)
+        command = law.command(answer, observation, self._memory, known)
         if remembers:
-            self._memory = law.next(self._memory, observation, action, command, known)
-        return action, command
+            self._memory = law.next(self._memory, observation, answer, command, known)
+        return answer[..., : layout.ACTION_SIZE], command
 
     def _answer_alone(self, observation: Array, lqg: MultiModelLqg) -> tuple[Array, Array] | None:
         """`_answer` to one observation (18,), by a `SingleFollower`; None if that cannot answer it."""
@@ -185,7 +172,7 @@ class NetworkLaw:
 
     def __init__(self, policy: Policy):
         self.name = policy.name
-        self._parts = (policy._weights, policy._biases, policy._mean, policy._scale)
+        self._network = policy._network
         self._law = policy._law
         self._context = policy._context
 
@@ -200,15 +187,12 @@ class NetworkLaw:
 
     def answer(self, memory: Array, observation: Array) -> tuple[Array, Array, Array]:
         """(action in [-1, 1] (..., 3), command (..., 3), memory of the next step) at `observation` (..., 18)."""
-        xp = observation.__array_namespace__()
-        weights, biases, mean, scale = self._parts
-        mean, scale = (xp.asarray(part, dtype=observation.dtype) for part in (mean, scale))
-        weights, biases = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
         known = self._law.known(observation, memory)
         seen = self._law.network_input(observation, memory, known)
-        scaled = mean_action(weights, biases, mean, scale, seen)
-        command = self._law.command(scaled, observation, memory, known)
-        return scaled, command, self._law.next(memory, observation, scaled, command, known)
+        answer = self._network.like(observation)(seen)
+        command = self._law.command(answer, observation, memory, known)
+        remembered = self._law.next(memory, observation, answer, command, known)
+        return answer[..., : layout.ACTION_SIZE], command, remembered
 
 
 def _known(name: str, law: FollowerLaw, context: Array | None) -> Array | None:

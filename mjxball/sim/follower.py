@@ -29,4 +29,5 @@ def follower_law(config: Config) -> FollowerLaw:
         gravity=config.plant.gravity,
         residual=follower.action == "residual",
         lqg=lqg,
+        units=follower.recurrent_units,
     )

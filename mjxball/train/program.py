@@ -119,6 +119,7 @@ class Environments:
     def __init__(self, env: Any, count: int, shards: Shards | None = None):
         self.env, self.count, self.shards = env, count, shards or Shards()
         self.observation_size, self.action_size = env.observation_size, env.action_size
+        self.recurrent_slots = getattr(env, "recurrent_slots", slice(self.observation_size, self.observation_size))
         self.policy_mask = getattr(env, "input_mask", None) or [1.0] * self.observation_size
         self.critic_mask = getattr(env, "critic_mask", None) or self.policy_mask
         self.smooth = is_pair(env)

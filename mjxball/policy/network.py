@@ -1,0 +1,52 @@
+"""The network of a policy file: its inputs normalised, ReLU layers, and in format 5 a GRU below them. NumPy alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from mjxball.control.gru import gru_cell
+
+Array = Any
+
+
+class Network(NamedTuple):
+    """What a policy file has learned, for inputs of any batch shape and array namespace.
+
+    Without `gru` an input (..., n) goes through ReLU layers. With it the last H numbers of the input are the GRU's
+    state: the first layer sees the next state and the normalised input, the last layer the layer below and that state.
+    """
+
+    weights: Sequence[Array]
+    biases: Sequence[Array]
+    mean: Array  # (n,) of the inputs, without the GRU's state
+    scale: Array  # (n,) 1 / deviation, 0 for an input that is not used
+    gru: tuple[Array, Array, Array] | None = None  # `control.gru.gru_cell`'s kernel, recurrent, bias
+
+    def __call__(self, seen: Array) -> Array:
+        """Action in [-1, 1] (..., 3) for the input `seen` (..., n), and behind it the next state (..., H) of a GRU."""
+        xp, width = seen.__array_namespace__(), self.mean.shape[-1]
+        below = (seen[..., :width] - self.mean) * self.scale
+        if self.gru is None:
+            return xp.tanh(self._head(below))
+        hidden = gru_cell(seen[..., width:], below, *self.gru)
+        return xp.concat([xp.tanh(self._head(xp.concat([hidden, below], axis=-1), hidden)), hidden], axis=-1)
+
+    def _head(self, below: Array, hidden: Array | None = None) -> Array:
+        xp = below.__array_namespace__()
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            below = xp.maximum(below @ weight + bias, 0.0)
+        if hidden is not None:
+            below = xp.concat([below, hidden], axis=-1)
+        return below @ self.weights[-1] + self.biases[-1]
+
+    def like(self, seen: Array) -> Network:
+        """The same with arrays of the namespace and dtype of `seen`."""
+        xp = seen.__array_namespace__()
+
+        def one(array: Array) -> Array:
+            return xp.asarray(array, dtype=seen.dtype)
+
+        gru = None if self.gru is None else (one(self.gru[0]), one(self.gru[1]), one(self.gru[2]))
+        weights, biases = tuple(map(one, self.weights)), tuple(map(one, self.biases))
+        return Network(weights, biases, one(self.mean), one(self.scale), gru)
