@@ -180,8 +180,8 @@ class TransportEnv:
     def step(self, state: State, action: Float[Array, "... actions"], physics: ControlStep | None = None) -> State:
         """Apply the network's `action` in [-1, 1] for one control period, with `physics` in place of the engine.
 
-        What a recurrent network remembers is part of the state as it is of the observation: a network is then a function
-        without memory, whose answer (..., 3 + H) ends with its next state.
+        What a recurrent network remembers is part of the state and of the observation: it is then a function without
+        memory, whose answer (..., 3 + H) ends with its next state.
         """
         world: PipelineState = state.pipeline_state
         finite = jnp.all(jnp.isfinite(action))

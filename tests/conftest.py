@@ -26,12 +26,14 @@ from command_line import HASTY
 from mjxball import cache, cli
 from mjxball import config as configs
 from mjxball.algorithms import sac
-from mjxball.algorithms.base import PolicyNetwork
+from mjxball.algorithms.base import PolicyNetwork, RecurrentNetwork
+from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.policy import PolicyFile, save_file
 from mjxball.policy.export import policy_file
 from mjxball.sim.follower import follower_law
+from mjxball.train.program import Environments
 
 # The same as in `command_line.environment`: a cached program is found by the flags that it was compiled with.
 if HASTY not in os.environ.get("XLA_FLAGS", ""):
@@ -250,6 +252,34 @@ def remembering(transport: Config) -> Trained:
 def estimating(transport: Config) -> Trained:
     """A follower whose network's action is added to an offset-free LQG."""
     return make_trained(with_settings(transport, follower={"base": "lqg", "observation_averages": (0.1,)}))
+
+
+class Recurrent(NamedTuple):
+    """A follower with a GRU, lived-in, and what is needed to run it."""
+
+    config: Config
+    network: RecurrentNetwork
+    contents: PolicyFile
+
+
+@pytest.fixture(scope="session")
+def recurrent(transport: Config) -> Recurrent:
+    """A follower with 7 recurrent units, a head of two layers and critics that are told more than it."""
+    follower = {"recurrent_units": 7, "previous_action": True, "privileged_critic": True}
+    config = with_settings(transport, follower=follower, gradient={"policy_layers": (9, 5)})
+    env = TransportEnv(config, "newton-euler")
+    algorithm = FirstOrderGradient(config, Environments(env, 4))
+    random = np.random.default_rng(4)
+    state = algorithm.init(jax.random.key(3))
+    # Weights that make the most of every input: none is near 0, as those of the last layer are at the start.
+    layers = jax.tree.map(lambda leaf: np.float32(random.normal(scale=0.5, size=leaf.shape)), state.layers)
+    spread, centre = random.uniform(0.05, 3.0, env.observation_size), random.normal(size=env.observation_size)
+    square = np.float32(spread**2 + centre**2)
+    network = algorithm.policy(
+        state._replace(layers=layers, mean=np.float32(centre), square=square, seen=np.float32(1))
+    )
+    assert isinstance(network, RecurrentNetwork)
+    return Recurrent(config, network, policy_file(config, follower_law(config), network, steps=1234))
 
 
 @pytest.fixture(scope="session")

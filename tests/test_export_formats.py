@@ -84,7 +84,7 @@ def limited(remembering: Trained) -> PolicyFile:
 
 @pytest.fixture(
     params=[
-        *("trained", "direct", "remembering", "limited", "estimating"),
+        *("trained", "direct", "remembering", "limited", "estimating", "recurrent"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
         *("team pair", "team team3", "universal pair", "universal team3", "lifting team6"),
         *("newer pair", "newer team3", "still pair", "older pair", "older team3"),
@@ -100,7 +100,7 @@ def contents(request: pytest.FixtureRequest) -> PolicyFile:
     if name in ("balance", "transport", "robust", "flight", "stand", "paper"):
         return load_file(shipped_policy(name))
     made = request.getfixturevalue(request.param)
-    return made.contents if isinstance(made, Trained) else made
+    return made if isinstance(made, PolicyFile) else made.contents
 
 
 # `universal` with the law as it is made now, and with what older files hold of it.

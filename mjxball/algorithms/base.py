@@ -11,6 +11,7 @@ import numpy as np
 from jax import Array
 
 from mjxball.config import Config
+from mjxball.errors import InputError
 from mjxball.policy.network import Network
 
 if TYPE_CHECKING:
@@ -126,6 +127,13 @@ class Shards(NamedTuple):
     def total(self, value: Any) -> Any:
         """Sum over the shards."""
         return jax.lax.psum(value, self.axis) if self.axis else value
+
+
+def without_recurrence(environments: Environments, name: str) -> None:
+    """Raise InputError if a recurrent policy is to be trained by the algorithm `name`, which learns step by step."""
+    slots = environments.recurrent_slots
+    if slots.stop > slots.start:
+        raise InputError(f"follower.recurrent_units is for --algorithm gradient, not for {name}")
 
 
 class Transition(NamedTuple):

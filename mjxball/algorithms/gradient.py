@@ -75,11 +75,10 @@ class FirstOrderGradient:
         pairs = list(zip(self._sizes[:-1], self._sizes[1:], strict=True))
         for number, (rows, columns) in enumerate(pairs):
             key, own = jax.random.split(key)
-            if self._units:
-                rows = self._slots.stop if number == 0 else rows  # what is seen, and the state
-                rows += self._units if number == len(pairs) - 1 else 0
-            kernel = jax.nn.initializers.lecun_uniform()(own, (rows, columns))
             last = number == len(pairs) - 1
+            first = self._slots.stop if self._units and number == 0 else rows  # what is seen, and a GRU's state
+            shape = first + (self._units if last else 0), columns
+            kernel = jax.nn.initializers.lecun_uniform()(own, shape)
             layers[f"hidden_{number}"] = {"kernel": kernel * (0.01 if last else 1.0), "bias": jnp.zeros(columns)}
         zero, none = jnp.zeros(()), jnp.zeros(self._sizes[0])
         slope = jax.tree.map(jnp.zeros_like, layers)
@@ -90,23 +89,29 @@ class FirstOrderGradient:
 
         What only critics see stands behind what the policy does, and keeps its rows. InputError for other layers.
         """
-        sizes = (policy.weights[0].shape[0], *(len(bias) for bias in policy.biases))
-        if sizes[1:] != self._sizes[1:] or sizes[0] > self._sizes[0]:
+        seen, units = len(policy.observation_mean), 0 if policy.gru is None else len(policy.gru[1])
+        sizes = (seen + units, *(len(bias) for bias in policy.biases))
+        if sizes[1:] != self._sizes[1:] or sizes[0] > self._sizes[0] or units != self._units:
             theirs, own = (",".join(map(str, hidden[1:-1])) for hidden in (sizes, self._sizes))
             raise InputError(
-                f"the policy to start from has {sizes[0]} inputs and hidden layers {theirs}, and the run has "
-                f"{self._sizes[0]} and {own}; say --gradient.policy_layers {theirs}"
+                f"the policy to start from has {seen} inputs, {units} recurrent units and hidden layers {theirs}, and "
+                f"the run has {self._sizes[0] - self._units}, {self._units} and {own}; say "
+                f"--gradient.policy_layers {theirs} --follower.recurrent_units {units}"
             )
         scale = np.asarray(policy.observation_scale, np.float64)
         deviation = np.where(scale > 0, np.maximum(1 / np.where(scale > 0, scale, 1.0), LEAST_DEVIATION), 1.0)
-        mean, seen = np.asarray(policy.observation_mean, np.float64), sizes[0]
+        mean, factor = np.asarray(policy.observation_mean, np.float64), (deviation * scale)[:, None]
         kernels = [np.array(state.layers[f"hidden_{number}"]["kernel"]) for number in range(len(policy.weights))]
-        kernels[0][:seen] = policy.weights[0] * (deviation * scale)[:, None]
+        kernels[0][:units] = policy.weights[0][:units]
+        kernels[0][units : units + seen] = policy.weights[0][units:] * factor
         kernels[1:] = policy.weights[1:]
-        layers = {
+        layers: dict[str, Any] = {
             f"hidden_{number}": {"kernel": np.asarray(kernel, np.float32), "bias": np.asarray(bias, np.float32)}
             for number, (kernel, bias) in enumerate(zip(kernels, policy.biases, strict=True))
         }
+        if policy.gru is not None:
+            kernel, recurrent, bias = policy.gru
+            layers["gru"] = {"kernel": np.asarray(kernel * factor, np.float32), "recurrent": recurrent, "bias": bias}
         means, squares = np.zeros(self._sizes[0], np.float32), np.ones(self._sizes[0], np.float32)
         means[:seen], squares[:seen] = mean, mean**2 + deviation**2
         return state._replace(layers=layers, mean=means, square=squares, seen=np.ones((), np.float32))
@@ -137,6 +142,7 @@ class FirstOrderGradient:
 
     def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
         policy = self.policy(state._replace(layers=layers))
+
         def step(carry: tuple[Any, Array], _: None) -> tuple[Any, tuple[Array, Array]]:
             envs, flies = carry
             envs = envs._replace(states=self._damped(envs.states))
@@ -258,7 +264,7 @@ _clip_backwards.defvjp(lambda leaves, decay, longest: (leaves, (decay, longest))
 
 
 def _clipped(tree: Any, decay: Any, longest: Any) -> Any:
-    """`tree` as it is; a gradient that passes through its floats is at most `longest` in each environment, times `decay`.
+    """`tree` as it is; a gradient that passes through its floats is at most `longest` in each environment, then decays.
 
     Numbers of it that are not finite are 0. Leaves of other lengths, as those of worlds with several followers, are
     limited apart. Without this a few environments that are about to diverge lead all others astray.

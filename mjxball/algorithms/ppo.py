@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, SwishNetwork, Transition
+from mjxball.algorithms.base import (
+    Environments,
+    Phase,
+    PolicyNetwork,
+    Schedule,
+    SwishNetwork,
+    Transition,
+    without_recurrence,
+)
 from mjxball.algorithms.networks import normaliser
 from mjxball.config import Config, Ppo
 from mjxball.errors import InputError
@@ -43,6 +51,7 @@ class ProximalPolicyOptimization:
     update_keys = 1
 
     def __init__(self, config: Config, environments: Environments):
+        without_recurrence(environments, "ppo")
         ppo = config.ppo
         self._config, self._environments, self._shards = ppo, environments, environments.shards
         self.steps_per_collect = ppo.unrolls * ppo.unroll_length

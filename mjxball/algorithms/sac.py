@@ -13,7 +13,7 @@ import optax
 from jax import Array
 
 from mjxball.algorithms import replay
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, without_recurrence
 from mjxball.algorithms.networks import Networks, make_networks
 from mjxball.algorithms.replay import Replay, Transitions
 from mjxball.config import Config, Sac
@@ -212,6 +212,7 @@ class SoftActorCritic:
     steps_per_collect = 1
 
     def __init__(self, config: Config, environments: Environments):
+        without_recurrence(environments, "sac")
         self._config, self._environments, self._shards = config.sac, environments, environments.shards
         sac = config.sac
         # At least one batch and one n-step window must be recorded before the first update.

@@ -74,6 +74,8 @@ def validate(config: Config) -> Config:
     _validate_team(config)
     _validate_autopilot(config)
     _validate_motion(config)
+    if config.follower.recurrent_units and config.follower.base == "lqg":
+        raise InputError("follower.recurrent_units is for follower.base pd: an LQG is a memory of its own")
     start, goal = config.scenario.start_position, config.scenario.goal_range
     farthest = math.sqrt(3) * (start + goal)
     if farthest >= config.scenario.termination_distance:

@@ -21,8 +21,8 @@ from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
 
 Array = Any
-# What a recurrent network sees besides: tanh of the object's error and of its rate over these, so that millimetres at the
-# goal are not lost beside metres on the way to it.
+# What a recurrent network sees besides: tanh of the object's error and of its rate over these, so that millimetres at
+# the goal are not lost beside metres on the way to it.
 NEAR_ERROR, NEAR_ERROR_RATE = 0.03, 0.1  # [m], [m/s]
 SATURATED = 6  # such numbers
 

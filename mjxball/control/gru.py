@@ -13,9 +13,9 @@ Array = Any
 def gru_cell(hidden: Array, seen: Array, kernel: Array, recurrent: Array, bias: Array) -> Array:
     """The next state (..., H) of a GRU in state `hidden` (..., H) at the input `seen` (..., n).
 
-    `kernel` (n, 3 H), `recurrent` (H, 3 H) and `bias` (3 H,) hold, side by side, the reset gate, the update gate and the
-    candidate. After Cho et al. 2014, the reset gate applied behind the product, as cuDNN and Flax do; an update gate of
-    1 keeps the state.
+    `kernel` (n, 3 H), `recurrent` (H, 3 H) and `bias` (3 H,) hold, side by side, the reset gate, the update gate and
+    the candidate. After Cho et al. 2014, the reset gate applied behind the product, as cuDNN and Flax do; an update
+    gate of 1 keeps the state.
     """
     xp, size = hidden.__array_namespace__(), hidden.shape[-1]
     given, kept = seen @ kernel + bias, hidden @ recurrent

@@ -135,7 +135,13 @@ def is_sound(policy: PolicyFile) -> bool:
     """True if every number of `policy` is finite."""
     return all(
         math.isfinite(float(np.abs(array).sum()))
-        for array in (*policy.weights, *policy.biases, policy.observation_mean, policy.observation_scale, *(policy.gru or ()))
+        for array in (
+            *policy.weights,
+            *policy.biases,
+            policy.observation_mean,
+            policy.observation_scale,
+            *(policy.gru or ()),
+        )
     )
 
 

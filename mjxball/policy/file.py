@@ -261,8 +261,10 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
             raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
     check_lqg(card, name)
     units = card.get("recurrent_units", 0)
-    if isinstance(units, bool) or not isinstance(units, int) or not (1 if card["format_version"] == 5 else 0) <= units <= (
-        MAX_UNITS if card["format_version"] == 5 else 0
+    if (
+        isinstance(units, bool)
+        or not isinstance(units, int)
+        or not (1 if card["format_version"] == 5 else 0) <= units <= (MAX_UNITS if card["format_version"] == 5 else 0)
     ):
         raise PolicyFileError(
             f"{name}: card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"

@@ -1,0 +1,216 @@
+"""Followers with a GRU: its equations, what is learnt through it, and one answer in training, files and flight."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import flax.linen
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toys
+from conftest import Recurrent, with_settings
+from tables import rows
+from test_algorithms import TRAIN, A, B, LinearQuadratic, Q, R, gradient_of
+
+from mjxball.algorithms.base import Shards
+from mjxball.algorithms.gradient import FirstOrderGradient
+from mjxball.commands.train import main
+from mjxball.config import Config
+from mjxball.control.gru import gru_cell
+from mjxball.env import TransportEnv
+from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
+from mjxball.policy.mean import mean_policy
+from mjxball.policy.policy import NetworkLaw
+from mjxball.train.program import Environments
+
+UNITS = 7
+
+
+def test_a_cell_is_that_of_flax() -> None:
+    """Flax has biases of its own for the recurrent product; ours are those of the input alone."""
+    random = np.random.default_rng(0)
+    kernel, recurrent = random.normal(size=(5, 3 * UNITS)), random.normal(size=(UNITS, 3 * UNITS))
+    bias, hidden, seen = (random.normal(size=size) for size in (3 * UNITS, (4, UNITS), (4, 5)))
+    parts = {"r": slice(UNITS), "z": slice(UNITS, 2 * UNITS), "n": slice(2 * UNITS, None)}
+    parameters: dict[str, Any] = {f"i{name}": {"kernel": kernel[:, k], "bias": bias[k]} for name, k in parts.items()}
+    parameters |= {f"h{name}": {"kernel": recurrent[:, k]} for name, k in parts.items()}
+    parameters["hn"]["bias"] = np.zeros(UNITS)
+    with jax.default_matmul_precision("highest"):
+        wanted, _ = flax.linen.GRUCell(UNITS).apply({"params": parameters}, jnp.asarray(hidden), jnp.asarray(seen))
+    np.testing.assert_allclose(gru_cell(hidden, seen, kernel, recurrent, bias), wanted, atol=2e-6)  # Flax: float32
+
+
+def test_training_and_file_answer_alike(recurrent: Recurrent) -> None:
+    """In flight after flight: action, state and command of the network in training, the batch law and `Policy`."""
+    env = TransportEnv(recurrent.config, "newton-euler")
+    policy, exact = Policy(recurrent.contents, "one"), Policy(recurrent.contents, "one", np.float64)
+    law = NetworkLaw(exact)
+    with jax.default_matmul_precision("highest"):
+        step, network = jax.jit(env.step), jax.jit(recurrent.network.__call__)
+        for seed in (0, 1):
+            state = jax.jit(env.reset)(jax.random.key(seed))
+            policy.reset(), exact.reset()
+            memory = law.start(np.asarray(state.obs[:18], float))
+            for _ in range(30):
+                answer, seen = np.asarray(network(state.obs)), np.asarray(state.obs[:18], float)
+                state = step(state, answer)
+                commands = np.array([policy(seen), exact(seen)])
+                np.testing.assert_allclose(commands[0], state.pipeline_state.command, atol=2e-5)  # float32, 30 steps
+                np.testing.assert_allclose(policy.memory[-UNITS:], answer[3:], atol=2e-5)
+                memory, command = law.step(memory, seen, None)
+                np.testing.assert_allclose(command, commands[1], atol=1e-12)
+                np.testing.assert_allclose(memory, exact.memory, atol=1e-12)
+            assert np.abs(answer[3:]).max() > 0.1
+
+
+def test_a_gradient_through_a_state_is_limited_in_each_world(transport: Config) -> None:
+    """Against the recursion written out: worlds whose gradient is longer than the limit pass a shorter one."""
+    gain, steps, clip = np.array([[2.0, 1.5]]), 30, 0.005
+    x, _, found = gradient_of(transport, gain, horizon=steps, gradient_decay=0.97, state_gradient_clip=clip)
+    states = [x]
+    for _ in range(steps):
+        states.append(states[-1] @ (A - B @ gain).T)
+    later, wanted, limited = np.zeros_like(x), np.zeros((1, 2)), 0
+    for x in states[-2::-1]:
+        length = np.linalg.norm(later, axis=1, keepdims=True)
+        limited += int((length > clip).sum())
+        later = 0.97 * later * np.minimum(1.0, clip / (length + 1e-30))
+        pushed = 2 * (-x @ gain.T) @ R + later @ B
+        wanted -= pushed.T @ x / (steps * len(x))
+        later = 2 * x @ Q + later @ A - pushed @ gain
+    assert 100 < limited < steps * len(x) - 100
+    np.testing.assert_allclose(found, wanted, rtol=2e-3)
+
+
+class Recalling(LinearQuadratic):
+    """A number is shown at the first of ten steps and to be answered at all others."""
+
+    observation_size, action_size, recurrent_slots = 2 + UNITS, 1 + UNITS, slice(2, 2 + UNITS)
+
+    def reset(self, rng: Any) -> Any:
+        number, zero = jax.random.uniform(rng, minval=-0.8, maxval=0.8), jnp.zeros(())
+        seen = jnp.concatenate([jnp.stack([number, 1.0]), jnp.zeros(UNITS)])
+        return toys.State(number, seen, zero, zero, {}, {"truncation": zero})
+
+    def step(self, state: Any, action: Any) -> Any:
+        reward = -((action[0] - state.pipeline_state) ** 2)
+        return state.replace(reward=reward, obs=jnp.concatenate([jnp.zeros(2), action[1:]]))
+
+
+def test_what_was_seen_once_is_remembered(transport: Config) -> None:
+    """Who answers 0 after the first step pays 0.8 ** 2 / 3 in nine of ten steps, 0.19 a step."""
+    own = dataclasses.replace(
+        transport.gradient, num_envs=64, horizon=10, windows_per_episode=1, policy_layers=(8,), learning_rate=2e-2,
+        max_grad_norm=1.0, state_gradient_clip=1e4,
+    )  # fmt: skip
+    environments = Environments(Recalling(), 64, Shards())
+    algorithm = FirstOrderGradient(dataclasses.replace(transport, gradient=own), environments)
+
+    @jax.jit
+    def learn(carry: Any, keys: Any) -> Any:
+        def one(carry: Any, key: Any) -> Any:
+            known, envs = algorithm.collect(*carry, [key], TRAIN)
+            known, _ = algorithm.update(known, [], jnp.float32(0.5), TRAIN)
+            return (known, envs), known.loss
+
+        return jax.lax.scan(one, carry, keys)
+
+    states = environments.reset(jax.random.key(0))
+    start = algorithm.init(jax.random.key(1)), environments.begin(states, 1.0)
+    _, losses = learn(start, jax.random.split(jax.random.key(2), 250))
+    assert losses[0] > 0.15
+    assert losses[-10:].mean() < 0.02
+
+
+def test_only_gradients_train_it(transport: Config, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    flags = ["--follower.recurrent_units", "4", "--out", str(tmp_path / "run")]
+    for more, words in (([], "--algorithm gradient"), (["--algorithm", "ppo"], "--algorithm gradient"),
+                        (["--follower.base", "lqg", "--algorithm", "gradient"], "follower.base pd")):  # fmt: skip
+        assert main([*flags, *more]) == 2
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@rows(
+    "card, arrays, words",
+    [
+        ({"recurrent_units": None}, {}, "recurrent_units"),
+        ({"recurrent_units": 6}, {}, "weight_0|gru_kernel"),
+        ({"recurrent_units": 513}, {}, "1 to 512"),
+        ({"recurrent_units": True}, {}, "1 to 512"),
+        ({"format_version": 1}, {}, "gru_bias|recurrent_units"),
+        ({}, {"gru_recurrent": np.full((UNITS, 3 * UNITS), np.nan, np.float32)}, "gru_recurrent"),
+        ({}, {"gru_bias": np.zeros(3, np.float32)}, "gru_bias"),
+        ({}, {"gru_bias": None}, "gru_bias"),
+        ({"lqg": {"limits": [1.0]}}, {}, "lqg"),
+    ],
+)
+def test_a_damaged_file_is_refused(
+    card: dict[str, Any], arrays: dict[str, Any], words: str, recurrent: Recurrent, tmp_path: Path
+) -> None:
+    path = tmp_path / "policy.npz"
+    save_file(path, recurrent.contents)
+    with np.load(path) as data:
+        held: dict[str, Any] = {**{name: data[name] for name in data.files}, **arrays}
+    whole = {**json.loads(str(held["card"])), **card}
+    held["card"] = np.array(json.dumps({name: value for name, value in whole.items() if value is not None}))
+    np.savez(path, **{name: array for name, array in held.items() if array is not None})
+    with pytest.raises(PolicyFileError, match=words):
+        load_file(path)
+
+
+def test_a_mean_is_of_the_gru_as_well(recurrent: Recurrent) -> None:
+    one = recurrent.contents
+    assert one.gru is not None
+    other = dataclasses.replace(one, gru=tuple(part + 1 for part in one.gru))
+    found = mean_policy([one, other])
+    assert found.gru is not None
+    for mean, part in zip(found.gru, one.gru, strict=True):
+        np.testing.assert_allclose(mean, part + 0.5, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_run_writes_a_policy_resumes_bit_for_bit_and_starts_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_verdict: None
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    flags = ["--gradient.num_envs", "4", "--gradient.horizon", "20", "--gradient.policy_layers", "5"]
+    flags += ["--follower.recurrent_units", "3", "--algorithm", "gradient", "--num-seeds", "2"]
+    flags += ["--gradient.num_evaluations", "2", "--gradient.gradient_steps", "4"]
+    assert main([*flags, "--out", "run"]) == 0
+    whole = load_file(Path("run/policy.npz"))
+    assert (whole.card["format_version"], whole.card["recurrent_units"]) == (5, 3)
+    last = max((path for path in Path("run/checkpoints").iterdir() if path.name.isdigit()), key=lambda p: int(p.name))
+    for path in sorted(last.rglob("*"), reverse=True):  # as if it had been stopped before
+        path.rmdir() if path.is_dir() else path.unlink()
+    last.rmdir()
+    Path("run/policy.npz").unlink()
+    assert main(["--resume", "run"]) == 0
+    resumed = load_file(Path("run/policy.npz"))
+    assert whole.gru is not None
+    assert resumed.gru is not None
+    for one, other in zip((*whole.weights, *whole.gru), (*resumed.weights, *resumed.gru), strict=True):
+        np.testing.assert_array_equal(one, other)
+    still = [*flags, "--gradient.learning_rate", "1e-9", "--start-from", "run", "--seed", "5", "--out", "next"]
+    assert main(still) == 0
+    before, after = (load_file(Path(name)) for name in ("run/members/seed0.npz", "next/members/seed5.npz"))
+    assert answers(before) == pytest.approx(answers(after), abs=1e-4)
+
+
+def answers(contents: PolicyFile) -> np.ndarray:
+    """Actions on a walk of observations."""
+    policy, random = Policy(contents, "one", np.float64), np.random.default_rng(3)
+    walk = np.cumsum(random.normal(scale=0.03, size=(20, 18)), axis=0)
+    return np.array([policy.scaled(seen) for seen in walk])
+
+
+def test_settings_reach_the_network(transport: Config) -> None:
+    config = with_settings(transport, follower={"recurrent_units": 5})
+    env = TransportEnv(config, "newton-euler")
+    assert (env.action_size, env.observation_size) == (3 + 5, 18 + 6 + 5)
+    assert env.recurrent_slots == slice(24, 29)
