@@ -306,8 +306,11 @@ class TransportEnv:
         plant = self.config.plant
         if rig is not None and rig.drawn is not None:
             return team_geometry(plant, rig.drawn.numbers.mounts, rig.drawn.size)
-        mass = jnp.float32(plant.object_mass) * (1.0 if rig is None else rig.share)
         numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
+        if self._law.geometry:
+            mounts, masses = jnp.asarray(numbers.mounts, jnp.float32), jnp.asarray(numbers.drone_mass)
+            return team_geometry(plant, mounts, (masses > 0).sum().astype(jnp.float32))
+        mass = jnp.float32(plant.object_mass) * (1.0 if rig is None else rig.share)
         return team_context(jax.tree.map(jnp.float32, numbers), plant, mass)
 
     def seeing(

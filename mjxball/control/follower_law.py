@@ -42,16 +42,18 @@ class FollowerLaw(NamedTuple):
     residual: bool = True  # whether the action is added to a law: `lqg`, or the leader's PD law if that is None
     lqg: OffsetFreeLqg | TeamLqg | MultiModelLqg | None = None
     units: int = 0  # H of the network's GRU; then there is no `lqg`, and the network's answer has its state behind it
+    geometry: bool = False  # whether a network with a GRU is told where the drones are mounted, `ring_context`
 
     @property
     def size(self) -> int:
         """Length m of the memory."""
-        return self.history.size + (self.units if self.lqg is None else self.lqg.size)
+        own = self.units + self.geometry * CONTEXT if self.lqg is None else self.lqg.size
+        return self.history.size + own
 
     @property
     def shown(self) -> int:
         """How many numbers s `network_input` has behind an observation."""
-        recurrent = SATURATED + self.units if self.units else 0
+        recurrent = SATURATED + self.geometry * CONTEXT + self.units if self.units else 0
         return self.history.size + (recurrent if self.lqg is None else self.lqg.shown)
 
     def mask(self, ignore_position: bool) -> list[float]:
@@ -61,7 +63,7 @@ class FollowerLaw(NamedTuple):
     @property
     def needs_context(self) -> bool:
         """Whether a follower has to be told its team: `team_lqg.team_context`, `multi_model_lqg.ring_context`."""
-        return isinstance(self.lqg, TeamLqg | MultiModelLqg)
+        return self.geometry or isinstance(self.lqg, TeamLqg | MultiModelLqg)
 
     def start(self, observation: Array, context: Array | None = None) -> Array:
         """Memory (..., m) before the first `observation` (..., 18); `context` (..., c) if `needs_context`."""
@@ -69,7 +71,11 @@ class FollowerLaw(NamedTuple):
         xp = observation.__array_namespace__()
         if self.units:
             nothing = xp.zeros_like(observation[..., :1])
-            return xp.concat([remembered, *[nothing] * self.units], axis=-1)
+            parts = [remembered, *[nothing] * self.units]
+            if self.geometry:
+                known = xp.asarray(context, dtype=observation.dtype)
+                parts.append(xp.broadcast_to(known, (*observation.shape[:-1], CONTEXT)))
+            return xp.concat(parts, axis=-1)
         if self.lqg is None:
             return remembered
         known = {"context": context} if self.needs_context else {}
@@ -78,7 +84,7 @@ class FollowerLaw(NamedTuple):
     @property
     def told(self) -> int:
         """How many of the last numbers of the memory never change."""
-        return CONTEXT if isinstance(self.lqg, MultiModelLqg) else 0
+        return CONTEXT if self.geometry or isinstance(self.lqg, MultiModelLqg) else 0
 
     def known(self, observation: Array, memory: Array) -> Any:
         """What `network_input`, `command` and `next` have in common at `observation`, so that it is found once."""
@@ -95,7 +101,9 @@ class FollowerLaw(NamedTuple):
                 xp.tanh(observation[..., part] * (1 / scale))
                 for part, scale in ((ERROR, NEAR_ERROR), (ERROR_RATE, NEAR_ERROR_RATE))
             ]
-            return xp.concat([seen, *small, memory[..., self.history.size :]], axis=-1)
+            behind = self.history.size + self.units
+            hidden, placed = memory[..., self.history.size : behind], memory[..., behind:]
+            return xp.concat([seen, *small, placed, hidden], axis=-1)
         if self.lqg is None:
             return seen
         features = self.lqg.features(memory[..., self.history.size :], observation, *_if_any(known))
@@ -120,7 +128,8 @@ class FollowerLaw(NamedTuple):
         """Memory for the next step, after `observation` was answered by `scaled`, which made `command`."""
         remembered = self.history.next(memory[..., : self.history.size], observation, scaled[..., :ACTION_SIZE])
         if self.units:
-            return observation.__array_namespace__().concat([remembered, scaled[..., ACTION_SIZE:]], axis=-1)
+            placed = memory[..., self.history.size + self.units :]
+            return observation.__array_namespace__().concat([remembered, scaled[..., ACTION_SIZE:], placed], axis=-1)
         if self.lqg is None:
             return remembered
         own = memory[..., self.history.size :]

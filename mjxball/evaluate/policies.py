@@ -49,7 +49,8 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy
 
 def flies_any_rig(policy: Policy) -> bool:
     """Whether `policy` flies any rig, of which it is told where the drones are mounted alone."""
-    return bool(policy.card["format_version"] == 4)
+    version = policy.card["format_version"]
+    return bool(version == 4 or (version == 5 and "context" in policy.card and trained_rigs(policy).rigs.number))
 
 
 def trained_rigs(policy: Policy) -> Config:

@@ -17,6 +17,7 @@ from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.motors import firmware
 from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.control.observation import ACTION, OBSERVATION, commanded
+from mjxball.control.team_lqg import TeamLqg
 from mjxball.policy.file import PolicyFile, write_whole
 from mjxball.policy.law_fields import CONTEXTS
 
@@ -37,7 +38,7 @@ def policy_file(
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
     version = 5 if law.units else 1 if law.lqg is None else 2
-    if law.needs_context:
+    if isinstance(law.lqg, TeamLqg | MultiModelLqg):
         version = 4 if isinstance(law.lqg, MultiModelLqg) else 3
     card = {
         "format_version": version,

@@ -81,6 +81,7 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
         residual=card["action_mode"] == "residual",
         lqg=_lqg_of(card),
         units=card.get("recurrent_units", 0),
+        geometry=card["format_version"] == 5 and "context" in card,
     )
 
 

@@ -12,7 +12,7 @@ from mjxball.policy.container import PolicyFileError
 # `control.team_lqg.team_context`, `control.multi_model_lqg.ring_context`.
 CONTEXT = ("command_share", "roll_per_lift", "pitch_per_lift", "roll_room", "pitch_room")
 GEOMETRY = ("command_share", "roll_acceleration_per_lift", "pitch_acceleration_per_lift", "rotor_room")
-CONTEXTS = {3: CONTEXT, 4: GEOMETRY}  # by format
+CONTEXTS = {3: CONTEXT, 4: GEOMETRY, 5: GEOMETRY}  # by format; a policy of format 5 may do without
 MAX_MODELS = 16
 MAX_SWINGS = 32  # frequencies at which a load may swing
 MAX_SIZES = 16  # of a team, from two drones on, that have factors of their own
@@ -82,6 +82,8 @@ def check_lqg(card: dict[str, Any], name: str) -> None:
     if version in (1, 5):
         if lqg is not None:
             raise PolicyFileError(f"{name}: card field lqg belongs to policy formats 2 to 4, not {version}")
+        if version == 5 and "context" in card:
+            _check_context(card, name)
         return
     if version == 4:
         stiffness = lqg.get("stiffness") if isinstance(lqg, dict) else None
@@ -98,12 +100,10 @@ def check_lqg(card: dict[str, Any], name: str) -> None:
         raise PolicyFileError(
             f"{name}: a residual policy of format {version} needs card field lqg: {', '.join(shapes)}"
         )
-    if in_team and card.get("context") != list(CONTEXTS[version]):
-        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(CONTEXTS[version])}")
     for field, shape in shapes.items():
         check_numbers(name, f"lqg.{field}", lqg[field], shape)
-    if in_team and "team" in card:
-        _check_team(card["team"], name, CONTEXTS[version])
+    if in_team:
+        _check_context(card, name)
     if min(np.min(lqg[field]) for field in positive) <= 0:
         raise PolicyFileError(f"{name}: card field lqg: {', '.join(positive[:2])} and {positive[2]} must be positive")
     if version == 4:
@@ -142,6 +142,15 @@ def _optional_shapes(lqg: dict[str, Any], version: int) -> dict[str, tuple[int, 
         if lqg.keys() & group.keys():
             shapes |= {field: tuple(counts.get(size, size) for size in shape) for field, shape in group.items()}
     return shapes
+
+
+def _check_context(card: dict[str, Any], name: str) -> None:
+    """Raise PolicyFileError unless a policy that is told its team names what this version can tell it."""
+    context = CONTEXTS[card["format_version"]]
+    if card.get("context") != list(context):
+        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(context)}")
+    if "team" in card:
+        _check_team(card["team"], name, context)
 
 
 def _check_team(team: Any, name: str, context: tuple[str, ...]) -> None:

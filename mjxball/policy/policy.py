@@ -35,7 +35,7 @@ def context_of(name: str, card: dict[str, Any], plant: Plant | None, attitude: A
     """
     if plant is None or attitude is None:
         raise not_told(name)
-    if card["format_version"] == 4:
+    if card["format_version"] in (4, 5):
         mounts = np.array([drone.mount for drone in plant.drones])
         return np.asarray(team_geometry(plant, mounts, np.float64(plant.count)))
     made_for, found = float(card["lqg"]["stiffness"]) ** 0.5, attitude.natural_frequency[:2]
@@ -98,7 +98,7 @@ class Policy:
         Raises InputError if the team's attitude loops are not those that its law is for.
         """
         if self._law.needs_context:
-            if not plant.is_team and not isinstance(self._law.lqg, MultiModelLqg):
+            if not plant.is_team and not self._law.told:
                 raise InputError(f"policy {self.name} was made for teams, or a load that moves in the plane")
             self._context = context_of(self.name, self.card, plant, attitude).astype(self._dtype)
 

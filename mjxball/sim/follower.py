@@ -30,4 +30,5 @@ def follower_law(config: Config) -> FollowerLaw:
         residual=follower.action == "residual",
         lqg=lqg,
         units=follower.recurrent_units,
+        geometry=follower.recurrent_units > 0 and config.plant.is_team,
     )
