@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mjxball.errors import InputError
 from mjxball.fly.telemetry import Note
 from mjxball.policy import Policy
 
@@ -79,9 +80,9 @@ class Handover:
         command = np.asarray(self.first(observation), float)
         if self.second is None:
             return command
-        with np.errstate(all="ignore"):
+        try:
             other = np.asarray(self.second(observation), float)
-        if not np.isfinite(other).all():
+        except InputError:  # the first one has answered this observation
             self.returned = "its command is not finite"
             self.second, self._count = None, 0
             return command
