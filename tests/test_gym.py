@@ -122,13 +122,35 @@ def test_the_time_limit_truncates_and_leaving_terminates(short: Config):
     assert env.step(STILL)[2:4] == (True, False)
 
 
-def test_an_action_that_is_not_finite_ends_the_episode():
-    env = FollowerEnv()
-    env.reset(seed=3)
-    seen, reward, terminated, truncated, info = env.step(np.array([0.0, np.nan, 0.0], np.float32))
-    assert (terminated, truncated, info["diverged"]) == (True, False, 1.0)
-    assert np.isfinite(seen).all()
-    assert np.isfinite(reward)
+OUTSIDE, CLIPPED = np.array([1e39, -1.5, 0.25]), np.array([1.0, -1.0, 0.25])
+NO_ACTIONS = {
+    "nan": (np.array([0.0, np.nan, 0.0]), "nan"),
+    "infinity": (np.array([0.0, 0.0, -np.inf]), "-inf"),
+    "too few": (np.zeros(2), r"not of shape \(2,\)"),
+    "a batch of one": (np.zeros((1, 3)), r"not of shape \(1, 3\)"),
+    "one number": (0.0, r"not of shape \(\)"),
+    "words": (np.full(3, "0.5"), "<U3"),
+    "dates": (np.full(3, np.datetime64("2026-01-01")), "datetime64"),
+    "nothing": (None, "object"),
+}
+
+
+def test_actions_are_clipped_to_the_box_and_refused_unless_they_are_finite(short: Config):
+    """Alike in one world and in a vector, which stay as they were; tests/test_parallel.py of followers."""
+    single = FollowerEnv(config=short, physics="newton-euler")
+    vector = FollowerVectorEnv(2, config=short, physics="newton-euler")
+    for env, shape in ((single, (3,)), (vector, (2, 3))):
+        found = []
+        for action in (OUTSIDE, CLIPPED):
+            env.reset(seed=3)
+            for bad, named in NO_ACTIONS.values():
+                both = np.stack([bad, bad]) if env is vector and np.shape(bad) == (3,) else bad
+                with pytest.raises(InputError, match=re.escape(f"of shape {shape}, ") + ".*" + named):
+                    env.step(both)
+            found.append([env.step(np.broadcast_to(action, shape))[:2] for _ in range(3)])
+        for one, other in zip(*found, strict=True):
+            jax.tree.map(np.testing.assert_array_equal, one, other)
+        assert np.abs(found[0][2][0] - env.reset(seed=3)[0]).max() > 1e-3  # the actions did something
 
 
 def test_mistakes_are_named():
@@ -264,6 +286,15 @@ def test_playgrounds_wrappers_take_the_adapter():
     first = jax.jit(wrapped.reset)(keys)
     assert first.obs.shape == (2, env.observation_size)
     step, state, dones = jax.jit(wrapped.step), first, []
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        *(
+            step(first, jnp.broadcast_to(jnp.asarray(action, jnp.float32), (2, 3)))
+            for action in (1e3 * CLIPPED, CLIPPED)
+        ),
+    )
+    with pytest.raises(InputError, match=r"shape \(3,\), not \(2,\)"):
+        jax.eval_shape(env.step, env.reset(jax.random.key(0)), jnp.zeros(2))
     for action in actions(8, 2):
         state = step(state, action)
         dones.append(np.asarray(state.done).tolist())

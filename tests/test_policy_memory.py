@@ -92,21 +92,15 @@ def test_what_is_no_observation_is_refused_and_not_remembered(name: str) -> None
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_after_any_observation_that_is_taken_commands_are_finite(dtype: type) -> None:
-    """Up to the largest that is: it may be refused because float32 cannot filter it, but never spoils the rest."""
+    """Up to the largest that is: float32 can filter it, and it never spoils the rest."""
     for name in POLICIES:
         flown = policy(name, dtype)
         for slot in range(18):
             flown.reset()
             for value in (1e3, 3e5, 9.9e5):
                 for seen in (SEEN[0], spoilt(slot, value), *SEEN[1:4]):
-                    try:
-                        command = flown(seen)
-                    except InputError as refused:
-                        assert "not finite" in str(refused), (name, slot, value)
-                    else:
-                        assert np.isfinite(command).all()
-                    if flown.memory is not None:
-                        assert np.isfinite(flown.memory).all(), (name, slot, value)
+                    assert np.isfinite(flown(seen)).all(), (name, slot, value)
+                    assert flown.memory is None or np.isfinite(flown.memory).all(), (name, slot, value)
 
 
 def test_a_network_that_answers_nothing_finite_is_named() -> None:
@@ -134,13 +128,13 @@ def test_a_memory_that_is_none_is_refused() -> None:
         np.testing.assert_array_equal(flown.memory, kept)
 
 
-def in_another_thread(call: Callable[[], Any]) -> Any:
+def in_another_thread(call: Callable[[Any], Any], given: Any) -> Any:
     """What `call` returns or raises there."""
     found: list[Any] = []
 
     def run() -> None:
         try:
-            found.append(call())
+            found.append(call(given))
         except Exception as error:  # looked at by who asks
             found.append(error)
 
@@ -155,17 +149,17 @@ def test_one_memory_serves_one_thread() -> None:
         flown, alone = make(), make()
         if name in ("paper", "copy"):  # it remembers nothing, so that anybody may ask
             for row in SEEN[:5]:
-                np.testing.assert_array_equal(in_another_thread(lambda row=row: flown(row)), alone(row))
+                np.testing.assert_array_equal(in_another_thread(flown, row), alone(row))
                 flown(row + 0.1)
             continue
         for row in SEEN[:5]:
             np.testing.assert_array_equal(flown(row), alone(row))
-            refused = in_another_thread(lambda row=row: flown(row + 0.1))
+            refused = in_another_thread(flown, row + 0.1)
             assert isinstance(refused, RuntimeError), name
             assert "thread" in str(refused)
         flown.reset()  # the next flight may be another thread's
         alone.reset()
-        np.testing.assert_array_equal(in_another_thread(lambda: flown(SEEN[7])), alone(SEEN[7]))
+        np.testing.assert_array_equal(in_another_thread(flown, SEEN[7]), alone(SEEN[7]))
         with pytest.raises(RuntimeError, match="thread"):
             flown(SEEN[8])
         own = copy.copy(flown)  # goes on by itself, in any thread
@@ -186,7 +180,11 @@ def test_many_threads_with_the_pure_law_fly_as_one_does() -> None:
             return np.array(commands)
 
         found: dict[int, np.ndarray] = {}
-        threads = [threading.Thread(target=lambda k=k: found.update({k: flight(k)})) for k in range(4)]
+
+        def keep(number: int, found: dict[int, np.ndarray] = found, flight: Any = flight) -> None:
+            found[number] = flight(number)
+
+        threads = [threading.Thread(target=keep, args=(number,)) for number in range(4)]
         for thread in threads:
             thread.start()
         for thread in threads:

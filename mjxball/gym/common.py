@@ -38,6 +38,23 @@ def spaces(pair: TransportEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.B
     return observations, gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 
 
+def checked_action(action: Array, shape: tuple[int, ...]) -> np.ndarray:
+    """`action` as float32, which the environment clips to the box [-1, 1].
+
+    Raises InputError unless it is finite and of `shape`, and of real numbers.
+    """
+    given = np.asarray(action)
+    if given.dtype.kind not in "fiu":
+        found = f"{given.dtype} of shape {given.shape}"
+    elif given.shape != shape:
+        found = f"of shape {given.shape}"
+    elif not np.isfinite(given).all():
+        found = f"of shape {given.shape} with {given[~np.isfinite(given)][0]} in it"
+    else:
+        return np.clip(given, -1.0, 1.0).astype(np.float32)  # float32 would make infinity of 1e39
+    raise InputError(f"an action must be finite numbers of shape {shape}, not {found}")
+
+
 def seed_number(random: np.random.Generator) -> int:
     """The number that one world's keys come from, drawn from Gymnasium's generator."""
     return int(random.integers(2**32))

@@ -109,14 +109,14 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
     def step(
         self, actions: dict[str, np.ndarray]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """Hold every agent's action (3,) in [-1, 1] for one control period."""
+        """Hold every agent's action (3,), clipped to [-1, 1], for one control period; InputError unless finite."""
         if not self.agents:
             raise gymnasium.error.ResetNeeded("call reset before step")
         if set(actions) != set(self.agents):
             raise ValueError(f"actions must be for {', '.join(self.agents)}, not for {', '.join(actions) or 'nobody'}")
         given = np.zeros((len(self._drones), 3), np.float32)
         for number, agent in enumerate(self.agents):
-            given[number] = actions[agent]
+            given[number] = common.checked_action(actions[agent], self.action_spaces[agent].shape)
         with on_the_host():
             self._state = self._program.step(self._state, given if self._several else given[0])
         state, agents = self._state, self.agents

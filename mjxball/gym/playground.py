@@ -49,7 +49,7 @@ class PlaygroundEnv:
         return _playground(self._pair.reset(rng))
 
     def step(self, state: PlaygroundState, action: Array) -> PlaygroundState:
-        """See `TransportEnv.step`."""
+        """See `TransportEnv.step`: `action` (3,) is clipped to [-1, 1]."""
         given = State(state.data, state.obs, state.reward, state.done, state.metrics, state.info)
         return _playground(self._pair.step(given, action))
 

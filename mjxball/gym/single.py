@@ -105,10 +105,10 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._seen(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold `action` (3,) in [-1, 1] for one control period."""
+        """Hold `action` (3,), clipped to [-1, 1], for one control period; InputError unless it is finite."""
         if self._state is None or self._plant is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        action = np.asarray(action, np.float32)
+        action = common.checked_action(action, self.action_space.shape)
         with on_the_host():
             commands, load = self._laws.commands(self._state, action)
         self._load = load

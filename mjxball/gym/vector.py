@@ -106,12 +106,10 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         return self._seen(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Hold `actions` (N, 3) in [-1, 1] for one control period."""
+        """Hold `actions` (N, 3), clipped to [-1, 1], for one control period; InputError unless they are finite."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        given = jnp.asarray(actions, jnp.float32)
-        if given.shape != self.action_space.shape:
-            raise ValueError(f"actions must have shape {self.action_space.shape}, not {given.shape}")
+        given = common.checked_action(actions, self.action_space.shape)
         going = np.asarray(self._state.done) == 0
         if self._same_step:
             self._chains, moved, self._state = self._program.same_step(self._chains, self._state, given)
