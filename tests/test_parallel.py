@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 
 import gymnasium
@@ -91,6 +92,18 @@ def test_seeds_start_a_sequence_of_worlds(team: Config):
     assert not np.array_equal(first, other)
     env.reset(seed=1)
     assert not np.array_equal(first, env.reset()[0]["follower_1"])
+
+
+def test_a_pickled_environment_goes_on_as_the_first_one(team: Config):
+    env = FollowersParallelEnv(config=team)
+    env.reset(seed=5)
+    env.step(draws(env.agents, 1))
+    other = pickle.loads(pickle.dumps(env))
+    assert other.agents == env.agents
+    for number in range(2):
+        given = draws(env.agents, number)
+        jax.tree.map(np.testing.assert_array_equal, other.step(given), env.step(given))
+    jax.tree.map(np.testing.assert_array_equal, other.reset(), env.reset())
 
 
 def test_leaving_terminates_all(team: Config):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -14,6 +15,39 @@ from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 
 Array = Any
+_home: dict[str, int] = {}  # number of the process in which JAX runs for the environments
+
+
+def check_process() -> None:
+    """Raise InputError in a process that was forked from one in which an environment has been: JAX would hang there.
+
+    Its threads are not in the copy.
+    """
+    if _home.setdefault("process", os.getpid()) != os.getpid():
+        raise InputError(
+            "this process was forked from one in which JAX runs, where it would wait for ever; start it with spawn, "
+            "such as gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
+        )
+
+
+class Picklable:
+    """An environment that is pickled with the state of its worlds, and compiled again where it arrives."""
+
+    _compiled: ClassVar[tuple[str, ...]]  # attributes that `__init__` makes anew: functions and renderers
+
+    def _arguments(self) -> dict[str, Any]:
+        """Those of `__init__`."""
+        raise NotImplementedError
+
+    def __getstate__(self) -> dict[str, Any]:
+        """(arguments, attributes)."""
+        own = {name: value for name, value in self.__dict__.items() if name not in self._compiled}
+        return {"arguments": self._arguments(), "attributes": own}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """See `__getstate__`."""
+        self.__init__(**state["arguments"])  # type: ignore[misc]
+        self.__dict__.update(state["attributes"])
 
 
 def settings(preset: str, config: Config | None) -> Config:
