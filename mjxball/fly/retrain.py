@@ -22,7 +22,7 @@ from mjxball.fly.handover import difference
 from mjxball.fly.telemetry import Note
 from mjxball.policy import Policy
 
-MODULE = "mjxball.rig.retrain"
+MODULE = "mjxball.commands.retrain"
 START_LIMIT = 300.0  # [s] in which the process must have compiled its programs
 LATE = 10.0  # [s] after the identification from when on a policy is not taken any more
 LONGEST_LINE = 2**16

@@ -1,4 +1,4 @@
-"""`python -m mjxball.rig.retrain`: retrains a policy for a load that is put on in flight; started by mjxball.fly.
+"""`python -m mjxball.commands.retrain`: retrains a policy for a load that is put on in flight; started by mjxball.fly.
 
 It reads the running flight's log, finds the load (`rig.load`), fine-tunes the policy for it from where the flight is
 (`train.fine_tune`), and prints lines of JSON: {"text"} while it compiles, {"what": "ready"}, then "identified", and
@@ -41,7 +41,7 @@ GUIDED_NAMES = tuple(state.value for state in GUIDED)
 
 def main(arguments: Sequence[str]) -> int:
     """Compile, watch, identify, fine-tune; return the exit code."""
-    parser = make_parser("python -m mjxball.rig.retrain", "Retrain a policy in flight; started by mjxball.fly.")
+    parser = make_parser("python -m mjxball.commands.retrain", "Retrain a policy in flight; started by mjxball.fly.")
     parser.add_argument("policy", type=Path, metavar="POLICY.npz")
     parser.add_argument("log", type=Path, metavar="LOG", help="of the flight, may be yet to come")
     parser.add_argument("out", type=Path, metavar="OUT.npz", help="to be written")
