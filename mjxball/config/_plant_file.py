@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mjxball.config._load import follow_plant
 from mjxball.config._plant import Plant
+from mjxball.config._renamed import current_name
 from mjxball.config._settings import Config
-from mjxball.config._tree import apply_overrides, leaves
+from mjxball.config._tree import apply_overrides, leaves, override
 from mjxball.config._validate import validate
 from mjxball.errors import InputError
 
@@ -89,11 +91,19 @@ def _check_inertias(plant: Plant) -> None:
             raise InputError(f"{name} {inertia!r} is that of no body: one number is larger than the sum of the others")
 
 
-def with_plant(config: Config, source: Path | str) -> Config:
-    """`config` with the settings of the plant file `source`, validated. Raises InputError with one sentence."""
+def with_plant(config: Config, source: Path | str | None, flags: Mapping[str, str] | None = None) -> Config:
+    """`config` with the settings of the plant file `source`, then those of `flags` (path -> text), validated as a whole.
+
+    The load that is drawn follows from the plant where neither says otherwise. Raises InputError with one sentence.
+    """
+    flags = flags or {}
     try:
-        settings = read_plant(source).settings
-        changed = validate(apply_overrides(config, settings))
+        settings = {} if source is None else read_plant(source).settings
+        changed = apply_overrides(config, settings)
+        for path, text in flags.items():
+            changed = override(changed, path, text)
+        said = {current_name(path) for path in (*settings, *flags)}
+        changed = validate(follow_plant(changed, config.plant, said))
         if DRONES in settings:
             _check_inertias(changed.plant)
         return changed
@@ -101,4 +111,6 @@ def with_plant(config: Config, source: Path | str) -> Config:
         raise InputError(f"plant file {source} holds a number that is not finite") from None
     except InputError as error:
         text = str(error)
-        raise InputError(text if text.startswith("plant file") else f"plant file {source}: {text}") from None
+        if source is None or text.startswith(("plant file", "--")):
+            raise
+        raise InputError(f"plant file {source}{' with these flags' if flags else ''}: {text}") from None

@@ -151,9 +151,7 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
 def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     """All scenarios in order, checked, and the followers' laws, each for its own part of the batch."""
     validate(config)
-    scenarios = [scenario for _, part in flights for scenario in part]
-    for scenario in scenarios:
-        check_scenario(config, scenario)
+    scenarios = [check_scenario(config, scenario) for _, part in flights for scenario in part]
     if len({scenario.seconds for scenario in scenarios}) != 1:
         raise InputError("scenarios of one batch must last equally long")
     ends = np.cumsum([len(part) for _, part in flights])

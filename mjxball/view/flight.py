@@ -170,23 +170,21 @@ def read_log(path: Path) -> Flight:
 def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None) -> Flight:
     from mjxball.baselines import LAWS, make_baseline
     from mjxball.evaluate.policies import load_policy, native_config
-    from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
+    from mjxball.evaluate.scenarios import standard_scenarios
     from mjxball.sim.rollout import simulate
 
-    setup, reference, path = plant_setup(plant), REFERENCE, Path(source)
-    if plant is not None:
-        reference = standard_scenarios(setup)[-1]
+    setup, path = plant_setup(plant), Path(source)
     if source in LAWS:
         follower: Any = make_baseline(source, setup)
     else:
         file = _policy_file(path)
         native = native_config(file)
         if native is not None and plant is None:
-            setup, reference = native, standard_scenarios(native)[-1]
+            setup = native
         follower = load_policy(file, setup)
         follower.name = path.name if path.is_dir() else follower.name
     tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
-    scenario = dataclasses.replace(reference, **tuples)
+    scenario = dataclasses.replace(standard_scenarios(setup)[-1], **tuples)
     flown = simulate(setup, follower, scenario, physics)
     reach = "±" if len(setup.plant.directions) == 1 else "on a circle of "
     motion = f"CG {reach}{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s"
