@@ -142,7 +142,9 @@ def test_bad_input_is_one_sentence(flights: list[Flight], made: Path, tmp_path: 
             name: column for name, column in long.items() if name not in ("motor_motor_m1", "pwr_pm_vbat")
         },
         "not finite in imu_gyro_x": long | {"imu_gyro_x": np.tile(holey, 6)},
-        "times do not increase": long | {"t": np.tile(backwards, 6)},
+        "row 8: the time goes back by 0.03 s": long | {"t": np.tile(backwards, 6)},
+        "10 ms would be 0.01 s": long | {"t": 10.0 * np.arange(6 * count)},
+        "0.02 s apart": long | {"t": 0.02 * np.arange(6 * count)},
         "less than 5 s of flight": long | {name: 0 * long["t"] for name in COLUMNS if name.startswith("motor_")},
         "s are needed": good,
     }

@@ -49,11 +49,25 @@ def parser() -> cli.Parser:
     result.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="policy files")
     result.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=f"baselines: {names}")
     result.add_argument("--omega", nargs="+", type=float, metavar="W", help="CG speeds [rad/s] (default 0.31)")
-    result.add_argument("--amplitude", nargs="+", type=float, metavar="A", help="CG amplitudes [m] (default 0.05, or what the plant allows)")
-    result.add_argument("--mass", nargs="+", type=float, metavar="M", help="object masses [kg] (default the plant's, 0.2)")
+    result.add_argument(
+        "--amplitude",
+        nargs="+",
+        type=float,
+        metavar="A",
+        help="CG amplitudes [m] (default 0.05, or what the plant allows)",
+    )
+    result.add_argument(
+        "--mass", nargs="+", type=float, metavar="M", help="object masses [kg] (default the plant's, 0.2)"
+    )
     result.add_argument("--believed-mass", type=float, metavar="M", help="mass that hover thrust assumes (true mass)")
     result.add_argument("--wn-pitch", type=float, metavar="W", help="pitch natural frequency of both drones [rad/s]")
-    result.add_argument("--goal", nargs=3, type=float, metavar=("X", "Y", "Z"), help="goal of O [m] (default 1 1 1, on a stand where it moves)")
+    result.add_argument(
+        "--goal",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="goal of O [m] (default 1 1 1, on a stand where it moves)",
+    )
     result.add_argument("--seconds", type=float, metavar="S", help="length of each flight (default 45)")
     result.add_argument(
         "--waveform", type=Path, metavar="FILE", help="CG offsets from a CSV file: time [s], offset [m] per line"
@@ -135,8 +149,6 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     groups = [] if others and not here else [Group(setup, scenarios, named, here, asked)]
     groups += [Group(own, native_scenarios(options, own), named or ["copy"], files, True) for own, files in others]
     command = shlex.join(["python", "eval.py", *arguments])
-    if options.plant:
-        print(rig_line(setup))  # noqa: T201
     if chosen:
         return _benchmark(groups[0], chosen, options, command, team)
     return _compare(groups, options, command)
@@ -215,6 +227,8 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
         results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
         if number:
             print(f"\n{group.setup.preset}: its own plant and scenarios")  # noqa: T201
+        if group.setup.plant != config.Plant():
+            print(rig_line(group.setup))  # noqa: T201
         print(table(results))  # noqa: T201
         if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
             every += results

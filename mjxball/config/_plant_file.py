@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -15,6 +14,7 @@ from mjxball.config._settings import Config
 from mjxball.config._tree import apply_overrides, leaves, override
 from mjxball.config._validate import validate
 from mjxball.errors import InputError
+from mjxball.reading import parse_json
 
 PLANT_PARTS = ("plant", "attitude", "autopilot", "scenario", "motion")  # what a plant file may set
 SHIPPED = Path(__file__).parent / "plants"
@@ -63,12 +63,12 @@ def _parsed(path: Path) -> dict[str, Any]:
     kind = "TOML" if path.suffix == ".toml" else "JSON"
     try:
         text = path.read_text(encoding="utf-8")
-        values = tomllib.loads(text) if kind == "TOML" else json.loads(text)
+        values = tomllib.loads(text) if kind == "TOML" else parse_json(text)
     except OSError as error:
         known = f"; by name there are {', '.join(PLANTS)}" if isinstance(error, FileNotFoundError) else ""
         raise InputError(f"plant file {path} cannot be read: {error.strerror or error}{known}") from None
-    except (ValueError, RecursionError):
-        raise InputError(f"plant file {path} is not {kind}") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"plant file {path} is not {kind}: {error}") from None
     if not isinstance(values, dict) or not values:
         raise InputError(f'plant file {path} must be one {kind} object such as {{"plant.rotor_lag": 0.06}}')
     return values
@@ -92,7 +92,7 @@ def _check_inertias(plant: Plant) -> None:
 
 
 def with_plant(config: Config, source: Path | str | None, flags: Mapping[str, str] | None = None) -> Config:
-    """`config` with the settings of the plant file `source`, then those of `flags` (path -> text), validated as a whole.
+    """`config` with the settings of the plant file `source`, then of `flags` (path -> text), validated as a whole.
 
     The load that is drawn follows from the plant where neither says otherwise. Raises InputError with one sentence.
     """

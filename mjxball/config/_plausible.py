@@ -11,6 +11,7 @@ from mjxball.config._settings import Config
 from mjxball.errors import InputError
 
 MOST_THRUST = 100.0  # times the weight; racing drones have 15
+WRONG_UNIT = 0.5  # below it a plant is not only too weak
 LONGEST_LAG = 1.0  # [s] of any rotor
 ARM_OF_SPACING = 1.0  # arm over the distance to the nearest drone; shipped plants have 0.15 to 0.43
 GYRATION = (0.02, 5.0)  # radius of gyration over the arm; shipped plants have 0.4 to 0.9
@@ -80,13 +81,14 @@ def _check_weight(config: Config) -> None:
     plant, force = config.plant, 4 * sum(config.plant.of_drones("rotor_force_max"))
     if plant.stand == "pivot":
         return
+    least = 1.0 if config.autopilot.kind == "ideal" else WRONG_UNIT  # a Crazyflie's margin is checked elsewhere
     for mass in (plant.object_mass, config.scenario.object_mass[1]):
         ratio = thrust_over_weight(plant, mass)
-        if 1.0 < ratio <= MOST_THRUST:
+        if least < ratio <= MOST_THRUST:
             continue
         weights = f"the rotors give {force:.4g} N, and {total_mass(plant, mass):.4g} kg weigh"
         weighs = f"{weights} {plant.gravity * total_mass(plant, mass):.4g} N: thrust over weight is {ratio:.2g}"
-        hint = next(_stronger(plant, mass), "") if ratio <= 1 else _weaker(plant, mass)
+        hint = _weaker(plant, mass) if ratio > 1 else next(_stronger(plant, mass), "") if ratio < WRONG_UNIT else ""
         raise InputError(f"{weighs}, where it must be between 1 and {MOST_THRUST:g}{hint}")
 
 
@@ -99,7 +101,11 @@ def _stronger(plant: Plant, mass: float) -> Iterator[str]:
     for name, value, changed, load in (
         ("plant.object_mass", mass, plant, mass / 1000),
         ("plant.carrier_mass", plant.carrier_mass, carried, mass),
-        *((("plant.drones' mass", heaviest, light, mass), ("every mass", heaviest, light, mass / 1000)) if sound else ()),
+        *(
+            (("plant.drones' mass", heaviest, light, mass), ("every mass", heaviest, light, mass / 1000))
+            if sound
+            else ()
+        ),
     ):
         if 1.0 < thrust_over_weight(changed, load) <= MOST_THRUST:
             yield f"; {name} was probably given in g: {value:g} g would be {value / 1000:g} kg"
@@ -139,7 +145,9 @@ def _check_loop(config: Config) -> None:
     for axis, frequency in zip(("roll", "pitch", "yaw"), loop.natural_frequency, strict=True):
         named = f"attitude.natural_frequency {frequency:g} rad/s of {axis}"
         if frequency * step > FASTEST:
-            raise InputError(f"{named} is too fast for physics steps of {1e3 * step:.3g} ms: at most {FASTEST / step:g}")
+            raise InputError(
+                f"{named} is too fast for physics steps of {1e3 * step:.3g} ms: at most {FASTEST / step:g}"
+            )
         if frequency * lag >= 2 * loop.damping:
             raise InputError(
                 f"{named} is unstable with damping {loop.damping:g} and a rotor lag of {lag:g} s: it must be below "

@@ -99,7 +99,7 @@ def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
 
 
 def native_config(path: Path) -> Config | None:
-    """The configuration in the card of a policy for Crazyflies, a team or a rig of its own; None on the paper's plant."""
+    """The configuration in a policy's card if its plant is not the paper's: Crazyflies, a team, a rig; else None."""
     settings = Policy.load(path).card.get("config")
     if not isinstance(settings, dict):
         return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 from mjxball.config import Config, ball_limit, preset, thrust_over_weight, total_mass
 from mjxball.errors import InputError
 from mjxball.plant.trim import largest_amplitude
+from mjxball.reading import check_times
 from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario, of_plant
 
 REFERENCE = of_plant(preset("paper"), Scenario())
@@ -21,6 +23,7 @@ STANDARD = (
     *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.31, 0.62, 1.0, 2.0, 3.1)),
 )
 MOST_SAMPLES = 100_000
+SLOWEST = 60.0  # [s] between two samples of a waveform, as a rule
 
 
 def cross(
@@ -62,7 +65,8 @@ def rig_line(settings: Config) -> str:
 def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Times [s] and offsets [m] from a CSV file with two columns; a header line is allowed.
 
-    Raises InputError if the file cannot be read; order and range are checked with the configuration.
+    Raises InputError if the file cannot be read or its times do not increase; the range is checked with the
+    configuration. stderr says where samples are missing and the motion is a guess.
     """
     try:
         with path.open(newline="") as stream:
@@ -83,4 +87,10 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     if not samples:
         raise InputError(f"waveform {path} has no samples")
     times, offsets = zip(*samples, strict=True)
+    if len(times) > 1:
+        try:
+            for remark in check_times(times, longest=SLOWEST):
+                print(f"waveform {path}: {remark}; the CG moves on a spline there", file=sys.stderr)  # noqa: T201
+        except ValueError as error:
+            raise InputError(f"waveform {path}: {error}, a header not counted") from None
     return times, offsets

@@ -25,12 +25,14 @@ from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.policy.container import read_arrays
 from mjxball.policy.file import write_whole
+from mjxball.reading import check_times, parse_json
 
 if TYPE_CHECKING:
     from mjxball.sim.rollout import Trajectory
 
 FORMAT = "mjxball flight 1"
 MAX_BYTES = 256 * 2**20
+STEPS = (1e-4, 1.0)  # [s] between two rows, as a rule
 
 
 def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
@@ -82,7 +84,7 @@ def load_flight(path: str | os.PathLike[str]) -> Flight:
     """Read and verify a flight; raise InputError with one sentence on anything unsound."""
     arrays: dict[str, Any] = dict(read_arrays(str(path), "flight", MAX_BYTES))
     try:
-        about = json.loads(str(arrays.pop("about")))
+        about = parse_json(str(arrays.pop("about")))
         if about["format"] != FORMAT:
             raise ValueError
         title = str(about["title"])
@@ -104,8 +106,10 @@ def check_flight(flight: Flight, name: str) -> Flight:
             raise InputError(f"{name}: {field} is missing or not of shape {rows + shape}")
         if not np.isfinite(array).all():
             raise InputError(f"{name}: {field} holds a value that is not finite")
-    if (np.diff(flight["time"]) <= 0).any():
-        raise InputError(f"{name}: time must increase from row to row")
+    try:
+        check_times(flight["time"].tolist(), *STEPS)
+    except ValueError as error:
+        raise InputError(f"{name}: time must increase from row to row: {error}") from None
     return Flight(flight.title, flight.plant, {field: flight[field] for field in wanted})
 
 
