@@ -71,6 +71,16 @@ def test_a_flight_is_read_in_our_units(flights: list[Flight]) -> None:
     assert flight.has_cascade
 
 
+def test_rows_that_are_missing_count_as_damaged(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    lines = (made / "other.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "other.csv").write_text("".join([*lines[:800], *lines[830:]]))  # 0.3 s
+    whole, found = read_flight(made / "other.csv"), read_flight(tmp_path / "other.csv")
+    assert "nothing for 0.31 s" in capsys.readouterr().err
+    before = 798  # the header is no row
+    assert found.damaged[before - 1 : before + 4].all()
+    np.testing.assert_array_equal(found.damaged[: before - 5], whole.damaged[: before - 5])
+
+
 def test_the_fit_recovers_the_simulated_drone(flights: list[Flight]) -> None:
     fit = fit_rotation([track_of(flight) for flight in flights])
     # Lag and delay are one for slow commands. The drone's own step adds a tick of 2 ms; rows every 10 ms.

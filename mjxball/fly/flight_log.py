@@ -153,6 +153,9 @@ class Tail:
 
     def _misplaces(self, record: Record) -> bool:
         """Whether `record` does not follow the one before it in its stream: one thread writes each, in order."""
+        if record["kind"] == "header":
+            self.misplaced = self.misplaced or f"line {self._lines} begins another log"
+            return True
         if record["kind"] not in STREAMS:
             return False
         stream, now = (record["kind"], record.get("drone")), record["t"]
