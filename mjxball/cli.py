@@ -135,11 +135,14 @@ def add_config_flags(parser: argparse.ArgumentParser) -> None:
 
 def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> configs.Config:
     """Return `config` with the settings of `--plant FILE` and every `--<path> VALUE` that was given, validated."""
-    config = apply_plant(config, options.plant)
-    for name, text in vars(options).items():
-        if name.startswith("config:") and text is not None:
-            config = configs.override(config, name.removeprefix("config:"), text)
-    return configs.validate(config)
+    flags = {
+        name.removeprefix("config:"): text
+        for name, text in vars(options).items()
+        if name.startswith("config:") and text is not None
+    }
+    if options.plant is not None:
+        read_plant(options.plant)
+    return configs.with_plant(config, options.plant, flags)
 
 
 def read_plant(path: Path) -> configs.PlantFile:

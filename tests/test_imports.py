@@ -17,7 +17,7 @@ from command_line import REPOSITORY, environment
 
 # Floor by floor: a part imports itself and what stands on lower floors, never a neighbour or what is above.
 FLOORS = (
-    {"errors"},
+    {"errors", "reading"},
     {"config"},
     {"cli", "cache", "quiet", "plotting", "xla"},
     {"plant"},
@@ -37,8 +37,17 @@ FLOORS = (
     {"entry"},
 )
 FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}
-GROUND = {"errors", "config", "plant", "control"}  # all of our own that `control` and `policy` may import
-BASE = ("errors", "config", "cli", "plant", "control", "policy", "entry")  # what the base install runs: NumPy alone
+GROUND = {"errors", "reading", "config", "plant", "control"}  # all of our own that `control` and `policy` may import
+BASE = (
+    "errors",
+    "reading",
+    "config",
+    "cli",
+    "plant",
+    "control",
+    "policy",
+    "entry",
+)  # what the base install runs: NumPy alone
 OURS = "mjxball"
 
 

@@ -24,7 +24,7 @@ from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant, load_policy, native_config
 from mjxball.evaluate.report import MADE, write_page, write_report
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
-from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
+from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.evaluate.stand_figure import stand_config
 from mjxball.evaluate.suites import find_suites, list_suites
 from mjxball.evaluate.variants import Suite
@@ -49,11 +49,25 @@ def parser() -> cli.Parser:
     result.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="policy files")
     result.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=f"baselines: {names}")
     result.add_argument("--omega", nargs="+", type=float, metavar="W", help="CG speeds [rad/s] (default 0.31)")
-    result.add_argument("--amplitude", nargs="+", type=float, metavar="A", help="CG amplitudes [m] (default 0.05)")
-    result.add_argument("--mass", nargs="+", type=float, metavar="M", help="object masses [kg] (default 0.2)")
+    result.add_argument(
+        "--amplitude",
+        nargs="+",
+        type=float,
+        metavar="A",
+        help="CG amplitudes [m] (default 0.05, or what the plant allows)",
+    )
+    result.add_argument(
+        "--mass", nargs="+", type=float, metavar="M", help="object masses [kg] (default the plant's, 0.2)"
+    )
     result.add_argument("--believed-mass", type=float, metavar="M", help="mass that hover thrust assumes (true mass)")
     result.add_argument("--wn-pitch", type=float, metavar="W", help="pitch natural frequency of both drones [rad/s]")
-    result.add_argument("--goal", nargs=3, type=float, metavar=("X", "Y", "Z"), help="goal of O [m] (default 1 1 1)")
+    result.add_argument(
+        "--goal",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="goal of O [m] (default 1 1 1, on a stand where it moves)",
+    )
     result.add_argument("--seconds", type=float, metavar="S", help="length of each flight (default 45)")
     result.add_argument(
         "--waveform", type=Path, metavar="FILE", help="CG offsets from a CSV file: time [s], offset [m] per line"
@@ -213,6 +227,8 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
         results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
         if number:
             print(f"\n{group.setup.preset}: its own plant and scenarios")  # noqa: T201
+        if group.setup.plant != config.Plant():
+            print(rig_line(group.setup))  # noqa: T201
         print(table(results))  # noqa: T201
         if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
             every += results
@@ -311,9 +327,9 @@ def _refuse_same_names(names: list[str]) -> None:
 
 def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[Result], physics: str) -> int:
     """Hold every policy against its card on the reference scenario, flown anew if the results lack it."""
-    own = setup.autopilot.kind != "ideal" or setup.plant.count > 2
+    own = setup.autopilot.kind != "ideal" or setup.plant != config.Plant()
     plain = setup if own else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
-    reference = standard_scenarios(setup)[-1] if own else REFERENCE
+    reference = standard_scenarios(plain)[-1]
     known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]
     if missing:

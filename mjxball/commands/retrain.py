@@ -109,10 +109,12 @@ def situation(load: IdentifiedLoad, watch: LoadWatch, replay: FlightReplay, conf
 
 
 def find(log: Path, watch: LoadWatch, replay: FlightReplay) -> IdentifiedLoad:
-    """Read the growing `log` until a load shows. Raises InputError if it is none."""
+    """Read the growing `log` until a load shows. Raises InputError if it is none or its clock goes back."""
     tail, looked = Tail(log), 0.0
     while True:
         records = tail.read()
+        if tail.misplaced:
+            raise InputError(f"flight log {log} cannot be placed in time: {tail.misplaced}")
         for record in records or ():
             watch.take(record)
             replay.take(record)

@@ -25,7 +25,7 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
-from mjxball.evaluate.scenarios import standard_scenarios
+from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.quiet import import_jax
 from mjxball.train import processes
@@ -113,6 +113,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
         with ThreadPoolExecutor(1) as beside:
 
             def prepare() -> None:
+                if writes and options.plant:
+                    print(rig_line(settings), file=sys.stderr)
                 if writes and _is_evaluated(origin):
                     beside.submit(_prepare_evaluation, settings, origin["physics"])
 

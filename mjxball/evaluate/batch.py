@@ -88,8 +88,7 @@ class Batch:
 
     def _run(self, scenarios: Sequence[Scenario], keeps: bool) -> Any:
         """(metrics, rows of `Course` or None)."""
-        for scenario in scenarios:
-            check_scenario(self._config, scenario)
+        scenarios = [check_scenario(self._config, scenario) for scenario in scenarios]
         if len({scenario.seconds for scenario in scenarios}) != 1:
             raise InputError("scenarios of one batch must last equally long")
         period = self._config.timing.control_period
@@ -98,10 +97,10 @@ class Batch:
         followers = followers_axis(self._config)
         sensors, delays = sensors_of(disturbances, period, followers)
         single = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf, _single(leaf)), tree)  # noqa: E731
-        flown = rollout.load_of(scenarios, self._config.plant.count), rollout.start_of(self._config, scenarios)
+        flown = rollout.load_of(self._config, scenarios), rollout.start_of(self._config, scenarios)
         load, start = single(flown)
         goals, samples = single(
-            (rollout.targets(scenarios, count + 1, period), record(disturbances, count + 2, period, followers))
+            (rollout.targets(self._config, scenarios, count + 1), record(disturbances, count + 2, period, followers))
         )
         force, later = samples.at(slice(count + 1)).force, samples.at(slice(1, None))
         inputs = Inputs(

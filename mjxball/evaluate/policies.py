@@ -99,16 +99,13 @@ def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
 
 
 def native_config(path: Path) -> Config | None:
-    """The configuration in the card of a policy for Crazyflies or for a team, None for any other policy."""
+    """The configuration in a policy's card if its plant is not the paper's: Crazyflies, a team, a rig; else None."""
     settings = Policy.load(path).card.get("config")
     if not isinstance(settings, dict):
         return None
-    autopilot, plant = settings.get("autopilot"), settings.get("plant")
-    crazyflies = isinstance(autopilot, dict) and autopilot.get("kind") == "crazyflie"
-    drones = plant.get("drones") if isinstance(plant, dict) else None
-    if not crazyflies and not (isinstance(drones, list) and len(drones) > 2):
-        return None
-    return configs.validate(configs.from_record(settings))
+    found = configs.validate(configs.from_record(settings))
+    paper = found.autopilot.kind == "ideal" and found.plant == configs.preset("paper").plant
+    return None if paper else found
 
 
 def group_by_plant(paths: list[Path]) -> tuple[list[Path], list[tuple[Config, list[Path]]]]:

@@ -15,7 +15,7 @@ from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics, measure_batch
 from mjxball.sim.rollout import Trajectory, simulate_batch
-from mjxball.sim.scenario import Scenario
+from mjxball.sim.scenario import Scenario, of_plant
 
 RESULTS = "cells.json"  # in the output directory
 # The metrics in `--json`, a fixed format; a benchmark's scores have all of them.
@@ -60,6 +60,7 @@ def fly_scenarios(
     config: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str
 ) -> list[Result]:
     """Fly every follower through every scenario; results are ordered by scenario, then by follower."""
+    scenarios = [of_plant(config, scenario) for scenario in scenarios]
     flights = simulate_batch(config, [(follower, scenarios) for follower in followers], physics)
     plant, limit = config.plant, config.scenario.termination_distance
     measured = measure_batch(flights, limit, plant.rotor_force_max, plant.leader)

@@ -35,6 +35,7 @@ from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose, Track, Track
 from mjxball.fly.process import wait_until
 from mjxball.fly.supervisor import Fault
 from mjxball.fly.telemetry import Note
+from mjxball.reading import parse_json
 
 BUILT = ("vicon", "optitrack", "qualisys", "vrpn", "mock")  # what the package on PyPI was built with
 KINDS = (*BUILT, "optitrack_closed_source", "nokov", "motionanalysis", "fzmotion")
@@ -113,7 +114,7 @@ class Source:
                 return
             *lines, waiting = (waiting + (received or b"")).split(b"\n")
             for line in lines:
-                self._line(json.loads(line))
+                self._line(parse_json(line))
 
     def _line(self, what: Any) -> None:
         if isinstance(what, dict):

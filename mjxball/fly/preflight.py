@@ -7,7 +7,6 @@ The curve is found while the motors turn slowly, and the gains for it are then w
 from __future__ import annotations
 
 import functools
-import json
 import math
 import re
 import time
@@ -32,6 +31,7 @@ from mjxball.fly.packets import THRUST_CEILING, Health
 from mjxball.fly.process import together, wait_until
 from mjxball.fly.supervisor import Event, Fault
 from mjxball.fly.telemetry import DroneLink, Note, Rig, yaw_of
+from mjxball.reading import parse_json
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class Preflight:
 def read_gains(path: Path) -> PairGains:
     """Parameters of leader and follower from a JSON file, see `firmware_gains.read_pair_gains`. Raises InputError."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"gain file {path} cannot be read: {error.strerror or error}") from None
-    except ValueError:
-        raise InputError(f"gain file {path} is not JSON") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"gain file {path} is not JSON: {error}") from None
     try:
         return read_pair_gains(data)
     except ValueError:

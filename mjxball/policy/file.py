@@ -20,6 +20,7 @@ from mjxball.control.team_lqg import TeamLqg
 from mjxball.errors import InputError
 from mjxball.policy.container import PolicyFileError, read_arrays
 from mjxball.policy.law_fields import LQG_SHAPES, MAX_NUMBER, check_lqg, is_finite
+from mjxball.reading import parse_json
 
 # 2: with the numbers of an offset-free LQG of a pair, card field `lqg`; 3: of a team, and what a follower has to know
 # of its team before a flight, card field `context`; 4: of attitude loops that nobody knows.
@@ -155,9 +156,9 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
     if text.dtype.itemsize > 4 * MAX_CARD:  # JSON takes fifty times its own length in memory
         raise PolicyFileError(f"{name}: the card is longer than {MAX_CARD} characters")
     try:
-        card = json.loads(str(text))
-    except (ValueError, RecursionError):
-        raise PolicyFileError(f"{name}: the card is not JSON") from None
+        card = parse_json(str(text))
+    except (ValueError, RecursionError) as error:
+        raise PolicyFileError(f"{name}: the card is not JSON: {error}") from None
     if not isinstance(card, dict):
         raise PolicyFileError(f"{name}: the card is not a JSON object")
     return card

@@ -16,6 +16,7 @@ from jax import Array
 from jax.sharding import Mesh
 
 from mjxball.cache import traced_directory
+from mjxball.reading import parse_json
 
 OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
 # One follower's kernels gain nothing from being tuned and optimised further, and it costs a third of the compile time.
@@ -191,7 +192,7 @@ def _read(path: Path | None) -> tuple[Any, list[int]] | None:
         return None
     try:
         first, _, program = path.read_bytes().partition(b"\n")
-        return jax.export.deserialize(bytearray(program)), json.loads(first)
+        return jax.export.deserialize(bytearray(program)), parse_json(first)
     except Exception:  # absent, cut short, or of another JAX: traced anew
         return None
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.train.run_directory import METRICS, read_rows
+from mjxball.train.run_directory import METRICS, read_metrics, read_rows
 
 LOG = "members.csv"
 POLICIES = "members"
@@ -142,7 +142,7 @@ def training_curve(run: Path, seed: int) -> dict[str, list[float]]:
 
 
 def _rows(run: Path) -> list[dict[str, str]]:
-    return read_rows(run / METRICS)
+    return read_metrics(run / METRICS)
 
 
 def draw_training(run: Path, config: Config, path: Path) -> None:

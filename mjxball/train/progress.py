@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from mjxball.quiet import import_tensorboard_writer
-from mjxball.train.run_directory import read_rows
+from mjxball.train.run_directory import read_metrics
 
 EVENTS = "tensorboard"  # directory beside metrics.csv
 
@@ -123,5 +123,4 @@ def _number(value: float | None) -> str:
 def _rows_until(path: Path, names: Sequence[str], steps: int) -> list[dict[str, str]]:
     if not steps or not path.exists():
         return []
-    rows = [row for row in read_rows(path) if set(row) == set(names) and row["steps"].isdecimal()]
-    return [row for row in rows if len(row["steps"]) < 20 and int(row["steps"]) <= steps]
+    return [row for row in read_metrics(path) if set(row) == set(names) and int(row["steps"]) <= steps]

@@ -11,6 +11,7 @@ import json
 import os
 import platform
 import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,9 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.file import PolicyFile, load_file
+from mjxball.reading import parse_json
 
+LONGEST_COUNT = 20  # digits of a number of steps
 MAX_BYTES = 16 * 2**20  # JSON and CSV take some ten times their own length in memory
 
 
@@ -32,7 +35,7 @@ def read_json(path: Path, called: str) -> Any:
     """
     text = _text(path, called)
     try:
-        return json.loads(text)
+        return parse_json(text)
     except (ValueError, RecursionError) as error:
         raise _refusal(path, called, error) from None
 
@@ -48,6 +51,23 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     except csv.Error as error:
         raise _refusal(path, "", error) from None
     return [row for row in rows if None not in row and None not in row.values()]
+
+
+def read_metrics(path: Path) -> list[dict[str, str]]:
+    """The rows of `metrics.csv` whose steps follow each other; stderr says what was left out. Errors as `read_rows`.
+
+    A row that stands twice or goes back is what another process wrote, or is left of a run that was cut short.
+    """
+    rows = read_rows(path)
+    kept: list[dict[str, str]] = []
+    for row in rows:
+        steps = row.get("steps", "")
+        if steps.isdecimal() and len(steps) < LONGEST_COUNT and (not kept or int(steps) > int(kept[-1]["steps"])):
+            kept.append(row)
+    if len(kept) < len(rows):
+        left = f"{len(rows) - len(kept)} of {len(rows)} rows do not follow the one before"
+        print(f"warning: {path}: {left} in steps and are left out", file=sys.stderr)  # noqa: T201
+    return kept
 
 
 def _text(path: Path, called: str) -> str:
@@ -84,7 +104,7 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     contents = load_file(path)
     if file_hash(path) != start["sha256"]:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
-    own = json.loads(json.dumps(configs.to_dict(config)["follower"]))
+    own = parse_json(json.dumps(configs.to_dict(config)["follower"]))
     trained = configs.with_current_names(contents.card.get("config", {})).get("follower", {})
     changed = [f"follower.{name}" for name in own if own[name] != trained.get(name)]
     if changed:
