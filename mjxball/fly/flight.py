@@ -12,6 +12,7 @@ from mjxball.fly.card import Commands, Controller
 from mjxball.fly.command import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
 from mjxball.fly.display import View
 from mjxball.fly.handover import HandoverMonitor, Successor
+from mjxball.fly.lift import LiftWatch
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.monitor import Monitor, Sustained, UplinkWatch, link_faults, tilt_angle
@@ -57,6 +58,7 @@ class Flight:
         self._every = max(round(controller.period / settings.period), 1)  # ticks per command
         self._count = 0
         self._monitor = Monitor(rig, settings)
+        self._lift = LiftWatch(settings.motor)
         self._saturated = Sustained(settings.limits.saturation_time)
         self._back = Sustained(settings.limits.fresh)
         self._holds = 0
@@ -127,6 +129,9 @@ class Flight:
         if self._mocap is not None:
             faults += self._mocap.faults(self._now)
         flying = self.supervisor.state in AIRBORNE and not self.settings.dry_run
+        if flying and all(self._fresh):
+            volts, sinking = [state.battery for state in self._states], self.settings.times.descend_speed
+            faults += self._lift.update(volts, self.maps, self._height(self._object()), sinking, self._now)
         if self.watchdog is not None and not self.watchdog.beat(flying, self._last_known_state()):
             faults.append(Fault(Event.WATCHDOG))
         return faults
@@ -194,7 +199,8 @@ class Flight:
         armed = dry or all(info & can_fly == can_fly for info in infos)
         flying = any(info & packets.FLYING for info in infos) or not all(self._fresh)
         hindered = self._holds > self.settings.limits.gaps + 1 or any(link.lost for link in self.links)
-        resumes = all(self._fresh) and self.supervisor.may_resume and not hindered
+        heard = all(self._fresh) and all(watch.hears for watch in self._monitor.uplinks)
+        resumes = heard and self.supervisor.may_resume and not (hindered or self._stands())
         reached = {
             Event.ARMED: state is State.ARM and elapsed >= times.arm and armed,
             Event.HOVERING: state is State.RAMP and elapsed >= times.ramp,
@@ -267,9 +273,12 @@ class Flight:
             tilt = command.brake(seen.velocity)
         if seen is not None and state is State.DESCEND:
             share = command.sinking_share(float(seen.velocity[2]), self.settings.times)
+        elif seen is not None and any(self._fresh):
+            share = command.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
             share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]
-        return [command.level(share * trim, tilt) for trim in self._trims]
+        shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
+        return [command.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 
     def _transmit(self, wanted: list[Setpoint]) -> None:
         state, dry = self.supervisor.state, self.settings.dry_run
