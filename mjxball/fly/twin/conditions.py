@@ -195,7 +195,7 @@ class DroneFaults:
 class BodyFault(NamedTuple):
     """What happens to the body of a drone, see `Pair.disturb`."""
 
-    what: str  # "frozen", "lost", "jump": of its poses; "battery", "gain"
+    what: str  # "frozen", "lost", "jump": of its poses; "battery", "fade", "gain"
     value: float
 
 
@@ -224,6 +224,7 @@ FAULT_KINDS: dict[str, What] = {
     "pose-lost": BodyFault("lost", 1.0),
     "pose-jump": BodyFault("jump", 0.4),
     "sag": BodyFault("battery", 3.0),
+    "fade": BodyFault("fade", 0.5),  # [V/s]
     "weak": BodyFault("gain", 0.9),
 }
 

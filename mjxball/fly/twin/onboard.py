@@ -24,6 +24,8 @@ class Power:
         self.kind, self.strength = kind, np.array(strength, float)[:, None]
         self._battery = battery
         self.charge = np.full(2, battery.full)  # [V] without load
+        self.sag = np.full(2, battery.sag)  # [V] at full power
+        self.fading = np.zeros(2)  # [V/s] that a cell loses whatever its load
         self._filtered = np.full((2, 1), FIRST)
         self.requested = np.zeros((2, 4))
         self.voltage = self.charge.copy()
@@ -51,8 +53,8 @@ class Power:
     def drain(self, pwm: np.ndarray, seconds: float) -> None:
         """Time goes on by `seconds` [s] at `pwm` (2, 4); the voltage follows the load at once."""
         load = pwm.mean(axis=1) / motors.FULL
-        self.charge = self.charge - self._battery.drain * seconds * load
-        self.voltage = self.charge - self._battery.sag * load
+        self.charge = self.charge - (self._battery.drain * load + self.fading) * seconds
+        self.voltage = self.charge - self.sag * load
         share = 1 - (1 - TAKEN) ** round(1000 * seconds)
         self._filtered = self._filtered + share * (self.voltage[:, None] - self._filtered)
 

@@ -62,8 +62,8 @@ class VirtualLink:
     command = send
 
     def stuck_for(self, now: float) -> float:
-        """How long nothing could be sent [s]: as long as a test says."""
-        return self.stuck
+        """How long nothing could be sent [s]: `stuck` now, as a test says."""
+        return max(self.stuck - (self._clock() - now), 0.0)
 
     def ask(self, port: int, channel: int, data: bytes) -> list[bytes]:
         """Answers to a request, without any delay or loss."""
