@@ -18,6 +18,7 @@ from command_line import REPOSITORY, environment
 # Floor by floor: a part imports itself and what stands on lower floors, never a neighbour or what is above.
 FLOORS = (
     {"errors"},
+    {"files"},
     {"config"},
     {"cli", "cache", "quiet", "plotting", "xla"},
     {"plant"},
@@ -36,8 +37,9 @@ FLOORS = (
     {"entry"},
 )
 FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}
-GROUND = {"errors", "config", "plant", "control"}  # all of our own that `control` and `policy` may import
-BASE = ("errors", "config", "cli", "plant", "control", "policy", "entry")  # what the base install runs: NumPy alone
+GROUND = {"errors", "files", "config", "plant", "control"}  # all of our own that `control` and `policy` may import
+# What the base install runs: NumPy alone.
+BASE = ("errors", "files", "config", "cli", "plant", "control", "policy", "entry")
 OURS = "mjxball"
 
 

@@ -249,10 +249,7 @@ def _start_from(options: argparse.Namespace, settings: config.Config, members: i
 
 
 def _start(path: Path, settings: config.Config) -> dict[str, str]:
-    try:
-        start = {"policy": str(path), "sha256": file_hash(path)}
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from None
+    start = {"policy": str(path), "sha256": file_hash(path)}
     sizes = [len(bias) for bias in start_policy(start, settings).biases[:-1]]
     if sizes != list(settings.gradient.policy_layers):
         layers = ",".join(map(str, sizes))

@@ -13,6 +13,7 @@ from mjxball.config._settings import Config
 from mjxball.config._tree import apply_overrides, leaves
 from mjxball.config._validate import validate
 from mjxball.errors import InputError
+from mjxball.files import MissingFileError, read_text
 
 PLANT_PARTS = ("plant", "attitude", "autopilot", "scenario", "motion")  # what a plant file may set
 SHIPPED = Path(__file__).parent / "plants"
@@ -60,11 +61,11 @@ def read_plant(source: Path | str) -> PlantFile:
 def _parsed(path: Path) -> dict[str, Any]:
     kind = "TOML" if path.suffix == ".toml" else "JSON"
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, "plant file")
+    except MissingFileError as error:
+        raise InputError(f"{error}; by name there are {', '.join(PLANTS)}") from None
+    try:
         values = tomllib.loads(text) if kind == "TOML" else json.loads(text)
-    except OSError as error:
-        known = f"; by name there are {', '.join(PLANTS)}" if isinstance(error, FileNotFoundError) else ""
-        raise InputError(f"plant file {path} cannot be read: {error.strerror or error}{known}") from None
     except (ValueError, RecursionError):
         raise InputError(f"plant file {path} is not {kind}") from None
     if not isinstance(values, dict) or not values:

@@ -11,6 +11,7 @@ from typing import Any
 
 from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
+from mjxball.files import read_text
 from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario
 
 REFERENCE = Scenario()
@@ -66,10 +67,9 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     Raises InputError if the file cannot be read; order and range are checked with the configuration.
     """
     try:
-        with path.open(newline="") as stream:
-            lines = [line for line in csv.reader(stream) if line]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"waveform {path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        lines = [line for line in csv.reader(read_text(path, "waveform").splitlines()) if line]
+    except csv.Error as error:
+        raise InputError(f"waveform {path} cannot be read: {error}") from None
     if len(lines) > MOST_SAMPLES:
         raise InputError(f"waveform {path} has more than {MOST_SAMPLES:,} lines")
     samples = []

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from mjxball.quiet import import_tensorboard_writer
-from mjxball.train.run_directory import read_rows
+from mjxball.train.run_directory import read_rows, write_rows
 
 EVENTS = "tensorboard"  # directory beside metrics.csv
 
@@ -56,12 +56,7 @@ class Progress:
             return
         kept = _rows_until(path, names, resumed_at)
         self.before = float(kept[-1]["seconds"]) if kept else 0.0
-        partial = path.with_name(f".{path.name}.partial")
-        with partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, names)
-            writer.writeheader()
-            writer.writerows(kept)
-        partial.replace(path)
+        write_rows(path, names, kept)
         self._file = path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, names)
         self._events = import_tensorboard_writer()(str(path.with_name(EVENTS)), purge_step=resumed_at or None)
