@@ -92,8 +92,11 @@ def run_command(command: Callable[[], int]) -> int:
         return 2
 
 
-def output_directory(path: Path) -> Path:
-    """Return `path` if it does not exist or is an empty directory, else raise InputError. Creates nothing."""
+def output_directory(path: Path, but: Sequence[str] = ()) -> Path:
+    """Return `path` if it does not exist or is an empty directory, else raise InputError. Creates nothing.
+
+    Files called as in `but` do not count.
+    """
     if (path.exists() or path.is_symlink()) and not path.is_dir():
         raise InputError(f"output directory {path} exists and is no directory")
     above = next(parent for parent in path.absolute().parents if parent.exists())
@@ -101,7 +104,7 @@ def output_directory(path: Path) -> Path:
         raise InputError(f"output directory {path} would lie below the file {above}")
     if not os.access(path if path.exists() else above, os.W_OK):
         raise InputError(f"output directory {path} cannot be written")
-    if path.is_dir() and any(path.iterdir()):
+    if path.is_dir() and any(one.name not in but for one in path.iterdir()):
         raise InputError(f"output directory {path} exists and is not empty; choose another with --out")
     return path
 

@@ -30,6 +30,7 @@ from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.quiet import import_jax
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
+from mjxball.train.lock import LOCK
 from mjxball.train.run_directory import (
     CHECKPOINTS,
     EXTENSIONS,
@@ -106,24 +107,33 @@ def _train(options: argparse.Namespace, command: str) -> int:
     else:
         settings, origin, out = _new_run(options, command)
     enable_compilation_cache()
-    with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
-        if meeting:
-            processes.join(meeting)
-        writes = not meeting or processes.is_writer()  # to ask wakes the devices, and waits
-        with ThreadPoolExecutor(1) as beside:
+    resume = options.resume is not None
+    check = (lambda: None) if resume else (lambda: _output_directory(out))  # what the lock's holder may have left there
+    with contextlib.ExitStack() as hold:
+        with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
+            if meeting:
+                processes.join(meeting)
+            hold.enter_context(processes.holding(out, meeting is not None, check))
+            writes = not meeting or processes.is_writer()  # to ask wakes the devices, and waits
+            with ThreadPoolExecutor(1) as beside:
 
-            def prepare() -> None:
-                if writes and _is_evaluated(origin):
-                    beside.submit(_prepare_evaluation, settings, origin["physics"])
+                def prepare() -> None:
+                    if writes and _is_evaluated(origin):
+                        beside.submit(_prepare_evaluation, settings, origin["physics"])
 
-            code = _run(settings, origin, out, options.resume is not None, prepare)
-        if meeting:
-            processes.leave()
-    if writes and code is None and (out / "eval" / RESULTS).exists():
+                code = _run(settings, origin, out, resume, prepare)
+            if meeting:
+                processes.leave()
+        return _finish(settings, origin, out, code, started) if writes else code or 0
+
+
+def _finish(settings: config.Config, origin: dict[str, Any], out: Path, code: int | None, started: float) -> int:
+    """Print and draw what came of a training that ended with `code`, see `_run`; return the exit code."""
+    if code is None and (out / "eval" / RESULTS).exists():
         print(f"{out} was finished and evaluated before; nothing is left to do")
         return 0
-    if not writes or code == 1:
-        return code or 0
+    if code == 1:
+        return code
     print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)
     if code:
         return code
@@ -133,6 +143,10 @@ def _train(options: argparse.Namespace, command: str) -> int:
     if origin["seeds"] > 1:
         _compare_members(settings, out, origin)
     return _evaluate(settings, origin["physics"], out, out / POLICY)
+
+
+def _output_directory(out: Path) -> Path:
+    return cli.output_directory(out, but=(LOCK,))
 
 
 def _run(
@@ -203,7 +217,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     for section in ALGORITHMS:
         if (units := getattr(getattr(settings, section), "activation", "relu")) != "relu":
             raise InputError(f"--{section}.activation {units}: policy files hold relu; see mjxball.train.train")
-    out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
+    out = _output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)
     members = 1 if options.num_seeds is None else options.num_seeds
     if not 1 <= members <= MOST_MEMBERS:
