@@ -16,7 +16,9 @@ from pathlib import Path
 from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
+from mjxball.xla import explained
 
+FAULT = 3  # exit code after an error of the program, where 1 is a result
 EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that another extra than `train` brings
 
 
@@ -89,6 +91,12 @@ def run_command(command: Callable[[], int]) -> int:
             raise
         extra = EXTRAS.get(error.name or "", "train")
         print(f"error: {error.name} is not installed; pip install 'mjxball[{extra}]'", file=sys.stderr)  # noqa: T201
+        return 2
+    except (MemoryError, RuntimeError, AssertionError) as error:
+        why = explained(error)
+        if why is None:
+            raise
+        print(f"error: {why}", file=sys.stderr)  # noqa: T201
         return 2
 
 

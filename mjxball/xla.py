@@ -1,8 +1,10 @@
-"""A flag of XLA's, which reads its flags once, when JAX finds its devices."""
+"""What XLA is told, once, before JAX finds its devices, and what its errors mean to a user."""
 
 from __future__ import annotations
 
 import os
+import sys
+from typing import Any
 
 # On CPUs a loop whose body touches fewer bytes than that becomes one function of LLVM's, instead of one for each
 # operation of its body, called by XLA's runtime, which takes longer than the operation if that has dozens of numbers.
@@ -14,3 +16,23 @@ def compile_small_loops_whole() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SMALL_LOOPS}".strip()
+
+
+def explained(error: BaseException) -> str | None:
+    """What a user can do about an `error` of JAX's, a sentence; None if it is nothing of the kind.
+
+    Without a device of `JAX_PLATFORMS` JAX fails in many ways, one of them an assertion without a word.
+    """
+    jax: Any = sys.modules.get("jax")
+    if isinstance(error, MemoryError):
+        return "there is not enough memory; make it smaller, or see `ulimit -v` and other programs"
+    if jax is None or not hasattr(jax, "devices"):
+        return None
+    if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error):
+        return f"there is not enough memory: {str(error).splitlines()[0][:200]}"
+    try:
+        jax.devices()
+    except Exception as missing:  # RuntimeError or AssertionError, as the platform may be
+        wanted, why = jax.config.jax_platforms, (str(missing).splitlines() or [""])[0][:200]
+        return f"JAX has no device of JAX_PLATFORMS={wanted}; unset that or say cpu{': ' if why else ''}{why}"
+    return None

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from command_line import assert_one_line, environment, listing, script, tiny
+from command_line import run as command
 from test_distributed import finish, launch
 
 from mjxball.errors import InputError
@@ -56,13 +57,11 @@ def test_the_second_is_refused_with_the_name_of_the_first(tmp_path: Path, holder
     run = tmp_path / "run"
     found = json.loads((run / lock.LOCK).read_text())
     before = listing(run)
-    with pytest.raises(InputError, match=f"in use by process {holder.pid} on {found['host']}, since 20"):
-        with lock.held(run):
-            pass
+    holds = f"in use by process {holder.pid} on {found['host']}, since 20"
+    with pytest.raises(InputError, match=holds), lock.held(run):
+        pass
     assert listing(run) == before
-    done = subprocess.run(
-        [sys.executable, script("train.py"), *tiny(out=run)], env=environment(), capture_output=True, text=True
-    )
+    done = command([script("train.py"), *tiny(out=run)], tmp_path)
     assert done.returncode == 2
     assert_one_line(done.stderr)
     assert f"process {holder.pid}" in done.stderr
@@ -93,9 +92,9 @@ def test_directories_that_nothing_was_written_to_are_removed(tmp_path: Path) -> 
 
 def test_between_machines_without_common_locks_the_age_counts(tmp_path: Path) -> None:
     written(tmp_path / "living", renewed=lock.RENEWED)
-    with pytest.raises(InputError, match="process 7 on far, since today; if that has ended, wait"):
-        with lock.held(tmp_path / "living"):
-            pass
+    living = "process 7 on far, since today; if that has ended, wait"
+    with pytest.raises(InputError, match=living), lock.held(tmp_path / "living"):
+        pass
     written(tmp_path / "left", renewed=lock.STALE + 1)
     with lock.held(tmp_path / "left"):
         assert json.loads((tmp_path / "left" / lock.LOCK).read_text())["pid"] == os.getpid()

@@ -109,7 +109,10 @@ def _train(options: argparse.Namespace, command: str) -> int:
     enable_compilation_cache()
     resume = options.resume is not None
     check = (lambda: None) if resume else (lambda: _output_directory(out))  # what the lock's holder may have left there
-    with contextlib.ExitStack() as hold:
+    from mjxball.train.compilation import jax_setting
+
+    # Float32 also where JAX_ENABLE_X64 is set: a run is the same then, and can be resumed.
+    with contextlib.ExitStack() as hold, jax_setting("jax_enable_x64", False):
         with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
             if meeting:
                 processes.join(meeting)
@@ -194,7 +197,8 @@ def _wake_devices() -> None:
 
 
 def _first_kernel(xp: Any) -> None:
-    xp.zeros(1).block_until_ready()
+    with contextlib.suppress(RuntimeError, AssertionError):  # without a device; who needs one says so
+        xp.zeros(1).block_until_ready()
 
 
 def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.cli import FAULT
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.train import lock
 
@@ -157,7 +158,7 @@ def exit_when_a_process_is_lost(resume: str) -> Iterator[None]:
             file=sys.stderr,
             flush=True,
         )
-        os._exit(1)  # the runtime's own farewell would wait for the lost process
+        os._exit(FAULT)  # the runtime's own farewell would wait for the lost process
     finally:
         _dismiss(watcher)
 
