@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mjxball.xla import check_address_space
+
 VARIABLE = "MJXBALL_CACHE"
 
 
@@ -37,6 +39,7 @@ def _directory_of_jax() -> str | None:
 
 def enable_compilation_cache() -> Path | None:
     """Turn the cache on, unless JAX was told of one or it is switched off; return its directory if it is ours."""
+    check_address_space()
     import jax
 
     place = cache_directory()

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from command_line import assert_one_line, environment, listing, script, tiny
 from command_line import run as command
-from test_distributed import finish, launch
+from test_distributed import SMALL, finish, launch
 
 from mjxball.errors import InputError
 from mjxball.train import lock
@@ -140,7 +140,7 @@ def test_two_processes_of_one_run_are_one_holder_and_a_second_pair_is_refused(
     tmp_path: Path, holder: subprocess.Popen[str]
 ) -> None:
     """Both of a pair are refused while another process has the directory, and train once it is free."""
-    arguments = ["--seeds", "2", *tiny(out=tmp_path / "run", sac__total_steps=3200)]
+    arguments = [*SMALL, "--seeds", "2", "--sac.total_steps", "800", "--out", str(tmp_path / "run")]
     children = launch(arguments, tmp_path / "cache")
     outputs = finish(children)
     assert [child.returncode for child in children] == [2, 2], outputs

@@ -161,10 +161,14 @@ def _run(
     """
     _wake_devices()
     # The algorithm's libraries are imported meanwhile, before anything asks for devices.
+    from mjxball.train import requirements
     from mjxball.train.extensions import find
     from mjxball.train.run import Run
 
-    find((origin.get("extensions") or {}).get("algorithm") or "sac", "--algorithm")
+    algorithm = (origin.get("extensions") or {}).get("algorithm") or "sac"
+    find(algorithm, "--algorithm")
+    if algorithm in ALGORITHMS:  # of others nobody knows what they take
+        requirements.check(settings, algorithm, origin["seeds"])
     state = None
     if resume:
         from mjxball.train.checkpoint import restore_state
