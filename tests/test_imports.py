@@ -18,8 +18,10 @@ from command_line import REPOSITORY, environment
 # Floor by floor: a part imports itself and what stands on lower floors, never a neighbour or what is above.
 FLOORS = (
     {"errors", "reading"},
+    {"files"},
     {"config"},
-    {"cli", "cache", "quiet", "plotting", "xla"},
+    {"xla"},
+    {"cli", "cache", "quiet", "plotting"},
     {"plant"},
     {"control"},
     {"policy", "baselines"},
@@ -37,17 +39,16 @@ FLOORS = (
     {"entry"},
 )
 FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}
-GROUND = {"errors", "reading", "config", "plant", "control"}  # all of our own that `control` and `policy` may import
-BASE = (
+GROUND = {
     "errors",
     "reading",
+    "files",
     "config",
-    "cli",
     "plant",
     "control",
-    "policy",
-    "entry",
-)  # what the base install runs: NumPy alone
+}  # all of our own that `control` and `policy` may import
+# What the base install runs: NumPy alone.
+BASE = ("errors", "reading", "files", "config", "cli", "plant", "control", "policy", "entry")
 OURS = "mjxball"
 
 

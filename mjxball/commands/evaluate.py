@@ -28,6 +28,7 @@ from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.evaluate.stand_figure import stand_config
 from mjxball.evaluate.suites import find_suites, list_suites
 from mjxball.evaluate.variants import Suite
+from mjxball.files import write_whole
 from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policies
@@ -209,7 +210,7 @@ def _benchmark(
     plant = suites[0].variants[0].nominal(group.setup).plant
     print(text_table(scores))  # noqa: T201
     if options.json:
-        options.json.write_text(json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
+        write_whole(options.json, json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
         write_report(options.out, plant, scores, suites, policies, command, versions())
         print(f"the report is {options.out / 'report.html'}")  # noqa: T201
@@ -241,7 +242,7 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
         if options.check:
             code = max(code, _check(group.setup, policies, results, options.physics))
     if options.json:
-        options.json.write_text(to_json(every))
+        write_whole(options.json, to_json(every))
     return code
 
 
@@ -276,7 +277,7 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         print(f"{time.monotonic() - started:6.1f} s  figure {name}", file=sys.stderr)  # noqa: T201
     options.out.mkdir(parents=True, exist_ok=True)
     for figure in figures:
-        (options.out / f"figure-{figure.name}.svg").write_text(figure.svg, encoding="utf-8")
+        write_whole(options.out / f"figure-{figure.name}.svg", figure.svg)
     page = options.out / "figures.html"
     links = [*((figure.name, figure.title) for figure in figures), MADE]
     context = {"title": "The paper's figures from our flights", "figures": figures, "links": links}

@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import json
 import os
+import select
 import sys
 import threading
 import time
@@ -47,6 +48,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("out", type=Path, metavar="OUT.npz", help="to be written")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="in which a policy is to be fine-tuned")
     options = parser.parse_args(arguments)
+    if _input_has_ended():
+        parser.error("standard input, whose end ends it, has ended; python -m mjxball.fly --retrain starts it with one")
     threading.Thread(target=_end_with_input, daemon=True).start()
     os.nice(NICE)
     collect_seldom()
@@ -173,6 +176,14 @@ class FlightReplay:
         body = self._laws.body_from_observation(np.asarray(record["observation"], float), goal)
         self._controller.step(body, goal)
         self.place = Place(body, goal, self._controller.integral, self._controller.policy.memory)
+
+
+def _input_has_ended() -> bool:
+    """Whether there is no standard input, or none that stays open."""
+    try:
+        return bool(select.select([0], [], [], 0)[0]) and not os.read(0, 4096)
+    except OSError:
+        return True
 
 
 def _end_with_input() -> None:

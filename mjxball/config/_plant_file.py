@@ -14,6 +14,7 @@ from mjxball.config._settings import Config
 from mjxball.config._tree import apply_overrides, leaves, override
 from mjxball.config._validate import validate
 from mjxball.errors import InputError
+from mjxball.files import MissingFileError, read_text
 from mjxball.reading import parse_json
 
 PLANT_PARTS = ("plant", "attitude", "autopilot", "scenario", "motion")  # what a plant file may set
@@ -62,11 +63,11 @@ def read_plant(source: Path | str) -> PlantFile:
 def _parsed(path: Path) -> dict[str, Any]:
     kind = "TOML" if path.suffix == ".toml" else "JSON"
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, "plant file")
+    except MissingFileError as error:
+        raise InputError(f"{error}; by name there are {', '.join(PLANTS)}") from None
+    try:
         values = tomllib.loads(text) if kind == "TOML" else parse_json(text)
-    except OSError as error:
-        known = f"; by name there are {', '.join(PLANTS)}" if isinstance(error, FileNotFoundError) else ""
-        raise InputError(f"plant file {path} cannot be read: {error.strerror or error}{known}") from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"plant file {path} is not {kind}: {error}") from None
     if not isinstance(values, dict) or not values:

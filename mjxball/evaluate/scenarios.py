@@ -12,6 +12,7 @@ from typing import Any
 
 from mjxball.config import Config, ball_limit, preset, thrust_over_weight, total_mass
 from mjxball.errors import InputError
+from mjxball.files import read_text
 from mjxball.plant.trim import largest_amplitude
 from mjxball.reading import check_times
 from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario, of_plant
@@ -69,10 +70,9 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     configuration. stderr says where samples are missing and the motion is a guess.
     """
     try:
-        with path.open(newline="") as stream:
-            lines = [line for line in csv.reader(stream) if line]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"waveform {path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        lines = [line for line in csv.reader(read_text(path, "waveform").splitlines()) if line]
+    except csv.Error as error:
+        raise InputError(f"waveform {path} cannot be read: {error}") from None
     if len(lines) > MOST_SAMPLES:
         raise InputError(f"waveform {path} has more than {MOST_SAMPLES:,} lines")
     samples = []

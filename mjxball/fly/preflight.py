@@ -20,6 +20,7 @@ from mjxball.control import motors
 from mjxball.control.crazyflie import PairGains, read_pair_gains
 from mjxball.control.motors import Motor
 from mjxball.errors import InputError
+from mjxball.files import read_text
 from mjxball.fly import packets
 from mjxball.fly.command import CURVE_NAMES, CurveName, Variant, Variants
 from mjxball.fly.connection import LinkError
@@ -52,9 +53,9 @@ class Preflight:
 def read_gains(path: Path) -> PairGains:
     """Parameters of leader and follower from a JSON file, see `firmware_gains.read_pair_gains`. Raises InputError."""
     try:
-        data = parse_json(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"gain file {path} cannot be read: {error.strerror or error}") from None
+        data = parse_json(read_text(path, "gain file"))
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:
         raise InputError(f"gain file {path} is not JSON: {error}") from None
     try:

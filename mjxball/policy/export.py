@@ -17,7 +17,8 @@ from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.motors import firmware
 from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.control.observation import ACTION, OBSERVATION, commanded
-from mjxball.policy.file import PolicyFile, write_whole
+from mjxball.files import write_whole
+from mjxball.policy.file import PolicyFile
 from mjxball.policy.law_fields import CONTEXTS
 
 

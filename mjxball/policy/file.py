@@ -18,6 +18,7 @@ from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERV
 from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
 from mjxball.errors import InputError
+from mjxball.files import write_whole
 from mjxball.policy.container import PolicyFileError, read_arrays
 from mjxball.policy.law_fields import LQG_SHAPES, MAX_NUMBER, check_lqg, is_finite
 from mjxball.reading import parse_json
@@ -106,20 +107,6 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     write_whole(path, stream.getvalue())
-
-
-def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write `data` to `path` atomically: a reader sees the old file or the whole new one."""
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.partial")
-    try:
-        with partial.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def load_file(path: str | os.PathLike[str]) -> PolicyFile:

@@ -14,6 +14,7 @@ from mjxball.errors import InputError
 from mjxball.fly.command import CurveName
 from mjxball.fly.limits import NAMES
 from mjxball.fly.recording import GUIDED, FlightLog, Outage, load, numbers, outages
+from mjxball.policy.container import read_arrays
 from mjxball.reading import check_times
 
 STATE = 13  # numbers of a drone's state in an .npz: position, velocity, quaternion (w, x, y, z), body rates
@@ -46,11 +47,11 @@ def read_log(path: Path) -> Log:
     if path.suffix != ".npz":
         return _of_flight(load(path))
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = [np.asarray(data[name], float) for name in ("time", "setpoints", "states")]
+        data = read_arrays(str(path), "log")
+        arrays = [np.asarray(data[name], float) for name in ("time", "setpoints", "states")]
         return make_log(arrays[0], arrays[1], arrays[0], [arrays[2][:, 0], arrays[2][:, 1]])
-    except OSError as error:
-        raise InputError(f"log {path} cannot be read: {error.strerror or error}") from None
+    except InputError:
+        raise
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"log {path} is no .npz of time, setpoints, states: {error}") from None
 

@@ -23,8 +23,8 @@ from mjxball.cli import plant_setup
 from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.errors import InputError
+from mjxball.files import write_whole
 from mjxball.policy.container import read_arrays
-from mjxball.policy.file import write_whole
 from mjxball.reading import check_times, parse_json
 
 if TYPE_CHECKING:
