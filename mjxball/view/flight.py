@@ -174,6 +174,7 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
     from mjxball.sim.rollout import simulate
 
     setup, reference, path = plant_setup(plant), REFERENCE, Path(source)
+    tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
     if plant is not None:
         reference = standard_scenarios(setup)[-1]
     if source in LAWS:
@@ -183,9 +184,9 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
         native = native_config(file)
         if native is not None and plant is None:
             setup, reference = native, standard_scenarios(native)[-1]
-        follower = load_policy(file, setup)
+        seconds = tuples.get("seconds", reference.seconds)
+        follower = load_policy(file, setup, seconds=seconds)
         follower.name = path.name if path.is_dir() else follower.name
-    tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
     scenario = dataclasses.replace(reference, **tuples)
     flown = simulate(setup, follower, scenario, physics)
     reach = "±" if len(setup.plant.directions) == 1 else "on a circle of "
