@@ -124,7 +124,7 @@ def test_power_of_the_rotors_over_that_of_hover() -> None:
 
 
 def test_spread_of_the_followers_commands() -> None:
-    """Two followers that pull against each other, 0.1 rad of pitch each; all alike is no spread, and a pair has none."""
+    """Two followers that pull against each other, 0.1 rad of pitch each; alike they have no spread."""
     apart = np.zeros((1501, 2, 3))
     apart[..., 1] = (0.1, -0.1)
     common = {"rotor_force": np.full((1501, 3, 4), 2.0)}

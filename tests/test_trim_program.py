@@ -233,7 +233,9 @@ def test_attitude_loops_give_the_forces_of_the_trim(config: Config, mass: float)
     margin, force = largest_margin(config, mass, (0.01, 0.03))
     assert force is not None
     believes = np.array(plant.known_masses) + np.array(plant.load_shares) * mass
-    alone = dataclasses.replace(plant, drones=tuple(dataclasses.replace(d, mount=(0.0, 0.0, 0.0)) for d in plant.drones))
+    alone = dataclasses.replace(
+        plant, drones=tuple(dataclasses.replace(d, mount=(0.0, 0.0, 0.0)) for d in plant.drones)
+    )
     wrench = np.array(
         [wrench_of(alone, np.where(np.arange(plant.count)[:, None] == k, force, 0.0)) for k in range(plant.count)]
     )

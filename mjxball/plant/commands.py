@@ -43,8 +43,8 @@ def asked_rows(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(yaw torques (A, 4 N), commands (3 A, 4 N) per force of a rotor, commands (3 A,) that hover at no force).
 
-    Of the A numbered `drones` that answer commands; commands over their limits. `factor` (N,) as `thrust` of `largest_margin`,
-    `believes` (N,) the mass that each drone's hover thrust is for [kg].
+    Of the A numbered `drones` that answer commands; commands over their limits. `factor` (N,) as `thrust` of
+    `largest_margin`, `believes` (N,) the mass that each drone's hover thrust is for [kg].
     """
     columns = 4 * plant.count
     if commands is None:
