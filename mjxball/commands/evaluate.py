@@ -168,7 +168,8 @@ class Group:
     def policies(self, options: argparse.Namespace) -> list[Policy]:
         """The policies, loaded to fit the plant; raise InputError for bounds that are wanted and missing."""
         # A pitch frequency that was asked for is an experiment, not a mistake.
-        found = _load(self.paths, lambda path: self.setup, options)
+        longest = max(scenario.seconds for scenario in self.scenarios)
+        found = _load(self.paths, lambda path: self.setup, options, longest)
         unbounded = [policy.name for policy in found if options.check and not policy.card["bounds"]]
         if unbounded:
             raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
@@ -295,9 +296,9 @@ def _figure_config(path: Path) -> config.Config | None:
 
 
 def _load(
-    paths: Sequence[Path], setup_of: Callable[[Path], config.Config], options: argparse.Namespace
+    paths: Sequence[Path], setup_of: Callable[[Path], config.Config], options: argparse.Namespace, seconds: float = 0.0
 ) -> list[Policy]:
-    """The policies, each to fit the configuration of its file.
+    """The policies, each to fit the configuration of its file, for flights of up to `seconds` [s].
 
     Files of one stem are called by their directory too, forced ones carry a mark in their name.
     """
@@ -306,7 +307,7 @@ def _load(
         setup, policy = setup_of(path), Policy.load(path)
         policy.join(setup.plant, setup.attitude)  # nothing forces a law into a team that it is not for
         try:
-            policy = load_policy(path, setup, compare_laws=options.wn_pitch is None)
+            policy = load_policy(path, setup, compare_laws=options.wn_pitch is None, seconds=seconds)
         except InputError as error:
             if not options.force:
                 raise InputError(f"{error}; --force flies it all the same") from None

@@ -99,6 +99,7 @@ class Batch:
         single = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf, _single(leaf)), tree)  # noqa: E731
         flown = rollout.load_of(self._config, scenarios), rollout.start_of(self._config, scenarios)
         load, start = single(flown)
+        most = single(metrics.rotor_limits(self._config.plant, scenarios))
         goals, samples = single(
             (rollout.targets(self._config, scenarios, count + 1), record(disturbances, count + 2, period, followers))
         )
@@ -107,7 +108,7 @@ class Batch:
             np.arange(count + 1, dtype=np.int32), (goals[:-1], goals[1:]), force, later._replace(force=None)
         )
         with jax.default_matmul_precision("highest"):
-            return self._program(sensors, delays, keeps)(start, load, goals[0], samples.at(0), inputs)
+            return self._program(sensors, delays, keeps)(start, load, most, goals[0], samples.at(0), inputs)
 
     def _program(self, sensors: SensorModel, delays: np.ndarray, keeps: bool) -> Any:
         """The compiled flight; delays, biases and resolutions are constants in it, everything else is given to it."""
@@ -125,6 +126,7 @@ class Batch:
         keeps: bool,
         start: PlantState,
         load: Load,
+        most: Float[Array, "n drones"],
         goal: Float[Array, "n 3"],
         first: Sample,
         inputs: Inputs,
@@ -134,7 +136,7 @@ class Batch:
         carry = Carry(state, observation, self._law.start(observation), running)
 
         def step(carry: Carry, inputs: Inputs) -> tuple[Carry, Any]:
-            return self._step(loop, load, carry, inputs), self._seen(carry, load, inputs) if keeps else None
+            return self._step(loop, load, most, carry, inputs), self._seen(carry, load, inputs) if keeps else None
 
         last, rows = jax.lax.scan(step, carry, inputs)
         return last.running, rows
@@ -145,7 +147,9 @@ class Batch:
         offset = self._offset(plant, load)
         return inputs.goals[0] - plant.position, plant.velocity, euler, offset, carry.loop.diverged
 
-    def _step(self, loop: ClosedLoop, load: Load, carry: Carry, inputs: Inputs) -> Carry:
+    def _step(
+        self, loop: ClosedLoop, load: Load, most: Float[Array, "n drones"], carry: Carry, inputs: Inputs
+    ) -> Carry:
         config, state, observation = self._config, carry.loop, carry.observation
         plant, goals = state.plant, inputs.goals
         follower, answer = self._law.step(carry.follower, observation, self._privileged(plant, load))
@@ -154,7 +158,7 @@ class Batch:
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         time = inputs.number * jnp.float32(config.timing.control_period)
         flown = (time, plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)
-        limits = (config.scenario.termination_distance, config.plant.rotor_force_max, config.plant.leader)
+        limits = (config.scenario.termination_distance, most, config.plant.leader)
         return Carry(moved, after, follower, metrics.update(carry.running, rollout.Tick(*flown), *limits))
 
 

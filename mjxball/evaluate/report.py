@@ -22,7 +22,7 @@ from mjxball.policy import Policy
 
 TEMPLATES = Path(__file__).parent / "templates"
 UNITS = {"rmse": "m", "settling_time": "s", "x_peak": "m", "peak": "m", "max_tilt": "rad", "effort": "N"}
-UNITS |= {"smoothness": "rad"}
+UNITS |= {"smoothness": "rad", "command_spread": "rad"}
 COUNTED = {"peak": "steady-state peak", "rmse": "RMSE", "settling_time": "settling time", "overshoot": "overshoot"}
 RIVALS = ("adaptive", "lqg", "lqg-slow")  # that followers are compared with one by one
 CARD_HIDES = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file

@@ -78,10 +78,11 @@ def policy_file(
 
 
 def with_network(policy: PolicyFile, learnt: Any) -> PolicyFile:
-    """`policy` with the network that has been learnt from it: its card, and the inputs that it sees."""
+    """`policy` with the network that has been learnt from it: the inputs that it sees, and its card but for `flown`."""
     weights, biases = _layers(learnt)
     return dataclasses.replace(
         policy,
+        card={name: value for name, value in policy.card.items() if name != "flown"},
         weights=tuple(weights),
         biases=tuple(biases),
         observation_mean=np.asarray(learnt.mean, np.float32),

@@ -226,6 +226,7 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
         if len(numbers) != length or not all(is_finite(value) and value >= 0 for value in numbers):
             raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
     check_lqg(card, name)
+    _check_flown(card.get("flown"), name)
     for field in ("control_period", "gravity"):
         if not (is_finite(card[field]) and card[field] >= 1e-6):
             raise PolicyFileError(f"{name}: card field {field} must be positive")
@@ -234,6 +235,17 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     odd = sorted(set(card["bounds"]) - set(BOUNDED))
     if odd:
         raise PolicyFileError(f"{name}: card field bounds names {odd[0]!r}; known are {', '.join(BOUNDED)}")
+
+
+def _check_flown(flown: Any, name: str) -> None:
+    """`flown`, if a card has it: the numbers of drones and the seconds up to which flights were found good."""
+    if flown is None:
+        return
+    fields = flown if isinstance(flown, dict) else {}
+    drones, seconds = fields.get("drones"), fields.get("seconds")
+    counts = isinstance(drones, list) and drones and all(type(count) is int and count > 1 for count in drones)
+    if not (counts and is_finite(seconds) and seconds > 0):
+        raise PolicyFileError(f"{name}: card field flown must hold drones, numbers above 1, and positive seconds")
 
 
 def shipped_policies() -> list[Path]:

@@ -178,6 +178,7 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
     from mjxball.sim.rollout import simulate
 
     setup, path = plant_setup(plant), Path(source)
+    tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
     if source in LAWS:
         follower: Any = make_baseline(source, setup)
     else:
@@ -185,9 +186,9 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
         native = native_config(file)
         if native is not None and plant is None:
             setup = native
-        follower = load_policy(file, setup)
+        seconds = tuples.get("seconds", standard_scenarios(setup)[-1].seconds)
+        follower = load_policy(file, setup, seconds=seconds)
         follower.name = path.name if path.is_dir() else follower.name
-    tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
     scenario = dataclasses.replace(standard_scenarios(setup)[-1], **tuples)
     flown = simulate(setup, follower, scenario, physics)
     reach = "±" if len(setup.plant.directions) == 1 else "on a circle of "
