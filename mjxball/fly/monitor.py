@@ -16,8 +16,9 @@ import numpy as np
 from mjxball.control import rotations
 from mjxball.fly import packets
 from mjxball.fly.limits import NAMES, FlightSettings, Limits
+from mjxball.fly.measured import DroneWatch
 from mjxball.fly.packets import DroneState, Health
-from mjxball.fly.supervisor import AIRBORNE, ON_GROUND, Event, Fault, State
+from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State
 from mjxball.fly.telemetry import DroneLink, ObjectState, Rig, Sample, object_of_one, object_state
 
 # From where on an estimator is not believed, and a drone counts as not hearing.
@@ -27,6 +28,7 @@ JUMP_TIME = 0.1  # between two states, beyond which nothing is said about a jump
 HEIGHT, CLIMB = 0.05, 0.3  # of one drone against the other one and the roll [m, m/s]
 LASTING = 0.25  # [s] that heights or climbs must disagree
 ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
+RISING = (State.RAMP, State.FLY)  # a drone that touches the ground feels more than its packets tell
 UNHEARD = 4  # health packets in a row without such an echo
 
 
@@ -89,6 +91,8 @@ class Monitor:
         self._low = [Sustained(bounds.battery_time) for _ in NAMES]
         self.origin = np.zeros(3)  # where O stood at the start [m]
         self.estimators = EstimatorWatch(rig, sideways=not settings.stand)
+        axes = (2,) if settings.stand else (0, 1, 2)
+        self._drones = [DroneWatch(axes) for _ in NAMES]
         self.uplinks = [UplinkWatch(name) for name in NAMES]
         self.object: ObjectState | None = None  # newest that can be trusted
 
@@ -97,7 +101,7 @@ class Monitor:
         samples = [link.telemetry.newest for link in links if link.telemetry.newest is not None]
         healths = [link.telemetry.health for link in links]
         fresh = [age <= self._settings.limits.state_age for age in ages]
-        dry, faults = self._settings.dry_run, []
+        dry, faults = self._settings.dry_run, self._measured(phase, links)
         if phase in AIRBORNE and all(fresh):
             faults += self.estimators.update(samples, [one and one.health for one in healths], now)
         if phase in AIRBORNE and not dry:  # a dry run is never echoed
@@ -113,6 +117,24 @@ class Monitor:
             if low.update(state.battery < bounds.battery, now):
                 faults.append(Fault(Event.BATTERY, f"{name} at {state.battery:.2f} V"))
         return faults
+
+    def _measured(self, phase: State, links: Sequence[DroneLink]) -> list[Fault]:
+        """Streams that stand still, or that the IMU contradicts; watched on the ground as well, said in flight."""
+        found = []
+        for number, (name, link, watch) in enumerate(zip(NAMES, links, self._drones, strict=True)):
+            sample, sensed, clock = link.telemetry.newest, link.telemetry.sensed, link.telemetry.clock
+            still = watch.state(sample) if sample is not None else ""
+            wrong = ""
+            if sensed is not None:
+                repeated, wrong = watch.sensed(sensed.sensed, clock.seconds(sensed.stamp))
+                still = still or repeated
+            if still and phase in GUIDED and not self._settings.dry_run:
+                found.append(Fault(Event.ESTIMATOR, f"{name}: {still}"))
+            if wrong and phase in RISING:
+                found.append(Fault(Event.FRAME, f"{name}: {wrong}"))
+            if found and phase in AIRBORNE and (still or wrong):
+                self.estimators.trusted[number] = False
+        return found
 
     def _from_state(self, name: str, state: DroneState, limits: Limits, armed: bool) -> list[Fault]:
         if not np.isfinite([*state.position, *state.velocity, *state.quaternion, *state.rates]).all():
