@@ -61,7 +61,7 @@ class Repeats:
 
 
 WINDOW = 0.6  # [s] over which turns and ways are compared
-TURN = 0.03  # [rad] by which the measured turn may differ from the gyroscope's
+TURN = 0.035  # [rad] by which the measured turn may differ from the gyroscope's
 LATE = 0.04  # [s] that the measured attitude may be late against the gyroscope
 WAY = 0.04  # [m] likewise of the way beyond a steady speed, from the accelerometer
 CONTRADICTING = 0.1  # [s] for which it must differ
@@ -71,6 +71,7 @@ class _Moment(NamedTuple):
     """What is known at one packet."""
 
     time: float  # [s] of the firmware's clock
+    fresh: bool  # position and attitude are measured anew
     position: np.ndarray  # (3,) measured [m]
     quaternion: np.ndarray  # (4,) measured
     turned: np.ndarray  # (4,) since the beginning, by the gyroscope
@@ -101,27 +102,30 @@ class ImuWatch:
         turn = 0.5 * step * (sample.state.rates + before.state.rates)
         self._turned = rotations.integrate_quaternion(self._turned, turn)
 
-    def update(self, time: float, force: Sequence[float], position: np.ndarray, quaternion: np.ndarray) -> str:
+    def update(
+        self, time: float, force: Sequence[float], position: np.ndarray, quaternion: np.ndarray, fresh: bool = True
+    ) -> str:
         """What contradicts the IMU, empty if nothing: `force` (3,) [m/s2] at `time` [s] of the firmware's clock.
 
-        `position` (3,) [m] and `quaternion` (4,) are what is measured.
+        `position` (3,) [m] and `quaternion` (4,) are what is measured; not `fresh`: what was measured before.
         """
         if self._state is None or (self._moments and not 0 < time - self._moments[-1].time <= GAP):
             self._moments.clear()
             return ""
         felt = rotations.matrix_from_quaternion(quaternion) @ np.array(force) - np.array([0.0, 0.0, GRAVITY])
         rates = self._state.state.rates
-        self._moments.append(_Moment(time, position, quaternion, self._turned, rates, felt))
+        self._moments.append(_Moment(time, fresh, position, quaternion, self._turned, rates, felt))
         while time - self._moments[0].time > WINDOW:
             self._moments.popleft()
-        if time - self._moments[0].time < 0.9 * WINDOW:
+        known = [one for one in self._moments if one.fresh]
+        if not fresh or time - known[0].time < 0.7 * WINDOW:
             return ""
-        why = self._turn_fault() or self._way_fault()
+        why = self._turn_fault(known[0], known[-1]) or self._way_fault(known)
         self._wrong_since = min(self._wrong_since, time) if why else math.inf
         return why if time - self._wrong_since >= CONTRADICTING else ""
 
-    def _turn_fault(self) -> str:
-        first, last = self._moments[0], self._moments[-1]
+    @staticmethod
+    def _turn_fault(first: _Moment, last: _Moment) -> str:
         measured = relative(first.quaternion, last.quaternion)
         felt = relative(first.turned, last.turned)
         beside = relative(felt, measured)[1:]
@@ -131,16 +135,19 @@ class ImuWatch:
             return ""
         return f"its attitude turned {math.degrees(angle):.1f} degrees otherwise than its gyroscope within {WINDOW:g} s"
 
-    def _way_fault(self) -> str:
+    def _way_fault(self, known: Sequence[_Moment]) -> str:
         """The second difference of the position over half a window against the accelerometer's."""
-        first, last = self._moments[0], self._moments[-1]
-        times = np.array([one.time for one in self._moments])
-        middle = self._moments[int(np.argmin(np.abs(times - 0.5 * (first.time + last.time))))]
+        first, last = known[0], known[-1]
+        middle = min(known, key=lambda one: abs(one.time - 0.5 * (first.time + last.time)))
+        if not 0.5 <= (last.time - middle.time) / max(middle.time - first.time, 1e-9) <= 2.0:
+            return ""
+        felt_by = [one for one in self._moments if one.time >= first.time]
+        times = np.array([one.time for one in felt_by])
         after, before = last.time - middle.time, middle.time - first.time
         way = last.position - middle.position - (middle.position - first.position) * after / before
         # What an acceleration at each moment adds to that way [s]: it rises from the first to the middle, then falls.
         share = np.where(times > middle.time, last.time - times, (times - first.time) * after / before)
-        felt = np.trapezoid(share[:, None] * np.array([one.acceleration for one in self._moments]), times, axis=0)
+        felt = np.trapezoid(share[:, None] * np.array([one.acceleration for one in felt_by]), times, axis=0)
         beside = (way - felt)[self._axes]
         size = math.sqrt(float(beside @ beside))
         if size <= WAY:
@@ -157,7 +164,8 @@ class DroneWatch:
         self._pose = Repeats(("x", "y", "z", "attitude"))
         self.imu = ImuWatch(axes)
         self._seen: Sample | None = None
-        self._sensed = -math.inf
+        self._sensed = -math.inf  # [s] of the newest packet
+        self._measured: Sequence[object] = ()  # pose in it
 
     def state(self, sample: Sample) -> str:
         """What stands still in the drone's states, empty if nothing."""
@@ -174,12 +182,14 @@ class DroneWatch:
         """(what stands still, what contradicts the IMU) in a packet of `time` [s] of the firmware's clock."""
         if self._seen is None or time <= self._sensed:
             return "", ""
-        self._sensed = time
+        self._sensed, before = time, self._measured
+        self._measured = sensed[1:]
+        fresh = self._measured != before
         still = self._pose.update((*sensed.position, sensed.quaternion), time)
         place, attitude = np.array(sensed.position), unit(sensed.quaternion)
         if not self._pose.live:  # it measures by itself: what it makes of it must do
             place, attitude = self._seen.state.position, self._seen.state.quaternion
-        wrong = self.imu.update(time, sensed.force, place, attitude)
+        wrong = self.imu.update(time, sensed.force, place, attitude, fresh or not self._pose.live)
         return f"{still} of its measured pose stands still" if still else "", wrong
 
 

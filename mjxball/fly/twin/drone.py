@@ -49,7 +49,13 @@ class TwinDrone:
         self._estimated = 0  # [ms] of the estimate that an app sees
 
     def _new_peer(self) -> Peer:
-        return Peer(self.firmware, self._written, functools.partial(self._pair.receive_pose, self.number), self._estimator, self.app)
+        return Peer(
+            self.firmware,
+            self._written,
+            functools.partial(self._pair.receive_pose, self.number),
+            self._estimator,
+            self.app,
+        )
 
     def _new_app(self) -> App | None:
         self.beat = b""  # heartbeat that is on its way to the other drone

@@ -257,7 +257,7 @@ class Positioning:
         self._last: np.ndarray | None = None  # (7,) position [m], quaternion
 
     def disturb(self, what: str, value: float) -> None:
-        """See `Pair.disturb`: all poses "frozen" or "lost", "frozen z" alone, each "repeated" `value` times, a "jump"."""
+        """See `Pair.disturb`: "frozen" or "lost", "frozen z" alone, each "repeated" `value` times, a "jump"."""
         match what:
             case "frozen":
                 self._frozen[:] = bool(value)

@@ -241,4 +241,5 @@ class Onboard:
         acceleration = self.imu.filtered[:, :3].copy()
         known = (self.estimators[0], self.estimators[1])
         drive = self.pwm, self.power.requested, self.thrust
-        return Report(position, velocity, attitude, rates.copy(), acceleration, variance, known, *drive, self.poses.copy())
+        poses = self.poses.copy()
+        return Report(position, velocity, attitude, rates.copy(), acceleration, variance, known, *drive, poses)

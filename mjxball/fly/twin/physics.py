@@ -35,7 +35,7 @@ class Report(NamedTuple):
 
 
 def remembered(before: np.ndarray, position: np.ndarray, quaternion: np.ndarray | None) -> np.ndarray:
-    """A row of `Report.pose` after one more pose; without a `quaternion` (w, x, y, z) that of the row `before` stays."""
+    """The row `before` of `Report.pose` after one more pose; without a `quaternion` (w, x, y, z) the old one stays."""
     turned = before[3:] if quaternion is None else np.roll(quaternion, -1)
     return np.concatenate([position, turned])
 
@@ -221,6 +221,8 @@ class StandIn:
         pwm = np.stack([motors.compensated(motors.MOTORS["2.1"], self._commands, battery)] * 4, axis=1)
         position, velocity = self._position + arms, self._velocity + swing
         quaternion, rates, force = (np.stack([one] * 2) for one in (self._quaternion, self._rates, felt))
+        motion = position, velocity, quaternion, rates, force
+        drive = pwm, pwm, self._commands
         return PairState(
             position=position,
             velocity=velocity,
@@ -228,10 +230,7 @@ class StandIn:
             rates=rates,
             specific_force=force,
             battery=battery,
-            report=Report(
-                *(position, velocity, quaternion, rates, force, np.full((2, 9), 1e-5), (2, 2), pwm, pwm, self._commands),
-                self._poses.copy(),
-            ),
+            report=Report(*motion, np.full((2, 9), 1e-5), (2, 2), *drive, self._poses.copy()),
         )
 
 

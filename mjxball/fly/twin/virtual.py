@@ -103,9 +103,7 @@ class VirtualLink:
             self.telemetry.health = HealthSample(health, now)
         elif logged and len(datagram) == 5 + _SENSED.size and datagram[1] == SENSED_BLOCK:
             seen = zip((name for name, _ in packets.SENSED), _SENSED.unpack(datagram[5:]), strict=True)
-            self.telemetry.sensed = SensedSample(
-                packets.sensed_of(dict(seen)), int.from_bytes(datagram[2:5], "little")
-            )
+            self.telemetry.sensed = SensedSample(packets.sensed_of(dict(seen)), int.from_bytes(datagram[2:5], "little"))
         elif logged and len(datagram) == 5 + len(APP_VARIABLES) and datagram[1] == APP_BLOCK:
             self.telemetry.app = sample_of(
                 dict(zip((name for name, _ in APP_VARIABLES), datagram[5:], strict=True)), now
