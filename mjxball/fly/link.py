@@ -104,7 +104,7 @@ class Link:
         return None if found is None else Element(found.ident, found.pytype, found.access == found.RO_ACCESS)
 
     def start_states(self) -> None:
-        """Have state, what is sensed and health sent at 100, 50 and 20 Hz; wait for the first state. Raises LinkError."""
+        """Have state, what is sensed and health sent at 100, 50, 20 Hz; wait for the first state. Raises LinkError."""
         block = self._log_block("state", packets.STATE_VARIABLES, 10)
         self._block = block.id
         self._crazyflie.add_header_callback(self._receive, LOG_PORT, LOG_DATA)

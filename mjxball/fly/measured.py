@@ -60,10 +60,10 @@ class Repeats:
         return still[0] if still and self.live else ""
 
 
-WINDOW = 0.6  # [s] over which turns and ways are compared
+WINDOW = 1.2  # [s] over which turns and ways are compared
 TURN = 0.035  # [rad] by which the measured turn may differ from the gyroscope's
 LATE = 0.04  # [s] that the measured attitude may be late against the gyroscope
-WAY = 0.04  # [m] likewise of the way beyond a steady speed, from the accelerometer
+WAY = 0.08  # [m] likewise of the way beyond a steady speed, from the accelerometer
 CONTRADICTING = 0.1  # [s] for which it must differ
 
 
