@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjxball.fly import command, packets
+from mjxball.fly import command, packets, probe
 from mjxball.fly.card import Commands, Controller
 from mjxball.fly.command import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
 from mjxball.fly.display import View
@@ -104,6 +104,8 @@ class Flight:
         self._read(now)
         faults = self._from_outside(missed, gap)
         faults += self._monitor.update(self.supervisor.state, self.links, self._ages, now)
+        if self._mocap is not None and any(fault.event is Event.FRAME for fault in faults):
+            self._mocap.halt()
         mapped, broken = self._command()
         self._advance(faults + broken + self._progress())
         self._note_ending(faults + broken, gap)
@@ -175,7 +177,9 @@ class Flight:
 
     def _stands(self) -> bool:
         seen, times = self._trusted(), self.settings.times
-        return seen is not None and self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
+        if seen is None:  # nothing tells: by the time that the blind way down takes, with some to spare
+            return self.elapsed >= len(self._shares) * self.settings.period + times.settled
+        return self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
 
     # What the laws want.
 
@@ -187,10 +191,11 @@ class Flight:
             seen = object_state(self._states, self.rig)
             if self.supervisor.state is State.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
-                self.succession.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
+                one, other = (s.thrust / c.hover_thrust for s, c in zip(self._sent, self.maps, strict=True))
+                self.succession.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion), (one, other))
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(self._now))
-            laws = (self._commands.leader, self._commands.follower)
+            laws = [law + self._probe() for law in (self._commands.leader, self._commands.follower)]
             mapped = [command.to_setpoint(law, constants) for law, constants in zip(laws, self.maps, strict=True)]
         except (PacketError, ValueError, FloatingPointError) as error:
             return None, [Fault(Event.BAD_STATE, str(error))]
@@ -204,10 +209,20 @@ class Flight:
     def goal(self, now: float) -> np.ndarray:
         """Goal of O (3,) at `now` [m]; while landing it sinks, far below the ground, since the laws lag behind it."""
         goal = self._monitor.origin + np.array(self.settings.goal)
+        if self._probes:
+            goal[2] = self._monitor.origin[2] + min(self.settings.goal[2], probe.HEIGHT)
         if self.supervisor.state is State.LAND:
             sunk = self.settings.times.land_speed * (now - self.supervisor.since)
             goal[2] = max(self._monitor.origin[2] + self._land_height - sunk, self._monitor.origin[2] - 1.0)
         return goal
+
+    @property
+    def _probes(self) -> bool:
+        """True at the begin of a flight on motion capture, whose axes no flight has shown to be right."""
+        return self._mocap is not None and self.supervisor.state is State.FLY and self.elapsed < probe.TIME
+
+    def _probe(self) -> np.ndarray:
+        return probe.command(self.elapsed, self.rig.span) if self._probes else np.zeros(3)
 
     # What comes next.
 

@@ -135,6 +135,7 @@ class Mocap:
         self._span = span
         self._links: list[Link | None] = [None, None]
         self.note: Note = lambda kind, t=None, **fields: None  # the log's, of gaps and of what is forwarded
+        self._halted = False
         self.guarding = False  # a pose far from the drone's own estimate is not sent; before, the estimate follows it
         self._noted = [-math.inf, -math.inf]
         self._gap = [False, False]
@@ -217,6 +218,10 @@ class Mocap:
                 self.note("gap", drone=NAMES[number], begins=gap, age=track.age(now), text=text if gap else "")
         return supervision.faults(tracks, now, self.limits)
 
+    def halt(self) -> None:
+        """Send no more poses: they are in wrong axes, and without any an estimator knows its attitude for longer."""
+        self._halted = True
+
     def take(self, frame: Frame, now: float | None = None) -> None:
         """One frame, in the reader's thread: check it, send what is fit to be sent."""
         before, now = self.tracks, time.monotonic() if now is None else now
@@ -228,7 +233,7 @@ class Mocap:
                 self._forward(number, new.good, now)
 
     def _forward(self, number: int, pose: Pose, now: float) -> None:
-        if (link := self._links[number]) is None:
+        if (link := self._links[number]) is None or self._halted:
             return
         link.pose(packets.pose_packet(pose.position, pose.quaternion))
         if now - self._noted[number] >= 0.75 * NOTE_PERIOD:

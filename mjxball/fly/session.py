@@ -21,6 +21,7 @@ from mjxball.fly.command import CurveName, Variants
 from mjxball.fly.display import Display, listening
 from mjxball.fly.flight import Flight
 from mjxball.fly.flight_log import Journal
+from mjxball.fly.handover import LEAST, SETTLING
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
@@ -186,6 +187,8 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
         _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
     late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
     _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
+    if supervisor.cause is None and not (flown or flight.settings.dry_run):
+        _say(f"no error of the flight: it takes {SETTLING:g} s to settle and {LEAST:g} s to measure (--seconds)")
     for name, figures in flight.succession.figures.items():
         if figures.ticks * flight.settings.period < ENOUGH:
             continue

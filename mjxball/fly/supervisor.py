@@ -53,6 +53,7 @@ class Event(Enum):
     TILT = "a drone tilts beyond the limit"
     STICK = "the two positions contradict the stick: its length or its tilt"
     ESTIMATOR = "an estimator's position cannot be trusted"
+    FRAME = "what is measured of a drone moves otherwise than its IMU feels"
     BATTERY = "a battery is low"
     LIFT = "a battery will not carry its drone to the end of a landing"
     SATURATED = "thrust has been at its bound for too long"
@@ -86,7 +87,9 @@ ENDED = (S.STOP, S.KILL, S.DONE)
 
 # What goes as planned; and after what the pair sinks under control.
 PLANNED = frozenset({E.READY, E.ARMED, E.CURVE_KNOWN, E.HOVERING, E.TIME_UP, E.RESUMED, E.TOUCHED_DOWN, E.GROUNDED})
-_CONTROLLED = (E.BAD_STATE, E.FENCE, E.LIFT, E.SATURATED, E.DEADLINES, E.STICK, E.ESTIMATOR, E.APP_DESCENDS, E.POSE)
+_CONTROLLED = (
+    *(E.BAD_STATE, E.FENCE, E.LIFT, E.SATURATED, E.DEADLINES, E.STICK, E.ESTIMATOR, E.FRAME, E.APP_DESCENDS, E.POSE),
+)
 
 
 def _planned() -> dict[tuple[State, Event], State]:
