@@ -42,6 +42,7 @@ from mjxball.evaluate.benchmark import Score, by_variant, run_benchmark
 from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.variants import Suite, Variant
 from mjxball.policy.file import shipped_policy
+from mjxball.reading import parse_json
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
 
@@ -80,7 +81,7 @@ class Level(Variant):
 def read_levels() -> list[Suite]:
     """The suites of levels.json."""
     suites: dict[str, list[Level]] = {}
-    for row in json.loads(LEVELS.read_text()):
+    for row in parse_json(LEVELS.read_text()):
         flights = []
         for flight in row["flights"]:
             numbers = {name: tupled(value) for name, value in flight.items() if name != "disturbance"}

@@ -80,7 +80,7 @@ class Course:
         sensors, self._delays = sensors_of(disturbances, period, axis)
         step = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
         self._loop = ClosedLoop(config, jax.vmap(step), sensors)
-        known = rollout.load_of(flights, config.plant.count), rollout.start_of(config, flights)
+        known = rollout.load_of(config, flights), rollout.start_of(config, flights)
         known = (*known, record(disturbances, self.count + 2, period, axis).at(0))
         self._load, self._start, self._sample = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), known)
         self._limits = jnp.array([config.command.tilt_limit, config.command.tilt_limit, VERTICAL_LIMIT])

@@ -96,6 +96,8 @@ FAULTS: dict[str, Injection] = {
     "reported state frozen": injected("frozen"),
     "clock stopped": injected("clock"),
     "battery sags to 3.0 V": injected("sag"),
+    "both batteries sag to 3.0 V": both("sag"),
+    "battery loses 0.5 V/s": injected("fade"),
     "battery reads 1.2 V less": injected("battery"),
     "thrust 10 % weaker": injected("weak"),
     "drone crashed": injected("crash"),

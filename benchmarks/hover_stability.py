@@ -70,7 +70,7 @@ def linearised(
             Scenario(omega=0.0, phase=np.pi / 2, amplitude=offset, mass=mass, believed_mass=believed)
             for offset, mass, believed in cases
         ]
-        loads = jax.tree.map(jnp.asarray, rollout.load_of(scenarios))
+        loads = jax.tree.map(jnp.asarray, rollout.load_of(config, scenarios))
 
         def of_one(own: Any) -> tuple[Array, Array, Array]:
             start, step = closed_loop(config, law(own), delay)

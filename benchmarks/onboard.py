@@ -26,7 +26,7 @@ from mjxball.fly.app.generate import CORE, options, rig_header, sources
 from mjxball.fly.card import config_of
 from mjxball.policy import Policy, PolicyFile
 from mjxball.policy.file import law_of, load_file, shipped_policies
-from mjxball.policy.formats.c_header import c_header, footprint
+from mjxball.policy.formats.c_header import APP, c_header, footprint
 
 FLIGHT = 500  # steps of a flight
 PAIR = Path("pair")  # the plant of a policy that has to be told its team
@@ -84,7 +84,7 @@ def flown(policy: PolicyFile, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 def compare(policy: PolicyFile, place: Path, int8: bool, steps: int) -> dict[str, Any]:
     """Both machines and NumPy on `steps` observations."""
-    (place / "policy.h").write_text(c_header(policy, "follower", int8))
+    (place / "policy.h").write_text(c_header(policy, "follower", int8, APP))
     cortex.build(place, MAIN, options(int8))
     records, actions = flown(policy, steps)
     host, arm = cortex.on_both(place, records.tobytes())

@@ -29,6 +29,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 import numpy as np
 
 from mjxball.cache import enable_compilation_cache
+from mjxball.commands.retrain import FlightReplay, situation
 from mjxball.fly import flight_log
 from mjxball.fly.card import config_of
 from mjxball.fly.limits import FlightSettings
@@ -38,7 +39,6 @@ from mjxball.fly.twin.conditions import AddedLoad, Surroundings
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, load_file, shipped_policy
 from mjxball.rig.load import LoadWatch
-from mjxball.rig.retrain import FlightReplay, situation
 from mjxball.train.fine_tune import MOST_STEPS, FineTuned, FineTuner
 
 ROOT = Path(__file__).parents[1]

@@ -41,6 +41,7 @@ from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy
 from mjxball.policy.network import Network
 from mjxball.policy.policy import NetworkLaw
+from mjxball.reading import parse_json
 from mjxball.sim.scenario import Scenario
 
 Array = Any
@@ -119,7 +120,7 @@ def of_levels(config: Config, policies: list[Policy]) -> list[dict[str, Any]]:
         for found, flown in zip(metrics, fly(own, policies, scenarios), strict=True):
             for name, one in zip(names, flown, strict=True):
                 found.setdefault(name, []).append(one)
-    recorded, rows = json.loads(RECORDED.read_text()), []
+    recorded, rows = parse_json(RECORDED.read_text()), []
     for found in metrics:
         counts, levels = dict.fromkeys(balance.METRICS, 0), []
         for row in recorded["levels"]:
@@ -137,7 +138,7 @@ def of_levels(config: Config, policies: list[Policy]) -> list[dict[str, Any]]:
 
 def of_cells(config: Config, policies: list[Policy]) -> list[dict[str, Any]]:
     """Of every policy: the cells that it meets, those beyond trim, changes of its commands."""
-    every, recorded = cells.feasible(config), json.loads(RECORDED.read_text())
+    every, recorded = cells.feasible(config), parse_json(RECORDED.read_text())
     calm = cells.fly(make_baseline("lqg", config), every, {}, False, PHASES)
     beyond = {(tuple(row["cell"]), row["disturbed"]): row for row in recorded["beyond trim"]}
     rows: list[dict[str, Any]] = [{"cells": [], "beyond trim": [], "commands": []} for _ in policies]

@@ -2,8 +2,8 @@
 
 CG positions are spread evenly over the carrier's disc, masses are those of `MASSES` times the number of drones. A load
 is trimmed if `mjxball.plant.trim` finds 15 % margin; a lost follower's rotors stand still. The leader lifts its share
-of the load as its hover law asks, which is PD at the goal; or its rotors help like the followers'. The second table
-gives the rotors of `team4` any size.
+of the load as its hover law asks, which is PD at the goal; or its rotors help like the followers'. Limits are
+those of the rotors alone, or of the commands too. The second table gives the rotors of `team4` any size.
 
     python benchmarks/trim.py --json benchmarks/results/trim.json
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mjxball.config import Plant, preset, with_plant
+from mjxball.config import Config, Plant, preset, with_plant
 from mjxball.plant.trim import largest_margin
 
 TEAMS = ("team3", "team4", "team6")
@@ -36,20 +36,21 @@ def positions(plant: Plant) -> np.ndarray:
     return np.vstack([[(0.0, 0.0)], rings.reshape(-1, 2)])
 
 
-def margins(plant: Plant, lost: tuple[int, ...], leader_helps: bool) -> np.ndarray:
+def margins(rig: Plant | Config, lost: tuple[int, ...], leader_helps: bool) -> np.ndarray:
     """Largest margin of every mass and CG position (masses, positions); the first position is O."""
+    plant = rig if isinstance(rig, Plant) else rig.plant
     return np.array(
         [
-            [largest_margin(plant, mass * plant.count, cg, None, lost, leader_helps).margin for cg in positions(plant)]
+            [largest_margin(rig, mass * plant.count, cg, None, lost, leader_helps).margin for cg in positions(plant)]
             for mass in MASSES
         ]
     )
 
 
-def losses(plant: Plant, leader_helps: bool) -> np.ndarray:
+def losses(rig: Plant | Config, leader_helps: bool) -> np.ndarray:
     """`margins` with each follower lost in turn (followers, masses, positions)."""
-    followers = [number for number in range(plant.count) if number != plant.leader]
-    return np.array([margins(plant, (number,), leader_helps) for number in followers])
+    plant = rig if isinstance(rig, Plant) else rig.plant
+    return np.array([margins(rig, (number,), leader_helps) for number in plant.followers])
 
 
 def shares(found: np.ndarray, margin: float) -> dict[str, float]:
@@ -57,14 +58,15 @@ def shares(found: np.ndarray, margin: float) -> dict[str, float]:
     return {"with margin": float((found >= margin).mean()), "without": float((found >= 0).mean())}
 
 
-def measure(name: str, plant: Plant, leader_helps: bool, margin: float) -> dict[str, object]:
+def measure(name: str, rig: Plant | Config, leader_helps: bool, margin: float) -> dict[str, object]:
     """One row of the first table."""
-    each = losses(plant, leader_helps)
+    each = losses(rig, leader_helps)
     return {
         "plant": name,
+        "limits": "rotors" if isinstance(rig, Plant) else "commands",
         "leader": "helps" if leader_helps else "hover law",
         "loads": each[0].size,
-        "all drones": shares(margins(plant, (), leader_helps), margin),
+        "all drones": shares(margins(rig, (), leader_helps), margin),
         "one follower lost": shares(each, margin),
         "any one lost": shares(each.min(axis=0), margin),
     }
@@ -88,21 +90,21 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     started, paper = time.process_time(), preset("paper")
-    plants, margin = {name: with_plant(paper, name).plant for name in TEAMS}, paper.scenario.trim_margin
+    teams, margin = {name: with_plant(paper, name) for name in TEAMS}, paper.scenario.trim_margin
     kinds = ("all drones", "one follower lost", "any one lost")
     rows, sizes = [], []
     print(f"shares of loads that can be trimmed with a margin of {margin:g} (in brackets: with none)")
-    print(f"{'plant':>6} {'leader':>10}" + "".join(f"{kind:>20}" for kind in kinds))
+    print(f"{'plant':>6} {'leader':>10} {'limits':>9}" + "".join(f"{kind:>20}" for kind in kinds))
     for helps in (False, True):
-        for name, plant in plants.items():
-            row = measure(name, plant, helps, margin)
+        for name, rig in ((name, rig) for name, team in teams.items() for rig in (team.plant, team)):
+            row = measure(name, rig, helps, margin)
             rows.append(row)
             figures = "".join(f"{row[kind]['with margin']:>12.1%} ({row[kind]['without']:5.1%})" for kind in kinds)
-            print(f"{name:>6} {row['leader']:>10}{figures}", flush=True)
+            print(f"{name:>6} {row['leader']:>10} {row['limits']:>9}{figures}", flush=True)
     print("team4, one follower lost, leader on its hover law")
     print(f"{'rotors':>8}{'one lost':>20}{'any one lost':>20}{'largest margin':>16}{'CG at O':>10}")
     for largest in ROTORS:
-        row = resized(plants["team4"], largest, margin)
+        row = resized(teams["team4"].plant, largest, margin)
         sizes.append(row)
         figures = "".join(f"{row[kind]['with margin']:>12.1%} ({row[kind]['without']:5.1%})" for kind in kinds[1:])
         best = f"{row['largest margin that any one leaves']:16.3f}{row['largest margin of CG at O']:10.3f}"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 from typing import Any
+
+from mjxball.xla import check_address_space
 
 VARIABLE = "MJXBALL_CACHE"
 
@@ -15,7 +18,10 @@ def cache_directory() -> Path | None:
     if chosen is not None:
         return None if chosen.lower() in ("", "off", "0") else Path(chosen)
     base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "mjxball" / "jax"
+    try:
+        return (Path(base) if base else Path.home() / ".cache") / "mjxball" / "jax"
+    except RuntimeError:  # whoever has no home directory
+        return None
 
 
 def traced_directory() -> Path | None:
@@ -33,6 +39,7 @@ def _directory_of_jax() -> str | None:
 
 def enable_compilation_cache() -> Path | None:
     """Turn the cache on, unless JAX was told of one or it is switched off; return its directory if it is ours."""
+    check_address_space()
     import jax
 
     place = cache_directory()
@@ -40,8 +47,13 @@ def enable_compilation_cache() -> Path | None:
         return None
     try:
         place.mkdir(parents=True, exist_ok=True)
+        usable = os.access(place, os.R_OK | os.W_OK | os.X_OK)
     except OSError:
-        return None  # a read-only home is no reason not to train
+        usable = False
+    if not usable:
+        text = f"warning: {place} cannot be written: nothing compiled is kept; set {VARIABLE} to another directory"
+        print(text, file=sys.stderr)  # noqa: T201
+        return None
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

@@ -16,7 +16,9 @@ from pathlib import Path
 from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
+from mjxball.xla import explained
 
+FAULT = 3  # exit code after an error of the program, where 1 is a result
 EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that another extra than `train` brings
 
 
@@ -90,10 +92,19 @@ def run_command(command: Callable[[], int]) -> int:
         extra = EXTRAS.get(error.name or "", "train")
         print(f"error: {error.name} is not installed; pip install 'mjxball[{extra}]'", file=sys.stderr)  # noqa: T201
         return 2
+    except (MemoryError, RuntimeError, AssertionError) as error:
+        why = explained(error)
+        if why is None:
+            raise
+        print(f"error: {why}", file=sys.stderr)  # noqa: T201
+        return 2
 
 
-def output_directory(path: Path) -> Path:
-    """Return `path` if it does not exist or is an empty directory, else raise InputError. Creates nothing."""
+def output_directory(path: Path, but: Sequence[str] = ()) -> Path:
+    """Return `path` if it does not exist or is an empty directory, else raise InputError. Creates nothing.
+
+    Files called as in `but` do not count.
+    """
     if (path.exists() or path.is_symlink()) and not path.is_dir():
         raise InputError(f"output directory {path} exists and is no directory")
     above = next(parent for parent in path.absolute().parents if parent.exists())
@@ -101,7 +112,7 @@ def output_directory(path: Path) -> Path:
         raise InputError(f"output directory {path} would lie below the file {above}")
     if not os.access(path if path.exists() else above, os.W_OK):
         raise InputError(f"output directory {path} cannot be written")
-    if path.is_dir() and any(path.iterdir()):
+    if path.is_dir() and any(one.name not in but for one in path.iterdir()):
         raise InputError(f"output directory {path} exists and is not empty; choose another with --out")
     return path
 
@@ -135,11 +146,14 @@ def add_config_flags(parser: argparse.ArgumentParser) -> None:
 
 def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> configs.Config:
     """Return `config` with the settings of `--plant FILE` and every `--<path> VALUE` that was given, validated."""
-    config = apply_plant(config, options.plant)
-    for name, text in vars(options).items():
-        if name.startswith("config:") and text is not None:
-            config = configs.override(config, name.removeprefix("config:"), text)
-    return configs.validate(config)
+    flags = {
+        name.removeprefix("config:"): text
+        for name, text in vars(options).items()
+        if name.startswith("config:") and text is not None
+    }
+    if options.plant is not None:
+        read_plant(options.plant)
+    return configs.with_plant(config, options.plant, flags)
 
 
 def read_plant(path: Path) -> configs.PlantFile:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from mjxball.cli import collect_seldom, quit_on_interrupt, run_command, switch_often
+import traceback
+from collections.abc import Callable
+
+from mjxball.cli import FAULT, collect_seldom, quit_on_interrupt, run_command, switch_often
 
 
 def train() -> int:
@@ -16,7 +19,7 @@ def train() -> int:
 
         return main()
 
-    return run_command(command)
+    return _exit_code(command)
 
 
 def evaluate() -> int:
@@ -29,4 +32,13 @@ def evaluate() -> int:
 
         return main()
 
-    return run_command(command)
+    return _exit_code(command)
+
+
+def _exit_code(command: Callable[[], int]) -> int:
+    """That of `command`; `FAULT` after an error of the program's own: 1, which Python would say, is a result."""
+    try:
+        return run_command(command)
+    except Exception:
+        traceback.print_exc()
+        return FAULT

@@ -18,6 +18,7 @@ from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
 from mjxball.control.multi_model_lqg import team_geometry
 from mjxball.control.team_lqg import team_context
+from mjxball.errors import InputError
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
 from mjxball.physics.motion import object_mass
@@ -79,8 +80,8 @@ class TransportEnv:
     Of a pair observations are (n,), actions (3,) and the reward (). Of F > 1 followers they are (F, n), (F, 3) and
     (F,), each in its mount frame; worlds of smaller teams are padded to the plant's drones (`scenario.team_sizes`).
 
-    `reset` draws goal, start, CG motion and object mass anew. `step` takes the network's action in
-    [-1, 1] (3,). An episode terminates at |e_o| > d_term or when the world diverges, and is truncated at
+    `reset` draws goal, start, CG motion and object mass anew. `step` takes the network's action (3,) and clips it to
+    [-1, 1]. An episode terminates at |e_o| > d_term or when the world diverges, and is truncated at
     `timing.episode_steps`: `done` is 1 in both cases, `info["truncation"]` only in the second. Inside Brax's
     EpisodeWrapper the wrapper keeps the time. A non-finite action counts as divergence.
     """
@@ -178,14 +179,18 @@ class TransportEnv:
         return State(world, seen, reward, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Float[Array, "... actions"], physics: ControlStep | None = None) -> State:
-        """Apply the network's `action` in [-1, 1] for one control period, with `physics` in place of the engine.
+        """Apply the network's `action` for one control period, with `physics` in place of the engine.
 
-        What a recurrent network remembers is part of the state and of the observation: it is then a function without
-        memory, whose answer (..., 3 + H) ends with its next state.
+        What lies outside [-1, 1] is clipped: followers, history and reward know no more. What a recurrent network
+        remembers is part of the state and of the observation: it is then a function without memory, whose answer
+        (..., 3 + H) ends with its next state. Raises InputError, as JAX traces it, for an action of another shape.
         """
         world: PipelineState = state.pipeline_state
+        shape = (*self._followers, self.action_size)
+        if jnp.shape(action) != shape:
+            raise InputError(f"an action of one world must have shape {shape}, not {jnp.shape(action)}")
         finite = jnp.all(jnp.isfinite(action))
-        action = jnp.where(finite, action, jnp.zeros_like(action)) * self._commanded
+        action = jnp.where(finite, jnp.clip(action, -1.0, 1.0), jnp.zeros_like(action)) * self._commanded
         command, memory = self._answered(action, self._observed(state), world.history, world.known)
         return self._step(state, command, memory, action, ~finite | world.loop.diverged, 1.0, physics)
 

@@ -21,7 +21,8 @@ from mjxball.config import Config
 from mjxball.control.motors import firmware
 from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
-from mjxball.policy.file import PolicyFile, law_of, load_file, save_file, write_whole
+from mjxball.files import write_whole
+from mjxball.policy.file import PolicyFile, law_of, load_file, save_file
 from mjxball.policy.mean import mean_policy
 from mjxball.policy.policy import context_of, not_told
 

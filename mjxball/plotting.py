@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
+from pathlib import Path
 from typing import Any
+
+from mjxball.files import write_whole
 
 
 def pyplot() -> Any:
@@ -13,3 +17,10 @@ def pyplot() -> Any:
     import matplotlib.pyplot as plt
 
     return plt
+
+
+def save(figure: Any, path: Path) -> None:
+    """Write the picture `path`, whole or not at all; its ending is the format."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format=path.suffix.removeprefix("."), dpi=110)
+    write_whole(path, stream.getvalue())

@@ -12,6 +12,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from mjxball.xla import check_address_space
+
 FOR_MESHES = ("trimesh", "scipy.spatial")  # what MJX imports for meshes alone: that takes as long as JAX
 
 
@@ -81,6 +83,7 @@ def import_jax() -> ModuleType:
 
     It need not where no directory of that name is there.
     """
+    check_address_space()
     if any(place.is_dir() and any(place.glob("jax_rocm*")) for place in map(Path, sys.path)):
         return importlib.import_module("jax")
     search = importlib.metadata.distributions

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
+import warnings
 from typing import Any
 
 import mujoco
@@ -11,6 +13,7 @@ import numpy as np
 
 from mjxball.assembly import BALL_JOINTS, build_spec
 from mjxball.config import Plant
+from mjxball.errors import InputError
 
 Array = Any
 GOAL_COLOUR = (0.18, 0.62, 0.27, 0.55)
@@ -39,7 +42,7 @@ class Scene:
         self._camera = mujoco.MjvCamera()
         self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, AZIMUTH, ELEVATION
         self._camera.lookat[:] = look_at
-        self._renderer = mujoco.Renderer(self._model, *size)
+        self._renderer = _renderer(self._model, size)
 
     def move_goal(self, goal: Array, look_at: Array) -> None:
         """Put the goal at `goal` (3,) [m] and turn the camera to `look_at` (3,) [m]."""
@@ -87,3 +90,21 @@ def _light(spec: mujoco.MjSpec, plant: Plant) -> None:
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35, 0.35, 0.35], [0.30, 0.30, 0.30]
     spec.visual.headlight.specular = [0.1, 0.1, 0.1]
     spec.visual.map.haze = 0.0
+
+
+def _renderer(model: mujoco.MjModel, size: tuple[int, int]) -> mujoco.Renderer:
+    """MuJoCo's, or InputError with the variable that chooses another GL library."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # GLFW says in other words what the sentence below does
+            return mujoco.Renderer(model, *size)
+    except Exception as error:  # of every GL library another one
+        chosen = os.environ.get("MUJOCO_GL")
+        now = (
+            f"MUJOCO_GL={chosen} does not work here"
+            if chosen
+            else "MUJOCO_GL is not set, and without it a display is needed"
+        )
+        raise InputError(
+            f"MuJoCo cannot render: {now}; set MUJOCO_GL to egl or osmesa before Python starts ({error})"
+        ) from error

@@ -1,8 +1,13 @@
-"""A flag of XLA's, which reads its flags once, when JAX finds its devices."""
+"""What XLA is told, once, before JAX finds its devices, and what its errors mean to a user."""
 
 from __future__ import annotations
 
 import os
+import resource
+import sys
+from typing import Any
+
+from mjxball.errors import InputError
 
 # On CPUs a loop whose body touches fewer bytes than that becomes one function of LLVM's, instead of one for each
 # operation of its body, called by XLA's runtime, which takes longer than the operation if that has dozens of numbers.
@@ -14,3 +19,45 @@ def compile_small_loops_whole() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SMALL_LOOPS}".strip()
+
+
+def explained(error: BaseException) -> str | None:
+    """What a user can do about an `error` of JAX's, a sentence; None if it is nothing of the kind.
+
+    Without a device of `JAX_PLATFORMS` JAX fails in many ways, one of them an assertion without a word.
+    """
+    jax: Any = sys.modules.get("jax")
+    if isinstance(error, MemoryError):
+        return "there is not enough memory; make it smaller, or see `ulimit -v` and other programs"
+    if jax is None or not hasattr(jax, "devices"):
+        return None
+    if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error):
+        return f"there is not enough memory: {str(error).splitlines()[0][:200]}"
+    try:
+        jax.devices()
+    except Exception as missing:  # RuntimeError or AssertionError, as the platform may be
+        wanted, why = jax.config.jax_platforms, (str(missing).splitlines() or [""])[0][:200]
+        return f"JAX has no device of JAX_PLATFORMS={wanted}; unset that or say cpu{': ' if why else ''}{why}"
+    return None
+
+
+ADDRESS_SPACE = 2.5e9  # [B] that JAX, its compiler and their threads reserve; with less they hang or abort
+
+
+def check_address_space() -> None:
+    """Refuse to start JAX below a limit in which it would hang or abort without a word. Raises InputError."""
+    limit, needed = resource.getrlimit(resource.RLIMIT_AS)[0], ADDRESS_SPACE / 1e9
+    if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE:
+        raise InputError(
+            f"the limit of address space, ulimit -v, is {limit / 1e9:.3g} GB, and JAX needs {needed:g} GB and what the "
+            "arrays take: raise it, or say ulimit -v unlimited"
+        )
+
+
+def room_in_address_space() -> float:
+    """What this process may still reserve [B]."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit == resource.RLIM_INFINITY:
+        return float("inf")
+    with open("/proc/self/statm", encoding="ascii") as stream:
+        return limit - int(stream.read().split()[0]) * resource.getpagesize()

@@ -10,6 +10,7 @@ from conftest import CompiledEnv, with_settings
 
 from mjxball.config import Config
 from mjxball.env import TransportEnv
+from mjxball.errors import InputError
 from mjxball.quiet import import_brax_env
 
 import_brax_env()  # silently, before Brax's wrappers import it with its notes
@@ -171,6 +172,16 @@ def test_an_action_that_is_not_finite_leaves_a_finite_state(remembering_pair: Co
     assert float(after.metrics["diverged"]) == 1.0
     assert (float(after.done), float(after.info["truncation"])) == (1.0, 0.0)
     assert finite((after.obs, after.reward, after.metrics, after.pipeline_state))
+
+
+def test_actions_are_clipped_to_the_box(remembering_pair: CompiledEnv):
+    """Also in the history, in the reward and in what critics are told."""
+    before, within = remembering_pair.reset(jax.random.key(8)), jnp.array([1.0, -1.0, 0.25])
+    inside, outside = (remembering_pair.step(before, action) for action in (within, within * jnp.array([7.0, 3e38, 1])))
+    jax.tree.map(np.testing.assert_array_equal, outside, inside)
+    np.testing.assert_array_equal(inside.pipeline_state.action, within)
+    with pytest.raises(InputError, match=r"shape \(3,\), not \(1, 3\)"):
+        jax.eval_shape(remembering_pair.env.step, before, within[None])
 
 
 def test_batch_of_worlds_equals_single_worlds(fast_pair: CompiledEnv):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tables import rows
 
 from mjxball.fly import command
 from mjxball.fly.command import LINEAR, OLDER, CommandMap, ForceCurve
@@ -81,6 +82,40 @@ def test_a_descent_holds_its_speed() -> None:
     assert shares == sorted(shares)
     assert shares[2] < 1 < shares[4]
     assert (shares[0], shares[3], shares[5]) == pytest.approx((0.7, 1.0, 1.1))
+
+
+def test_the_trim_follows_the_thrust_within_bounds() -> None:
+    """A running average over a second, never beyond 15 % of the thrust that should hover, however it is driven."""
+    hover, period = 50000.0, 0.01
+    for thrust, bound in ((60000.0, 57500.0), (10001.0, 42500.0), (51000.0, 51000.0)):
+        trim, path = hover, []
+        for _ in range(2000):
+            trim = command.smoothed(trim, thrust, period, hover)
+            path.append(trim)
+        assert trim == pytest.approx(bound, rel=1e-6)
+        assert (min(path), max(path)) == (pytest.approx(min(path[0], bound)), pytest.approx(max(path[0], bound)))
+        # Before a bound is met: 1 - exp(-t) of the way.
+        early = hover + (thrust - hover) * (1 - math.exp(-20 * period))
+        assert path[19] == pytest.approx(min(max(early, 42500.0), 57500.0), rel=1e-9)
+    # A trim that is out of bounds already comes back at once.
+    assert command.smoothed(80000.0, hover, period, hover) == pytest.approx(57500.0)
+    assert command.smoothed(0.0, hover, period, hover) == pytest.approx(42500.0)
+
+
+@rows("height, climb, left", [(0.4, 0.0, 1.75), (0.4, -0.3, 1.0), (0.8, 0.0, 1.75), (0.1, 0.0, 0.7), (0.0, 0.0, 1.0)])
+def test_a_timed_descent_stands_in_time(height: float, climb: float, left: float) -> None:
+    """Although one of two drones keeps its thrust, where physics lets it: 0.75 m/s2 of what is measured at most."""
+    period, touched, within = 0.01, math.inf, 0.0
+    for number in range(round(left / period)):
+        share = command.timed_share(height, climb, left - number * period)
+        assert abs(share - 1) <= command.UNEVEN / command.GRAVITY + 1e-9
+        climb += 0.5 * (share - 1) * command.GRAVITY * period
+        height += climb * period
+        if height <= 0 and math.isinf(touched):
+            touched, within = number * period, -climb
+            break
+    assert touched < left
+    assert within < 1.2
 
 
 def test_nothing_lifts_without_force() -> None:

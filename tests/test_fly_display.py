@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
 import os
 import pty
+import re
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -55,6 +59,35 @@ def test_danger_is_red(danger: View) -> None:
 
 def test_without_colour_there_are_no_escapes() -> None:
     assert "\x1b" not in "\n".join(lines(view(State.HOLD, Fault(Event.STALE), age=1.0), LIMITS, colour=False))
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80, 104, 105, 200])
+def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
+    """A terminal breaks a line that is too long, and what is redrawn over it smears."""
+    cause = Fault(Event.ESTIMATOR, "the leader's height is +12 cm from where the follower and the roll put it")
+    wide = view(State.DESCEND, cause)
+    shown = lines(wide, LIMITS, False, columns)
+    assert max(map(len, shown)) < columns
+    words = " ".join(lines(wide, LIMITS, False, 500)).split()
+    assert " ".join(shown).split() == words  # nothing is lost
+    coloured = lines(wide, LIMITS, True, columns)
+    assert [re.sub(r"\x1b\[[\d;]*m", "", line) for line in coloured] == shown
+
+
+def test_what_is_redrawn_covers_what_was_drawn() -> None:
+    """In a terminal of 60 columns, by a terminal's own rules for long lines and the cursor."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 60, 0, 0))
+    with os.fdopen(theirs, "w") as stream, Display(view, LIMITS, stream):
+        time.sleep(0.75)
+    data = os.read(ours, 1 << 16).decode()
+    os.close(ours)
+    drawn = data.split("\x1b[J")
+    assert len(drawn) > 1  # it was redrawn
+    for before in drawn[:-1]:
+        text, _, up = before.rpartition("\x1b[")
+        assert int(up.removesuffix("A")) == text.count("\n")
+        assert max(len(re.sub(r"\x1b\[[\d;]*m", "", line).rstrip("\r")) for line in text.split("\n")) < 60
 
 
 def test_what_is_no_terminal_gets_nothing() -> None:

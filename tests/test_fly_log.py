@@ -21,7 +21,7 @@ from mjxball.commands import evaluate
 from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.errors import InputError
 from mjxball.fly import packets, recording
-from mjxball.fly.flight_log import Journal, Tail, read
+from mjxball.fly.flight_log import STREAMS, Journal, Tail, read
 from mjxball.fly.log_schema import KINDS, SCHEMA
 from mjxball.fly.packets import DroneState
 from mjxball.fly.recording import SILENCE, load
@@ -180,6 +180,17 @@ def without(*kinds: str) -> Callable[[list[bytes]], list[bytes]]:
     return lambda lines: [line for line in lines if json.loads(line)["kind"] not in kinds]
 
 
+def shifted(after: float, by: float) -> Callable[[list[bytes]], list[bytes]]:
+    """The log whose clock jumps by `by` at the time `after`."""
+
+    def change(lines: list[bytes]) -> list[bytes]:
+        found = [json.loads(line) for line in lines]
+        late = [{**one, "t": one["t"] + by * (one["t"] > after and one["kind"] in STREAMS)} for one in found]
+        return [json.dumps(one).encode() + b"\n" for one in late]
+
+    return change
+
+
 OLD = {**HEADER, "t": 0.0, "kind": "header", "format": 1}
 REFUSED: dict[str, tuple[Callable[[list[bytes]], list[bytes]], str]] = {
     "newer": (changed(schema=SCHEMA + 1), f"has schema version {SCHEMA + 1}, this mjxball reads {SCHEMA}"),
@@ -198,6 +209,9 @@ REFUSED: dict[str, tuple[Callable[[list[bytes]], list[bytes]], str]] = {
     "no time": (changed(t="now"), "the t of its header"),
     "never flew": (without("tick"), "no motor was ever told to turn"),
     "no states": (without("state"), "no state of the leader"),
+    "a clock that jumps back": (shifted(1.2, -0.3), "the time goes back by 0.29 s in its tick: cut it there"),
+    "a clock that jumps back by a lot": (shifted(1.2, -3.0), "the time goes back by 2.99 s in its tick"),
+    "two logs in one": (lambda lines: [*lines, *lines], "begins another log: cut it there"),
     "a dry run": (changed(settings={"dry_run": True}), "a dry run"),
 }  # fmt: skip
 
@@ -245,6 +259,33 @@ def test_gaps_and_frozen_estimates_are_told(tmp_path: Path) -> None:
         assert known in remark
     assert silent.end - silent.begin > SILENCE
     assert recording.outages("leader", np.arange(9) * 0.01, np.arange(9)[:, None], 1.0)[0].end == 1.0  # to the end
+
+
+def test_records_that_stand_twice_count_once_and_are_told(tmp_path: Path) -> None:
+    lines = write(tmp_path / "whole.jsonl", 0.5)
+    path = tmp_path / "twice.jsonl"
+    path.write_bytes(b"".join([*lines[:40], *lines[37:40], *lines[40:]]))  # both states and the tick of one moment
+    whole, found = load(tmp_path / "whole.jsonl"), load(path)
+    assert [(one["kind"], one["t"]) for one in found.records] == [(one["kind"], one["t"]) for one in whole.records]
+    assert whole.remarks == ()
+    (remark,) = found.remarks
+    assert "a time stands twice" in remark
+    assert "2 more" in remark
+
+
+def test_missing_ticks_and_another_rate_are_told(tmp_path: Path) -> None:
+    lines = write(tmp_path / "whole.jsonl", 1.0)
+    holey = [line for line in lines if not (b'"tick"' in line and 1.2 < json.loads(line)["t"] < 1.5)]
+    path = tmp_path / "holey.jsonl"
+    path.write_bytes(b"".join(holey))
+    (remark,) = load(path).remarks
+    assert "nothing for 0.31 s from 1.19 s on" in remark  # ticks at 1.191 and 1.501 s
+    every = [json.loads(line) for line in lines]
+    slow = [{**one, "t": one["t"] * (3.0 if one["kind"] in STREAMS else 1.0)} for one in every]
+    path = tmp_path / "slow.jsonl"
+    path.write_text("".join(json.dumps(one) + "\n" for one in slow))
+    (remark,) = load(path).remarks
+    assert "30 ms apart, and the policy's period is 10 ms" in remark
 
 
 def test_it_never_overwrites(tmp_path: Path) -> None:

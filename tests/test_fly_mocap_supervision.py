@@ -36,8 +36,8 @@ PERIOD = 0.01
 
 def frame(number: int, places: tuple = PLACES, turns: tuple = (LEVEL, LEVEL)) -> Frame:
     """What a camera system sees of a pair at rest: the same places with 10 um of noise."""
-    noise = 1e-5 * math.sin(1.0 + 7 * number)
-    one, other = (Pose(PERIOD * number, (x + noise, y, z), turn) for (x, y, z), turn in zip(places, turns, strict=True))
+    noise = 1e-5 * np.sin(1.0 + 7 * number + np.arange(3))
+    one, other = (Pose(PERIOD * number, tuple(place + noise), turn) for place, turn in zip(places, turns, strict=True))
     return one, other
 
 
@@ -69,6 +69,12 @@ STANDING: list[tuple[str, Callable[[int], Frame], str]] = [
     ("gone", lambda n: frame(n) if n < 40 else (frame(n)[0], None), "the follower's body: it is not seen"),
     ("never there", lambda n: (None, frame(n)[1]), "the leader's body: it was never seen"),
     ("jumping", lambda n: (moved(frame(n)[0], 0.09 * (n % 20 == 3)), frame(n)[1]), "jumps while it stands"),
+    ("1.2 times", lambda n: frame(n, tuple(tuple(1.2 * x for x in place) for place in PLACES)), "is the scale 1.20"),
+    (
+        "a height that stands still",
+        lambda n: tuple(with_z_of(p, q) for p, q in zip(frame(n), frame(0))),
+        "its z stands",
+    ),
     # The right angle of a body defined with its x axis to the left, and a world with y up.
     ("turned", lambda n: frame(n, ((-0.15, 0, 0), (0.15, 0, 0)), ((0.5**0.5, 0, 0, 0.5**0.5),) * 2), "90 degrees off"),
     ("y up", lambda n: frame(n, ((0, 0, 0.15), (0, 0, -0.15)), ((0.5**0.5, 0.5**0.5, 0, 0),) * 2), "tilts 90 degrees"),
@@ -102,6 +108,10 @@ def held(frame: Frame) -> Frame:
     return frame[0], HELD._replace(time=frame[0].time)
 
 
+def with_z_of(pose: Pose, other: Pose) -> Pose:
+    return pose._replace(position=(*pose.position[:2], other.position[2]))
+
+
 HELD = frame(99)[1]
 # (what happens to the follower's body from frame 100 on, poses of it that are sent, fault after [s] or None, why)
 FLYING: list[tuple[str, Callable[[int, Frame], Frame], int, float | None, str]] = [
@@ -118,6 +128,9 @@ FLYING: list[tuple[str, Callable[[int, Frame], Frame], int, float | None, str]] 
         "0.40 m from where the drone believes",
     ),
     ("takes the leader's pose", lambda n, f: (f[0], f[0]), 0, LIMITS.lost, "0.30 m from where the drone believes"),
+    # One coordinate is not sent from 0.2 s on, and the age of the last pose that was counts from there.
+    ("z stands still", lambda n, f: (f[0], with_z_of(f[1], HELD)), 19, 0.2 + LIMITS.lost, "its z stands still"),
+    ("every second one repeated", lambda n, f: frame(n - n % 2), 30, None, ""),
     # 1 m/s sideways while the leader and both estimates stand: sent until the rig's line is 10 cm wrong.
     ("creeps away", lambda n, f: (f[0], moved(f[1], 0.01 * (n - 99))), 10, 0.1 + LIMITS.lost, "believes to be"),
 ]

@@ -192,7 +192,7 @@ def test_without_jax_one_sentence(tmp_path: Path) -> None:
     """The process itself says what to install."""
     (tmp_path / "jax.py").write_text("raise ModuleNotFoundError(\"No module named 'jax'\", name='jax')\n")
     surroundings = {**environment(), "PYTHONPATH": f"{tmp_path}:{REPOSITORY}"}
-    command = [sys.executable, "-m", "mjxball.rig.retrain", str(FLIGHT), "log.jsonl", "out.npz"]
+    command = [sys.executable, "-m", "mjxball.commands.retrain", str(FLIGHT), "log.jsonl", "out.npz"]
     with subprocess.Popen(command, cwd=tmp_path, env=surroundings, stdin=-1, stdout=-1) as running:
         assert running.stdout is not None  # it ends with its standard input, which stays open
         lines = running.stdout.read().splitlines()
@@ -201,15 +201,15 @@ def test_without_jax_one_sentence(tmp_path: Path) -> None:
 
 
 def test_the_runner_loads_no_jax() -> None:
-    script = "import sys, mjxball.fly.main, mjxball.fly.retrain, mjxball.rig.load, mjxball.rig.retrain\n"
+    script = "import sys, mjxball.fly.main, mjxball.fly.retrain, mjxball.rig.load, mjxball.commands.retrain\n"
     done = run(["-c", script + "print('jax' in sys.modules, 'scipy' in sys.modules)"], REPOSITORY)
     assert done.stdout.split() == ["False", "False"], done
 
 
 def test_a_card_says_what_it_was_retrained_for(tmp_path: Path) -> None:
+    from mjxball.commands.retrain import with_origin
     from mjxball.policy import load_file
     from mjxball.rig.load import IdentifiedLoad
-    from mjxball.rig.retrain import with_origin
 
     load = IdentifiedLoad(1.0, 0.004, 0.0002, 1e-4, 1e-5, 0.0, 0.0, 0.5, 0.0, 3.8)
     contents: PolicyFile = with_origin(load_file(FLIGHT), load, {"steps": 3})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
 import warnings
 from pathlib import Path
@@ -122,13 +124,35 @@ def test_the_time_limit_truncates_and_leaving_terminates(short: Config):
     assert env.step(STILL)[2:4] == (True, False)
 
 
-def test_an_action_that_is_not_finite_ends_the_episode():
-    env = FollowerEnv()
-    env.reset(seed=3)
-    seen, reward, terminated, truncated, info = env.step(np.array([0.0, np.nan, 0.0], np.float32))
-    assert (terminated, truncated, info["diverged"]) == (True, False, 1.0)
-    assert np.isfinite(seen).all()
-    assert np.isfinite(reward)
+OUTSIDE, CLIPPED = np.array([1e39, -1.5, 0.25]), np.array([1.0, -1.0, 0.25])
+NO_ACTIONS = {
+    "nan": (np.array([0.0, np.nan, 0.0]), "nan"),
+    "infinity": (np.array([0.0, 0.0, -np.inf]), "-inf"),
+    "too few": (np.zeros(2), r"not of shape \(2,\)"),
+    "a batch of one": (np.zeros((1, 3)), r"not of shape \(1, 3\)"),
+    "one number": (0.0, r"not of shape \(\)"),
+    "words": (np.full(3, "0.5"), "<U3"),
+    "dates": (np.full(3, np.datetime64("2026-01-01")), "datetime64"),
+    "nothing": (None, "object"),
+}
+
+
+def test_actions_are_clipped_to_the_box_and_refused_unless_they_are_finite(short: Config):
+    """Alike in one world and in a vector, which stay as they were; tests/test_parallel.py of followers."""
+    single = FollowerEnv(config=short, physics="newton-euler")
+    vector = FollowerVectorEnv(2, config=short, physics="newton-euler")
+    for env, shape in ((single, (3,)), (vector, (2, 3))):
+        found = []
+        for action in (OUTSIDE, CLIPPED):
+            env.reset(seed=3)
+            for bad, named in NO_ACTIONS.values():
+                both = np.stack([bad, bad]) if env is vector and np.shape(bad) == (3,) else bad
+                with pytest.raises(InputError, match=re.escape(f"of shape {shape}, ") + ".*" + named):
+                    env.step(both)
+            found.append([env.step(np.broadcast_to(action, shape))[:2] for _ in range(3)])
+        for one, other in zip(*found, strict=True):
+            jax.tree.map(np.testing.assert_array_equal, one, other)
+        assert np.abs(found[0][2][0] - env.reset(seed=3)[0]).max() > 1e-3  # the actions did something
 
 
 def test_mistakes_are_named():
@@ -187,6 +211,62 @@ def test_the_vector_is_gymnasiums_own_vector_of_single_worlds(short: Config, mod
     assert ended == 9
 
 
+def by_pickle(env: Any) -> Any:
+    return pickle.loads(pickle.dumps(env))
+
+
+@pytest.mark.parametrize("duplicate", [by_pickle, copy.deepcopy])
+def test_a_pickled_environment_goes_on_as_the_first_one(short: Config, duplicate: Any):
+    """In the middle of an episode, into the next one, and with the same samples of its spaces."""
+    wrapped = gymnasium.make("mjxball/Transport-v0", config=short)  # on C MuJoCo
+    for env, shape in ((wrapped, (3,)), (FollowerVectorEnv(2, config=short, physics="newton-euler"), (2, 3))):
+        env.reset(seed=5)
+        env.action_space.seed(1)
+        given = actions(6, *shape[:-1])
+        for action in given[:3]:
+            env.step(action)
+        other = duplicate(env)
+        for action in given[3:]:
+            jax.tree.map(np.testing.assert_array_equal, other.step(action), env.step(action))
+        jax.tree.map(np.testing.assert_array_equal, other.reset(), env.reset())
+        np.testing.assert_array_equal(other.action_space.sample(), env.action_space.sample())
+    new = duplicate(FollowerEnv(config=short))  # one that was never reset
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        new.step(STILL)
+    flown = duplicate(PlaygroundEnv("transport", config=short, physics="newton-euler"))
+    assert (flown.config, flown._pair.backend) == (short, "newton-euler")
+
+
+ASYNC = """
+import sys, gymnasium, numpy as np, mjxball.gym
+if __name__ == "__main__":
+    given = {"vector_kwargs": {"context": "spawn"}} if sys.argv[1] == "spawn" else {}
+    make = dict(id="mjxball/Transport-v0", num_envs=2, physics="newton-euler")
+    envs = gymnasium.make_vec(**make, vectorization_mode="async", **given)
+    try:
+        first, _ = envs.reset(seed=3)
+    except ValueError as error:
+        sys.exit(f"refused: {error}")
+    same = gymnasium.make_vec(**make, vectorization_mode="sync")
+    np.testing.assert_array_equal(first, same.reset(seed=3)[0])
+    actions = np.full((2, 3), 0.5, np.float32)
+    np.testing.assert_array_equal(envs.step(actions)[0], same.step(actions)[0])
+    envs.close()
+"""
+
+
+@pytest.mark.slow
+def test_workers_are_spawned_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Forked ones waited for ever at their first reset."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    (tmp_path / "workers.py").write_text(ASYNC)
+    done = run(["workers.py", "fork"], tmp_path)
+    assert (done.returncode, "refused: " in done.stderr) == (1, True), done.stderr
+    assert "{'context': 'spawn'}" in done.stderr
+    done = run(["workers.py", "spawn"], tmp_path)
+    assert done.returncode == 0, done.stderr
+
+
 def test_make_vec_takes_mjx():
     vector = gymnasium.make_vec("mjxball/Transport-v0", num_envs=2, vectorization_mode="vector_entry_point")
     assert isinstance(vector.unwrapped, FollowerVectorEnv)
@@ -204,6 +284,16 @@ last = env.render()
 env.close()
 np.savez("pictures.npz", first=first, last=last)
 """
+
+
+@pytest.mark.slow
+def test_without_a_display_the_variable_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    done = run(["-c", RENDER], tmp_path)
+    assert done.returncode == 1
+    assert re.search("InputError: .*MUJOCO_GL to egl", done.stderr.splitlines()[-1]), done.stderr
 
 
 @pytest.mark.slow
@@ -264,6 +354,15 @@ def test_playgrounds_wrappers_take_the_adapter():
     first = jax.jit(wrapped.reset)(keys)
     assert first.obs.shape == (2, env.observation_size)
     step, state, dones = jax.jit(wrapped.step), first, []
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        *(
+            step(first, jnp.broadcast_to(jnp.asarray(action, jnp.float32), (2, 3)))
+            for action in (CLIPPED * [9, 3e38, 1], CLIPPED)
+        ),
+    )
+    with pytest.raises(InputError, match=r"shape \(3,\), not \(2,\)"):
+        jax.eval_shape(env.step, env.reset(jax.random.key(0)), jnp.zeros(2))
     for action in actions(8, 2):
         state = step(state, action)
         dones.append(np.asarray(state.done).tolist())

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjxball.evaluate.metrics import Metrics, measure, measure_batch
+from mjxball.config import preset
+from mjxball.evaluate.metrics import Metrics, measure, measure_batch, rotor_limits
 from mjxball.sim.rollout import Trajectory
+from mjxball.sim.scenario import Scenario
 
 TIME = np.arange(1501) * 0.02  # 30 s
 GOAL = np.array([1.0, -2.0, 0.0])
@@ -89,6 +91,47 @@ def test_commands_and_rotors() -> None:
     assert found.paper_return == pytest.approx(-10 * 0.1 * 500)
     assert found.saturation == pytest.approx(751 / 1501 / 4)
     assert found.effort == pytest.approx(np.sqrt(3.5**2 * 751 / 1501 / 4))
+
+
+def test_time_with_a_rotor_at_its_limit() -> None:
+    """A tenth of the time the leader's rotor stands nearly still, another tenth a follower's is near its own most."""
+    rotors = np.full((1500, 3, 4), 2.0)
+    rotors[:150, 0, 2] = 0.05
+    rotors[150:300, 2, 1:3] = 2.98
+    team = {"rotor_force": rotors, "follower_command": np.zeros((1500, 2, 3))}
+    made = flight(approach()[:1500], **team)
+    for most, share in ((5.5, 0.1), ((5.5, 5.5, 3.0), 0.2), ((np.nan, 5.5, 3.0), 0.1)):
+        assert measure(made, 2.5, most).rotors_at_limit == pytest.approx(share)
+    unknown = flight(approach()[:1500], **{**team, "rotor_force": rotors * np.nan})
+    found = measure(unknown, 2.5)
+    assert (found.rotors_at_limit, found.saturation, found.rotor_power) == (None, None, None)
+
+
+def test_limits_are_those_of_the_drones_that_give_less_and_a_lost_one_has_none() -> None:
+    plant = preset("team").plant
+    weak, lost = Scenario(thrust=(1.0, 1.0, 0.8, 1.0, 1.0, 1.0)), Scenario(lost=((3, 10.0),))
+    found = rotor_limits(plant, [Scenario(), weak, lost])
+    assert found[0] == pytest.approx(np.full(6, plant.rotor_force_max))
+    assert found[1] == pytest.approx(found[0] * [1, 1, 0.8, 1, 1, 1])
+    assert np.flatnonzero(np.isnan(found[2])).tolist() == [3]
+
+
+def test_power_of_the_rotors_over_that_of_hover() -> None:
+    """Half the time two of eight rotors give four times what hovers: 8 times the power each."""
+    rotors = np.full((1500, 2, 4), 1.0)
+    rotors[750:, 0, :2] = 4.0
+    assert of(flight(approach()[:1500], rotor_force=rotors)).rotor_power == pytest.approx((1 + (6 + 16) / 8) / 2)
+
+
+def test_spread_of_the_followers_commands() -> None:
+    """Two followers that pull against each other, 0.1 rad of pitch each; alike they have no spread."""
+    apart = np.zeros((1501, 2, 3))
+    apart[..., 1] = (0.1, -0.1)
+    common = {"rotor_force": np.full((1501, 3, 4), 2.0)}
+    found = of(flight(approach(), follower_command=apart, **common))
+    assert found.command_spread == pytest.approx(np.sqrt(0.01 / 2))
+    assert of(flight(approach(), follower_command=np.abs(apart), **common)).command_spread == pytest.approx(0)
+    assert of(flight(approach())).command_spread is None
 
 
 def test_the_first_command_is_no_change() -> None:

@@ -84,7 +84,7 @@ def test_model_moves_as_the_simulator(command: tuple[float, float]) -> None:
     """A command stepped from hover, for 0.3 s: the model without delay against the full physics."""
     config, model = FLIGHT, linear_model(FLIGHT, 0.0)
     scenario = Scenario(mass=0.0175, amplitude=0.0, goal=(0.0, 0.0, 0.0), seconds=1.0)
-    state, load, step = start_of(config, [scenario]), load_of([scenario]), make_stepper(config, "newton-euler")
+    state, load, step = start_of(config, [scenario]), load_of(config, [scenario]), make_stepper(config, "newton-euler")
     assert state.rotor_force == pytest.approx(hover_rotor_force(config, load.believed_mass))
     transition, drive = lqg_design.discretise(model.a, model.b, config.timing.control_period)
     x = np.zeros(len(model.names))

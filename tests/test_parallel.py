@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import warnings
 
 import gymnasium
@@ -74,6 +75,16 @@ def test_it_flies_as_the_brax_environment(team: Config):
         env.step({})
 
 
+def test_actions_are_clipped_to_the_box(team: Config):
+    env, found = FollowersParallelEnv(config=team), []
+    for action in (np.array([1e39, -2.0, 0.25]), np.array([1.0, -1.0, 0.25])):
+        env.reset(seed=2)
+        for _ in range(3):
+            moved = env.step(dict.fromkeys(env.agents, action))[:2]
+        found.append(moved)
+    jax.tree.map(np.testing.assert_array_equal, *found)
+
+
 def test_seeds_start_a_sequence_of_worlds(team: Config):
     env = FollowersParallelEnv(config=team)
     first, again, other = (env.reset(seed=seed)[0]["follower_1"] for seed in (1, 1, 2))
@@ -81,6 +92,18 @@ def test_seeds_start_a_sequence_of_worlds(team: Config):
     assert not np.array_equal(first, other)
     env.reset(seed=1)
     assert not np.array_equal(first, env.reset()[0]["follower_1"])
+
+
+def test_a_pickled_environment_goes_on_as_the_first_one(team: Config):
+    env = FollowersParallelEnv(config=team)
+    env.reset(seed=5)
+    env.step(draws(env.agents, 1))
+    other = pickle.loads(pickle.dumps(env))
+    assert other.agents == env.agents
+    for number in range(2):
+        given = draws(env.agents, number)
+        jax.tree.map(np.testing.assert_array_equal, other.step(given), env.step(given))
+    jax.tree.map(np.testing.assert_array_equal, other.reset(), env.reset())
 
 
 def test_leaving_terminates_all(team: Config):
@@ -127,6 +150,9 @@ def test_what_makes_no_sense_is_refused(team: Config):
     env.reset(seed=0)
     with pytest.raises(ValueError, match="follower_1"):
         env.step({"follower_1": np.zeros(3)})
+    for bad, named in ((np.full(3, np.nan), "nan"), (np.zeros((1, 3)), r"\(1, 3\)"), (np.full(3, "1"), "<U1")):
+        with pytest.raises(InputError, match=r"of shape \(3,\), not .*" + named):
+            env.step(dict.fromkeys(env.agents, bad))
     for kind in (FollowerEnv, PlaygroundEnv):
         with pytest.raises(InputError, match=r"mjxball\.gym\.parallel"):
             kind(config=team)

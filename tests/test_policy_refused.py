@@ -280,6 +280,13 @@ class TestDamagedCard:
             ("bounds", {"x_peak": HUGE}),
             ("bounds", {"x_peak": -1e300}),
             ("bounds", [0.05]),
+            ("flown", [2, 3]),
+            ("flown", {"drones": [2, 3]}),
+            ("flown", {"drones": [], "seconds": 60.0}),
+            ("flown", {"drones": [1], "seconds": 60.0}),
+            ("flown", {"drones": [2.0], "seconds": 60.0}),
+            ("flown", {"drones": [2], "seconds": HUGE}),
+            ("flown", {"drones": [2], "seconds": 0}),
         ],
         ids=lambda value: "huge" if value == HUGE else repr(value)[:20],
     )

@@ -71,6 +71,16 @@ def test_a_flight_is_read_in_our_units(flights: list[Flight]) -> None:
     assert flight.has_cascade
 
 
+def test_rows_that_are_missing_count_as_damaged(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    lines = (made / "other.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "other.csv").write_text("".join([*lines[:800], *lines[830:]]))  # 0.3 s
+    whole, found = read_flight(made / "other.csv"), read_flight(tmp_path / "other.csv")
+    assert "nothing for 0.31 s" in capsys.readouterr().err
+    before = 798  # the header is no row
+    assert found.damaged[before - 1 : before + 4].all()
+    np.testing.assert_array_equal(found.damaged[: before - 5], whole.damaged[: before - 5])
+
+
 def test_the_fit_recovers_the_simulated_drone(flights: list[Flight]) -> None:
     fit = fit_rotation([track_of(flight) for flight in flights])
     # Lag and delay are one for slow commands. The drone's own step adds a tick of 2 ms; rows every 10 ms.
@@ -142,7 +152,9 @@ def test_bad_input_is_one_sentence(flights: list[Flight], made: Path, tmp_path: 
             name: column for name, column in long.items() if name not in ("motor_motor_m1", "pwr_pm_vbat")
         },
         "not finite in imu_gyro_x": long | {"imu_gyro_x": np.tile(holey, 6)},
-        "times do not increase": long | {"t": np.tile(backwards, 6)},
+        "row 8: the time goes back by 0.03 s": long | {"t": np.tile(backwards, 6)},
+        "10 ms would be 0.01 s": long | {"t": 10.0 * np.arange(6 * count)},
+        "0.02 s apart": long | {"t": 0.02 * np.arange(6 * count)},
         "less than 5 s of flight": long | {name: 0 * long["t"] for name in COLUMNS if name.startswith("motor_")},
         "s are needed": good,
     }

@@ -115,7 +115,9 @@ def test_truth_is_found(found, name: str) -> None:
     ("change", "said"),
     [
         ({"states": np.zeros((9, 2, 12))}, "shapes"),
-        ({"time": np.zeros(9)}, "times do not increase"),
+        ({"time": np.zeros(9)}, "row 2: a time stands twice"),
+        ({"time": np.array([0, 1, 2, 3, 2.5, 4, 5, 6, 7]) * 0.01}, "row 5: the time goes back by 0.005 s"),
+        ({"time": np.arange(9) * 10.0}, "10 ms would be 0.01 s"),
         ({"setpoints": np.full((9, 2, 4), np.nan)}, "not finite"),
     ],
 )

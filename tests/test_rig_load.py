@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mjxball import config as configs
+from mjxball.commands.retrain import FlightReplay
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.log_schema import decode
 from mjxball.fly.supervisor import State
@@ -18,7 +19,6 @@ from mjxball.fly.twin.coupled import CoupledPair, grounded_model, put_on
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, shipped_policy
 from mjxball.rig.load import LONGEST, IdentifiedLoad, LoadWatch
-from mjxball.rig.retrain import FlightReplay
 
 LATE = 12.0  # [s] after the motors first turn
 TURNED = 0.4  # [s] after which they do

@@ -159,7 +159,7 @@ def test_thrust_falls_as_the_battery_empties() -> None:
     config = preset("paper")
     step = make_control_step(config, make_engine(config.plant, config.attitude))
     scenario = [Scenario(seconds=1.0)]
-    load, state = load_of(scenario), start_of(config, scenario)
+    load, state = load_of(config, scenario), start_of(config, scenario)
     for fade in (0.0, 0.1):
         flown = state
         for _ in range(100):

@@ -208,33 +208,29 @@ def test_a_copy_goes_on_by_itself(duplicate: Any) -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e7])
-def test_what_is_not_finite_or_huge_is_left_to_the_law_of_arrays(value: float, dtype: type) -> None:
-    """After huge numbers both round what is left of them, in float32 to some 1e-4 of a command.
+@pytest.mark.parametrize("value", [3e5, -9e5])
+def test_what_is_huge_is_left_to_the_law_of_arrays(value: float, dtype: type) -> None:
+    """Up to the largest that `checked_observation` takes; afterwards both round what is left of it.
 
-    Of 1e30 float32 leaves numbers of 1e5, of which the last digit is a hundredth of a command: only limits are kept.
+    In float32 that is a hundredth of a command.
     """
+    left = 0
     for slot, first in itertools.product(range(18), (0, 3)):
         (policy, reference), flight = told("team4", dtype), walk(6).astype(dtype)
         flight[first, slot] = value
-        with np.errstate(all="ignore"):
-            for number, seen in enumerate(flight):
-                wanted, found = reference(seen)[1], policy(seen)
-                if dtype != np.float32 or value != 1e30:
-                    np.testing.assert_allclose(found, wanted, *[1e-3 if dtype == np.float32 else 1e-9] * 2)
-                assert (np.abs(found) <= [0.6 + 1e-6, 0.6 + 1e-6, 8.0]).all() or np.isnan(found).all()
-                np.testing.assert_array_equal(np.isfinite(policy.memory), np.isfinite(reference.memory))
-                assert not np.isnan(value) or number < first or np.isnan(found).all()
-        policy.reset()
-        assert np.isfinite(policy(walk(1)[0])).all()
+        for seen in flight:
+            wanted, found = reference(seen)[1], policy(seen)
+            np.testing.assert_allclose(found, wanted, *[1e-2 if dtype == np.float32 else 1e-9] * 2)
+            assert (np.abs(found) <= [0.6 + 1e-6, 0.6 + 1e-6, 8.0]).all()
+            left += not policy._ahead
+    assert left  # some of these were answered by the law of arrays
 
 
 @pytest.mark.parametrize(
-    ("value", "places"),
-    [(np.nan, slice(None)), (np.inf, slice(None)), (1e200, slice(50, 200, 40)), (0.0, slice(-CONTEXT, 1 - CONTEXT))],
+    ("value", "places"), [(1e200, slice(50, 200, 40)), (0.0, slice(-CONTEXT, 1 - CONTEXT))], ids=["huge", "no share"]
 )
 def test_a_memory_that_is_not_sound_is_left_to_the_law_of_arrays(value: float, places: slice) -> None:
-    """Also states of filters whose squares overflow, and a share of the command of 0, by which a follower divides."""
+    """States of filters whose squares overflow, and a share of the command of 0, by which a follower divides."""
     policy, reference = told("pair")
     agree(policy, reference, walk(5))
     sound = policy.memory
@@ -244,6 +240,13 @@ def test_a_memory_that_is_not_sound_is_left_to_the_law_of_arrays(value: float, p
         policy.memory, reference.memory = spoilt, spoilt
         with np.errstate(all="ignore"):
             for seen in walk(3, 1):
-                # Of what the lift has turned only the scores are made: they stay finite, and rounded another way.
-                np.testing.assert_allclose(policy(seen), reference(seen)[1], 1e-9, 1e-12)
-        np.testing.assert_allclose(policy.memory, reference.memory, 1e-9, 1e-9)
+                wanted, kept = reference(seen)[1], policy.memory
+                if np.isfinite(wanted).all() and np.isfinite(reference.memory).all():
+                    # Of what the lift has turned only the scores are made: they stay finite, and rounded another way.
+                    np.testing.assert_allclose(policy(seen), wanted, 1e-9, 1e-12)
+                    np.testing.assert_allclose(policy.memory, reference.memory, 1e-9, 1e-9)
+                    continue
+                with pytest.raises(InputError, match="not finite"):
+                    policy(seen)
+                np.testing.assert_array_equal(policy.memory, kept)
+                break

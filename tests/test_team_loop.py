@@ -141,7 +141,7 @@ def test_a_lost_drones_rotors_stop_and_a_weak_one_gives_its_share() -> None:
 
 def test_privileged_information_is_in_each_followers_frame() -> None:
     scenario = Scenario(mass=0.4, amplitude=0.05, phase=np.pi / 2, omega=0.01)
-    told = make_privileged_info(TEAM4)(start_of(TEAM4, [scenario]), load_of([scenario], 4))
+    told = make_privileged_info(TEAM4)(start_of(TEAM4, [scenario]), load_of(TEAM4, [scenario]))
     assert isinstance(told, PrivilegedInfo)
     assert told.believed_mass.shape == (1, 3)
     # The CG lies at +x: ahead of drone 2, across for drones 1 and 3, which look at O from +y and -y.

@@ -64,7 +64,7 @@ def test_an_external_force_acts_along_the_world_however_the_pair_is_turned() -> 
     """F dt / M of velocity after one control step, for the first of which thrust and tilt hardly change."""
     config = paper_with()
     scenario, step = Scenario(seconds=1), make_stepper(config, "newton-euler")
-    load, start = load_of([scenario]), start_of(config, [scenario])
+    load, start = load_of(config, [scenario]), start_of(config, [scenario])
     turned = start._replace(quaternion=rotations.quaternion_from_euler(np.array([[0.0, 0.0, np.pi / 2]])))
     commands, force = np.zeros((1, 2, 3)), np.array([[0.7, 0.2, -0.4]])
     pushed, free = (step(turned, commands, one).velocity for one in (load._replace(external_force=force), load))

@@ -12,7 +12,8 @@ import pytest
 from plants import team
 from tables import rows
 
-from mjxball.config import Attitude, Drone, Plant, preset, with_plant
+from mjxball.config import Attitude, Config, Drone, Plant, preset, replace, with_plant
+from mjxball.control.attitude import rotor_commands
 from mjxball.control.constants import trim_limit
 from mjxball.control.mixer import torque_per_force
 from mjxball.errors import InputError
@@ -196,6 +197,60 @@ def test_no_rotors_let_four_drones_lose_any_follower_whose_leader_flies_its_hove
         assert min(largest_margin(plant, mass, cg, lost=[one]).margin for one in (1, 2, 3)) < -0.2
     assert min(largest_margin(plant, 0.4, (0.0, 0.0), lost=[one], leader_helps=True).margin for one in (1, 2, 3)) > 0.15
     assert min(largest_margin(TEAMS["team6"], 0.6, (0.0, 0.0), lost=[one]).margin for one in range(1, 6)) > 0.15
+
+
+IN_PLANE = replace(preset("paper"), "plant.cg_axis", "xy")
+
+
+def test_a_pair_whose_roll_command_is_too_large_is_not_trimmed() -> None:
+    """0.2 kg 10 cm beside the line of a pair: the follower's loop of 0.2404 N m/rad is asked for 0.816 of 0.6 rad."""
+    moment, gain = 0.2 * 9.81 * 0.1, float(plant_parameters(IN_PLANE.plant, IN_PLANE.attitude).gains.kp[0])
+    assert (gain, moment / gain) == pytest.approx((0.2404, 0.816), abs=1e-3)
+    assert largest_margin(IN_PLANE.plant, 0.2, (0.0, 0.1)).margin > 0.6  # by its rotors alone
+    assert largest_margin(IN_PLANE, 0.2, (0.0, 0.1)).margin == pytest.approx(1 - moment / gain / 0.6)
+    across = largest_amplitude(IN_PLANE, 0.2, 0.15, (0.0, 1.0))
+    assert across == pytest.approx(0.85 * 0.6 * gain / (0.2 * 9.81))
+    along = largest_amplitude(IN_PLANE, 0.2, 0.15, (1.0, 0.0))
+    assert along == pytest.approx(largest_amplitude(IN_PLANE.plant, 0.2, 0.15, (1.0, 0.0)))
+    assert largest_margin(replace(IN_PLANE, "command.tilt_limit", 1.2), 0.2, (0.0, 0.1)).margin > 0.15
+
+
+def test_an_unknown_mass_takes_vertical_commands() -> None:
+    """A believed 0.1 kg of 0.5: the follower lifts 0.4 kg more than its hover thrust of 1.05 kg is for."""
+    config = replace(preset("paper"), "command.vertical_limit", 4.0)
+    lifted = (1.0 + 0.5 - 0.05) / 1.05  # without the leader's 1.05 kg, over what is believed
+    expected = 1 - 9.81 * (lifted - 1) / 4.0
+    # The follower's lift at its own mount is a moment, which a CG on its side takes back.
+    own = 0.17 * ((1.45 - 1.0) - (1.05 - 1.0)) / 0.5
+    assert largest_margin(config.plant, 0.5, -own, 0.1).margin > expected + 0.05
+    assert largest_margin(config, 0.5, -own, 0.1).margin == pytest.approx(expected)
+
+
+@rows("config, mass", [(IN_PLANE, 0.15), *((with_plant(preset("paper"), name), 0.3) for name in TEAMS)])
+def test_attitude_loops_give_the_forces_of_the_trim(config: Config, mass: float) -> None:
+    """The commands that the forces say, to the loops that fly; the largest of them leaves the margin."""
+    plant, gains = config.plant, plant_parameters(config.plant, config.attitude).gains
+    margin, force = largest_margin(config, mass, (0.01, 0.03))
+    assert force is not None
+    believes = np.array(plant.known_masses) + np.array(plant.load_shares) * mass
+    alone = dataclasses.replace(
+        plant, drones=tuple(dataclasses.replace(d, mount=(0.0, 0.0, 0.0)) for d in plant.drones)
+    )
+    wrench = np.array(
+        [wrench_of(alone, np.where(np.arange(plant.count)[:, None] == k, force, 0.0)) for k in range(plant.count)]
+    )
+    command = np.column_stack([wrench[:, 1:3] / gains.kp[:2], wrench[:, 0] / believes - plant.gravity])
+    level, arms = np.zeros((plant.count, 3)), np.array(plant.of_drones("arm"))
+    yaw = np.array(plant.of_drones("yaw_per_thrust"))
+    found = rotor_commands(command, level, level, believes, gains, plant.gravity, arms, yaw, 5.5, plant.layout)
+    assert found == pytest.approx(force, abs=1e-9)
+    shares = np.abs(command) / [config.command.tilt_limit, config.command.tilt_limit, config.command.vertical_limit]
+    assert shares.max() <= 1 - margin + 1e-9
+
+
+def test_where_loops_integrate_any_force_can_be_commanded() -> None:
+    config = preset("flight")
+    assert largest_margin(config, 0.01, 0.02).margin == pytest.approx(largest_margin(config.plant, 0.01, 0.02).margin)
 
 
 @rows(

@@ -78,6 +78,17 @@ def test_rows_are_the_recording(lines: list[bytes], tmp_path: Path) -> None:
         np.testing.assert_allclose(shown[name][time > turned + 0.005], wanted[rows], atol=1e-6)  # float32
 
 
+def test_a_clock_that_goes_back_is_told(lines: list[bytes], tmp_path: Path) -> None:
+    path, records = tmp_path / "log.jsonl", [json.loads(line) for line in lines]
+    middle = records[len(records) // 2]["t"]
+    late = [{**one, "t": one["t"] - 3.0 * (one["t"] > middle)} for one in records]
+    path.write_text("".join(json.dumps(one) + "\n" for one in late))
+    log = read_all(path)
+    assert log.level == "bad"
+    assert "time goes back by" in log.text
+    assert (np.diff([row[0] for row in log.rows]) > 0).all()
+
+
 def test_a_log_in_pieces_gives_the_same_rows(lines: list[bytes], tmp_path: Path) -> None:
     """However a line is torn, it counts once it is whole; damaged ones in between do not count at all."""
     whole, pieces = tmp_path / "whole.jsonl", tmp_path / "pieces.jsonl"

@@ -34,6 +34,9 @@ GOOD = Metrics(
     effort=0.1,
     smoothness=0.01,
     saturation=0.0,
+    rotors_at_limit=0.0,
+    rotor_power=1.0,
+    command_spread=None,
     failed=False,
 )
 

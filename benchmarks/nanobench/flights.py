@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import gzip
 import io
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from mjxball.errors import InputError
+from mjxball.reading import GAP, check_times
 
 Array = np.ndarray
 GRAVITY = 9.81  # [m/s2], of the accelerometer's g as well
@@ -92,6 +94,8 @@ def read_flight(path: Path) -> Flight:
     except (OSError, EOFError, UnicodeDecodeError) as error:
         raise InputError(f"{path.name} cannot be read: {error}") from None
     names = [name.strip() for name in header.split(",")]
+    if len(set(names)) < len(names):
+        raise InputError(f"{path.name} has a column twice: {next(n for n in names if names.count(n) > 1)}")
     missing = [name for group in GROUPS.values() for name in group if name not in names]
     if missing:
         raise InputError(f"{path.name} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing[:5])}")
@@ -105,8 +109,11 @@ def read_flight(path: Path) -> Flight:
     for key, group in GROUPS.items():
         if not np.isfinite(parts[key]).all():
             raise InputError(f"{path.name} holds a number that is not finite in {' or '.join(group)}")
-    if (np.diff(parts["time"][:, 0]) <= 0).any():
-        raise InputError(f"{path.name}: its times do not increase")
+    try:
+        for remark in check_times(parts["time"][:, 0].tolist(), 0.9 * ROW, 1.1 * ROW):
+            print(f"{path.name}: {remark}; rows beside such gaps count as damaged", file=sys.stderr)
+    except ValueError as error:
+        raise InputError(f"{path.name}: {error}") from None
     return _flight(path.name.removesuffix(".gz").removesuffix(".csv"), parts)
 
 
@@ -135,9 +142,13 @@ def _flight(name: str, parts: dict[str, Array]) -> Flight:
 
 
 def _damaged(time: Array, parts: dict[str, Array], estimate: Array) -> Array:
-    """Rows (n,) where the on-board columns are a straight line or their estimate jumps, and `SPREAD` rows around."""
+    """Rows (n,) where the on-board columns are a straight line, their estimate jumps, or rows are missing.
+
+    `SPREAD` rows around count as well.
+    """
     bad = _stalled(parts["gyro"]) | _stalled(parts["pwm"])
     step = np.diff(time)[:, None]
+    bad[1:] |= step[:, 0] > GAP * ROW
     for column, slope, limit in zip((parts["place"], estimate), (parts["drift"], parts["gyro"]), LOST, strict=True):
         axes = min(column.shape[1], 3) if column is not estimate else 2  # yaw is corrected too slowly to tell
         moved = np.diff(column[:, :axes], axis=0) - step * (slope[1:, :axes] + slope[:-1, :axes]) / 2

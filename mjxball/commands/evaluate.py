@@ -24,10 +24,11 @@ from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant, load_policy, native_config
 from mjxball.evaluate.report import MADE, write_page, write_report
 from mjxball.evaluate.results import Result, fly_scenarios, table, to_json
-from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
+from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.evaluate.stand_figure import stand_config
 from mjxball.evaluate.suites import find_suites, list_suites
 from mjxball.evaluate.variants import Suite
+from mjxball.files import write_whole
 from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policies
@@ -49,11 +50,25 @@ def parser() -> cli.Parser:
     result.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="policy files")
     result.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=f"baselines: {names}")
     result.add_argument("--omega", nargs="+", type=float, metavar="W", help="CG speeds [rad/s] (default 0.31)")
-    result.add_argument("--amplitude", nargs="+", type=float, metavar="A", help="CG amplitudes [m] (default 0.05)")
-    result.add_argument("--mass", nargs="+", type=float, metavar="M", help="object masses [kg] (default 0.2)")
+    result.add_argument(
+        "--amplitude",
+        nargs="+",
+        type=float,
+        metavar="A",
+        help="CG amplitudes [m] (default 0.05, or what the plant allows)",
+    )
+    result.add_argument(
+        "--mass", nargs="+", type=float, metavar="M", help="object masses [kg] (default the plant's, 0.2)"
+    )
     result.add_argument("--believed-mass", type=float, metavar="M", help="mass that hover thrust assumes (true mass)")
     result.add_argument("--wn-pitch", type=float, metavar="W", help="pitch natural frequency of both drones [rad/s]")
-    result.add_argument("--goal", nargs=3, type=float, metavar=("X", "Y", "Z"), help="goal of O [m] (default 1 1 1)")
+    result.add_argument(
+        "--goal",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="goal of O [m] (default 1 1 1, on a stand where it moves)",
+    )
     result.add_argument("--seconds", type=float, metavar="S", help="length of each flight (default 45)")
     result.add_argument(
         "--waveform", type=Path, metavar="FILE", help="CG offsets from a CSV file: time [s], offset [m] per line"
@@ -153,7 +168,8 @@ class Group:
     def policies(self, options: argparse.Namespace) -> list[Policy]:
         """The policies, loaded to fit the plant; raise InputError for bounds that are wanted and missing."""
         # A pitch frequency that was asked for is an experiment, not a mistake.
-        found = _load(self.paths, lambda path: self.setup, options)
+        longest = max(scenario.seconds for scenario in self.scenarios)
+        found = _load(self.paths, lambda path: self.setup, options, longest)
         unbounded = [policy.name for policy in found if options.check and not policy.card["bounds"]]
         if unbounded:
             raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
@@ -195,7 +211,7 @@ def _benchmark(
     plant = suites[0].variants[0].nominal(group.setup).plant
     print(text_table(scores))  # noqa: T201
     if options.json:
-        options.json.write_text(json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
+        write_whole(options.json, json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
         write_report(options.out, plant, scores, suites, policies, command, versions())
         print(f"the report is {options.out / 'report.html'}")  # noqa: T201
@@ -213,6 +229,8 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
         results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
         if number:
             print(f"\n{group.setup.preset}: its own plant and scenarios")  # noqa: T201
+        if group.setup.plant != config.Plant():
+            print(rig_line(group.setup))  # noqa: T201
         print(table(results))  # noqa: T201
         if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
             every += results
@@ -225,7 +243,7 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
         if options.check:
             code = max(code, _check(group.setup, policies, results, options.physics))
     if options.json:
-        options.json.write_text(to_json(every))
+        write_whole(options.json, to_json(every))
     return code
 
 
@@ -260,7 +278,7 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         print(f"{time.monotonic() - started:6.1f} s  figure {name}", file=sys.stderr)  # noqa: T201
     options.out.mkdir(parents=True, exist_ok=True)
     for figure in figures:
-        (options.out / f"figure-{figure.name}.svg").write_text(figure.svg, encoding="utf-8")
+        write_whole(options.out / f"figure-{figure.name}.svg", figure.svg)
     page = options.out / "figures.html"
     links = [*((figure.name, figure.title) for figure in figures), MADE]
     context = {"title": "The paper's figures from our flights", "figures": figures, "links": links}
@@ -278,9 +296,9 @@ def _figure_config(path: Path) -> config.Config | None:
 
 
 def _load(
-    paths: Sequence[Path], setup_of: Callable[[Path], config.Config], options: argparse.Namespace
+    paths: Sequence[Path], setup_of: Callable[[Path], config.Config], options: argparse.Namespace, seconds: float = 0.0
 ) -> list[Policy]:
-    """The policies, each to fit the configuration of its file.
+    """The policies, each to fit the configuration of its file, for flights of up to `seconds` [s].
 
     Files of one stem are called by their directory too, forced ones carry a mark in their name.
     """
@@ -289,7 +307,7 @@ def _load(
         setup, policy = setup_of(path), Policy.load(path)
         policy.join(setup.plant, setup.attitude)  # nothing forces a law into a team that it is not for
         try:
-            policy = load_policy(path, setup, compare_laws=options.wn_pitch is None)
+            policy = load_policy(path, setup, compare_laws=options.wn_pitch is None, seconds=seconds)
         except InputError as error:
             if not options.force:
                 raise InputError(f"{error}; --force flies it all the same") from None
@@ -311,9 +329,9 @@ def _refuse_same_names(names: list[str]) -> None:
 
 def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[Result], physics: str) -> int:
     """Hold every policy against its card on the reference scenario, flown anew if the results lack it."""
-    own = setup.autopilot.kind != "ideal" or setup.plant.count > 2
+    own = setup.autopilot.kind != "ideal" or setup.plant != config.Plant()
     plain = setup if own else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
-    reference = standard_scenarios(setup)[-1] if own else REFERENCE
+    reference = standard_scenarios(plain)[-1]
     known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]
     if missing:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjxball import cli
 from mjxball.control import rotations
-from mjxball.evaluate.metrics import measure
+from mjxball.evaluate.metrics import measure, rotor_limits
 from mjxball.evaluate.plots import draw_flights
 from mjxball.evaluate.results import Result, scenario_title
 from mjxball.fly.recording import Recording, fly_again, read_recording
@@ -41,7 +41,7 @@ def result_of(recording: Recording, name: str) -> Result:
     met = Conditions.of(config)
     numbers = (met.cg_speed, met.cg_amplitude, met.object_mass)
     scenario = Scenario(*numbers, ball_start=met.ball, seconds=float(flight.time[-1]))
-    metrics = measure(flight, config.scenario.termination_distance, config.plant.rotor_force_max)
+    metrics = measure(flight, config.scenario.termination_distance, rotor_limits(config.plant, [scenario])[0])
     return Result(name, scenario, metrics, flight, config.motion.kind)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from mjxball import cli, config
 from mjxball.errors import InputError
-from mjxball.evaluate.scenarios import REFERENCE, STANDARD, cross, read_waveform, standard_scenarios
+from mjxball.evaluate.scenarios import STANDARD, cross, read_waveform, standard_scenarios
 from mjxball.sim.scenario import Scenario, check_scenario
 
 SCENARIO_FLAGS = (
@@ -57,8 +57,6 @@ def scenarios_of(options: argparse.Namespace, setup: config.Config) -> Sequence[
         return standard_scenarios(setup)
     if not (given or options.policies or options.followers):
         return STANDARD
-    if len(setup.plant.directions) == 1:
-        return _asked(options, setup, REFERENCE, ball_start=options.rolling or 0.0)
     reference = standard_scenarios(setup)[-1]
     ball = reference.ball_start if options.rolling is None else options.rolling
     return _asked(options, setup, reference, ball_start=ball, path=reference.path)
@@ -90,9 +88,7 @@ def _asked(options: argparse.Namespace, setup: config.Config, reference: Scenari
         mass_changes=tuple(map(_mass_change, options.mass_change or [])),
         **common,
     )
-    for scenario in made:
-        check_scenario(setup, scenario)
-    return made
+    return tuple(check_scenario(setup, scenario) for scenario in made)
 
 
 def _mass_change(text: str) -> tuple[float, float]:

@@ -25,11 +25,12 @@ from mjxball.algorithms import ALGORITHMS
 from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
-from mjxball.evaluate.scenarios import standard_scenarios
+from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.quiet import import_jax
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
+from mjxball.train.lock import LOCK
 from mjxball.train.run_directory import (
     CHECKPOINTS,
     EXTENSIONS,
@@ -106,24 +107,38 @@ def _train(options: argparse.Namespace, command: str) -> int:
     else:
         settings, origin, out = _new_run(options, command)
     enable_compilation_cache()
-    with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
-        if meeting:
-            processes.join(meeting)
-        writes = not meeting or processes.is_writer()  # to ask wakes the devices, and waits
-        with ThreadPoolExecutor(1) as beside:
+    resume = options.resume is not None
+    check = (lambda: None) if resume else (lambda: _output_directory(out))  # what the lock's holder may have left there
+    from mjxball.train.compilation import jax_setting
 
-            def prepare() -> None:
-                if writes and _is_evaluated(origin):
-                    beside.submit(_prepare_evaluation, settings, origin["physics"])
+    # Float32 also where JAX_ENABLE_X64 is set: a run is the same then, and can be resumed.
+    with contextlib.ExitStack() as hold, jax_setting("jax_enable_x64", False):
+        with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
+            if meeting:
+                processes.join(meeting)
+            hold.enter_context(processes.holding(out, meeting is not None, check))
+            writes = not meeting or processes.is_writer()  # to ask wakes the devices, and waits
+            with ThreadPoolExecutor(1) as beside:
 
-            code = _run(settings, origin, out, options.resume is not None, prepare)
-        if meeting:
-            processes.leave()
-    if writes and code is None and (out / "eval" / RESULTS).exists():
+                def prepare() -> None:
+                    if writes and options.plant:
+                        print(rig_line(settings), file=sys.stderr)
+                    if writes and _is_evaluated(origin):
+                        beside.submit(_prepare_evaluation, settings, origin["physics"])
+
+                code = _run(settings, origin, out, resume, prepare)
+            if meeting:
+                processes.leave()
+        return _finish(settings, origin, out, code, started) if writes else code or 0
+
+
+def _finish(settings: config.Config, origin: dict[str, Any], out: Path, code: int | None, started: float) -> int:
+    """Print and draw what came of a training that ended with `code`, see `_run`; return the exit code."""
+    if code is None and (out / "eval" / RESULTS).exists():
         print(f"{out} was finished and evaluated before; nothing is left to do")
         return 0
-    if not writes or code == 1:
-        return code or 0
+    if code == 1:
+        return code
     print(f"policy: {out / POLICY}  ({time.monotonic() - started:.0f} s)", flush=True)
     if code:
         return code
@@ -135,6 +150,10 @@ def _train(options: argparse.Namespace, command: str) -> int:
     return _evaluate(settings, origin["physics"], out, out / POLICY)
 
 
+def _output_directory(out: Path) -> Path:
+    return cli.output_directory(out, but=(LOCK,))
+
+
 def _run(
     settings: config.Config, origin: dict[str, Any], out: Path, resume: bool, beside: Callable[[], None]
 ) -> int | None:
@@ -144,10 +163,14 @@ def _run(
     """
     _wake_devices()
     # The algorithm's libraries are imported meanwhile, before anything asks for devices.
+    from mjxball.train import requirements
     from mjxball.train.extensions import find
     from mjxball.train.run import Run
 
-    find((origin.get("extensions") or {}).get("algorithm") or "sac", "--algorithm")
+    algorithm = (origin.get("extensions") or {}).get("algorithm") or "sac"
+    find(algorithm, "--algorithm")
+    if algorithm in ALGORITHMS:  # of others nobody knows what they take
+        requirements.check(settings, algorithm, origin["seeds"])
     state = None
     if resume:
         from mjxball.train.checkpoint import restore_state
@@ -180,7 +203,8 @@ def _wake_devices() -> None:
 
 
 def _first_kernel(xp: Any) -> None:
-    xp.zeros(1).block_until_ready()
+    with contextlib.suppress(RuntimeError, AssertionError):  # without a device; who needs one says so
+        xp.zeros(1).block_until_ready()
 
 
 def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:
@@ -203,7 +227,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     for section in ALGORITHMS:
         if (units := getattr(getattr(settings, section), "activation", "relu")) != "relu":
             raise InputError(f"--{section}.activation {units}: policy files hold relu; see mjxball.train.train")
-    out = cli.output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
+    out = _output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)
     members = 1 if options.num_seeds is None else options.num_seeds
     if not 1 <= members <= MOST_MEMBERS:
@@ -249,10 +273,7 @@ def _start_from(options: argparse.Namespace, settings: config.Config, members: i
 
 
 def _start(path: Path, settings: config.Config) -> dict[str, str]:
-    try:
-        start = {"policy": str(path), "sha256": file_hash(path)}
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from None
+    start = {"policy": str(path), "sha256": file_hash(path)}
     sizes = [len(bias) for bias in start_policy(start, settings).biases[:-1]]
     if sizes != list(settings.gradient.policy_layers):
         layers = ",".join(map(str, sizes))

@@ -7,6 +7,7 @@ from mjxball.config._leaf import Range
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._plant import LEAST_LIFTING, Drone, Plant
 from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
+from mjxball.config._plausible import thrust_over_weight, total_mass
 from mjxball.config._presets import PRESETS, preset
 from mjxball.config._renamed import CONSTANT, RENAMED, current_name, old_names, with_current_names
 from mjxball.config._rigs import Rigs
@@ -75,8 +76,10 @@ __all__ = [
     "preset",
     "read_plant",
     "replace",
+    "thrust_over_weight",
     "to_dict",
     "to_json",
+    "total_mass",
     "validate",
     "with_current_names",
     "with_plant",

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mjxball.config._load import follow_plant
 from mjxball.config._plant import Plant
+from mjxball.config._renamed import current_name
 from mjxball.config._settings import Config
-from mjxball.config._tree import apply_overrides, leaves
+from mjxball.config._tree import apply_overrides, leaves, override
 from mjxball.config._validate import validate
 from mjxball.errors import InputError
+from mjxball.files import MissingFileError, read_text
+from mjxball.reading import parse_json
 
 PLANT_PARTS = ("plant", "attitude", "autopilot", "scenario", "motion")  # what a plant file may set
 SHIPPED = Path(__file__).parent / "plants"
@@ -60,13 +63,13 @@ def read_plant(source: Path | str) -> PlantFile:
 def _parsed(path: Path) -> dict[str, Any]:
     kind = "TOML" if path.suffix == ".toml" else "JSON"
     try:
-        text = path.read_text(encoding="utf-8")
-        values = tomllib.loads(text) if kind == "TOML" else json.loads(text)
-    except OSError as error:
-        known = f"; by name there are {', '.join(PLANTS)}" if isinstance(error, FileNotFoundError) else ""
-        raise InputError(f"plant file {path} cannot be read: {error.strerror or error}{known}") from None
-    except (ValueError, RecursionError):
-        raise InputError(f"plant file {path} is not {kind}") from None
+        text = read_text(path, "plant file")
+    except MissingFileError as error:
+        raise InputError(f"{error}; by name there are {', '.join(PLANTS)}") from None
+    try:
+        values = tomllib.loads(text) if kind == "TOML" else parse_json(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"plant file {path} is not {kind}: {error}") from None
     if not isinstance(values, dict) or not values:
         raise InputError(f'plant file {path} must be one {kind} object such as {{"plant.rotor_lag": 0.06}}')
     return values
@@ -89,11 +92,19 @@ def _check_inertias(plant: Plant) -> None:
             raise InputError(f"{name} {inertia!r} is that of no body: one number is larger than the sum of the others")
 
 
-def with_plant(config: Config, source: Path | str) -> Config:
-    """`config` with the settings of the plant file `source`, validated. Raises InputError with one sentence."""
+def with_plant(config: Config, source: Path | str | None, flags: Mapping[str, str] | None = None) -> Config:
+    """`config` with the settings of the plant file `source`, then of `flags` (path -> text), validated as a whole.
+
+    The load that is drawn follows from the plant where neither says otherwise. Raises InputError with one sentence.
+    """
+    flags = flags or {}
     try:
-        settings = read_plant(source).settings
-        changed = validate(apply_overrides(config, settings))
+        settings = {} if source is None else read_plant(source).settings
+        changed = apply_overrides(config, settings)
+        for path, text in flags.items():
+            changed = override(changed, path, text)
+        said = {current_name(path) for path in (*settings, *flags)}
+        changed = validate(follow_plant(changed, config.plant, said))
         if DRONES in settings:
             _check_inertias(changed.plant)
         return changed
@@ -101,4 +112,6 @@ def with_plant(config: Config, source: Path | str) -> Config:
         raise InputError(f"plant file {source} holds a number that is not finite") from None
     except InputError as error:
         text = str(error)
-        raise InputError(text if text.startswith("plant file") else f"plant file {source}: {text}") from None
+        if source is None or text.startswith(("plant file", "--")):
+            raise
+        raise InputError(f"plant file {source}{' with these flags' if flags else ''}: {text}") from None

@@ -151,8 +151,8 @@ class Follower:
 class Timing:
     """Clock rates."""
 
-    control_period: float = setting(0.02, "time between two commands [s]", above=0)
-    physics_steps: int = setting(4, "physics and attitude-loop steps in a control period", low=1)
+    control_period: float = setting(0.02, "time between two commands [s]", low=1e-3)
+    physics_steps: int = setting(4, "physics and attitude-loop steps in a control period", low=1, high=1000)
     episode_steps: int = setting(1000, "control steps of a training episode, then truncated", low=1)
 
 

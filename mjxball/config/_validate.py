@@ -10,6 +10,7 @@ import typing
 from typing import Any, Literal
 
 from mjxball.config._plant import LEAST_LIFTING, Plant
+from mjxball.config._plausible import check_units
 from mjxball.config._settings import Config
 from mjxball.config._tree import leaves
 from mjxball.errors import InputError
@@ -71,6 +72,7 @@ def validate(config: Config) -> Config:
         kind: Any = type(owner)  # hashable, which no type checker knows of `type[Any]`
         _check_leaf(path, value, item, _types_of(kind)[item.name])
     _validate_plant(config.plant)
+    check_units(config)
     _validate_team(config)
     _validate_autopilot(config)
     _validate_motion(config)
@@ -117,7 +119,10 @@ def _validate_plant(plant: Plant) -> None:
             raise InputError(f"plant.drones.{one}.mount and plant.drones.{other}.mount are the same place")
     for number, drone in enumerate(plant.drones):
         if math.hypot(*drone.mount) > FARTHEST:
-            raise InputError(f"plant.drones.{number}.mount lies beyond {FARTHEST:g} m from O")
+            far = max(map(abs, drone.mount))
+            raise InputError(
+                f"plant.drones.{number}.mount lies beyond {FARTHEST:g} m from O; {far:g} mm would be {far / 1000:g} m"
+            )
     if plant.carrier_mass > 0 and min(plant.carrier_inertia) <= 0:
         raise InputError(f"plant.carrier_inertia {plant.carrier_inertia!r} is singular, and the carrier has a mass")
     if len(plant.directions) == 1:
@@ -173,7 +178,8 @@ def _validate_team(config: Config) -> None:
         return
     if max(scenario.team_sizes) > plant.count:
         raise InputError(
-            f"scenario.team_sizes go up to {max(scenario.team_sizes)} drones, and the plant has {plant.count}"
+            f"scenario.team_sizes go up to {max(scenario.team_sizes)} drones, and the plant has {plant.count}: set "
+            f"scenario.team_sizes to {plant.count} or less, or to nothing for this plant alone"
         )
     if plant.count < 3 or len(plant.directions) == 1 or plant.leader or config.autopilot.kind != "ideal":
         raise InputError(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from threading import get_ident
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
 from mjxball.config import Config
-from mjxball.control.observation import copy_command
+from mjxball.control.observation import OBSERVATION, OBSERVATION_SIZE, copy_command
 from mjxball.errors import InputError
 
 Array = Any
+LARGEST = 1e6  # sum of the absolute numbers of an observation: no flight comes near it, and float32 can filter it
 
 
 class PrivilegedInfo(NamedTuple):
@@ -51,26 +55,95 @@ class Follower(Protocol):
         """Start an episode with a fresh state."""
 
     def __call__(self, observation: Array) -> Array:
-        """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18)."""
+        """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18).
+
+        Raises InputError for what is no observation (`checked_observation`), and remembers nothing of it.
+        """
+
+
+def checked_observation(observation: Array) -> np.ndarray:
+    """`observation` (..., 18) as float64; InputError, with the name of the number, unless a follower may see it.
+
+    Real numbers, finite, their absolute sum below `LARGEST`. A follower that filters what it sees would otherwise
+    remember one such number for the rest of the flight.
+    """
+    given = np.asarray(observation)
+    if given.dtype.kind not in "fiu" or isinstance(observation, np.ma.MaskedArray):
+        kind = "masked numbers" if given.dtype.kind in "fiu" else given.dtype
+        raise InputError(f"an observation is of {OBSERVATION_SIZE} real numbers, not of {kind}")
+    if given.shape[-1:] != (OBSERVATION_SIZE,):
+        raise InputError(f"observation must have {OBSERVATION_SIZE} numbers last, not shape {given.shape}")
+    seen = given.astype(np.float64)
+    if given.ndim == 1:
+        sound = sum(map(abs, seen.tolist())) < LARGEST  # of so few numbers a third of the time that NumPy needs
+    else:
+        sound = bool((np.abs(seen).sum(axis=-1) < LARGEST).all())
+    if not sound:
+        size = np.where(np.isnan(seen), np.inf, np.abs(seen))
+        value, (name, unit) = seen.flat[int(size.argmax())], OBSERVATION[int(size.argmax()) % OBSERVATION_SIZE]
+        raise InputError(
+            f"an observation has {value:g} for {name} [{unit}], which no flight has; it was not answered, and nothing "
+            "of it is remembered: leave it out, or reset the follower"
+        )
+    return seen
+
+
+class OneThread:
+    """The thread whose flight a follower remembers: the first that calls it after a reset.
+
+    Two threads that call one follower by turns would each be answered from a mixture of both flights.
+    """
+
+    def __init__(self) -> None:
+        self._of: dict[str, int] = {}
+
+    def check(self, name: str) -> None:
+        """Raise RuntimeError if another thread has called follower `name` since its last reset."""
+        here = get_ident()
+        if self._of.setdefault("flight", here) != here:  # atomic, so that of two first callers one is refused
+            raise RuntimeError(
+                f"follower {name} remembers a flight of another thread: give every thread its own (copy.copy), "
+                "reset it between flights, or keep the memory yourself (.law, which is pure)"
+            )
+
+    def forget(self) -> None:
+        """Any thread may be the next."""
+        self._of = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which any thread may take."""
+        return {"_of": {}}
 
 
 class Baseline:
-    """A `Law` with its state. Set `privileged` before a call; without it the plant's own mass is believed."""
+    """A `Law` with its state, for one flight of one thread at a time (see `OneThread`); `law` itself is pure.
+
+    Set `privileged` before a call; without it the plant's own mass is believed.
+    """
 
     def __init__(self, law: Law, config: Config):
         self.law, self.name = law, law.name
         self.privileged: PrivilegedInfo | None = None
         self._believed_mass = config.plant.object_mass
         self._state: Any = None
+        self._thread = OneThread()
 
     def reset(self) -> None:
         """See `Follower.reset`."""
         self._state, self.privileged = None, None
+        self._thread.forget()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which go on by themselves."""
+        return {**self.__dict__, "_thread": OneThread()}
 
     def __call__(self, observation: Array) -> Array:
         """See `Follower.__call__`. Raises InputError if the law needs `privileged` and it is not set."""
+        observation = checked_observation(observation)
         if self._state is None:
             self._state = self.law.start(observation)
+        if not isinstance(self._state, tuple) or self._state:
+            self._thread.check(self.name)
         privileged = self.privileged or self._nominal(observation)
         self._state, command = self.law.step(self._state, observation, privileged)
         return command

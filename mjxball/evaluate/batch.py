@@ -88,8 +88,7 @@ class Batch:
 
     def _run(self, scenarios: Sequence[Scenario], keeps: bool) -> Any:
         """(metrics, rows of `Course` or None)."""
-        for scenario in scenarios:
-            check_scenario(self._config, scenario)
+        scenarios = [check_scenario(self._config, scenario) for scenario in scenarios]
         if len({scenario.seconds for scenario in scenarios}) != 1:
             raise InputError("scenarios of one batch must last equally long")
         period = self._config.timing.control_period
@@ -98,17 +97,18 @@ class Batch:
         followers = followers_axis(self._config)
         sensors, delays = sensors_of(disturbances, period, followers)
         single = lambda tree: jax.tree.map(lambda leaf: np.asarray(leaf, _single(leaf)), tree)  # noqa: E731
-        flown = rollout.load_of(scenarios, self._config.plant.count), rollout.start_of(self._config, scenarios)
+        flown = rollout.load_of(self._config, scenarios), rollout.start_of(self._config, scenarios)
         load, start = single(flown)
+        most = single(metrics.rotor_limits(self._config.plant, scenarios))
         goals, samples = single(
-            (rollout.targets(scenarios, count + 1, period), record(disturbances, count + 2, period, followers))
+            (rollout.targets(self._config, scenarios, count + 1), record(disturbances, count + 2, period, followers))
         )
         force, later = samples.at(slice(count + 1)).force, samples.at(slice(1, None))
         inputs = Inputs(
             np.arange(count + 1, dtype=np.int32), (goals[:-1], goals[1:]), force, later._replace(force=None)
         )
         with jax.default_matmul_precision("highest"):
-            return self._program(sensors, delays, keeps)(start, load, goals[0], samples.at(0), inputs)
+            return self._program(sensors, delays, keeps)(start, load, most, goals[0], samples.at(0), inputs)
 
     def _program(self, sensors: SensorModel, delays: np.ndarray, keeps: bool) -> Any:
         """The compiled flight; delays, biases and resolutions are constants in it, everything else is given to it."""
@@ -126,6 +126,7 @@ class Batch:
         keeps: bool,
         start: PlantState,
         load: Load,
+        most: Float[Array, "n drones"],
         goal: Float[Array, "n 3"],
         first: Sample,
         inputs: Inputs,
@@ -135,7 +136,7 @@ class Batch:
         carry = Carry(state, observation, self._law.start(observation), running)
 
         def step(carry: Carry, inputs: Inputs) -> tuple[Carry, Any]:
-            return self._step(loop, load, carry, inputs), self._seen(carry, load, inputs) if keeps else None
+            return self._step(loop, load, most, carry, inputs), self._seen(carry, load, inputs) if keeps else None
 
         last, rows = jax.lax.scan(step, carry, inputs)
         return last.running, rows
@@ -146,7 +147,9 @@ class Batch:
         offset = self._offset(plant, load)
         return inputs.goals[0] - plant.position, plant.velocity, euler, offset, carry.loop.diverged
 
-    def _step(self, loop: ClosedLoop, load: Load, carry: Carry, inputs: Inputs) -> Carry:
+    def _step(
+        self, loop: ClosedLoop, load: Load, most: Float[Array, "n drones"], carry: Carry, inputs: Inputs
+    ) -> Carry:
         config, state, observation = self._config, carry.loop, carry.observation
         plant, goals = state.plant, inputs.goals
         follower, answer = self._law.step(carry.follower, observation, self._privileged(plant, load))
@@ -155,7 +158,7 @@ class Batch:
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
         time = inputs.number * jnp.float32(config.timing.control_period)
         flown = (time, plant.position, goals[0], euler, plant.rotor_force, *commands, state.diverged)
-        limits = (config.scenario.termination_distance, config.plant.rotor_force_max, config.plant.leader)
+        limits = (config.scenario.termination_distance, most, config.plant.leader)
         return Carry(moved, after, follower, metrics.update(carry.running, rollout.Tick(*flown), *limits))
 
 

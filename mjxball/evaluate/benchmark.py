@@ -18,7 +18,10 @@ from mjxball.evaluate.results import Result, fly_scenarios, scenario_title
 from mjxball.evaluate.variants import Suite, Variant
 
 # What the tables show and rank: less is better in each.
-RANKED = ("rmse", "settling_time", "overshoot", "x_peak", "peak", "max_tilt", "effort", "smoothness", "saturation")
+RANKED = (
+    *("rmse", "settling_time", "overshoot", "x_peak", "peak", "max_tilt", "effort", "smoothness", "saturation"),
+    *("rotors_at_limit", "rotor_power", "command_spread"),
+)
 MEASURED = tuple(item.name for item in dataclasses.fields(Metrics) if item.name != "failed")
 ORACLE = "oracle"
 BATCH = 32  # scenarios in one batch of recorded flights
@@ -183,7 +186,10 @@ def by_variant(scores: Sequence[Score]) -> dict[tuple[str, str], list[Score]]:
     return variants
 
 
-SHOWN = ("peak", "rmse", "settling_time", "overshoot", "saturation")  # in the text table
+SHOWN = (  # in the text table
+    *("peak", "rmse", "settling_time", "overshoot", "saturation"),
+    *("rotors_at_limit", "rotor_power", "command_spread"),
+)
 
 
 def text_table(scores: Sequence[Score]) -> str:
@@ -191,11 +197,11 @@ def text_table(scores: Sequence[Score]) -> str:
     heads = ("suite", "variant", "follower")
     width = [max(len(head), *(len(getattr(score, head)) for score in scores)) for head in heads]
     lines = [" ".join(f"{head:<{w}}" for head, w in zip(heads, width, strict=True))]
-    lines[0] += "".join(f"{name:>15}" for name in (*SHOWN, "failed"))
+    lines[0] += "".join(f"{name:>16}" for name in (*SHOWN, "failed"))
     for score in scores:
         line = " ".join(f"{getattr(score, head):<{w}}" for head, w in zip(heads, width, strict=True))
-        line += "".join(f"{score.summary(name).median:15.4g}" for name in SHOWN)
-        lines.append(line + f"{score.failures:>11}/{len(score.metrics)}")
+        line += "".join(f"{score.summary(name).median:16.4g}" for name in SHOWN)
+        lines.append(line + f"{score.failures:>12}/{len(score.metrics)}")
     return "\n".join(lines)
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.config import Plant
 from mjxball.rewards import paper_reward
 from mjxball.sim.rollout import Tick, Trajectory
+from mjxball.sim.scenario import Scenario
 
 Array = Any
 RMSE_UNTIL = 20.0  # [s]
@@ -18,6 +21,8 @@ STEADY_AFTER = 20.0  # [s]
 WAYPOINT_SECONDS = 10.0  # [s] after the last waypoint became the goal, before which nothing is steady
 SETTLED = (0.02, 0.10)  # of the error at the start of the last leg
 SATURATED_WITHIN = 1e-6  # of the largest rotor force
+# Likewise: a lagging rotor comes this near within 0.14 s, and to the exact limit only if it is asked for much longer.
+AT_LIMIT_WITHIN = 0.01
 NEVER_WITHIN = 0.1  # [s] of the end: not settled
 TINY, ROUNDING = 1e-9, 1e-5  # [s] of a time in float64, in float32
 
@@ -40,6 +45,9 @@ class Metrics:
     effort: float | None  # rms deviation of the followers' rotor forces from those at the start, hover [N]
     smoothness: float | None  # rms change of the followers' pitch and roll commands from step to step [rad]
     saturation: float | None  # share of the followers' rotors and all steps at 0 or the largest force
+    rotors_at_limit: float | None  # share of steps in which any rotor is within 1 % of 0 or of its largest force
+    rotor_power: float | None  # mean of sum F^1.5 over all rotors, over that at the start, hover
+    command_spread: float | None  # rms of the followers' roll and pitch less their mean; None: one follower [rad]
     failed: bool  # |e_o| beyond d_term, or a value that is not finite
 
     @property
@@ -61,6 +69,9 @@ class RunningMetrics(NamedTuple):
     effort: Array
     change: Array
     saturated: Array
+    limited: Array
+    power: Array
+    spread: Array
     failed: Array
     initial: Array  # |e_o| at the start of the leg [m]
     leg: Array  # when the last waypoint became the goal [s]
@@ -71,6 +82,7 @@ class RunningMetrics(NamedTuple):
     furthest: Array  # (n, 3) along each axis towards the goal [m]
     tilt: Array
     hover: Array  # (n, F, 4) the followers' rotor forces at the start [N]
+    hover_power: Array  # of all rotors there [N^1.5]
     tilts: Array  # (n, F, 2) their last roll and pitch commands
     target: Array  # (n, 3)
 
@@ -83,7 +95,7 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
     no_peaks = xp.concat([none, none[:, :1]], axis=-1)
     scalar = xp.sum(zero[:0])
     return RunningMetrics(
-        *(scalar, scalar, scalar, zero, zero, zero, zero, zero, zero, zero > 1),
+        *(scalar, scalar, scalar, *[zero] * 9, zero > 1),
         initial=_norm(target - position),
         leg=zero,
         steady_from=zero + STEADY_AFTER,
@@ -93,15 +105,19 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
         furthest=none,
         tilt=zero,
         hover=hover,
+        hover_power=_power(rotor_force),
         tilts=xp.zeros_like(hover[..., :2]),
         target=target,
     )
 
 
 def update(
-    running: RunningMetrics, tick: Tick, termination_distance: float, rotor_force_max: float, leader: int = 0
+    running: RunningMetrics, tick: Tick, termination_distance: float, rotor_force_max: Array | float, leader: int = 0
 ) -> RunningMetrics:
-    """Take one control step of all flights into account; `leader` is the number of the drone that leads."""
+    """Take one control step of all flights into account; `leader` is the number of the drone that leads.
+
+    `rotor_force_max` [N] is one number, or (N,) or (n, N), see `rotor_limits`.
+    """
     xp = tick.position.__array_namespace__()
     error = tick.target - tick.position
     distance = _norm(error)
@@ -118,11 +134,14 @@ def update(
     rotors = _of_followers(tick.rotor_force, leader)
     led, followed = tick.leader_command[:, None], xp.reshape(tick.follower_command, (*rotors.shape[:2], 3))
     tilts, difference = followed[..., :2], followed - led
-    slack = SATURATED_WITHIN * rotor_force_max
-    at_a_limit = (rotors <= slack) | (rotors >= rotor_force_max - slack)
+    most = xp.asarray(rotor_force_max, dtype=rotors.dtype)
+    most = xp.broadcast_to(most, tick.rotor_force.shape[:-1])[..., None]
+    saturated = _of_followers(_within(SATURATED_WITHIN, tick.rotor_force, most), leader)
+    limited = xp.max(_within(AT_LIMIT_WITHIN, tick.rotor_force, most), axis=(-2, -1))
     early = tick.time <= RMSE_UNTIL + TINY
     mimicry = xp.mean(paper_reward(led, followed), axis=-1)
     change = xp.mean((tilts - running.tilts) ** 2, axis=(-2, -1))
+    apart = tilts - xp.mean(tilts, axis=-2, keepdims=True)
     return RunningMetrics(
         steps=running.steps + 1,
         time=running.time * 0 + tick.time,
@@ -132,7 +151,10 @@ def update(
         returned=running.returned + xp.where(running.steps < PAPER_STEPS, mimicry, 0.0),
         effort=running.effort + xp.mean((rotors - running.hover) ** 2, axis=(-2, -1)),
         change=running.change + xp.where(running.steps > 0, change, 0.0),
-        saturated=running.saturated + xp.mean(xp.where(at_a_limit, 1.0, 0.0), axis=(-2, -1)),
+        saturated=running.saturated + xp.mean(saturated, axis=(-2, -1)),
+        limited=running.limited + limited,
+        power=running.power + _power(tick.rotor_force),
+        spread=running.spread + xp.mean(apart**2, axis=(-2, -1)),
         failed=running.failed | tick.diverged | ~(distance <= termination_distance),
         initial=initial,
         leg=xp.where(new, tick.time, running.leg),
@@ -143,6 +165,7 @@ def update(
         furthest=xp.fmax(running.furthest, tick.position * xp.sign(tick.target)),
         tilt=xp.fmax(running.tilt, xp.hypot(tick.euler[:, 0], tick.euler[:, 1])),
         hover=running.hover,
+        hover_power=running.hover_power,
         tilts=tilts,
         target=tick.target,
     )
@@ -172,19 +195,35 @@ def results(running: RunningMetrics) -> list[Metrics]:
             "effort": np.sqrt(t.effort / t.steps),
             "smoothness": np.sqrt(t.change / max(t.steps - 1, 1)),
             "saturation": t.saturated / t.steps,
+            "rotors_at_limit": t.limited / t.steps,
+            "rotor_power": t.power / t.steps / t.hover_power,
+            "command_spread": np.sqrt(t.spread / t.steps) if t.hover.shape[1] > 1 else t.spread * np.nan,
         }
     rows = zip(*columns.values(), strict=True)
     named = (dict(zip(columns, map(_number, row), strict=True)) for row in rows)
     return [Metrics(**numbers, failed=bool(failed)) for numbers, failed in zip(named, t.failed, strict=True)]
 
 
-def measure(flight: Trajectory, termination_distance: float, rotor_force_max: float = 5.5, leader: int = 0) -> Metrics:
+def rotor_limits(plant: Plant, scenarios: Sequence[Scenario]) -> np.ndarray:
+    """Largest force (n, N) of a rotor of every drone in each flight [N]; NaN of a drone that is lost in it.
+
+    What a drone gives less than it is asked for (`Scenario.thrust`) lowers its limit; a stopped rotor has none.
+    """
+    found = np.array([np.array(plant.of_drones("rotor_force_max")) * (s.thrust or 1.0) for s in scenarios])
+    for number, scenario in enumerate(scenarios):
+        found[number, [drone for drone, _ in scenario.lost]] = np.nan
+    return found
+
+
+def measure(
+    flight: Trajectory, termination_distance: float, rotor_force_max: Array | float = 5.5, leader: int = 0
+) -> Metrics:
     """Metrics of one recorded flight (no batch axis)."""
     return measure_batch(flight.batched(), termination_distance, rotor_force_max, leader)[0]
 
 
 def measure_batch(
-    flights: Trajectory, termination_distance: float, rotor_force_max: float = 5.5, leader: int = 0
+    flights: Trajectory, termination_distance: float, rotor_force_max: Array | float = 5.5, leader: int = 0
 ) -> list[Metrics]:
     """Metrics of every flight of a recorded batch."""
     first = flights.tick(0)
@@ -200,6 +239,19 @@ def _of_followers(rotor_force: Array, leader: int) -> Array:
         return rotor_force[:, 1:]
     xp = rotor_force.__array_namespace__()
     return xp.concat([rotor_force[:, :leader], rotor_force[:, leader + 1 :]], axis=1)
+
+
+def _within(share: float, force: Array, most: Array) -> Array:
+    """1 where a rotor's force is within `share` of `most` of 0 or `most`, else 0; NaN of a force that nobody knows."""
+    xp = force.__array_namespace__()
+    found = (force <= share * most) | (force >= (1 - share) * most)
+    return xp.where(xp.isnan(force), xp.nan, xp.astype(found, force.dtype))
+
+
+def _power(rotor_force: Array) -> Array:
+    """(n,) of (n, N, 4): what air takes from rotors that hover, but for a factor of their size [N^1.5]."""
+    xp = rotor_force.__array_namespace__()
+    return xp.sum(xp.maximum(rotor_force, xp.zeros_like(rotor_force)) ** 1.5, axis=(-2, -1))
 
 
 def _norm(vector: Array) -> Array:

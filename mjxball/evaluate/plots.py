@@ -15,7 +15,8 @@ import numpy as np
 
 from mjxball.evaluate.benchmark import Score, Summary
 from mjxball.evaluate.results import RESULTS, Result, scenario_stem, scenario_title, to_json
-from mjxball.plotting import pyplot
+from mjxball.files import write_whole
+from mjxball.plotting import pyplot, save
 from mjxball.sim.rollout import Trajectory
 
 POINTS = 240  # of a curve over time
@@ -184,7 +185,7 @@ def draw_flights(results: Sequence[Result], title: str, path: Path) -> None:
     axes[-1].set_xlabel("time [s]")
     axes[-1].xaxis.set_label_coords(0.5, -0.22)
     figure.suptitle(title, y=0.985)
-    figure.savefig(path, dpi=110)
+    save(figure, path)
     plt.close(figure)
 
 
@@ -229,7 +230,7 @@ def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | No
 def write_results(results: Sequence[Result], out: Path) -> None:
     """Write `cells.json` and one PNG for each scenario into the directory `out`, which is made."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / RESULTS).write_text(to_json(results))
+    write_whole(out / RESULTS, to_json(results))
     for _, group in itertools.groupby(results, key=lambda result: result.scenario):
         same = list(group)
         draw_flights(same, scenario_title(same[0]), out / f"{scenario_stem(same[0])}.png")

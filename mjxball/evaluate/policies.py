@@ -15,8 +15,32 @@ from mjxball.policy import Policy
 from mjxball.sim.outside import outside
 
 
-def load_policy(path: Path, config: Config, compare_laws: bool = True) -> Policy:
-    """Load a policy and refuse one that was made for another plant or rate, or for other control laws."""
+def load_policy(path: Path, config: Config, compare_laws: bool = True, seconds: float = 0.0) -> Policy:
+    """Load a policy and refuse one that was made for another plant or rate, or for other control laws.
+
+    Warns on stderr where a flight of `seconds` [s] goes beyond what its card says it was flown for.
+    """
+    policy = _fitting(path, config, compare_laws)
+    for text in beyond_card(policy.card, config.plant.count, seconds):
+        print(f"warning: {path} {text}", file=sys.stderr)  # noqa: T201
+    return policy
+
+
+def beyond_card(card: dict[str, Any], drones: int, seconds: float) -> list[str]:
+    """How a flight of `seconds` [s] with so many `drones` goes beyond what `card` says of flights, one phrase each."""
+    flown = card.get("flown")
+    if flown is None:
+        return []
+    sizes, longest = sorted(flown["drones"]), flown["seconds"]
+    found = []
+    if drones not in sizes:
+        found.append(f"is good for teams of {', '.join(map(str, sizes))} drones by its card, and here are {drones}")
+    if seconds > longest:
+        found.append(f"is good for {longest:g} s by its card, and this flight lasts {seconds:g} s")
+    return found
+
+
+def _fitting(path: Path, config: Config, compare_laws: bool) -> Policy:
     policy = Policy.load(path)
     policy.join(config.plant, config.attitude)
     period = config.timing.control_period
@@ -100,16 +124,13 @@ def check_bounds(policy: Policy, metrics: Metrics) -> list[str]:
 
 
 def native_config(path: Path) -> Config | None:
-    """The configuration in the card of a policy for Crazyflies or for a team, None for any other policy."""
+    """The configuration in a policy's card if its plant is not the paper's: Crazyflies, a team, a rig; else None."""
     settings = Policy.load(path).card.get("config")
     if not isinstance(settings, dict):
         return None
-    autopilot, plant = settings.get("autopilot"), settings.get("plant")
-    crazyflies = isinstance(autopilot, dict) and autopilot.get("kind") == "crazyflie"
-    drones = plant.get("drones") if isinstance(plant, dict) else None
-    if not crazyflies and not (isinstance(drones, list) and len(drones) > 2):
-        return None
-    return configs.validate(configs.from_record(settings))
+    found = configs.validate(configs.from_record(settings))
+    paper = found.autopilot.kind == "ideal" and found.plant == configs.preset("paper").plant
+    return None if paper else found
 
 
 def group_by_plant(paths: list[Path]) -> tuple[list[Path], list[tuple[Config, list[Path]]]]:

@@ -19,6 +19,7 @@ import numpy as np
 
 from mjxball import config as configs
 from mjxball.config import Plant
+from mjxball.reading import parse_json
 from mjxball.sim.rollout import Trajectory
 
 PANEL = (360, 360)  # height, width of one flight's panel
@@ -112,7 +113,7 @@ def _framing(plant: Plant, position: np.ndarray, goal: np.ndarray) -> tuple[np.n
 
 
 def _render(folder: Path) -> None:
-    about = json.loads((folder / "about.json").read_text())
+    about = parse_json((folder / "about.json").read_text())
     plant = configs.from_record({"plant": about["plant"]}).plant
     with np.load(folder / "flights.npz") as stored:
         pictures = frames(plant, about["labels"], {name: stored[name] for name in stored.files})

@@ -17,11 +17,12 @@ from mjxball.evaluate.benchmark import RANKED, Score, Summary, by_variant, winne
 from mjxball.evaluate.render import film
 from mjxball.evaluate.suites import GRID
 from mjxball.evaluate.variants import Suite
+from mjxball.files import write_whole
 from mjxball.policy import Policy
 
 TEMPLATES = Path(__file__).parent / "templates"
 UNITS = {"rmse": "m", "settling_time": "s", "x_peak": "m", "peak": "m", "max_tilt": "rad", "effort": "N"}
-UNITS |= {"smoothness": "rad"}
+UNITS |= {"smoothness": "rad", "command_spread": "rad"}
 COUNTED = {"peak": "steady-state peak", "rmse": "RMSE", "settling_time": "settling time", "overshoot": "overshoot"}
 RIVALS = ("adaptive", "lqg", "lqg-slow")  # that followers are compared with one by one
 CARD_HIDES = ("config", "plant", "observation", "action", "curve")  # long, and in the policy file
@@ -62,7 +63,7 @@ def write_report(
     }
     write_page("report.html", out / "report.html", context, policies, command, versions)
     records = {"command": command, "scores": [score.record() for score in scores]}
-    (out / "scores.json").write_text(json.dumps(records, indent=1, allow_nan=False) + "\n")
+    write_whole(out / "scores.json", json.dumps(records, indent=1, allow_nan=False) + "\n")
 
 
 def write_page(
@@ -85,7 +86,7 @@ def write_page(
         "versions": json.dumps(dict(versions), indent=1),
         "cards": {name: json.dumps(card, indent=1, default=str) for name, card in shown.items()},
     }
-    path.write_text(environment.get_template(template).render(**context, **made), encoding="utf-8")
+    write_whole(path, environment.get_template(template).render(**context, **made))
 
 
 def verdict(scores: Sequence[Score]) -> dict[str, Any]:

@@ -13,15 +13,15 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.control.followers import Follower
-from mjxball.evaluate.metrics import Metrics, measure_batch
+from mjxball.evaluate.metrics import Metrics, measure_batch, rotor_limits
 from mjxball.sim.rollout import Trajectory, simulate_batch
-from mjxball.sim.scenario import Scenario
+from mjxball.sim.scenario import Scenario, of_plant
 
 RESULTS = "cells.json"  # in the output directory
 # The metrics in `--json`, a fixed format; a benchmark's scores have all of them.
 JSON_METRICS = (
     *("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "plane_peak"),
-    *("max_tilt", "action_error", "failed"),
+    *("max_tilt", "action_error", "failed", "rotors_at_limit", "rotor_power", "command_spread"),
 )
 
 
@@ -60,9 +60,11 @@ def fly_scenarios(
     config: Config, followers: Sequence[Follower], scenarios: Sequence[Scenario], physics: str
 ) -> list[Result]:
     """Fly every follower through every scenario; results are ordered by scenario, then by follower."""
+    scenarios = [of_plant(config, scenario) for scenario in scenarios]
     flights = simulate_batch(config, [(follower, scenarios) for follower in followers], physics)
     plant, limit = config.plant, config.scenario.termination_distance
-    measured = measure_batch(flights, limit, plant.rotor_force_max, plant.leader)
+    most = rotor_limits(plant, [scenario for _ in followers for scenario in scenarios])
+    measured = measure_batch(flights, limit, most, plant.leader)
     results = []
     for (i, scenario), (j, follower) in itertools.product(enumerate(scenarios), enumerate(followers)):
         index = j * len(scenarios) + i
@@ -80,14 +82,19 @@ COLUMNS = (
     ("plane_peak", "plane m", 1.0, 4),
     ("max_tilt", "tilt deg", 180 / math.pi, 1),
     ("action_error", "act.err", 1.0, 3),
+    ("rotors_at_limit", "limit %", 100.0, 1),
+    ("rotor_power", "power", 1.0, 3),
+    ("command_spread", "spread deg", 180 / math.pi, 2),
 )
 
 
 def table(results: Sequence[Result]) -> str:
     """One line per result; a dash where a metric does not exist."""
-    # Where the load moves along a line, the error in the plane is hardly more than along it.
+    # Where the load moves along a line, the error in the plane is hardly more than along it; a pair has no spread.
     in_plane = any(np.ndim(result.flight.cg_offset) > 1 for result in results)
-    columns = [column for column in COLUMNS if in_plane or column[0] != "plane_peak"]
+    several = any(result.metrics.command_spread is not None for result in results)
+    shown = {"plane_peak": in_plane, "command_spread": several}
+    columns = [column for column in COLUMNS if shown.get(column[0], True)]
     head = ["omega", "ampl.", "mass", "believed", "follower", *(title for _, title, _, _ in columns), ""]
     rows = [head]
     for result in results:

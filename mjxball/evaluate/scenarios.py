@@ -5,21 +5,26 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mjxball.config import Config, ball_limit, cg_limit
+from mjxball.config import Config, ball_limit, preset, thrust_over_weight, total_mass
 from mjxball.errors import InputError
-from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario
+from mjxball.files import read_text
+from mjxball.plant.trim import largest_amplitude
+from mjxball.reading import check_times
+from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario, of_plant
 
-REFERENCE = Scenario()
+REFERENCE = of_plant(preset("paper"), Scenario())
 # Copy without CG motion, then five speeds of the CG.
 STANDARD = (
     dataclasses.replace(REFERENCE, amplitude=0.0),
     *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.31, 0.62, 1.0, 2.0, 3.1)),
 )
 MOST_SAMPLES = 100_000
+SLOWEST = 60.0  # [s] between two samples of a waveform, as a rule
 
 
 def cross(
@@ -33,43 +38,41 @@ def cross(
 def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
     """The standard scenarios as far as the plant allows them, the reference one last; raise InputError if unsound.
 
-    The object has the plant's mass, the CG keeps to the object and to what training draws, a stand's locked axes have
-    goal 0, and the goal is drawn in to what training may draw. A waveform or a rolling ball makes one scenario. In the
-    plane the CG goes round in a circle.
+    Load and goal are the plant's (`of_plant`). A waveform or a rolling ball makes one scenario. In the plane the CG
+    goes round in a circle.
     """
-    plant = settings.plant
-    distance = min(REFERENCE.goal[0], settings.scenario.goal_range)
-    free = {"free": (1, 1, 1), "pivot": (0, 0, 0), "heave": (0, 0, 1)}[plant.stand]
-    common: dict[str, Any] = {"mass": plant.object_mass, "goal": tuple(distance * float(axis) for axis in free)}
-    if len(plant.directions) == 2:
-        common["path"] = CIRCLE
-    reference = dataclasses.replace(
-        REFERENCE,
-        amplitude=min(REFERENCE.amplitude, cg_limit(plant), settings.scenario.cg_amplitude[1]),
-        ball_start=min(settings.scenario.ball_start, ball_limit(plant)),
-        **common,
-    )
+    plant, path = settings.plant, CIRCLE if len(settings.plant.directions) == 2 else REFERENCE.path
+    start = min(settings.scenario.ball_start, ball_limit(plant))
+    reference = of_plant(settings, Scenario(path=path, ball_start=start))
     others = [
         dataclasses.replace(reference, omega=s.omega, amplitude=min(s.amplitude, reference.amplitude))
         for s in STANDARD
         if s != REFERENCE and settings.motion.kind == "sine"
     ]
-    scenarios = (*others, reference)
-    for scenario in scenarios:
-        check_scenario(settings, scenario)
-    return scenarios
+    return tuple(check_scenario(settings, scenario) for scenario in (*others, reference))
+
+
+def rig_line(settings: Config) -> str:
+    """What a user should see of a rig before its results: mass, thrust over weight, trim."""
+    plant, margin = settings.plant, settings.scenario.trim_margin
+    offset = largest_amplitude(plant, plant.object_mass, margin)
+    trimmed = f"CG trimmed up to {offset:.3g} m" if offset >= 0 else "CG not trimmed even at O"
+    return (
+        f"rig: {plant.count} drones, {total_mass(plant):.4g} kg with an object of {plant.object_mass:g} kg, "
+        f"thrust over weight {thrust_over_weight(plant):.3g}, {trimmed} with {margin:.0%} of the rotors' range left"
+    )
 
 
 def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Times [s] and offsets [m] from a CSV file with two columns; a header line is allowed.
 
-    Raises InputError if the file cannot be read; order and range are checked with the configuration.
+    Raises InputError if the file cannot be read or its times do not increase; the range is checked with the
+    configuration. stderr says where samples are missing and the motion is a guess.
     """
     try:
-        with path.open(newline="") as stream:
-            lines = [line for line in csv.reader(stream) if line]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"waveform {path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        lines = [line for line in csv.reader(read_text(path, "waveform").splitlines()) if line]
+    except csv.Error as error:
+        raise InputError(f"waveform {path} cannot be read: {error}") from None
     if len(lines) > MOST_SAMPLES:
         raise InputError(f"waveform {path} has more than {MOST_SAMPLES:,} lines")
     samples = []
@@ -84,4 +87,10 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     if not samples:
         raise InputError(f"waveform {path} has no samples")
     times, offsets = zip(*samples, strict=True)
+    if len(times) > 1:
+        try:
+            for remark in check_times(times, longest=SLOWEST):
+                print(f"waveform {path}: {remark}; the CG moves on a spline there", file=sys.stderr)  # noqa: T201
+        except ValueError as error:
+            raise InputError(f"waveform {path}: {error}, a header not counted") from None
     return times, offsets

@@ -27,6 +27,10 @@ BRAKE_TILT = math.radians(8)  # of a descent that brakes sideways
 BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
 BLIND_LIMIT = 2.5  # [s] that it lasts at most
 BRISK, GENTLE = 3.0, 0.7  # [m/s2] downward at most: where both drones hear, and where one may not
+UNEVEN = 1.5  # [m/s2] likewise of the one that hears, measured: the stick bears the moment of so much less thrust
+STAND_BY = 0.4  # [s] before the firmware stops a drone by which the pair is to stand
+NEAR_GROUND = 0.04  # [m]
+HELD_SPEEDS = (0.2, 1.2)  # [m/s] least and most of a descent that has to end in time
 Array = Any
 
 
@@ -125,6 +129,19 @@ def ramp(elapsed: float, times: Times, constants: CommandMap) -> Setpoint:
 def sinking_share(climb: float, times: Times) -> float:
     """Share of the thrust that hovers by which a drone of vertical speed `climb` [m/s] comes to sink as wanted."""
     return 1 + min(max(-0.4 * (climb + times.descend_speed), -0.3), 0.1)
+
+
+def timed_share(height: float, climb: float, left: float) -> float:
+    """Share of the trim by which a pair `height` [m] up, of vertical speed `climb` [m/s], stands in time.
+
+    In `left` seconds a drone that hears nothing, and holds its last thrust until then, is stopped by its firmware. What
+    is measured steers the descent, so that it is the same whether one drone obeys or both. Near the ground nothing is
+    braked: a pair that bounces may be in the air when it is stopped.
+    """
+    least, most = HELD_SPEEDS
+    wanted = -min(max(height / max(left - STAND_BY, 0.2), least), most)
+    faster = min(max(4 * (wanted - climb), -UNEVEN), UNEVEN) if height > NEAR_GROUND else -UNEVEN
+    return 1 + faster / GRAVITY
 
 
 def brake(velocity: np.ndarray) -> tuple[float, float]:

@@ -8,6 +8,7 @@ import os
 import select
 import signal
 import sys
+import textwrap
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -38,33 +39,51 @@ class View(NamedTuple):
     missed: int
 
 
-def lines(view: View, bounds: Limits, colour: bool = True) -> list[str]:
-    """What is shown of `view`; danger is white on red."""
-
-    def painted(text: str, code: str) -> str:
-        return f"{code}{text}{PLAIN}" if colour else text
-
+def lines(view: View, bounds: Limits, colour: bool = True, columns: int = 120) -> list[str]:
+    """What is shown of `view`, in lines that fit a terminal of `columns`; danger is white on red."""
     state = view.supervisor.state
     code = GREEN if state in GUIDED and view.supervisor.cause is None else YELLOW
     code = RED if view.supervisor.cause is not None or state in (State.HOLD, State.KILL) else code
     cause = view.supervisor.cause
     why = f" {cause.event.name} {cause.detail}" if cause else ""
-    timing = painted(f"loop {1000 * view.late:5.2f} ms late, {view.missed} missed/s", RED if view.missed else "")
-    shown = [f"{view.time:7.2f} s  {painted(f' {state.value.upper()}{why} ', code)}  {timing}"]
+    timing = f"loop {1000 * view.late:5.2f} ms late, {view.missed} missed/s"
+    first = [
+        (f"{view.time:7.2f} s", ""),
+        (f" {state.value.upper()}{why} ", code),
+        (timing, RED if view.missed else ""),
+    ]
+    shown = _wrapped(first, columns, colour)
     for name, drone, age, sent in zip(NAMES, view.states, view.ages, view.wanted, strict=True):
         roll, pitch, yaw = np.degrees(rotations.euler_from_matrix(rotations.matrix_from_quaternion(drone.quaternion)))
         x, y, z = drone.position
         low = drone.battery < bounds.battery + 0.1
         old = age > bounds.state_age / 2
         parts = [
-            f"{name:8} ({x:+.2f}, {y:+.2f}, {z:+.2f}) m",
-            f"roll {roll:+5.1f} pitch {pitch:+5.1f} yaw {yaw:+5.1f}",
-            painted(f"{drone.battery:.2f} V", RED if low else ""),
-            painted(f"state {1000 * age:4.0f} ms" if math.isfinite(age) else "state never", RED if old else ""),
-            f"thrust {sent.thrust:5d}",
+            (f"{name:8} ({x:+.2f}, {y:+.2f}, {z:+.2f}) m", ""),
+            (f"roll {roll:+5.1f} pitch {pitch:+5.1f} yaw {yaw:+5.1f}", ""),
+            (f"{drone.battery:.2f} V", RED if low else ""),
+            (f"state {1000 * age:4.0f} ms" if math.isfinite(age) else "state never", RED if old else ""),
+            (f"thrust {sent.thrust:5d}", ""),
         ]
-        shown.append("  ".join(parts))
+        shown += _wrapped(parts, columns, colour)
     return shown
+
+
+def _wrapped(parts: list[tuple[str, str]], columns: int, colour: bool) -> list[str]:
+    """Texts and their colours in lines of less than `columns`: one that a terminal breaks is not overwritten."""
+    rows: list[list[str]] = [[]]
+    width = 0
+    pieces = [(text, code) for whole, code in parts for text in _pieces(whole, columns - 1)]
+    for text, code in pieces:
+        if rows[-1] and width + 2 + len(text) >= columns:
+            rows.append([])
+        width = len(text) + (width + 2 if rows[-1] else 0)
+        rows[-1].append(f"{code}{text}{PLAIN}" if colour else text)
+    return ["  ".join(row) for row in rows]
+
+
+def _pieces(text: str, width: int) -> list[str]:
+    return [text] if len(text) <= width else textwrap.wrap(text, width)
 
 
 class Display:
@@ -86,14 +105,21 @@ class Display:
         if self._thread.is_alive():
             self._thread.join(timeout=1)
 
+    def _columns(self) -> int:
+        """Of the terminal, whose window may have changed."""
+        try:
+            return max(os.get_terminal_size(self._stream.fileno()).columns, 40)
+        except (OSError, ValueError):
+            return 80
+
     def _draw_all(self) -> None:
         while not self._done.wait(PERIOD):
             view = self._view()
             if view is None or (view.supervisor.state in ENDED and not self._drawn):
                 continue
-            text = lines(view, self._bounds)
-            up = f"\x1b[{self._drawn}A" if self._drawn else ""
-            self._stream.write(up + "".join(f"\x1b[2K{line}\n" for line in text))
+            text = lines(view, self._bounds, columns=self._columns())
+            up = f"\x1b[{self._drawn}A\x1b[J" if self._drawn else ""
+            self._stream.write(up + "".join(f"{line}\n" for line in text))
             self._stream.flush()
             self._drawn = len(text)
 

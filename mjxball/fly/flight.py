@@ -7,17 +7,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjxball.fly import command, packets
+from mjxball.fly import command, packets, probe
 from mjxball.fly.card import Commands, Controller
 from mjxball.fly.command import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
 from mjxball.fly.display import View
+from mjxball.fly.ending import Ending
 from mjxball.fly.handover import HandoverMonitor, Successor
+from mjxball.fly.lift import LiftWatch
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.monitor import Monitor, Sustained, UplinkWatch, link_faults, tilt_angle
 from mjxball.fly.packets import ZERO, PacketError, Setpoint
 from mjxball.fly.preflight import SpinCheck
-from mjxball.fly.supervisor import AIRBORNE, GUIDED, Event, Fault, State, Supervisor
+from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
 from mjxball.fly.watchdog import Watchdog
 
@@ -57,6 +59,8 @@ class Flight:
         self._every = max(round(controller.period / settings.period), 1)  # ticks per command
         self._count = 0
         self._monitor = Monitor(rig, settings)
+        self._lift = LiftWatch(settings.motor)
+        self.ending = Ending(settings, self._lifts_at)
         self._saturated = Sustained(settings.limits.saturation_time)
         self._back = Sustained(settings.limits.fresh)
         self._holds = 0
@@ -74,7 +78,11 @@ class Flight:
     @property
     def lifted(self) -> bool:
         """True if the pair left the ground, or was not to."""
-        return self._highest_place >= min(LIFTED, self.settings.goal[2] / 2)
+        return self._highest_place >= self._lifts_at
+
+    @property
+    def _lifts_at(self) -> float:
+        return min(LIFTED, self.settings.goal[2] / 2)
 
     @property
     def elapsed(self) -> float:
@@ -96,13 +104,26 @@ class Flight:
         self._read(now)
         faults = self._from_outside(missed, gap)
         faults += self._monitor.update(self.supervisor.state, self.links, self._ages, now)
+        if self._mocap is not None and any(fault.event is Event.FRAME for fault in faults):
+            self._mocap.halt()
         mapped, broken = self._command()
         self._advance(faults + broken + self._progress())
+        self._note_ending(faults + broken, gap)
         wanted = self._wanted(mapped)
         self._transmit(wanted)
         self._record(wanted, late, missed)
         self._count += 1
         return self.supervisor.state is not State.DONE
+
+    def _note_ending(self, faults: list[Fault], gap: float) -> None:
+        self.ending.update(faults, self.supervisor, self._now, gap)
+        seen = self._trusted()
+        if seen is not None and any(self._fresh) and self.supervisor.state not in ON_GROUND:
+            self.ending.touchdown.update(seen.position - self._monitor.origin, float(seen.velocity[2]), self._now)
+
+    def how_it_ended(self) -> list[str]:
+        """Why, and how the pair came down, a sentence each."""
+        return self.ending.sentences(self.supervisor, self._start, asked=self.interrupts > 0)
 
     def _read(self, now: float) -> None:
         self._now = now
@@ -119,7 +140,9 @@ class Flight:
             faults.append(Fault(Event.KEY_KILL, "asked for on the laptop"))
         elif self.interrupts:
             faults.append(Fault(Event.INTERRUPT, "asked for on the laptop"))
-        faults += link_faults(self.links, self._ages, bounds, self._now)
+        # Time in which this computer did nothing says nothing of the links.
+        idle = max(gap - self.settings.period, 0.0)
+        faults += link_faults(self.links, [age - idle for age in self._ages], bounds, self._now - idle)
         if self._holds > bounds.gaps:
             faults.append(Fault(Event.GAPS, f"{self._holds} times"))
         if missed > bounds.missed_deadlines or gap > bounds.longest_gap:
@@ -127,6 +150,9 @@ class Flight:
         if self._mocap is not None:
             faults += self._mocap.faults(self._now)
         flying = self.supervisor.state in AIRBORNE and not self.settings.dry_run
+        if flying and all(self._fresh):
+            volts, sinking = [state.battery for state in self._states], self.settings.times.descend_speed
+            faults += self._lift.update(volts, self.maps, self._height(self._object()), sinking, self._now)
         if self.watchdog is not None and not self.watchdog.beat(flying, self._last_known_state()):
             faults.append(Fault(Event.WATCHDOG))
         return faults
@@ -151,7 +177,9 @@ class Flight:
 
     def _stands(self) -> bool:
         seen, times = self._trusted(), self.settings.times
-        return seen is not None and self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
+        if seen is None:  # nothing tells: by the time that the blind way down takes, with some to spare
+            return self.elapsed >= len(self._shares) * self.settings.period + times.settled
+        return self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
 
     # What the laws want.
 
@@ -163,10 +191,11 @@ class Flight:
             seen = object_state(self._states, self.rig)
             if self.supervisor.state is State.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
-                self.succession.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
+                one, other = (s.thrust / c.hover_thrust for s, c in zip(self._sent, self.maps, strict=True))
+                self.succession.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion), (one, other))
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(self._now))
-            laws = (self._commands.leader, self._commands.follower)
+            laws = [law + self._probe() for law in (self._commands.leader, self._commands.follower)]
             mapped = [command.to_setpoint(law, constants) for law, constants in zip(laws, self.maps, strict=True)]
         except (PacketError, ValueError, FloatingPointError) as error:
             return None, [Fault(Event.BAD_STATE, str(error))]
@@ -180,10 +209,20 @@ class Flight:
     def goal(self, now: float) -> np.ndarray:
         """Goal of O (3,) at `now` [m]; while landing it sinks, far below the ground, since the laws lag behind it."""
         goal = self._monitor.origin + np.array(self.settings.goal)
+        if self._probes:
+            goal[2] = self._monitor.origin[2] + min(self.settings.goal[2], probe.HEIGHT)
         if self.supervisor.state is State.LAND:
             sunk = self.settings.times.land_speed * (now - self.supervisor.since)
             goal[2] = max(self._monitor.origin[2] + self._land_height - sunk, self._monitor.origin[2] - 1.0)
         return goal
+
+    @property
+    def _probes(self) -> bool:
+        """True at the begin of a flight on motion capture, whose axes no flight has shown to be right."""
+        return self._mocap is not None and self.supervisor.state is State.FLY and self.elapsed < probe.TIME
+
+    def _probe(self) -> np.ndarray:
+        return probe.command(self.elapsed, self.rig.span) if self._probes else np.zeros(3)
 
     # What comes next.
 
@@ -194,7 +233,8 @@ class Flight:
         armed = dry or all(info & can_fly == can_fly for info in infos)
         flying = any(info & packets.FLYING for info in infos) or not all(self._fresh)
         hindered = self._holds > self.settings.limits.gaps + 1 or any(link.lost for link in self.links)
-        resumes = all(self._fresh) and self.supervisor.may_resume and not hindered
+        heard = all(self._fresh) and all(watch.hears for watch in self._monitor.uplinks)
+        resumes = heard and self.supervisor.may_resume and not (hindered or self._stands())
         reached = {
             Event.ARMED: state is State.ARM and elapsed >= times.arm and armed,
             Event.HOVERING: state is State.RAMP and elapsed >= times.ramp,
@@ -267,9 +307,12 @@ class Flight:
             tilt = command.brake(seen.velocity)
         if seen is not None and state is State.DESCEND:
             share = command.sinking_share(float(seen.velocity[2]), self.settings.times)
+        elif seen is not None and any(self._fresh):
+            share = command.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
             share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]
-        return [command.level(share * trim, tilt) for trim in self._trims]
+        shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
+        return [command.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 
     def _transmit(self, wanted: list[Setpoint]) -> None:
         state, dry = self.supervisor.state, self.settings.dry_run

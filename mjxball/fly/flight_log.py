@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import queue
 import threading
@@ -20,10 +21,12 @@ from typing import Any, BinaryIO
 from mjxball.errors import InputError
 from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.log_schema import SCHEMA, Record, decode
+from mjxball.reading import parse_json, time_fault
 
 SYNC_PERIOD = 1.0  # [s] between two fsyncs: a killed process loses nothing that was flushed, a power cut this much
 CHUNK = 2**20  # bytes read at once
 LONGEST_LINE = 2**20  # bytes
+STREAMS = ("tick", "state", "health")  # kinds that come in a steady stream, of each drone its own
 
 
 class Journal:
@@ -89,13 +92,15 @@ class Tail:
         self.path = path
         self.damaged: list[str] = []  # one sentence for each line that is no record of the schema, without a full stop
         self._stream: BinaryIO | None = None
+        self.misplaced: str | None = None  # the first record whose time goes back, one sentence without a full stop
         self._rest, self._lines, self._begun = b"", 0, False
+        self._times: dict[tuple[str, Any], float] = {}  # of the newest record of every stream
 
     def read(self) -> list[Record] | None:
         """The records that were added, a chunk at most; None if nothing was. A torn last line waits for its rest.
 
-        Lines that are no records of the schema are left out. Raises InputError: this is no flight log, or one of
-        another schema, or of a firmware whose force curve is not known.
+        Lines that are no records of the schema are left out, and ticks and states whose time does not follow. Raises
+        InputError: this is no flight log, or one of another schema, or of a firmware whose force curve is not known.
         """
         try:
             added = self._added()
@@ -131,7 +136,7 @@ class Tail:
     def _take(self, line: bytes) -> Record | None:
         self._lines += 1
         try:
-            raw = json.loads(line)
+            raw = parse_json(line)
         except (ValueError, RecursionError):
             raw = None
         sound = isinstance(raw, dict) and "t" in raw and "kind" in raw
@@ -144,7 +149,25 @@ class Tail:
         except ValueError as error:
             self.damaged.append(f"line {self._lines} is damaged: {error}")
             return None
-        return self._checked(record)
+        return None if record is None or self._misplaces(record) else self._checked(record)
+
+    def _misplaces(self, record: Record) -> bool:
+        """Whether `record` does not follow the one before it in its stream: one thread writes each, in order."""
+        if record["kind"] == "header":
+            self.misplaced = self.misplaced or f"line {self._lines} begins another log"
+            return True
+        if record["kind"] not in STREAMS:
+            return False
+        stream, now = (record["kind"], record.get("drone")), record["t"]
+        fault = time_fault(self._times.get(stream, -math.inf), now)
+        if fault is None:
+            self._times[stream] = now
+            return False
+        said = f"line {self._lines}: {fault} in its {' '.join(filter(None, stream[::-1]))}"
+        self.damaged.append(said)
+        if now < self._times.get(stream, now):
+            self.misplaced = self.misplaced or said
+        return True
 
     def _header(self, raw: dict[str, Any]) -> Record | None:
         if raw.get("kind") != "header":
@@ -177,7 +200,8 @@ class Tail:
 def read(path: Path, remark: Callable[[str], None] | None = None) -> Iterator[Record]:
     """Every record of a whole log, the header first; a torn last one is left out, as is any line that is no record.
 
-    `remark` is called with what is left out. Raises InputError with one sentence if there is no log.
+    A tick or state that is there twice is left out, too. `remark` is called with what is left out. Raises InputError
+    with one sentence if there is no log, or if its clock goes back: then nothing says when the rest happened.
     """
     if not path.exists():
         raise InputError(f"flight log {path} cannot be read: No such file or directory")
@@ -185,6 +209,10 @@ def read(path: Path, remark: Callable[[str], None] | None = None) -> Iterator[Re
         begun = False
         while (records := tail.read()) is not None:
             begun = begun or bool(records)
+            if tail.misplaced:
+                raise InputError(
+                    f"flight log {path} cannot be placed in time, {tail.misplaced}: cut it there, into two logs"
+                )
             yield from records
         if not begun:
             raise InputError(f"{path} is not a flight log: it {'ends within its header' if tail.torn else 'is empty'}")

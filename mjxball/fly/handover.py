@@ -8,13 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mjxball.errors import InputError
 from mjxball.fly.telemetry import Note
 from mjxball.policy import Policy
 
 Successor = Callable[[], Policy | None]  # a policy that is to take over now, once; neither blocks nor raises
 SETTLING = 5.0  # [s] under both laws that are left out, while the pair climbs to its goal
+LEAST = 2.0  # [s] of which figures are worth a number
 BLEND = 0.5  # [s] over which the command goes from one policy's to the other's
 AWAY = 0.15  # [m] further from the goal than when it took over, from where on the new policy has to hand back
+UNKNOWN = (math.nan, math.nan)
 # What a card says of the laws around the network, which a new policy must share to remember what the old one did.
 SAME = (
     "history",
@@ -79,9 +82,9 @@ class Handover:
         command = np.asarray(self.first(observation), float)
         if self.second is None:
             return command
-        with np.errstate(all="ignore"):
+        try:
             other = np.asarray(self.second(observation), float)
-        if not np.isfinite(other).all():
+        except InputError:  # the first one has answered this observation
             self.returned = "its command is not finite"
             self.second, self._count = None, 0
             return command
@@ -93,28 +96,38 @@ class Handover:
 
 @dataclass
 class Figures:
-    """Error of O and tilt of the follower over some ticks."""
+    """Error of O, tilt of the follower and thrust of both drones over some ticks."""
 
     ticks: int = 0
+    seconds: float = 0.0  # of them
     error_rms: float = 0.0  # [m]
     error_peak: float = 0.0  # [m]
     tilt_rms: float = 0.0  # [rad]
     tilt_peak: float = 0.0  # [rad]
+    thrust: tuple[float, float] = (math.nan, math.nan)  # mean of leader and follower, of what should hover
 
-    def add(self, error: float, tilt: float) -> None:
-        """One tick with O `error` [m] from its goal and a `tilt` [rad]."""
+    def add(self, error: float, tilt: float, seconds: float, thrust: tuple[float, float]) -> None:
+        """One tick of `seconds` with O `error` [m] from its goal, a `tilt` [rad] and `thrust` as shares of hover's."""
         if not (math.isfinite(error) and math.isfinite(tilt)):
             return
         self.ticks += 1
+        self.seconds += seconds
+        before = self.thrust if self.ticks > 1 else thrust
+        leader, follower = (old + (new - old) / self.ticks for old, new in zip(before, thrust, strict=True))
+        self.thrust = leader, follower
         self.error_rms = math.sqrt(self.error_rms**2 + (error**2 - self.error_rms**2) / self.ticks)
         self.tilt_rms = math.sqrt(self.tilt_rms**2 + (tilt**2 - self.tilt_rms**2) / self.ticks)
         self.error_peak, self.tilt_peak = max(self.error_peak, error), max(self.tilt_peak, tilt)
 
     def __str__(self) -> str:
-        """In millimetres and degrees."""
+        """In millimetres, degrees and percent."""
         text = f"error rms {1e3 * self.error_rms:.1f} mm, largest {1e3 * self.error_peak:.0f} mm"
         tilt = f"tilt rms {math.degrees(self.tilt_rms):.2f}, largest {math.degrees(self.tilt_peak):.1f} degrees"
-        return f"{text}; {tilt}"
+        if not all(map(math.isfinite, self.thrust)):
+            return f"{text}; {tilt}"
+        # A motor that gives more needs less; a load that is heavier on one side shows in the same way.
+        leader, follower = (f"{100 * (share - 1):+.0f}" for share in self.thrust)
+        return f"{text}; {tilt}; thrust {leader} / {follower} % of the card's"
 
 
 class HandoverMonitor:
@@ -123,10 +136,22 @@ class HandoverMonitor:
     def __init__(self, handover: Handover, successor: Successor | None, note: Note):
         self._handover, self._successor, self._note = handover, successor, note
         self._returned = False
-        self.figures: dict[str, Figures] = {}  # under both laws, by the policy in command
+        self._figures: dict[str, Figures] = {}
+        self._last = -math.inf  # [s]
 
-    def update(self, now: float, elapsed: float, distance: float, tilt: float) -> None:
-        """A tick at `now` [s], `elapsed` [s] under both laws, O `distance` [m] from its goal, at a `tilt` [rad]."""
+    @property
+    def figures(self) -> dict[str, Figures]:
+        """Under both laws, by the policy in command; those of at least `LEAST` seconds."""
+        return {name: one for name, one in self._figures.items() if one.seconds >= LEAST}
+
+    def update(
+        self, now: float, elapsed: float, distance: float, tilt: float, thrust: tuple[float, float] = UNKNOWN
+    ) -> None:
+        """A tick at `now` [s], `elapsed` [s] under both laws, O `distance` [m] from its goal, at a `tilt` [rad].
+
+        `thrust` of leader and follower are shares of what the card says hovers.
+        """
+        seconds, self._last = now - self._last, now
         policy = self._successor() if self._successor is not None else None
         if policy is not None:
             self._handover.begin(policy, distance)
@@ -137,4 +162,5 @@ class HandoverMonitor:
             self._note("retrain", now, what="returned", text=self._handover.returned)
         if elapsed >= SETTLING:
             name = "first policy" if self._handover.second is None else "second policy"
-            self.figures.setdefault(name, Figures()).add(distance, tilt)
+            figures = self._figures.setdefault(name, Figures())
+            figures.add(distance, tilt, seconds if figures.ticks else 0.0, thrust)

@@ -19,7 +19,7 @@ from mjxball.fly.app.protocol import APP_VARIABLES, Reply, reply_of, sample_of
 from mjxball.fly.connection import PORT, Deadlines, Element, Identity, LinkError, Parameters, connect
 from mjxball.fly.packets import Packet, PacketError
 from mjxball.fly.process import bounded
-from mjxball.fly.telemetry import HealthSample, Note, Telemetry
+from mjxball.fly.telemetry import HealthSample, Note, SensedSample, Telemetry
 
 PROTOCOL = 12  # CRTP version with a supervisor port
 LOG_PORT, LOG_DATA = 5, 2
@@ -104,13 +104,15 @@ class Link:
         return None if found is None else Element(found.ident, found.pytype, found.access == found.RO_ACCESS)
 
     def start_states(self) -> None:
-        """Have the state sent at 100 Hz and health at 20 Hz, and wait for the first state. Raises LinkError."""
+        """Have state, what is sensed and health sent at 100, 50, 20 Hz; wait for the first state. Raises LinkError."""
         block = self._log_block("state", packets.STATE_VARIABLES, 10)
         self._block = block.id
         self._crazyflie.add_header_callback(self._receive, LOG_PORT, LOG_DATA)
         health = self._log_block("health", self._health_variables(), 50)
         health.data_received_cb.add_callback(lambda stamp, values, config: self._take_health(values))
-        blocks = [block, health]
+        sensed = self._log_block("sensed", self._listed(packets.SENSED), 20)
+        sensed.data_received_cb.add_callback(lambda stamp, values, config: self._take_sensed(values, stamp))
+        blocks = [block, health, sensed]
         if self._crazyflie.log.toc.get_element_by_complete_name(APP_VARIABLES[0][0]) is not None:
             blocks.append(self._log_block("app", APP_VARIABLES, 20))
             blocks[-1].data_received_cb.add_callback(lambda stamp, values, config: self._take_app(values))
@@ -122,11 +124,14 @@ class Link:
                 raise LinkError(f"the {self.name} sends no state within {self._deadlines.first_state:g} s")
             time.sleep(0.01)
 
+    def _listed(self, variables: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+        """Those of `variables` that the firmware lists."""
+        find = self._crazyflie.log.toc.get_element_by_complete_name
+        return [(name, kind) for name, kind in variables if find(name) is not None]
+
     def _health_variables(self) -> list[tuple[str, str]]:
-        listed = self._crazyflie.log.toc.get_element_by_complete_name
-        motors = next((names for names in packets.MOTORS if all(listed(name) for name, _ in names)), ())
-        thrust = [packets.ACTING_THRUST] if listed(packets.ACTING_THRUST[0]) else []
-        return [*packets.VARIANCES, *motors, *thrust]
+        motors = next((names for names in packets.MOTORS if len(self._listed(names)) == len(names)), ())
+        return [*packets.VARIANCES, *motors, *self._listed([packets.ACTING_THRUST])]
 
     def write_parameters(self, values: Mapping[str, float], check: bool = True) -> None:
         """Write each parameter and read it back (see `Parameters.write`). Raises LinkError."""
@@ -297,6 +302,9 @@ class Link:
         arrival, health = time.monotonic(), packets.health_of(values)
         self.telemetry.health = HealthSample(health, arrival)
         self._note("health", t=arrival, drone=self.name, **health._asdict())
+
+    def _take_sensed(self, values: Mapping[str, float], stamp: int) -> None:
+        self.telemetry.sensed = SensedSample(packets.sensed_of(values), stamp)
 
     def _take_app(self, values: Mapping[str, float]) -> None:
         self.telemetry.app = sample_of(values, time.monotonic())

@@ -215,6 +215,7 @@ KINDS: dict[str, Kind] = {
         "last",
         code=need(COUNT, "exit code"),
         cause=may(TEXT, "what ended the flight, if not its plan"),
+        told=may(TEXTS, "why it ended and how the pair came down, a sentence each"),
         timing=may(JSON, "the loop's: ticks, missed deadlines, lateness (median, p99, largest) [s]"),
         flown=may(JSON, "figures of the flight under both laws, see `fly.handover`"),
         overwritten=may(array(None), "setpoints of each link that a newer one replaced"),

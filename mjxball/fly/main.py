@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.util
-import json
 import math
 import re
 import sys
@@ -44,6 +43,7 @@ from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
 from mjxball.policy import Policy, load_file
 from mjxball.policy.formats.c_header import weight_bytes
+from mjxball.reading import parse_json
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
 RETRAINED = (0.004, -0.06, 14.0)  # load that --retrain puts on, unless --twin-load says more: kg, m, s
@@ -290,7 +290,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 flags = [*rehearsed_options(options), *twin_options(options)]
                 failure = "the twin did not start; are the ports of --leader and --follower free?"
                 twin = stack.enter_context(Child(["mjxball.fly.twin", *flags], failure))
-                uris = tuple(json.loads(twin.line)["uris"])
+                uris = tuple(parse_json(twin.line)["uris"])
             if capture is not None:
                 setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
             if options.view is not None and log is not None:

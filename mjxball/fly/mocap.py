@@ -35,6 +35,7 @@ from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose, Track, Track
 from mjxball.fly.process import wait_until
 from mjxball.fly.supervisor import Fault
 from mjxball.fly.telemetry import Note
+from mjxball.reading import parse_json
 
 BUILT = ("vicon", "optitrack", "qualisys", "vrpn", "mock")  # what the package on PyPI was built with
 KINDS = (*BUILT, "optitrack_closed_source", "nokov", "motionanalysis", "fzmotion")
@@ -113,7 +114,7 @@ class Source:
                 return
             *lines, waiting = (waiting + (received or b"")).split(b"\n")
             for line in lines:
-                self._line(json.loads(line))
+                self._line(parse_json(line))
 
     def _line(self, what: Any) -> None:
         if isinstance(what, dict):
@@ -134,6 +135,7 @@ class Mocap:
         self._span = span
         self._links: list[Link | None] = [None, None]
         self.note: Note = lambda kind, t=None, **fields: None  # the log's, of gaps and of what is forwarded
+        self._halted = False
         self.guarding = False  # a pose far from the drone's own estimate is not sent; before, the estimate follows it
         self._noted = [-math.inf, -math.inf]
         self._gap = [False, False]
@@ -216,6 +218,10 @@ class Mocap:
                 self.note("gap", drone=NAMES[number], begins=gap, age=track.age(now), text=text if gap else "")
         return supervision.faults(tracks, now, self.limits)
 
+    def halt(self) -> None:
+        """Send no more poses: they are in wrong axes, and without any an estimator knows its attitude for longer."""
+        self._halted = True
+
     def take(self, frame: Frame, now: float | None = None) -> None:
         """One frame, in the reader's thread: check it, send what is fit to be sent."""
         before, now = self.tracks, time.monotonic() if now is None else now
@@ -227,7 +233,7 @@ class Mocap:
                 self._forward(number, new.good, now)
 
     def _forward(self, number: int, pose: Pose, now: float) -> None:
-        if (link := self._links[number]) is None:
+        if (link := self._links[number]) is None or self._halted:
             return
         link.pose(packets.pose_packet(pose.position, pose.quaternion))
         if now - self._noted[number] >= 0.75 * NOTE_PERIOD:

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mjxball.cli import make_parser
+from mjxball.reading import parse_json
 
 CONNECT = 20.0  # [s] after which a connection that still blocks is given up, whatever became of the parent
 
@@ -75,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("kind")
     parser.add_argument("rate", type=float)
     parser.add_argument("bodies", nargs=2)
-    parser.add_argument("settings", type=json.loads)
+    parser.add_argument("settings", type=parse_json)
     options = parser.parse_args(arguments)
     pipe = os.fdopen(os.dup(1), "wb", buffering=0)
     silence = os.open(os.devnull, os.O_WRONLY)

@@ -30,6 +30,8 @@ class MocapLimits:
     age: float = 0.1  # a gap in the poses that goes into the log, and makes a pose unfit for comparisons [s]
     lost: float = 0.3  # a gap that ends the flight: until then the estimator coasts [s]
     frozen: float = 0.2  # of bit-identical poses, which no camera sees twice [s]
+    still: float = 0.2  # of one bit-identical coordinate beside others that change [s]
+    length_error: float = 0.03  # of the distance between bodies that stand: 1.1 times that of a rig of 0.3 m [m]
     speed: float = 5.0  # between two frames [m/s]
     jitter: float = 0.02  # that is allowed beside the speed [m]
     longest_step: float = 0.1  # time for which the speed counts after a gap, at most [s]
@@ -59,6 +61,7 @@ class Track:
     last: Pose | None = None  # newest that came
     good: Pose | None = None  # newest that was fit to be sent
     reason: str = "it was never seen"  # why none has been fit since
+    changed: tuple[float, ...] = (-math.inf,) * 3  # when each coordinate was another one the last time [s]
     received: int = 0
     jumps: int = 0
 
@@ -101,9 +104,16 @@ def follow(
 def _follow_one(track: Track, pose: Pose | None, limits: MocapLimits, place: Sequence[float] | None) -> Track:
     if pose is None:
         return track if track.reason else dataclasses.replace(track, reason="it is not seen")
-    seen = dataclasses.replace(track, last=pose, received=track.received + 1)
+    changed = (pose.time,) * 3
+    if track.last is not None:
+        parts = zip(track.changed, track.last.position, pose.position, strict=True)
+        changed = tuple(since if old == new else pose.time for since, old, new in parts)  # type: ignore[assignment]
+    seen = dataclasses.replace(track, last=pose, received=track.received + 1, changed=changed)
     if track.last is not None and track.last[1:] == pose[1:]:
         return dataclasses.replace(seen, reason=FROZEN)
+    still = [axis for axis, since in zip("xyz", changed, strict=True) if pose.time - since >= limits.still]
+    if still:
+        return dataclasses.replace(seen, reason=f"its {still[0]} stands still")
     if track.good is not None and pose.time - track.good.time <= limits.lost:
         step = math.dist(track.good.position, pose.position)
         elapsed = min(pose.time - track.good.time, limits.longest_step)
@@ -138,6 +148,20 @@ def pair_fault(tracks: Tracks, limits: MocapLimits, span: np.ndarray) -> str:
     return "the line between the bodies does not lie as the follower's attitude says"
 
 
+def scale_fault(tracks: Tracks, limits: MocapLimits, span: np.ndarray) -> str:
+    """Why two bodies that stand cannot be as far from each other as they are, empty if they can."""
+    one, other = tracks[0].last, tracks[1].last
+    if one is None or other is None:
+        return ""
+    far, known = math.dist(one.position, other.position), float(np.linalg.norm(span))
+    if abs(far - known) <= limits.length_error:
+        return ""
+    return (
+        f"the bodies are {far:.3f} m apart on a rig of {known:.3f} m: is the scale {far / known:.2f}, "
+        "or are their origins not at the drones' centres?"
+    )
+
+
 def faults(tracks: Tracks, now: float, limits: MocapLimits = MocapLimits()) -> list[Fault]:
     """A body without a fit pose for too long at `now` [s]."""
     found = []
@@ -152,7 +176,7 @@ def faults(tracks: Tracks, now: float, limits: MocapLimits = MocapLimits()) -> l
 
 def standing_fault(tracks: Tracks, now: float, limits: MocapLimits, span: np.ndarray) -> str:
     """Why a pair that stands on the ground may not be flown on these poses at `now` [s], empty if it may."""
-    wrong = pair_fault(tracks, limits, span)
+    wrong = pair_fault(tracks, limits, span) or scale_fault(tracks, limits, span)
     if wrong:
         return wrong
     for name, track in zip(NAMES, tracks, strict=True):

@@ -16,8 +16,9 @@ import numpy as np
 from mjxball.control import rotations
 from mjxball.fly import packets
 from mjxball.fly.limits import NAMES, FlightSettings, Limits
+from mjxball.fly.measured import REPEATING, DroneWatch
 from mjxball.fly.packets import DroneState, Health
-from mjxball.fly.supervisor import AIRBORNE, ON_GROUND, Event, Fault, State
+from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State
 from mjxball.fly.telemetry import DroneLink, ObjectState, Rig, Sample, object_of_one, object_state
 
 # From where on an estimator is not believed, and a drone counts as not hearing.
@@ -26,8 +27,13 @@ JUMP = 0.08  # of the position, beyond what its velocity explains [m]
 JUMP_TIME = 0.1  # between two states, beyond which nothing is said about a jump [s]
 HEIGHT, CLIMB = 0.05, 0.3  # of one drone against the other one and the roll [m, m/s]
 LASTING = 0.25  # [s] that heights or climbs must disagree
+APART, DOUBT = 0.015, 4.0  # the same along any axis against its mean: [m], and in standard deviations of the filters
+USUAL = 10.0  # [s] of that mean
 ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
-UNHEARD = 4  # health packets in a row without such an echo
+RECENT = 0.1  # [s] within which a thrust that was sent must move for the one in force to have to move
+SAME = 1.5  # [thrust units] within which two thrusts are one, rounded
+RISING = (State.RAMP, State.FLY)  # a drone that touches the ground feels more than its packets tell
+UNHEARD = 4  # health packets in a row without such an echo, or with one that stands still
 
 
 class Sustained:
@@ -89,6 +95,8 @@ class Monitor:
         self._low = [Sustained(bounds.battery_time) for _ in NAMES]
         self.origin = np.zeros(3)  # where O stood at the start [m]
         self.estimators = EstimatorWatch(rig, sideways=not settings.stand)
+        axes = (2,) if settings.stand else (0, 1, 2)
+        self._drones = [DroneWatch(axes) for _ in NAMES]
         self.uplinks = [UplinkWatch(name) for name in NAMES]
         self.object: ObjectState | None = None  # newest that can be trusted
 
@@ -97,7 +105,7 @@ class Monitor:
         samples = [link.telemetry.newest for link in links if link.telemetry.newest is not None]
         healths = [link.telemetry.health for link in links]
         fresh = [age <= self._settings.limits.state_age for age in ages]
-        dry, faults = self._settings.dry_run, []
+        dry, faults = self._settings.dry_run, self._measured(phase, links)
         if phase in AIRBORNE and all(fresh):
             faults += self.estimators.update(samples, [one and one.health for one in healths], now)
         if phase in AIRBORNE and not dry:  # a dry run is never echoed
@@ -113,6 +121,23 @@ class Monitor:
             if low.update(state.battery < bounds.battery, now):
                 faults.append(Fault(Event.BATTERY, f"{name} at {state.battery:.2f} V"))
         return faults
+
+    def _measured(self, phase: State, links: Sequence[DroneLink]) -> list[Fault]:
+        """Streams that stand still, or that the IMU contradicts; watched on the ground as well, said in flight."""
+        found = []
+        for number, (name, link, watch) in enumerate(zip(NAMES, links, self._drones, strict=True)):
+            sample, sensed, clock = link.telemetry.newest, link.telemetry.sensed, link.telemetry.clock
+            still = watch.state(sample) if sample is not None else ""
+            wrong = ""
+            if sensed is not None:
+                repeated, wrong = watch.sensed(sensed.sensed, clock.seconds(sensed.stamp))
+                still = still or repeated
+            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and phase in GUIDED else []
+            own += [Fault(Event.FRAME, f"{name}: {wrong}")] if wrong and phase in RISING else []
+            if own and not self._settings.dry_run:
+                self.estimators.trusted[number] = False
+                found += own
+        return found
 
     def _from_state(self, name: str, state: DroneState, limits: Limits, armed: bool) -> list[Fault]:
         if not np.isfinite([*state.position, *state.velocity, *state.quaternion, *state.rates]).all():
@@ -136,7 +161,10 @@ class EstimatorWatch:
         self._rig = rig
         self._axes = (0, 1, 2) if sideways else (2,)
         self._before: list[Sample | None] = [None, None]
-        self._height, self._climb = Sustained(LASTING), Sustained(LASTING)
+        self._height, self._climb, self._apart = Sustained(LASTING), Sustained(LASTING), Sustained(REPEATING)
+        self._usual: np.ndarray | None = None  # (3,) mean of what the leader is beside where the stick puts it [m]
+        self._at = 0.0  # [s] of that mean
+        self._doubt = np.zeros(3)  # standard deviation of the distance between both, as the filters have it [m]
         self.trusted = [True, True]
         self.contradiction = False  # of the two drones: it is not known which one is wrong
 
@@ -148,6 +176,8 @@ class EstimatorWatch:
             if reason:
                 self.trusted[number] = False
                 found.append(Fault(Event.ESTIMATOR, f"{NAMES[number]}: {reason}"))
+        known = [health.variance for health in healths if health is not None]
+        self._doubt = np.sqrt(np.sum(known, axis=0)) if known else self._doubt
         if all(self.trusted):
             found += self._against_each_other(samples, now)
         return found
@@ -173,22 +203,40 @@ class EstimatorWatch:
         return f"position variance {variance:.2g} m2, no more than {VARIANCE:g} is believed"
 
     def _against_each_other(self, samples: Sequence[Sample], now: float) -> list[Fault]:
-        """Heights and climbs of the two ends of one stick, whose attitude both drones measure."""
+        """Places, heights and climbs of the two ends of one stick, whose attitude both drones measure."""
         leader, follower = (sample.state for sample in samples)
         matrices = [rotations.matrix_from_quaternion(state.quaternion) for state in (leader, follower)]
         matrix, span = 0.5 * (matrices[0] + matrices[1]), self._rig.span
         turning = np.cross(0.5 * (leader.rates + follower.rates), span)
-        beside = float((leader.position - follower.position - matrix @ span)[2])
+        later = (samples[0].arrival - samples[1].arrival) * 0.5 * (leader.velocity + follower.velocity)
+        beside = leader.position - follower.position - later - matrix @ span
         faster = float((leader.velocity - follower.velocity - matrix @ turning)[2])
-        high = self._height.update(abs(beside) > HEIGHT, now)
-        fast = self._climb.update(abs(faster) > CLIMB, now)
-        if not (high or fast):
-            return []
-        self.contradiction = True
-        detail = f"the leader's height is {100 * beside:+.0f} cm from where the follower and the roll put it"
-        if not high:
-            detail = f"the leader climbs {faster:+.1f} m/s against the follower"
-        return [Fault(Event.ESTIMATOR, detail)]
+        details = {
+            f"the leader's height is {100 * beside[2]:+.0f} cm from where the follower and the roll put it": (
+                self._height.update(abs(beside[2]) > HEIGHT, now)
+            ),
+            f"the leader climbs {faster:+.1f} m/s against the follower": self._climb.update(abs(faster) > CLIMB, now),
+        }
+        apart = self._moved_apart(beside, now)
+        details[f"the leader moved {1000 * apart:.0f} mm from where the stick puts it"] = self._apart.update(
+            apart > 0, now
+        )
+        found = [Fault(Event.ESTIMATOR, detail) for detail, holds in details.items() if holds][:1]
+        self.contradiction = self.contradiction or bool(found)
+        return found
+
+    def _moved_apart(self, beside: np.ndarray, now: float) -> float:
+        """How far `beside` (3,) [m], of the leader from where the stick puts it, is from where it was [m].
+
+        0 as long as that may be noise. What lasts, of two frames or mounts, is no fault: a slow mean is taken off.
+        """
+        if self._usual is None:
+            self._usual, self._at = beside, now
+        moved = beside - self._usual
+        self._usual = self._usual - math.expm1((self._at - now) / USUAL) * moved
+        self._at = now
+        beyond = np.abs(moved)[list(self._axes)] > np.maximum(APART, DOUBT * self._doubt[list(self._axes)])
+        return float(np.abs(moved)[list(self._axes)].max()) if beyond.any() else 0.0
 
     def object(self, samples: Sequence[Sample], fresh: Sequence[bool]) -> ObjectState | None:
         """The object's state from those that are fresh and trusted; None if there is none.
@@ -213,14 +261,18 @@ class EstimatorWatch:
 
 
 class UplinkWatch:
-    """Whether one drone acts on what it is sent: its thrust in force must be one that was sent a moment ago."""
+    """Whether one drone acts on what it is sent: its thrust in force was sent a moment ago, and moves as that does.
+
+    A thrust that stands still while what is sent moves tells a lost uplink 0.3 s before it is too old.
+    """
 
     def __init__(self, name: str):
         self._name = name
         self._sent: collections.deque[tuple[float, int]] = collections.deque()
         self._missing = 0
-        self._checked = -math.inf
+        self._checked, self._before = -math.inf, math.nan
         self.heard = -math.inf  # [s] when the last thrust that it acted on was sent
+        self.hears = True  # by the newest health packet
 
     def sent(self, thrust: int, now: float) -> None:
         """`thrust` [units] goes out at `now` [s]."""
@@ -233,8 +285,12 @@ class UplinkWatch:
         self._checked = arrival
         while self._sent and self._sent[0][0] < arrival - ECHO:
             self._sent.popleft()
-        times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < 1.5]
-        if times:
+        before, self._before = self._before, health.thrust
+        times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < SAME]
+        recent = [thrust for time, thrust in self._sent if time >= arrival - RECENT]
+        steady = not recent or max(recent) - min(recent) < SAME
+        self.hears = bool(times) and (steady or health.thrust != before)
+        if self.hears:
             self._missing, self.heard = 0, max(self.heard, times[-1])
             return []
         self._missing += 1

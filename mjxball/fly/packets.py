@@ -46,6 +46,14 @@ MOTORS = (
 )
 ACTING_THRUST = ("controller.cmd_thrust", "float")  # [thrust units] of the setpoint that is in force
 
+# A third log packet of 26 bytes: what the accelerometer feels, and the pose from outside that the firmware took last.
+SENSED: tuple[tuple[str, str], ...] = (
+    *((f"acc.{axis}", "FP16") for axis in "xyz"),  # [g], body axes
+    *((f"locSrv.{axis}", "float") for axis in "xyz"),  # [m]
+    *((f"locSrv.{part}", "FP16") for part in ("qx", "qy", "qz", "qw")),
+)
+GRAVITY = 9.81  # [m/s2]
+
 CAN_ARM, ARMED, AUTO_ARMED, CAN_FLY, FLYING, TUMBLED, LOCKED, CRASHED = (1 << bit for bit in range(8))
 
 
@@ -70,6 +78,14 @@ class Health(NamedTuple):
     variance: tuple[float, float, float]  # of the estimated position [m2]
     motors: tuple[int, int, int, int]  # PWM 0 .. 65535
     thrust: float  # of the setpoint in force [thrust units]
+
+
+class Sensed(NamedTuple):
+    """What one drone's accelerometer feels, and the pose from outside that it took last, as the bits came."""
+
+    force: tuple[float, float, float]  # specific, body axes [m/s2]
+    position: tuple[float, float, float]  # [m]; 0 if no pose ever came
+    quaternion: tuple[float, float, float, float]  # body -> world (w, x, y, z), coarse: 11 bits a number
 
 
 class Setpoint(NamedTuple):
@@ -136,6 +152,14 @@ def health_of(values: Mapping[str, float]) -> Health:
     variance = [float(values[name]) for name, _ in VARIANCES]
     thrust = float(values.get(ACTING_THRUST[0], math.nan))
     return Health((variance[0], variance[1], variance[2]), (motors[0], motors[1], motors[2], motors[3]), thrust)
+
+
+def sensed_of(values: Mapping[str, float]) -> Sensed:
+    """What was sensed, from log variables by name; numbers that are not among them are 0."""
+    x, y, z = (GRAVITY * values.get(f"acc.{axis}", 0.0) for axis in "xyz")
+    place = [values.get(f"locSrv.{axis}", 0.0) for axis in "xyz"]
+    w, i, j, k = (values.get(f"locSrv.q{part}", 0.0) for part in "wxyz")
+    return Sensed((x, y, z), (place[0], place[1], place[2]), (w, i, j, k))
 
 
 class Packet(NamedTuple):

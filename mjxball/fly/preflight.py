@@ -7,7 +7,6 @@ The curve is found while the motors turn slowly, and the gains for it are then w
 from __future__ import annotations
 
 import functools
-import json
 import math
 import re
 import time
@@ -17,10 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mjxball.control import motors
+from mjxball.control import motors, rotations
 from mjxball.control.crazyflie import PairGains, read_pair_gains
 from mjxball.control.motors import Motor
 from mjxball.errors import InputError
+from mjxball.files import read_text
 from mjxball.fly import packets
 from mjxball.fly.command import CURVE_NAMES, CurveName, Variant, Variants
 from mjxball.fly.connection import LinkError
@@ -28,10 +28,11 @@ from mjxball.fly.limits import NAMES, Check, Limits
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import KALMAN, Mocap
 from mjxball.fly.monitor import down_reason, stick_faults, tilt_angle
-from mjxball.fly.packets import THRUST_CEILING, Health
+from mjxball.fly.packets import GRAVITY, THRUST_CEILING, DroneState, Health
 from mjxball.fly.process import together, wait_until
 from mjxball.fly.supervisor import Event, Fault
 from mjxball.fly.telemetry import DroneLink, Note, Rig, yaw_of
+from mjxball.reading import parse_json
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ class Preflight:
     converge: float = 10.0  # time the estimators get [s]
     tilt: float = math.radians(8)  # [rad]
     yaw: float = math.radians(15)  # from the world's x axis [rad]
+    apart: float = math.radians(8)  # between both yaws, which the stick holds equal [rad]
+    gravity: float = math.radians(5)  # between the accelerometer's up and the attitude's [rad]
+    length: float = 0.03  # of the distance between both from the stick's length [m]
     rearm: float = 4.0  # time that a firmware gets to settle after a landing [s]
     reset: float = 0.1  # time between the two writes that reset an estimator [s]
     drone: str = "2.1"  # which Crazyflie the policy was trained for, a key of `motors.MOTORS`
@@ -52,11 +56,11 @@ class Preflight:
 def read_gains(path: Path) -> PairGains:
     """Parameters of leader and follower from a JSON file, see `firmware_gains.read_pair_gains`. Raises InputError."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"gain file {path} cannot be read: {error.strerror or error}") from None
-    except ValueError:
-        raise InputError(f"gain file {path} is not JSON") from None
+        data = parse_json(read_text(path, "gain file"))
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"gain file {path} is not JSON: {error}") from None
     try:
         return read_pair_gains(data)
     except ValueError:
@@ -181,12 +185,42 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
             Check(f"{link.name} level", tilt <= required.tilt, f"{math.degrees(tilt):.1f} degrees"),
             Check(f"{link.name} heading", abs(yaw) <= required.yaw, f"{math.degrees(yaw):.0f} degrees from +x"),
         ]
+        checks += gravity_checks(link, state, required)
+    beside = yaw_of(states[0]) - yaw_of(states[1])
+    beside = math.remainder(beside, 2 * math.pi)
+    text = (
+        f"leader {math.degrees(beside):+.1f} degrees from the follower; each one costs {YAW_COST:g} mm of hover error"
+    )
+    checks.append(Check("headings", abs(beside) <= required.apart, text))
+    return [*checks, stick_check(states, rig, bounds, required)]
+
+
+YAW_COST = 6  # [mm] of hover error for each degree between both yaws: 29 mm for 5 on the real firmware
+
+
+def gravity_checks(link: Link, state: DroneState, required: Preflight) -> list[Check]:
+    """Whether a standing drone feels gravity where its attitude says; none if nothing is known of it."""
+    sample = link.telemetry.sensed
+    if sample is None:
+        return []
+    force = np.array(sample.sensed.force)
+    size = float(np.linalg.norm(force))
+    up = float((rotations.matrix_from_quaternion(state.quaternion) @ force)[2])
+    off = math.acos(min(max(up / max(size, 1e-9), -1.0), 1.0))
+    good = off <= required.gravity and abs(size - GRAVITY) <= 0.1 * GRAVITY
+    text = f"{size / GRAVITY:.2f} g, {math.degrees(off):.1f} degrees from the attitude's"
+    return [Check(f"{link.name} gravity", good, text)]
+
+
+def stick_check(states: Sequence[DroneState], rig: Rig, bounds: Limits, required: Preflight) -> Check:
+    """Whether both drones are where the stick holds them, as far from each other as it is long."""
     faults = stick_faults(states, rig.span, bounds)
     line = states[0].position - states[1].position
     beside = float(np.linalg.norm(line - rig.span))
-    text = faults[0].detail if faults else f"{np.linalg.norm(line):.3f} m long, {beside:.3f} m from where it should be"
-    placed = not faults and beside <= bounds.stick_error
-    return [*checks, Check("stick", placed, text)]
+    length, known = float(np.linalg.norm(line)), float(np.linalg.norm(rig.span))
+    text = f"{length:.3f} m long, {known:.3f} m needed; {beside:.3f} m from where it should be"
+    placed = not faults and beside <= bounds.stick_error and abs(length - known) <= required.length
+    return Check("stick", placed, faults[0].detail if faults else text)
 
 
 COMPENSATES_SINCE = (2025, 12)  # version of the firmware, as delivered

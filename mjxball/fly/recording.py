@@ -25,9 +25,11 @@ from mjxball.fly.supervisor import State
 from mjxball.fly.telemetry import ObjectState, Rig, object_state
 from mjxball.fly.twin.conditions import DroneKind, Surroundings, drone_kind
 from mjxball.fly.twin.physics import PairState, pair_of
+from mjxball.reading import check_times
 
 SILENCE = 0.1  # [s] between two states of a drone from which on the log has a gap
 FROZEN = 0.25  # [s] of equal states from which on an estimator counts as frozen while the laws are in command
+OFF_RATE = 0.2  # share of the control period by which ticks may be apart
 GUIDED = State.FLY.value  # both laws fly
 LONGEST = 3600.0  # [s] of a flight that is read
 OBSERVATION = 18  # numbers of an observation, where the log holds none
@@ -132,6 +134,7 @@ def load(path: Path) -> FlightLog:
             raise InputError(f"flight log {path} holds no flight: it has no state of the {drone}")
     if not any(one["kind"] == "end" for one in records):
         remarks.append("it has no end: the runner was killed, or the log was cut")
+    remarks += _tick_remarks([one["t"] for one in flown if one["kind"] == "tick"], header["config"])
     found = _outages(flown, turning[-1])
     for gap in found:
         what = f"the {gap.drone}'s estimate is frozen" if gap.frozen else f"there is no state of the {gap.drone}"
@@ -141,6 +144,17 @@ def load(path: Path) -> FlightLog:
         setup = setup.after(one, header["config"])
     lines = tuple(f"{path.name}: {remark}" for remark in remarks)
     return FlightLog(path, header["policy"][:80], header["config"], setup, flown, found, lines)
+
+
+def _tick_remarks(times: list[float], config: Config) -> list[str]:
+    """What a reader should know of the ticks' times: holes, and another period than the policy's."""
+    if len(times) < 2:
+        return []
+    period, usual = config.timing.control_period, float(np.median(np.diff(times)))
+    found = [f"of its ticks {phrase}, where what was sent is held" for phrase in check_times(times)]
+    if abs(usual - period) > OFF_RATE * period:
+        found.append(f"its ticks are {1e3 * usual:.3g} ms apart, and the policy's period is {1e3 * period:.3g} ms")
+    return found
 
 
 def outages(drone: str, time: np.ndarray, states: np.ndarray, end: float) -> list[Outage]:

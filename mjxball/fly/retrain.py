@@ -6,7 +6,6 @@ unsound or for another rig, one that is late, an end or a silence only lead to a
 
 from __future__ import annotations
 
-import json
 import math
 import queue
 import subprocess
@@ -21,8 +20,9 @@ from mjxball.errors import InputError
 from mjxball.fly.handover import difference
 from mjxball.fly.telemetry import Note
 from mjxball.policy import Policy
+from mjxball.reading import parse_json
 
-MODULE = "mjxball.rig.retrain"
+MODULE = "mjxball.commands.retrain"
 START_LIMIT = 300.0  # [s] in which the process must have compiled its programs
 LATE = 10.0  # [s] after the identification from when on a policy is not taken any more
 LONGEST_LINE = 2**16
@@ -124,7 +124,7 @@ class Retrainer:
 
 def _message(line: bytes) -> dict[str, Any]:
     try:
-        found = json.loads(line)
+        found = parse_json(line)
     except ValueError:
         return {}
     return found if isinstance(found, dict) else {}

@@ -21,6 +21,7 @@ from mjxball.fly.command import CurveName, Variants
 from mjxball.fly.display import Display, listening
 from mjxball.fly.flight import Flight
 from mjxball.fly.flight_log import Journal
+from mjxball.fly.handover import LEAST, SETTLING
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
@@ -32,7 +33,7 @@ from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.watchdog import NOTHING, Watchdog
 
-BUSY = 0.02  # [s]: ticks that come later than that are no fault of drones or policy
+ENOUGH = 2.0  # [s] of data, below which an error says nothing
 SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
 
 
@@ -175,12 +176,10 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     code = 0 if cause is None and not stayed else 1
     sent = [getattr(link, "overwritten", 0) for link in flight.links]
     flown = {name: dataclasses.asdict(one) for name, one in flight.succession.figures.items()}
-    why = str(cause) if cause else ""
-    journal.note("end", code=code, cause=why, timing=timing, overwritten=sent, flown=flown)
-    if cause is not None:
-        _say(f"ended by {cause.event.name.lower().replace('_', ' ')}{': ' + cause.detail if cause.detail else ''}")
-        if cause.event in (Event.DEADLINES, Event.STALE) and timing.largest > BUSY:
-            _say(f"this computer was too busy: a tick came {1e3 * timing.largest:.0f} ms late")
+    why, told = str(cause) if cause else "", flight.how_it_ended()
+    journal.note("end", code=code, cause=why, told=told, timing=timing, overwritten=sent, flown=flown)
+    for text in told:
+        _say(text)
     if cause is None and stayed:
         _say("it did not lift: is the thrust that hovers right for this rig (--thrust, --hover, --mass)?")
     if flight.settings.dry_run and flight.highest:
@@ -188,7 +187,11 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
         _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
     late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
     _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
+    if supervisor.cause is None and not (flown or flight.settings.dry_run):
+        _say(f"no error of the flight: it takes {SETTLING:g} s to settle and {LEAST:g} s to measure (--seconds)")
     for name, figures in flight.succession.figures.items():
+        if figures.ticks * flight.settings.period < ENOUGH:
+            continue
         _say(f"{name}: {figures}" if len(flight.succession.figures) > 1 else str(figures))
     if journal.failure:
         _say(f"the log is not complete: {journal.failure}")

@@ -53,7 +53,9 @@ class Event(Enum):
     TILT = "a drone tilts beyond the limit"
     STICK = "the two positions contradict the stick: its length or its tilt"
     ESTIMATOR = "an estimator's position cannot be trusted"
+    FRAME = "what is measured of a drone moves otherwise than its IMU feels"
     BATTERY = "a battery is low"
+    LIFT = "a battery will not carry its drone to the end of a landing"
     SATURATED = "thrust has been at its bound for too long"
     DEADLINES = "the loop missed too many deadlines"
     WATCHDOG = "the watchdog process ended"
@@ -85,7 +87,9 @@ ENDED = (S.STOP, S.KILL, S.DONE)
 
 # What goes as planned; and after what the pair sinks under control.
 PLANNED = frozenset({E.READY, E.ARMED, E.CURVE_KNOWN, E.HOVERING, E.TIME_UP, E.RESUMED, E.TOUCHED_DOWN, E.GROUNDED})
-_CONTROLLED = (E.BAD_STATE, E.FENCE, E.SATURATED, E.DEADLINES, E.STICK, E.ESTIMATOR, E.APP_DESCENDS, E.POSE)
+_CONTROLLED = (
+    *(E.BAD_STATE, E.FENCE, E.LIFT, E.SATURATED, E.DEADLINES, E.STICK, E.ESTIMATOR, E.FRAME, E.APP_DESCENDS, E.POSE),
+)
 
 
 def _planned() -> dict[tuple[State, Event], State]:
@@ -170,12 +174,16 @@ class Supervisor:
 
     @property
     def may_resume(self) -> bool:
-        """True in a hold that a gap in the states began while the laws were in command."""
+        """True in a hold that a gap in the states or in what a drone hears began while the laws were in command."""
         guided = self.held is not None and self.held[0] in GUIDED
-        return guided and self.cause is not None and self.cause.event is Event.STALE
+        return guided and self._gap
+
+    @property
+    def _gap(self) -> bool:
+        return self.cause is not None and self.cause.event in (Event.STALE, Event.UNHEARD)
 
     def _resumed(self, now: float) -> Supervisor:
         """Back to what HOLD interrupted; a gap that closed is no cause. A ramp is not taken up again."""
         state, since = self.held or (State.DESCEND, now)
-        cause = None if self.cause is not None and self.cause.event is Event.STALE else self.cause
+        cause = None if self._gap else self.cause
         return Supervisor(state, since, cause) if state in GUIDED else Supervisor(State.DESCEND, now, self.cause)

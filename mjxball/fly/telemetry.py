@@ -12,7 +12,7 @@ import numpy as np
 from mjxball import config as configs
 from mjxball.control import rotations
 from mjxball.fly.app.protocol import AppSample
-from mjxball.fly.packets import DroneState, Health, Packet
+from mjxball.fly.packets import DroneState, Health, Packet, Sensed
 
 Note = Callable[..., None]  # note(kind, t=None, **fields): into the flight log, without blocking
 WRAP = 1 << 24  # [ms] the firmware's time stamps have 24 bits
@@ -33,6 +33,13 @@ class HealthSample(NamedTuple):
 
     health: Health
     arrival: float  # [s] of our monotonic clock
+
+
+class SensedSample(NamedTuple):
+    """One packet of what a drone senses, as it arrived."""
+
+    sensed: Sensed
+    stamp: int  # [ms] of the firmware's clock
 
 
 class FirmwareClock:
@@ -63,6 +70,12 @@ class FirmwareClock:
         self._newest = arrival
         return seconds
 
+    def seconds(self, stamp: int) -> float:
+        """Time of `stamp` [ms] in seconds, of a packet that came close to the newest state; NaN before that."""
+        if self._last is None:
+            return math.nan
+        return (self._time + (stamp - self._last + WRAP // 2) % WRAP - WRAP // 2) / 1000
+
     def age(self, seconds: float, now: float) -> float:
         """Age [s] at `now` of what was stamped at `seconds` of the firmware."""
         return math.inf if self.restarted else now - (seconds + self._offset)
@@ -75,6 +88,7 @@ class Telemetry:
         self.clock = FirmwareClock()
         self.newest: Sample | None = None
         self.health: HealthSample | None = None
+        self.sensed: SensedSample | None = None  # None until the first one, or if the firmware does not list it
         self.app: AppSample | None = None
         self.received = self.damaged = self.late = 0
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -14,6 +15,39 @@ from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 
 Array = Any
+_home: dict[str, int] = {}  # number of the process in which JAX runs for the environments
+
+
+def check_process() -> None:
+    """Raise InputError in a process that was forked from one in which an environment has been: JAX would hang there.
+
+    Its threads are not in the copy.
+    """
+    if _home.setdefault("process", os.getpid()) != os.getpid():
+        raise InputError(
+            "this process was forked from one in which JAX runs, where it would wait for ever; start it with spawn, "
+            "such as gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
+        )
+
+
+class Picklable:
+    """An environment that is pickled with the state of its worlds, and compiled again where it arrives."""
+
+    _compiled: ClassVar[tuple[str, ...]]  # attributes that `__init__` makes anew: functions and renderers
+
+    def _arguments(self) -> dict[str, Any]:
+        """Those of `__init__`."""
+        raise NotImplementedError
+
+    def __getstate__(self) -> dict[str, Any]:
+        """(arguments, attributes)."""
+        own = {name: value for name, value in self.__dict__.items() if name not in self._compiled}
+        return {"arguments": self._arguments(), "attributes": own}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """See `__getstate__`."""
+        self.__init__(**state["arguments"])  # type: ignore[misc]
+        self.__dict__.update(state["attributes"])
 
 
 def settings(preset: str, config: Config | None) -> Config:
@@ -36,6 +70,23 @@ def spaces(pair: TransportEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.B
     """Spaces of observation (n,) and action (3,): what the follower sees and remembers, and [-1, 1]."""
     observations = gymnasium.spaces.Box(-np.inf, np.inf, (pair.policy_input_size,), np.float32)
     return observations, gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+
+def checked_action(action: Array, shape: tuple[int, ...]) -> np.ndarray:
+    """`action` as float32, which the environment clips to the box [-1, 1].
+
+    Raises InputError unless it is finite and of `shape`, and of real numbers.
+    """
+    given = np.asarray(action)
+    if given.dtype.kind not in "fiu":
+        found = f"{given.dtype} of shape {given.shape}"
+    elif given.shape != shape:
+        found = f"of shape {given.shape}"
+    elif not np.isfinite(given).all():
+        found = f"of shape {given.shape} with {given[~np.isfinite(given)][0]} in it"
+    else:
+        return np.clip(given, -1.0, 1.0).astype(np.float32)  # float32 would make infinity of 1e39
+    raise InputError(f"an action must be finite numbers of shape {shape}, not {found}")
 
 
 def seed_number(random: np.random.Generator) -> int:

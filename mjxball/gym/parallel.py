@@ -38,6 +38,7 @@ class Program(NamedTuple):
 @functools.lru_cache(maxsize=8)
 def compiled_program(config: Config, physics: str) -> Program:
     """The program of `config` on `physics`, compiled once for all environments of a process."""
+    common.check_process()
     enable_compilation_cache()
     env = TransportEnv(config, physics)
 
@@ -48,7 +49,7 @@ def compiled_program(config: Config, physics: str) -> Program:
     return Program(env, jax.jit(start), jax.jit(env.step))
 
 
-class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
+class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
     """One world of `mjxball.env` in float32: each follower sees (n,) float32 and acts (3,) in [-1, 1] in its own frame.
 
     All share the goal and end together: `terminated` means that the object left d_term or that the world diverged,
@@ -58,6 +59,7 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
     """
 
     metadata = METADATA
+    _compiled = ("_program", "_cg_offset", "_scene")
 
     def __init__(
         self,
@@ -69,7 +71,7 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
         if render_mode not in (None, *METADATA["render_modes"]):
             raise ValueError(f"render_mode must be None or rgb_array, not {render_mode!r}")
         self.config = common.settings(preset, config)
-        self.render_mode = render_mode
+        self.render_mode, self._physics = render_mode, physics
         self.metadata = {**METADATA, "render_fps": round(1 / self.config.timing.control_period)}
         self._drones = np.array(self.config.plant.followers)
         with on_the_host():
@@ -84,6 +86,9 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
         self._state: Any = None
         self._scene: Any = None
 
+    def _arguments(self) -> dict[str, Any]:
+        return {"config": self.config, "physics": self._physics, "render_mode": self.render_mode}
+
     def observation_space(self, agent: str) -> gymnasium.spaces.Space:
         """(n,) float32, the same for all."""
         return self.observation_spaces[agent]
@@ -96,6 +101,7 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
         """A fresh world drawn from `config.scenario`; seeds as of `FollowerEnv`, `options` are not used."""
+        common.check_process()
         with on_the_host():
             if seed is not None or self._chain is None:
                 self._chain = jax.random.key(common.seed_number(np_random(seed)[0]))
@@ -109,14 +115,15 @@ class FollowersParallelEnv(pettingzoo.ParallelEnv[str, np.ndarray, np.ndarray]):
     def step(
         self, actions: dict[str, np.ndarray]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """Hold every agent's action (3,) in [-1, 1] for one control period."""
+        """Hold every agent's action (3,), clipped to [-1, 1], for one control period; InputError unless finite."""
         if not self.agents:
             raise gymnasium.error.ResetNeeded("call reset before step")
         if set(actions) != set(self.agents):
             raise ValueError(f"actions must be for {', '.join(self.agents)}, not for {', '.join(actions) or 'nobody'}")
+        common.check_process()
         given = np.zeros((len(self._drones), 3), np.float32)
         for number, agent in enumerate(self.agents):
-            given[number] = actions[agent]
+            given[number] = common.checked_action(actions[agent], self.action_spaces[agent].shape)
         with on_the_host():
             self._state = self._program.step(self._state, given if self._several else given[0])
         state, agents = self._state, self.agents

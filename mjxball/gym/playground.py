@@ -32,24 +32,29 @@ class PlaygroundState:
     info: dict[str, Any]
 
 
-class PlaygroundEnv:
+class PlaygroundEnv(common.Picklable):
     """`TransportEnv` with the attributes of Playground's `MjxEnv`. For its `wrap_for_brax_training`.
 
     Worlds are randomised by every reset, so Playground's `randomization_fn` has nothing to do here; use
     `full_reset=True`, or every episode of a world repeats its first one.
     """
 
+    _compiled = ("_pair", "_model")
+
     def __init__(self, preset: str = "transport", config: Config | None = None, physics: str = "mjx"):
         self.config = common.pair_settings(preset, config)
         self._pair = TransportEnv(self.config, physics)
         self._model: mujoco.MjModel | None = None
+
+    def _arguments(self) -> dict[str, Any]:
+        return {"config": self.config, "physics": self._pair.backend}
 
     def reset(self, rng: Array) -> PlaygroundState:
         """See `TransportEnv.reset`."""
         return _playground(self._pair.reset(rng))
 
     def step(self, state: PlaygroundState, action: Array) -> PlaygroundState:
-        """See `TransportEnv.step`."""
+        """See `TransportEnv.step`: `action` (3,) is clipped to [-1, 1]."""
         given = State(state.data, state.obs, state.reward, state.done, state.metrics, state.info)
         return _playground(self._pair.step(given, action))
 

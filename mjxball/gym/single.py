@@ -34,6 +34,7 @@ class Laws(NamedTuple):
 @functools.lru_cache(maxsize=8)
 def compiled_laws(config: Config) -> Laws:
     """The laws of `config`, compiled once for all environments of a process."""
+    common.check_process()
     enable_compilation_cache()
     pair = TransportEnv(config, "newton-euler")  # its own physics is never called
 
@@ -58,7 +59,7 @@ def engine_of(config: Config, physics: str | None) -> str:
     return physics or ("newton-euler" if massless else "mujoco")
 
 
-class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+class FollowerEnv(common.Picklable, gymnasium.Env[np.ndarray, np.ndarray]):
     """The follower's task: observation (n,) float32, action (3,) in [-1, 1], both as in `mjxball.env`.
 
     `physics` is mujoco, newton-euler or mjx, in float64 (default: `engine_of`); `config` replaces the preset's.
@@ -67,6 +68,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """
 
     metadata = METADATA
+    _compiled = ("_laws", "_move", "_cg_offset", "_scene")
 
     def __init__(
         self,
@@ -78,7 +80,7 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or rgb_array, not {render_mode!r}")
         self.config = common.pair_settings(preset, config)
-        self.render_mode = render_mode
+        self.render_mode, self._physics = render_mode, physics
         self.metadata = {**METADATA, "render_fps": round(1 / self.config.timing.control_period)}
         with on_the_host():
             self._laws = compiled_laws(self.config)
@@ -91,8 +93,12 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._plant: PlantState | None = None  # of `_state`, in float64 and with a batch axis (1, ...)
         self._scene: Any = None
 
+    def _arguments(self) -> dict[str, Any]:
+        return {"config": self.config, "physics": self._physics, "render_mode": self.render_mode}
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """A fresh world drawn from `config.scenario`; `options` are not used."""
+        common.check_process()
         super().reset(seed=seed)
         with on_the_host():
             if seed is not None or self._chain is None:
@@ -105,10 +111,11 @@ class FollowerEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._seen(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold `action` (3,) in [-1, 1] for one control period."""
+        """Hold `action` (3,), clipped to [-1, 1], for one control period; InputError unless it is finite."""
         if self._state is None or self._plant is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        action = np.asarray(action, np.float32)
+        common.check_process()
+        action = common.checked_action(action, self.action_space.shape)
         with on_the_host():
             commands, load = self._laws.commands(self._state, action)
         self._load = load

@@ -32,6 +32,7 @@ class Program(NamedTuple):
 @functools.lru_cache(maxsize=8)
 def compiled_program(config: Config, physics: str) -> Program:
     """The program of `config` on `physics`, compiled once for each number of worlds."""
+    common.check_process()
     enable_compilation_cache()
     pair = TransportEnv(config, physics)
 
@@ -57,7 +58,7 @@ def _where(ended: Array, fresh: Any, going: Any) -> Any:
     return jax.tree.map(lambda new, old: jnp.where(ended, new, old), fresh, going)
 
 
-class FollowerVectorEnv(gymnasium.vector.VectorEnv):
+class FollowerVectorEnv(common.Picklable, gymnasium.vector.VectorEnv):
     """N worlds of the follower's task; world i is `FollowerEnv` seeded with `seed + i`, on another engine.
 
     `physics` is mjx or newton-euler, in float32. Autoreset as in Gymnasium: by the next step, which ignores that
@@ -66,6 +67,7 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
     """
 
     metadata = METADATA
+    _compiled = ("_program",)
 
     def __init__(
         self,
@@ -86,7 +88,7 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {num_envs}")
         self.config = common.pair_settings(preset, config)
-        self.num_envs, self.render_mode = num_envs, render_mode
+        self.num_envs, self.render_mode, self._physics = num_envs, render_mode, physics
         self._program = compiled_program(self.config, physics)
         self.single_observation_space, self.single_action_space = common.spaces(self._program.pair)
         batch = gymnasium.vector.utils.batch_space
@@ -95,10 +97,15 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         self._chains: Any = None
         self._state: Any = None
 
+    def _arguments(self) -> dict[str, Any]:
+        mode = self.metadata["autoreset_mode"]
+        return {"num_envs": self.num_envs, "config": self.config, "physics": self._physics, "autoreset_mode": mode}
+
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict]:
         """Fresh worlds. `seed` seeds world i with `seed + i`, or each with its own of a list; None goes on."""
+        common.check_process()
         super().reset(seed=seed if isinstance(seed, int) else None)
         if self._chains is None or seed is not None:
             self._chains = jax.vmap(jax.random.key)(jnp.asarray(self._numbers(seed), jnp.uint32))
@@ -106,12 +113,11 @@ class FollowerVectorEnv(gymnasium.vector.VectorEnv):
         return self._seen(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Hold `actions` (N, 3) in [-1, 1] for one control period."""
+        """Hold `actions` (N, 3), clipped to [-1, 1], for one control period; InputError unless they are finite."""
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        given = jnp.asarray(actions, jnp.float32)
-        if given.shape != self.action_space.shape:
-            raise ValueError(f"actions must have shape {self.action_space.shape}, not {given.shape}")
+        common.check_process()
+        given = common.checked_action(actions, self.action_space.shape)
         going = np.asarray(self._state.done) == 0
         if self._same_step:
             self._chains, moved, self._state = self._program.same_step(self._chains, self._state, given)

@@ -10,6 +10,9 @@ force F_max that hovers gives h F_max. A margin m leaves that share of the way t
 m = 1 if all rotors hover alike, 0 if one stands still or gives its most, negative if the rotors cannot hold the load
 (ours). For a pair the upper bound is that of `mjxball.control.constants.trim_limit`, which has no lower one. A stand is
 left out of account, as if the plant flew freely. Needs SciPy.
+
+Of a whole `Config` the rotors give only what can be commanded (`mjxball.plant.commands`), and a margin m leaves that
+share of every limit of the commands, too: |command| <= (1 - m) limit.
 """
 
 from __future__ import annotations
@@ -20,10 +23,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mjxball.config import Plant
+from mjxball.config import Config, Plant
 from mjxball.errors import InputError
+from mjxball.plant.commands import Commands, asked_rows, commanded, effect_of
 from mjxball.plant.parameters import PlantParameters
-from mjxball.plant.rotors import PLACES, SPIN, lever
 
 Array = Any
 TINY, LEAST_SCATTER = 1e-9, 1e-3  # [N], [m2] below which drones sit in one place
@@ -47,18 +50,20 @@ class _Hover(NamedTuple):
     Forces in units of their mean `unit`, moments in metres times that.
     """
 
-    effect: Float[np.ndarray, "4 n"]
-    wrench: Float[np.ndarray, "4"]
-    per_offset: Float[np.ndarray, "4 2"]
+    effect: Float[np.ndarray, "e n"]  # of the whole assembly's four, then of every drone's yaw that is commanded
+    wrench: Float[np.ndarray, " e"]
+    per_offset: Float[np.ndarray, "e 2"]
     most: Float[np.ndarray, " n"]
     level: Float[np.ndarray, " n"]  # force that hovers, h F_max
     acts: np.ndarray  # (N,) bool
     leader_force: float  # of each of the leader's rotors, unless it acts or is lost [N]
     unit: float  # [N]
+    asked: Float[np.ndarray, "c n"]  # asked @ force - level_command: commands over their limits
+    level_command: Float[np.ndarray, " c"]
 
 
 def largest_margin(
-    plant: Plant,
+    plant: Plant | Config,
     object_mass: float,
     cg: float | Sequence[float],
     believed_mass: float | None = None,
@@ -71,9 +76,11 @@ def largest_margin(
     `cg` is one number along a line and (x, y) in the plane. The followers' rotors act, and the leader's too if
     `leader_helps`; else the leader lifts its share of `believed_mass` [kg], by default the true one. Rotors of the
     drones `lost` stand still. `thrust` (N,) is what drones give of the force that they are asked for. A plant with
-    rotor_force_max inf has no upper bound. Raises InputError if an argument does not fit the plant.
+    rotor_force_max inf has no upper bound. Of a `Plant` alone, any force can be commanded. Raises InputError if an
+    argument does not fit the plant.
     """
-    hover = _hover(plant, object_mass, believed_mass, lost, leader_helps, thrust)
+    plant, commands = commanded(plant)
+    hover = _hover(plant, object_mass, believed_mass, lost, leader_helps, thrust, commands)
     if hover is None:
         return Trim(-math.inf, None)
     bounded = np.isfinite(hover.most)
@@ -81,13 +88,19 @@ def largest_margin(
     room = np.where(bounded, hover.most - hover.level, 0.0)
     found = _solve(
         np.append(np.zeros(len(hover.most)), -1.0),
-        np.column_stack([hover.effect, np.zeros(4)]),
+        np.column_stack([hover.effect, np.zeros(len(hover.wrench))]),
         hover.wrench + hover.per_offset @ _in_plane(plant, cg),
         [(None, None)] * (len(hover.most) + 1),
         np.vstack(
-            [np.column_stack([-identity, hover.level]), np.column_stack([identity, room])[bounded]],
+            [
+                np.column_stack([-identity, hover.level]),
+                np.column_stack([identity, room])[bounded],
+                *(np.column_stack([sign * hover.asked, np.ones(len(hover.asked))]) for sign in (1, -1)),
+            ],
         ),
-        np.append(np.zeros(len(hover.most)), hover.most[bounded]),
+        np.concatenate(
+            [np.zeros(len(hover.most)), hover.most[bounded], 1 + hover.level_command, 1 - hover.level_command]
+        ),
     )
     if found is None:
         return Trim(-math.inf, None)
@@ -98,7 +111,7 @@ def largest_margin(
 
 
 def largest_amplitude(
-    plant: Plant,
+    plant: Plant | Config,
     object_mass: float,
     margin: float = 0.15,
     direction: Sequence[float] | None = None,
@@ -112,6 +125,7 @@ def largest_amplitude(
     Along `direction` (x, y) of any length, by default the load's line or x; -inf if no offset can be trimmed. The
     other arguments are those of `largest_margin`.
     """
+    plant, commands = commanded(plant)
     if not margin <= 1:
         raise InputError(f"the margin must be at most 1, not {margin}")
     along = np.eye(2)[plant.directions[0]] if direction is None else np.asarray(direction, dtype=float)
@@ -119,15 +133,17 @@ def largest_amplitude(
         raise InputError(f"the direction must be two numbers that are not both 0, not {direction!r}")
     if any(along[axis] for axis in {0, 1} - set(plant.directions)):
         raise InputError(f"the load moves along {plant.cg_axis}, not in the direction {direction!r}")
-    hover = _hover(plant, object_mass, believed_mass, lost, leader_helps, thrust)
+    hover = _hover(plant, object_mass, believed_mass, lost, leader_helps, thrust, commands)
     if hover is None:
         return -math.inf
     least, most = margin * hover.level, hover.most - margin * np.nan_to_num(hover.most - hover.level, posinf=0.0)
     equations = np.column_stack([hover.effect, -hover.per_offset @ along / np.linalg.norm(along)])
     bounds = [*zip(least, most, strict=True), (None, None)]
+    rows = np.column_stack([np.vstack([hover.asked, -hover.asked]), np.zeros(2 * len(hover.asked))])
+    below = 1 - margin + np.concatenate([hover.level_command, -hover.level_command])
     ends = []
     for side in (1.0, -1.0):
-        found = _solve(np.append(np.zeros(len(least)), -side), equations, hover.wrench, bounds)
+        found = _solve(np.append(np.zeros(len(least)), -side), equations, hover.wrench, bounds, rows, below)
         if found is None:
             return -math.inf
         ends.append(side * float(found[-1]))
@@ -213,6 +229,7 @@ def _hover(
     lost: Collection[int],
     leader_helps: bool,
     thrust: Sequence[float] | None,
+    commands: Commands | None,
 ) -> _Hover | None:
     """The equations, or None if the rotors that act cannot lift the assembly or need not lift anything."""
     count, gravity = plant.count, plant.gravity
@@ -241,31 +258,28 @@ def _hover(
         return None
     level = lift / 4 * capacity / capacity.sum()
 
-    drones = [_effect(plant, number) for number in range(count)]
+    drones = [effect_of(plant, number) for number in range(count)]
     # Weights pull at their places: the wrench that holds them is (1, y, -x, 0) times each.
     held = gravity * masses @ np.column_stack([np.ones(count), mounts[:, 1], -mounts[:, 0], np.zeros(count)])
     held[0] = weight
     per_offset = gravity * object_mass * np.array([[0.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
     unit = lift / (4 * acts.sum())
+    believes = np.array(plant.known_masses) + np.array(plant.load_shares) * believed
+    answer = np.flatnonzero(acts & (limit > 0))
+    twist, asked, level_command = asked_rows(plant, commands, answer, factor, believes)
+    columns = np.repeat(acts, 4)
     return _Hover(
-        effect=np.column_stack([drones[number] for number in np.flatnonzero(acts)]),
-        wrench=(held - leader * drones[plant.leader].sum(axis=1)) / unit,
-        per_offset=per_offset / unit,
+        effect=np.vstack([np.column_stack(drones), twist])[:, columns],
+        wrench=np.append(held - leader * drones[plant.leader].sum(axis=1), np.zeros(len(twist))) / unit,
+        per_offset=np.vstack([per_offset, np.zeros((len(twist), 2))]) / unit,
         most=np.repeat(limit[acts], 4) / unit,
         level=np.repeat(level, 4) / unit,
         acts=acts,
         leader_force=leader,
         unit=unit,
+        asked=unit * asked[:, columns],
+        level_command=level_command,
     )
-
-
-def _effect(plant: Plant, number: int) -> Float[np.ndarray, "4 4"]:
-    """Wrench about O (T, tau_x, tau_y, tau_z) per force of each of a drone's rotors, columns rotor by rotor [1, m]."""
-    drone, arm = plant.drones[number], plant.of_drones("arm")[number]
-    cosine, sine = math.cos(drone.yaw), math.sin(drone.yaw)
-    own = lever(arm, plant.layout) * np.array(PLACES[plant.layout], dtype=float)
-    x, y = (own @ [[cosine, sine], [-sine, cosine]] + drone.mount[:2]).T
-    return np.array([np.ones(4), y, -x, plant.of_drones("yaw_per_thrust")[number] * np.array(SPIN[plant.layout])])
 
 
 def _solve(

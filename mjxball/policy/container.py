@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import io
 import math
-import stat
 import zipfile
-from pathlib import Path
 
 import numpy as np
 
 from mjxball.errors import InputError
+from mjxball.files import read_bytes
 
 MAX_BYTES = 64 * 2**20  # of the file, and of everything in it unpacked
 MAX_ENTRIES = 68
@@ -35,7 +34,10 @@ def read_arrays(name: str, kind: str = "policy file", limit: int = MAX_BYTES) ->
 
     Raises PolicyFileError with one sentence on anything unsound; `kind` says in it what the file should be.
     """
-    content = _read_file(name, kind, limit)
+    try:
+        content = read_bytes(name, kind, limit)
+    except InputError as error:
+        raise PolicyFileError(str(error)) from None
     if content.count(DIRECTORY_ENTRY) > MAX_ENTRIES:
         raise PolicyFileError(f"{name} is not a {kind}: it has more than {MAX_ENTRIES} entries")
     try:
@@ -54,27 +56,6 @@ def read_arrays(name: str, kind: str = "policy file", limit: int = MAX_BYTES) ->
         raise PolicyFileError(f"{kind} {name} cannot be read: {error}") from None
     except Exception:  # zipfile, zlib and NumPy raise a dozen kinds for damaged bytes
         raise PolicyFileError(f"{kind} {name} cannot be read: it is damaged or not an .npz") from None
-
-
-def _read_file(name: str, kind: str, limit: int) -> bytes:
-    try:
-        status = Path(name).stat()
-        if stat.S_ISDIR(status.st_mode):
-            raise PolicyFileError(f"{kind} {name} is a directory")
-        if not stat.S_ISREG(status.st_mode):  # a pipe would wait for ever
-            raise PolicyFileError(f"{kind} {name} is not a regular file")
-        if status.st_size > limit:
-            raise PolicyFileError(f"{name} is not a {kind}: it is larger than {limit >> 20} MiB")
-        with Path(name).open("rb") as stream:
-            return stream.read(status.st_size)
-    except PolicyFileError:
-        raise
-    except FileNotFoundError:
-        raise PolicyFileError(f"{kind} {name} does not exist") from None
-    except OSError as error:
-        raise PolicyFileError(f"{kind} {name} cannot be read: {error.strerror or error}") from None
-    except ValueError:
-        raise PolicyFileError(f"{kind} {name!r} has an impossible name") from None
 
 
 def _unpack(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:

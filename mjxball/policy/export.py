@@ -18,7 +18,8 @@ from mjxball.control.motors import firmware
 from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.control.observation import ACTION, OBSERVATION, commanded
 from mjxball.control.team_lqg import TeamLqg
-from mjxball.policy.file import PolicyFile, write_whole
+from mjxball.files import write_whole
+from mjxball.policy.file import PolicyFile
 from mjxball.policy.law_fields import CONTEXTS
 
 
@@ -82,10 +83,11 @@ def policy_file(
 
 
 def with_network(policy: PolicyFile, learnt: Any) -> PolicyFile:
-    """`policy` with the network that has been learnt from it: its card, and the inputs that it sees."""
+    """`policy` with the network that has been learnt from it: the inputs that it sees, and its card but for `flown`."""
     weights, biases = _layers(learnt)
     return dataclasses.replace(
         policy,
+        card={name: value for name, value in policy.card.items() if name != "flown"},
         weights=tuple(weights),
         biases=tuple(biases),
         observation_mean=np.asarray(learnt.mean, np.float32),

@@ -18,8 +18,10 @@ from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERV
 from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
 from mjxball.errors import InputError
+from mjxball.files import write_whole
 from mjxball.policy.container import PolicyFileError, read_arrays
 from mjxball.policy.law_fields import LQG_SHAPES, MAX_NUMBER, check_lqg, is_finite
+from mjxball.reading import parse_json
 
 # 2: with the numbers of an offset-free LQG of a pair, card field `lqg`; 3: of a team, and what a follower has to know
 # of its team before a flight, card field `context`; 4: of attitude loops that nobody knows; 5: with a GRU below the
@@ -115,20 +117,6 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
     write_whole(path, stream.getvalue())
 
 
-def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write `data` to `path` atomically: a reader sees the old file or the whole new one."""
-    target = Path(path)
-    partial = target.with_name(f".{target.name}.partial")
-    try:
-        with partial.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
 def load_file(path: str | os.PathLike[str]) -> PolicyFile:
     """Read and verify a policy file; raise PolicyFileError with one sentence on anything unsound."""
     name = str(path)
@@ -166,9 +154,9 @@ def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
     if text.dtype.itemsize > 4 * MAX_CARD:  # JSON takes fifty times its own length in memory
         raise PolicyFileError(f"{name}: the card is longer than {MAX_CARD} characters")
     try:
-        card = json.loads(str(text))
-    except (ValueError, RecursionError):
-        raise PolicyFileError(f"{name}: the card is not JSON") from None
+        card = parse_json(str(text))
+    except (ValueError, RecursionError) as error:
+        raise PolicyFileError(f"{name}: the card is not JSON: {error}") from None
     if not isinstance(card, dict):
         raise PolicyFileError(f"{name}: the card is not a JSON object")
     return card
@@ -261,12 +249,9 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
         if len(numbers) != length or not all(is_finite(value) and value >= 0 for value in numbers):
             raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
     check_lqg(card, name)
-    units = card.get("recurrent_units", 0)
-    if (
-        isinstance(units, bool)
-        or not isinstance(units, int)
-        or not (1 if card["format_version"] == 5 else 0) <= units <= (MAX_UNITS if card["format_version"] == 5 else 0)
-    ):
+    _check_flown(card.get("flown"), name)
+    units, most = card.get("recurrent_units", 0), MAX_UNITS if card["format_version"] == 5 else 0
+    if isinstance(units, bool) or not isinstance(units, int) or not min(most, 1) <= units <= most:
         raise PolicyFileError(
             f"{name}: card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
         )
@@ -278,6 +263,17 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     odd = sorted(set(card["bounds"]) - set(BOUNDED))
     if odd:
         raise PolicyFileError(f"{name}: card field bounds names {odd[0]!r}; known are {', '.join(BOUNDED)}")
+
+
+def _check_flown(flown: Any, name: str) -> None:
+    """`flown`, if a card has it: the numbers of drones and the seconds up to which flights were found good."""
+    if flown is None:
+        return
+    fields = flown if isinstance(flown, dict) else {}
+    drones, seconds = fields.get("drones"), fields.get("seconds")
+    counts = isinstance(drones, list) and drones and all(type(count) is int and count > 1 for count in drones)
+    if not (counts and is_finite(seconds) and seconds > 0):
+        raise PolicyFileError(f"{name}: card field flown must hold drones, numbers above 1, and positive seconds")
 
 
 def shipped_policies() -> list[Path]:

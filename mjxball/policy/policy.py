@@ -11,6 +11,7 @@ import numpy as np
 from mjxball.config import LEAST_LIFTING, Attitude, Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.followers import OneThread, checked_observation
 from mjxball.control.multi_model_lqg import MultiModelLqg, team_geometry
 from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
@@ -61,7 +62,8 @@ def known_context(card: dict[str, Any], name: str) -> np.ndarray | None:
 class Policy:
     """A follower from a policy file. It remembers past observations if the file asks for them.
 
-    One instance serves one flight, or one batch of worlds: `reset()` starts anew.
+    One instance serves one flight, or one batch of worlds, of one thread: `reset()` starts anew. `law` is the same as
+    pure functions, memory in and memory out.
     """
 
     def __init__(self, contents: PolicyFile, name: str, dtype: type = np.float32):
@@ -84,6 +86,7 @@ class Policy:
         told = self._law.needs_context and "team" in card
         self._context: Array | None = np.array(card["team"]["context"], dtype) if told else None
         self._memory: Array | None = None
+        self._thread = OneThread()
         self._single: SingleFollower | None = None
         self._ahead = False  # whether `_single` has the memory, newer than `_memory`
 
@@ -107,6 +110,11 @@ class Policy:
         self.memory = None
 
     @property
+    def law(self) -> NetworkLaw:
+        """What it answers and remembers, as pure functions."""
+        return NetworkLaw(self)
+
+    @property
     def memory(self) -> Array:
         """What it remembers (..., m), see `control.follower_law.FollowerLaw`; None: nothing yet."""
         if self._ahead and self._single is not None:
@@ -115,42 +123,44 @@ class Policy:
 
     @memory.setter
     def memory(self, memory: Array) -> None:
-        self._memory, self._ahead = None if memory is None else np.array(memory, self._dtype), False
+        """Raises InputError, and keeps the old one, unless `memory` is of m finite numbers."""
+        self._memory, self._ahead = None if memory is None else self._checked(memory), False
+        self._thread.forget()
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies, which do not share the buffers of `_single`."""
-        return {**self.__dict__, "_memory": self.memory, "_single": None, "_ahead": False}
+        """For copies, which share neither the buffers of `_single` nor the thread."""
+        return {**self.__dict__, "_memory": self.memory, "_single": None, "_ahead": False, "_thread": OneThread()}
 
     def scaled(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
         return self._answer(observation)[0]
 
     def __call__(self, observation: Array) -> Array:
-        """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18)."""
+        """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18).
+
+        Raises InputError for what is no observation (`checked_observation`) or has no finite answer, and remembers
+        nothing of it; RuntimeError if the flight that it remembers is another thread's.
+        """
         return self._answer(observation)[1]
 
     def _answer(self, observation: Array) -> tuple[Array, Array]:
         """(action in [-1, 1], command) for `observation`, remembered if need be."""
-        observation = np.asarray(observation, self._dtype)
-        if observation.shape[-1:] != (layout.OBSERVATION_SIZE,):
-            raise ValueError(
-                f"observation must have {layout.OBSERVATION_SIZE} numbers last, not shape {observation.shape}"
-            )
-        law, remembers = self._law, self._law.size > 0
-        if not self._ahead and remembers and self._memory is None:
-            self._memory = law.start(observation, _known(self.name, law, self._context))
-        if observation.ndim == 1 and isinstance(law.lqg, MultiModelLqg):
-            alone = self._answer_alone(observation, law.lqg)
+        observation = checked_observation(observation).astype(self._dtype, copy=False)
+        remembers = self._law.size > 0
+        if remembers:
+            self._thread.check(self.name)
+        if observation.ndim == 1 and isinstance(self._law.lqg, MultiModelLqg):
+            alone = self._answer_alone(observation, self._law.lqg)
             if alone is not None:
                 return alone
-        self._memory, self._ahead = self.memory, False
-        known = law.known(observation, self._memory) if remembers else None
-        full = law.network_input(observation, self._memory, known) if remembers else observation
-        answer = self._network(full)
-        command = law.command(answer, observation, self._memory, known)
+        law, memory = self.law, self.memory if remembers else None
+        with np.errstate(all="ignore"):  # what is not finite is refused below
+            action, command, memory = law.answer(law.start(observation) if memory is None else memory, observation)
+        if not (np.isfinite(command).all() and np.isfinite(memory).all()):
+            raise InputError(f"policy {self.name} has no answer to an observation: what it computes is not finite")
         if remembers:
-            self._memory = law.next(self._memory, observation, answer, command, known)
-        return answer[..., : layout.ACTION_SIZE], command
+            self._memory, self._ahead = memory, False
+        return action, command
 
     def _answer_alone(self, observation: Array, lqg: MultiModelLqg) -> tuple[Array, Array] | None:
         """`_answer` to one observation (18,), by a `SingleFollower`; None if that cannot answer it."""
@@ -158,15 +168,33 @@ class Policy:
             network = (self._weights, self._biases, self._mean, self._scale)
             self._single = SingleFollower(self._law, lqg, network)
         if not self._ahead:
-            if not remembers_one(self._memory):
+            memory = self.law.start(observation) if self._memory is None else self._memory
+            if not remembers_one(memory):
                 return None
-            self._single.memory, self._ahead = self._memory, True
+            self._single.memory = memory
         found = self._single.answer(observation)
-        return None if found is None else (np.array(found[0], self._dtype), np.array(found[1], self._dtype))
+        if found is None:
+            return None
+        self._ahead = True
+        return np.array(found[0], self._dtype), np.array(found[1], self._dtype)
+
+    def _checked(self, memory: Array) -> Array:
+        """A copy of `memory`, or InputError unless it is of m finite numbers."""
+        given, size = np.asarray(memory), self._law.size
+        if given.dtype.kind not in "fiu" or given.shape[-1:] != (size,):
+            raise InputError(f"policy {self.name} remembers {size} numbers, not {given.dtype} of shape {given.shape}")
+        with np.errstate(over="ignore"):
+            own = np.array(given, self._dtype)
+        if not np.isfinite(own).all():
+            raise InputError(f"a memory of policy {self.name} must be finite, and this one is not finite")
+        return own
 
 
 class NetworkLaw:
-    """A policy as two pure functions of arrays (see `control.followers.Law`), for batches on NumPy or JAX."""
+    """A policy as pure functions of arrays (see `control.followers.Law`), on NumPy or JAX, for any number of threads.
+
+    What they are given is not checked, so that JAX can trace them.
+    """
 
     needs_privileged = False
 

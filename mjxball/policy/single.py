@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.followers import LARGEST
 from mjxball.control.multi_model_lqg import (
     ANGLE_STATES,
     AXES,
@@ -28,7 +29,6 @@ from mjxball.control.swing import LEAST_ENERGY, SHARPNESS, STATES
 
 Array = Any
 TURNED = (0, 1), (2, 3), (5, 8), (6, 9), (7, 10), (15, 16), (20, 21)  # features about roll and pitch that are vectors
-LARGEST = 1e6  # sum of what is seen, and of what is made of it
 
 
 class SingleFollower:
@@ -83,12 +83,10 @@ class SingleFollower:
     def answer(self, observation: Array) -> tuple[list[float], list[float]] | None:
         """(action in [-1, 1] (3), command (3)) for `observation` (18,), which is remembered.
 
-        None, and nothing is remembered, if numbers are not finite or huge: Python's floats do not treat those as
-        arrays do.
+        None, and nothing is remembered, if numbers that are made of it are not finite or huge: Python's floats do not
+        treat those as arrays do.
         """
         seen, rising = observation.tolist(), self._rising
-        if not sum(map(abs, seen)) < LARGEST:
-            return None
         (cos, sin), (share, roll_per_lift, pitch_per_lift, room) = self._frame, self._inside
         roll, pitch, roll_rate, pitch_rate, x, y, z, vx, vy, vz = _turned(seen, cos, sin)
         # What is known.
@@ -144,6 +142,8 @@ class SingleFollower:
             _clipped(sin * roll_own + cos * pitch_own + tilt_reach * counted[1], tilt_limit),
             _clipped(vertical + vertical_reach * counted[2], vertical_limit),
         ]
+        if not math.isfinite(sum(command)):
+            return None
         own, led = (roll_own, pitch_own, vertical), (led_roll, led_pitch, led_vertical)
         self._advance(own, led, command, (height, lift, lift_error))
         self._network.remember(action)
@@ -393,9 +393,9 @@ class _Network:
         self.history[:] = np.dot(self._past, self._next_history)
 
 
-def remembers_one(memory: Array | None) -> bool:
-    """Whether `memory` is one that a `SingleFollower` can take over: of one follower, finite, with a sound share."""
-    return memory is not None and memory.ndim == 1 and bool(np.isfinite(memory).all()) and memory[-CONTEXT] > 0
+def remembers_one(memory: Array) -> bool:
+    """Whether `memory` is one that a `SingleFollower` can take over: of one follower, with a sound share."""
+    return memory.ndim == 1 and memory[-CONTEXT] > 0
 
 
 def _clipped(value: float, limit: float) -> float:

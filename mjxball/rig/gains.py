@@ -11,6 +11,7 @@ from pathlib import Path
 from mjxball import cli, config
 from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.errors import InputError
+from mjxball.files import write_whole
 from mjxball.rig.design import (
     REQUIREMENTS,
     Design,
@@ -53,7 +54,7 @@ def _gains(options: argparse.Namespace) -> int:
         raise InputError(f"{error}: a lighter or shorter stick, or faster motors, would help") from None
     print(report(designs, settings.plant.rotor_lag))  # noqa: T201
     if options.out:
-        options.out.write_text(parameter_file(apply(settings.autopilot, designs)))
+        write_whole(options.out, parameter_file(apply(settings.autopilot, designs)))
     return 0
 
 

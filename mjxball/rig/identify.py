@@ -18,6 +18,7 @@ from mjxball.control import crazyflie
 from mjxball.control.constants import hover
 from mjxball.control.crazyflie import PARAMETERS, THRUST_CEILING, PairGains, pair_gains
 from mjxball.errors import InputError
+from mjxball.files import write_whole
 from mjxball.fly.card import with_curve
 from mjxball.fly.command import CurveName
 from mjxball.fly.preflight import read_gains
@@ -72,7 +73,7 @@ def _identify(options: argparse.Namespace) -> int:
         print(f"all {len(found)} logs\n{report(converted, mean)}")  # noqa: T201
     values = {**known, **conversion(settings, converted), **plant_settings(converted, mean)}
     if options.out:
-        options.out.write_text(json.dumps({"preset": options.preset, **values}, indent=1) + "\n")
+        write_whole(options.out, json.dumps({"preset": options.preset, **values}, indent=1) + "\n")
     config.validate(config.apply_overrides(settings, values))  # the file is kept: what is wrong is the rig
     return 0
 

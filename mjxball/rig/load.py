@@ -117,7 +117,9 @@ class LoadWatch:
             self._rows.clear()
             self._begin = math.nan
             return
-        self._begin = now if math.isnan(self._begin) else self._begin
+        if math.isnan(self._begin) or (self._rows and now - self._rows[-1].time > BIN):  # a bin would be empty
+            self._rows.clear()
+            self._begin = now
         known = len(self._states) == len(self._motors) == len(NAMES)
         if not known or now - self._begin < SETTLING or any(now - t > OTHER_DRONE for t, _ in self._motors.values()):
             return

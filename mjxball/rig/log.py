@@ -14,9 +14,12 @@ from mjxball.errors import InputError
 from mjxball.fly.command import CurveName
 from mjxball.fly.limits import NAMES
 from mjxball.fly.recording import GUIDED, FlightLog, Outage, load, numbers, outages
+from mjxball.policy.container import read_arrays
+from mjxball.reading import check_times
 
 STATE = 13  # numbers of a drone's state in an .npz: position, velocity, quaternion (w, x, y, z), body rates
 OFF_THE_GROUND = 0.03  # [m] above the start of a flight from which on nothing touches the pair
+STEPS = (5e-4, 0.2)  # [s] between two rows, as a rule: what is slower or faster is in another unit
 LONGEST_HOLD = 0.4  # [s] without a setpoint after which what the firmware does is not what is modelled
 
 
@@ -44,11 +47,11 @@ def read_log(path: Path) -> Log:
     if path.suffix != ".npz":
         return _of_flight(load(path))
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = [np.asarray(data[name], float) for name in ("time", "setpoints", "states")]
+        data = read_arrays(str(path), "log")
+        arrays = [np.asarray(data[name], float) for name in ("time", "setpoints", "states")]
         return make_log(arrays[0], arrays[1], arrays[0], [arrays[2][:, 0], arrays[2][:, 1]])
-    except OSError as error:
-        raise InputError(f"log {path} cannot be read: {error.strerror or error}") from None
+    except InputError:
+        raise
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"log {path} is no .npz of time, setpoints, states: {error}") from None
 
@@ -73,8 +76,11 @@ def make_log(
         raise ValueError("it holds fewer than two rows")
     if not all(np.isfinite(part).all() for part in (sent_at, setpoints, *states, *times)):
         raise ValueError("numbers are missing or not finite")
-    if any((np.diff(t) <= 0).any() for t in (sent_at, *times)):
-        raise ValueError("times do not increase")
+    for name, t in zip(("setpoints", *NAMES), (sent_at, *times), strict=True):
+        try:
+            check_times(t.tolist(), *STEPS)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
     grid = np.arange(max(t[0] for t in (sent_at, *times)), min(t[-1] for t in (sent_at, *times)), PERIOD)
     latest = np.searchsorted(sent_at, grid + 1e-9, side="right") - 1
     rows = [_on_grid(grid, t, s) for t, s in zip(times, states, strict=True)]

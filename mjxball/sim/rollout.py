@@ -28,7 +28,7 @@ from mjxball.physics.step import (
 from mjxball.plant import plant_parameters
 from mjxball.sim.closed_loop import ClosedLoop
 from mjxball.sim.disturbances import followers_axis, record, sensors_of
-from mjxball.sim.scenario import CgPath, Scenario, check_scenario
+from mjxball.sim.scenario import CgPath, Scenario, check_scenario, of_plant
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -151,9 +151,7 @@ def simulate_batch(config: Config, flights: Flights, physics: str = "mjx") -> Tr
 def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     """All scenarios in order, checked, and the followers' laws, each for its own part of the batch."""
     validate(config)
-    scenarios = [scenario for _, part in flights for scenario in part]
-    for scenario in scenarios:
-        check_scenario(config, scenario)
+    scenarios = [check_scenario(config, scenario) for _, part in flights for scenario in part]
     if len({scenario.seconds for scenario in scenarios}) != 1:
         raise InputError("scenarios of one batch must last equally long")
     ends = np.cumsum([len(part) for _, part in flights])
@@ -190,7 +188,7 @@ def fly(
     on_pid = np.ones(len(scenarios)) if on_pid is None else on_pid
     cg_offset, privileged, period = make_cg_offset(config), make_privileged_info(config), config.timing.control_period
     count = round(scenarios[0].seconds / period)
-    load, target = load_of(scenarios, config.plant.count), targets(scenarios, count + 1, period)
+    load, target = load_of(config, scenarios), targets(config, scenarios, count + 1)
     disturbances, followers = [scenario.disturbance for scenario in scenarios], followers_axis(config)
     samples = record(disturbances, count + 2, period, followers)
     sensors, delays = sensors_of(disturbances, period, followers)
@@ -213,7 +211,7 @@ def _record(
 ) -> Trajectory:
     ticks = list(fly(config, scenarios, act, physics, on_pid))
     grid = np.array([tick.time for tick in ticks])
-    load, count = load_of(scenarios, config.plant.count), len(ticks)
+    load, count = load_of(config, scenarios), len(ticks)
     force = record([s.disturbance for s in scenarios], count, config.timing.control_period).force
     target, euler, leader_command, follower_command, observation, offset = (
         np.stack([getattr(tick, name) for tick in ticks])
@@ -309,11 +307,11 @@ def flown_contact_wrenches(
     return contact_wrenches(config.plant, constants, flown, linear, angular)
 
 
-def targets(scenarios: Sequence[Scenario], count: int, period: float) -> Float[np.ndarray, "rows n 3"]:
+def targets(config: Config, scenarios: Sequence[Scenario], count: int) -> Float[np.ndarray, "rows n 3"]:
     """Goal of O, count + 1 rows, before the first control step and after each of `count`."""
-    time = np.arange(count + 1) * period
+    time = np.arange(count + 1) * config.timing.control_period
     target = np.empty((count + 1, len(scenarios), 3))
-    for number, scenario in enumerate(scenarios):
+    for number, scenario in enumerate(of_plant(config, one) for one in scenarios):
         target[:, number] = scenario.goal
         for when, goal in scenario.waypoints:
             target[time >= when - 1e-9, number] = goal
@@ -322,7 +320,7 @@ def targets(scenarios: Sequence[Scenario], count: int, period: float) -> Float[n
 
 def start_of(config: Config, scenarios: Sequence[Scenario]) -> PlantState:
     """The state in which the scenarios begin."""
-    believed = load_of(scenarios).believed_mass
+    believed = load_of(config, scenarios).believed_mass
     position = np.array([scenario.start_position for scenario in scenarios], float)
     velocity = np.array([scenario.start_velocity for scenario in scenarios], float)
     tilt = np.array([(*scenario.start_tilt, 0.0) for scenario in scenarios])
@@ -335,8 +333,9 @@ def start_of(config: Config, scenarios: Sequence[Scenario]) -> PlantState:
     return start_state(config, position, tilt, velocity, believed, ball)._replace(ball_rate=rolling)
 
 
-def load_of(scenarios: Sequence[Scenario], drones: int = 2) -> Load:
-    """Masses, CG motions and drones that fail of the scenarios, one world each; N = `drones`."""
+def load_of(config: Config, scenarios: Sequence[Scenario]) -> Load:
+    """Masses, CG motions and drones that fail of the scenarios, one world each."""
+    scenarios = [of_plant(config, scenario) for scenario in scenarios]
     mass = np.array([scenario.mass for scenario in scenarios], float)
     believed = [s.mass if s.believed_mass is None else s.believed_mass for s in scenarios]
     names = ("amplitude", "omega", "phase")
@@ -351,6 +350,6 @@ def load_of(scenarios: Sequence[Scenario], drones: int = 2) -> Load:
     if count:
         load = load._replace(thrust_scale=np.array([s.thrust or (1.0,) * count for s in scenarios], float))
     if any(scenario.lost for scenario in scenarios):
-        stops = [[dict(s.lost).get(number, np.inf) for number in range(drones)] for s in scenarios]
+        stops = [[dict(s.lost).get(number, np.inf) for number in range(config.plant.count)] for s in scenarios]
         load = load._replace(stop_time=np.array(stops, float))
     return load

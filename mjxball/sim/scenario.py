@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,20 +24,24 @@ class CgPath:
 
 
 CIRCLE = CgPath(width=1.0, lead=math.pi / 2)
+OF_PLANT: Any = None  # of a scenario's number: what the plant says, see `of_plant`
+AMPLITUDE, GOAL = 0.05, 1.0  # [m] of a plant that allows them
+MOVES = {"free": (1.0, 1.0, 1.0), "pivot": (0.0, 0.0, 0.0), "heave": (0.0, 0.0, 1.0)}  # axes that a stand leaves O
 
 
 @dataclass(frozen=True)
 class Scenario:
     """One flight: from rest at the origin, rotors at the believed hover thrust, to the goal.
 
-    How the CG moves (sine, waveform, rolling ball) is the configuration's `motion`; a sine's numbers are here.
+    How the CG moves (sine, waveform, rolling ball) is the configuration's `motion`; a sine's numbers are here. Load and
+    goal that are not given are those of the plant that flies (`of_plant`).
     """
 
     omega: float = 0.31  # angular speed of the CG's sine [rad/s]
-    amplitude: float = 0.05  # of the CG's sine [m]
-    mass: float = 0.2  # true mass of the object [kg]
+    amplitude: float = OF_PLANT  # of the CG's sine [m]
+    mass: float = OF_PLANT  # true mass of the object [kg]
     believed_mass: float | None = None  # mass that the hover thrust assumes, None: the true one [kg]
-    goal: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of O [m]
+    goal: tuple[float, float, float] = OF_PLANT  # of O [m]
     seconds: float = 45.0
     phase: float = 0.0  # of the CG's sine [rad]
     mass_changes: tuple[tuple[float, float], ...] = ()  # (time [s], mass added or, if negative, dropped [kg])
@@ -54,8 +58,25 @@ class Scenario:
     lost: tuple[tuple[int, float], ...] = ()  # (number of a drone, time at which its rotors stop [s])
 
 
-def check_scenario(config: Config, scenario: Scenario) -> None:
-    """Raise InputError with one sentence if `scenario` makes no sense on `config`'s plant."""
+def of_plant(config: Config, scenario: Scenario) -> Scenario:
+    """`scenario` with the load and the goal of `config`'s plant where it gives none.
+
+    The mass is the plant's, the CG goes as far as the object and training's draws allow, 5 cm at most, and the goal is
+    1 m away on every axis that a stand leaves free, drawn in to what training may draw.
+    """
+    ranges, plant = config.scenario, config.plant
+    distance = min(GOAL, ranges.goal_range)
+    own = {
+        "mass": plant.object_mass,
+        "amplitude": min(AMPLITUDE, cg_limit(plant), ranges.cg_amplitude[1]),
+        "goal": tuple(distance * free for free in MOVES[plant.stand]),
+    }
+    return replace(scenario, **{name: value for name, value in own.items() if getattr(scenario, name) is OF_PLANT})
+
+
+def check_scenario(config: Config, scenario: Scenario) -> Scenario:
+    """`scenario` with what `of_plant` fills in; InputError with one sentence if it makes no sense on the plant."""
+    scenario = of_plant(config, scenario)
     if len(scenario.goal) != 3:
         raise InputError(f"goal takes 3 numbers, not {len(scenario.goal)}")
     if not np.isfinite(_numbers(astuple(scenario))).all():
@@ -85,6 +106,7 @@ def check_scenario(config: Config, scenario: Scenario) -> None:
     _check_goals(config, scenario)
     if scenario.seconds < config.timing.control_period or scenario.seconds > 86_400:
         raise InputError(f"seconds must be between one control period and a day, not {scenario.seconds:g}")
+    return scenario
 
 
 def _check_drones(count: int, scenario: Scenario) -> None:

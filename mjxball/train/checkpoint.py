@@ -25,7 +25,9 @@ from mjxball.train.run_directory import CHECKPOINTS, read_config
 
 KEEP = 2
 CHECKSUMS = "checksums"
-logging.getLogger("absl").setLevel(logging.CRITICAL)  # what is wrong with a checkpoint is said here, in one line
+# What is wrong with a checkpoint is said here, in one line.
+for chatty in ("absl", "asyncio"):
+    logging.getLogger(chatty).setLevel(logging.CRITICAL)
 
 
 class Checkpoints:

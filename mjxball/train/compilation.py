@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +15,8 @@ from jax import Array
 from jax.sharding import Mesh
 
 from mjxball.cache import traced_directory
+from mjxball.files import write_whole
+from mjxball.reading import parse_json
 
 OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
 # One follower's kernels gain nothing from being tuned and optimised further, and it costs a third of the compile time.
@@ -191,7 +192,7 @@ def _read(path: Path | None) -> tuple[Any, list[int]] | None:
         return None
     try:
         first, _, program = path.read_bytes().partition(b"\n")
-        return jax.export.deserialize(bytearray(program)), json.loads(first)
+        return jax.export.deserialize(bytearray(program)), parse_json(first)
     except Exception:  # absent, cut short, or of another JAX: traced anew
         return None
 
@@ -199,10 +200,6 @@ def _read(path: Path | None) -> tuple[Any, list[int]] | None:
 def _write(path: Path | None, exported: Any, unchanged: list[int]) -> None:
     if path is None:
         return
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    try:
+    with contextlib.suppress(OSError):  # a full or read-only cache is no reason not to train
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(json.dumps(unchanged).encode() + b"\n" + exported.serialize())
-        partial.replace(path)
-    except OSError:  # a full or read-only cache is no reason not to train
-        partial.unlink(missing_ok=True)
+        write_whole(path, json.dumps(unchanged).encode() + b"\n" + exported.serialize())

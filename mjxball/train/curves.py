@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,8 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.train.run_directory import METRICS, read_rows
+from mjxball.files import MissingFileError
+from mjxball.train.run_directory import METRICS, read_metrics, read_rows, write_rows
 
 LOG = "members.csv"
 POLICIES = "members"
@@ -32,12 +32,7 @@ class MemberLog:
             self._rows.append({"steps": steps, "seed": self._seed + member, **named})
         if self._out is None:
             return
-        partial = self._out / f".{LOG}.partial"
-        with partial.open("w", newline="") as stream:
-            writer = csv.DictWriter(stream, list(self._rows[-1]))
-            writer.writeheader()
-            writer.writerows(self._rows)
-        partial.replace(self._out / LOG)
+        write_rows(self._out / LOG, list(self._rows[-1]), self._rows)
 
     def best(self) -> int:
         """The member with the highest return at the last evaluation; 0 before the first."""
@@ -56,7 +51,7 @@ def read_members(run: Path) -> list[dict[str, float]]:
     """Rows of a run's `members.csv`; none if it has no such file."""
     try:
         texts = read_rows(run / LOG)
-    except FileNotFoundError:
+    except MissingFileError:
         return []
     try:
         rows = [{name: float(row[name]) for name in {**dict.fromkeys(COLUMNS), **row}} for row in texts]
@@ -74,7 +69,7 @@ def best_member(rows: list[dict[str, float]]) -> int:
 
 def draw_members(run: Path, path: Path) -> None:
     """Picture of all members over training: steady-state error and return, each one, their median and quartiles."""
-    from mjxball.plotting import pyplot
+    from mjxball.plotting import pyplot, save
 
     rows = read_members(run)
     steps = sorted({row["steps"] for row in rows})
@@ -95,7 +90,7 @@ def draw_members(run: Path, path: Path) -> None:
     axes[1].legend()
     axes[1].set_xlabel("environment steps of each member")
     figure.suptitle(f"{table.shape[1]} followers")
-    figure.savefig(path, dpi=110)
+    save(figure, path)
     plt.close(figure)
 
 
@@ -142,12 +137,12 @@ def training_curve(run: Path, seed: int) -> dict[str, list[float]]:
 
 
 def _rows(run: Path) -> list[dict[str, str]]:
-    return read_rows(run / METRICS)
+    return read_metrics(run / METRICS)
 
 
 def draw_training(run: Path, config: Config, path: Path) -> None:
     """Draw `metrics.csv` of the directory `run` to `path`, whose directory is made."""
-    from mjxball.plotting import pyplot
+    from mjxball.plotting import pyplot, save
 
     rows = _rows(run)
 
@@ -178,5 +173,5 @@ def draw_training(run: Path, config: Config, path: Path) -> None:
     axes[-1].set_xlabel("environment steps")
     figure.suptitle(f"training of preset {config.preset}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save(figure, path)
     plt.close(figure)

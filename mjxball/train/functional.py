@@ -39,7 +39,19 @@ def train(
     `eval_` holds nothing. `mjxball.train.compilation.compiler_options()` are the options with which `train.py` compiles
     sooner. Raises InputError if one of them does not fit.
     """
-    program = Program(config, physics, overrides, extensions=Extensions(env, reward, algorithm))
+    with jax.enable_x64(False):  # float32 throughout, also where the user's own program is not
+        return _train(config, key, physics, Extensions(env, reward, algorithm), overrides, evaluate)
+
+
+def _train(
+    config: Config,
+    key: Array,
+    physics: str,
+    extensions: Extensions,
+    overrides: Mapping[str, Any] | None,
+    evaluate: bool,
+) -> tuple[PolicyNetwork, dict[str, Array]]:
+    program = Program(config, physics, overrides, extensions=extensions)
     program.algorithm.check_parts(1)
     state = program.create(key)
     fresh = program.evaluation_envs(jax.random.PRNGKey(0)) if evaluate else state.envs

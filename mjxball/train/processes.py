@@ -8,13 +8,16 @@ import os
 import subprocess
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mjxball.cli import FAULT
 from mjxball.errors import InputError, TrainingDivergedError
+from mjxball.train import lock
 
 HEARTBEAT = 20  # [s] after which a process that does not answer counts as dead
 PATIENCE = 120  # [s] for all processes to come together at the start
@@ -105,6 +108,32 @@ def any_of(flags: tuple[bool, ...]) -> tuple[bool, ...]:
 
 
 @contextlib.contextmanager
+def holding(run: Path, meeting: bool, check: Callable[[], Any]) -> Iterator[None]:
+    """Hold the run directory `run` for all processes, see `lock.held`, and `check` it then, both in process 0.
+
+    Raises InputError in every process if it is refused.
+    """
+    if not meeting:
+        with lock.held(run):
+            check()
+            yield
+        return
+    refused = None
+    with contextlib.ExitStack() as stack:
+        if is_writer():
+            try:
+                stack.enter_context(lock.held(run))
+                check()
+            except InputError as error:
+                refused = error
+        (anywhere,) = any_of((refused is not None,))
+        if anywhere:
+            leave()
+            raise refused or InputError(f"process 0 cannot train into {run}, and says why")
+        yield
+
+
+@contextlib.contextmanager
 def exit_when_a_process_is_lost(resume: str) -> Iterator[None]:
     """If this or another process fails, say so, name `resume` as the way on, and end with a non-zero exit code.
 
@@ -129,7 +158,7 @@ def exit_when_a_process_is_lost(resume: str) -> Iterator[None]:
             file=sys.stderr,
             flush=True,
         )
-        os._exit(1)  # the runtime's own farewell would wait for the lost process
+        os._exit(FAULT)  # the runtime's own farewell would wait for the lost process
     finally:
         _dismiss(watcher)
 

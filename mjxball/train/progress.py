@@ -5,12 +5,12 @@ from __future__ import annotations
 import csv
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
 from mjxball.quiet import import_tensorboard_writer
-from mjxball.train.run_directory import read_rows
+from mjxball.train.run_directory import CONFIG_FILE, read_metrics, write_rows
 
 EVENTS = "tensorboard"  # directory beside metrics.csv
 
@@ -56,15 +56,10 @@ class Progress:
             return
         kept = _rows_until(path, names, resumed_at)
         self.before = float(kept[-1]["seconds"]) if kept else 0.0
-        partial = path.with_name(f".{path.name}.partial")
-        with partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, names)
-            writer.writeheader()
-            writer.writerows(kept)
-        partial.replace(path)
+        write_rows(path, names, kept)
         self._file = path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, names)
-        self._events = import_tensorboard_writer()(str(path.with_name(EVENTS)), purge_step=resumed_at or None)
+        self._events = _events_anew(path, kept)
 
     def elapsed(self) -> float:
         """Seconds since this object was made."""
@@ -116,6 +111,24 @@ class Progress:
         self._events.close()
 
 
+def _events_anew(path: Path, kept: Sequence[Mapping[str, str]]) -> Any:
+    """A writer of TensorBoard's events beside `path`, with the rows `kept`: each point once, whoever reads them.
+
+    What is there besides goes: rows that will come again, and others than an earlier process wrote to metrics.csv.
+    """
+    place = path.with_name(EVENTS)
+    for older in place.glob("events.out.tfevents.*"):
+        older.unlink()
+    events, began = import_tensorboard_writer()(str(place)), path.with_name(CONFIG_FILE)
+    start = began.stat().st_mtime if began.exists() else time.time()
+    for row in kept:
+        numbers = {name: float(text) for name, text in row.items() if text and name != "steps"}
+        for name, value in numbers.items():
+            events.add_scalar(name, value, int(row["steps"]), walltime=start + numbers["seconds"])
+    events.flush()
+    return events
+
+
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.4g}"
 
@@ -123,5 +136,4 @@ def _number(value: float | None) -> str:
 def _rows_until(path: Path, names: Sequence[str], steps: int) -> list[dict[str, str]]:
     if not steps or not path.exists():
         return []
-    rows = [row for row in read_rows(path) if set(row) == set(names) and row["steps"].isdecimal()]
-    return [row for row in rows if len(row["steps"]) < 20 and int(row["steps"]) <= steps]
+    return [row for row in read_metrics(path) if set(row) == set(names) and int(row["steps"]) <= steps]

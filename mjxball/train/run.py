@@ -22,7 +22,7 @@ from mjxball.errors import TrainingDivergedError
 from mjxball.policy import save_file
 from mjxball.policy.export import is_sound, network_file, policy_file
 from mjxball.sim.follower import follower_law
-from mjxball.train import processes
+from mjxball.train import lock, processes
 from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
 from mjxball.train.extensions import Extensions, is_pair, resolve
@@ -58,6 +58,7 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
         restore()
         if not stop.begun and jax.process_count() == 1:
             progress.say("stopped before training began; --resume begins it")
+            lock.drop()
             os._exit(130)  # what XLA compiles cannot be cut short
         progress.say("stopping: saving the policy and a checkpoint (Ctrl-C again to quit at once)")
 

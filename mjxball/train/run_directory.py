@@ -7,11 +7,13 @@ from __future__ import annotations
 import csv
 import hashlib
 import importlib.metadata
+import io
 import json
 import os
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,20 +21,23 @@ from mjxball import config as configs
 from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.files import MissingFileError, read_bytes, read_text, write_whole
 from mjxball.physics.step import TRAINING_ENGINES
+from mjxball.policy.container import MAX_BYTES
 from mjxball.policy.file import PolicyFile, load_file
+from mjxball.reading import parse_json
 
-MAX_BYTES = 16 * 2**20  # JSON and CSV take some ten times their own length in memory
+LONGEST_COUNT = 20  # digits of a number of steps
 
 
 def read_json(path: Path, called: str) -> Any:
-    """The contents of a JSON file; FileNotFoundError if there is none, InputError if it cannot be read.
+    """The contents of a JSON file; MissingFileError if there is none, InputError if it cannot be read.
 
     `called` says in the error what the file is, '' for nothing but its path.
     """
-    text = _text(path, called)
+    text = read_text(path, called)
     try:
-        return json.loads(text)
+        return parse_json(text)
     except (ValueError, RecursionError) as error:
         raise _refusal(path, called, error) from None
 
@@ -40,9 +45,9 @@ def read_json(path: Path, called: str) -> Any:
 def read_rows(path: Path) -> list[dict[str, str]]:
     """The rows of a CSV file with a header; a row that is cut short or too long is left out.
 
-    FileNotFoundError if there is no such file, InputError if it cannot be read.
+    MissingFileError if there is no such file, InputError if it cannot be read.
     """
-    lines = _text(path, "").splitlines()
+    lines = read_text(path).splitlines()
     try:
         rows = list(csv.DictReader(lines))
     except csv.Error as error:
@@ -50,15 +55,30 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     return [row for row in rows if None not in row and None not in row.values()]
 
 
-def _text(path: Path, called: str) -> str:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise _refusal(path, called, f"it is larger than {MAX_BYTES >> 20} MiB")
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise
-    except (OSError, UnicodeDecodeError) as error:
-        raise _refusal(path, called, getattr(error, "strerror", None) or error) from None
+def read_metrics(path: Path) -> list[dict[str, str]]:
+    """The rows of `metrics.csv` whose steps follow each other; stderr says what was left out. Errors as `read_rows`.
+
+    A row that stands twice or goes back is what another process wrote, or is left of a run that was cut short.
+    """
+    rows = read_rows(path)
+    kept: list[dict[str, str]] = []
+    for row in rows:
+        steps = row.get("steps", "")
+        if steps.isdecimal() and len(steps) < LONGEST_COUNT and (not kept or int(steps) > int(kept[-1]["steps"])):
+            kept.append(row)
+    if len(kept) < len(rows):
+        left = f"{len(rows) - len(kept)} of {len(rows)} rows do not follow the one before"
+        print(f"warning: {path}: {left} in steps and are left out", file=sys.stderr)  # noqa: T201
+    return kept
+
+
+def write_rows(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write a CSV file with the header `names`."""
+    stream = io.StringIO(newline="")
+    writer = csv.DictWriter(stream, names)
+    writer.writeheader()
+    writer.writerows(rows)
+    write_whole(path, stream.getvalue())
 
 
 def _refusal(path: Path, called: str, why: object) -> InputError:
@@ -84,7 +104,7 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
     contents = load_file(path)
     if file_hash(path) != start["sha256"]:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
-    own = json.loads(json.dumps(configs.to_dict(config)["follower"]))
+    own = parse_json(json.dumps(configs.to_dict(config)["follower"]))
     trained = configs.with_current_names(contents.card.get("config", {})).get("follower", {})
     changed = [f"follower.{name}" for name in own if own[name] != trained.get(name)]
     if changed:
@@ -107,16 +127,14 @@ def members_of(run: Path) -> list[Path]:
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    """SHA-256 of a policy file."""
+    return hashlib.sha256(read_bytes(path, "policy file", MAX_BYTES)).hexdigest()
 
 
 def write_config(run: Path, config: Config, origin: dict[str, Any]) -> None:
     """Write the run's `config.json`: configuration, its hash, and `origin` (seed, physics, command, commit)."""
     record = {"config": configs.to_dict(config), "config_hash": configs.config_hash(config), **origin}
-    partial = run / f".{CONFIG_FILE}.partial"
-    partial.write_text(json.dumps(record, indent=2) + "\n")
-    partial.replace(run / CONFIG_FILE)
+    write_whole(run / CONFIG_FILE, json.dumps(record, indent=2) + "\n")
 
 
 def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
@@ -124,7 +142,7 @@ def read_config(run: Path) -> tuple[Config, dict[str, Any]]:
     path = run / CONFIG_FILE
     try:
         record = read_json(path, "")
-    except FileNotFoundError:
+    except MissingFileError:
         raise InputError(f"{run} is not a run directory: it has no {CONFIG_FILE}") from None
     if not isinstance(record, dict) or "config" not in record:
         raise InputError(f"{path} holds no configuration")
@@ -228,11 +246,7 @@ Sweep = Mapping[str, Sequence[float]]
 
 def read_sweep(path: Path, members: int, config: Config) -> dict[str, list[float]]:
     """A sweep file: JSON {"<config path>": [one number for each member], ...}. Raises InputError if unsound."""
-    try:
-        sweep = read_json(path, "sweep file")
-    except FileNotFoundError:
-        raise InputError(f"sweep file {path} does not exist") from None
-    return check_sweep(sweep, members, config, f"sweep file {path}")
+    return check_sweep(read_json(path, "sweep file"), members, config, f"sweep file {path}")
 
 
 def check_sweep(sweep: Any, members: int, config: Config, where: str) -> dict[str, list[float]]:

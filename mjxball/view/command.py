@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mjxball.cli import Parser, make_parser, output_file, run_command
 from mjxball.errors import InputError
-from mjxball.policy.file import write_whole
+from mjxball.files import write_whole
 from mjxball.view.flight import flight_from, save_flight
 from mjxball.view.page import flight_page
 

@@ -23,14 +23,16 @@ from mjxball.cli import plant_setup
 from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.errors import InputError
+from mjxball.files import write_whole
 from mjxball.policy.container import read_arrays
-from mjxball.policy.file import write_whole
+from mjxball.reading import check_times, parse_json
 
 if TYPE_CHECKING:
     from mjxball.sim.rollout import Trajectory
 
 FORMAT = "mjxball flight 1"
 MAX_BYTES = 256 * 2**20
+STEPS = (1e-4, 1.0)  # [s] between two rows, as a rule
 
 
 def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
@@ -82,7 +84,7 @@ def load_flight(path: str | os.PathLike[str]) -> Flight:
     """Read and verify a flight; raise InputError with one sentence on anything unsound."""
     arrays: dict[str, Any] = dict(read_arrays(str(path), "flight", MAX_BYTES))
     try:
-        about = json.loads(str(arrays.pop("about")))
+        about = parse_json(str(arrays.pop("about")))
         if about["format"] != FORMAT:
             raise ValueError
         title = str(about["title"])
@@ -104,8 +106,10 @@ def check_flight(flight: Flight, name: str) -> Flight:
             raise InputError(f"{name}: {field} is missing or not of shape {rows + shape}")
         if not np.isfinite(array).all():
             raise InputError(f"{name}: {field} holds a value that is not finite")
-    if (np.diff(flight["time"]) <= 0).any():
-        raise InputError(f"{name}: time must increase from row to row")
+    try:
+        check_times(flight["time"].tolist(), *STEPS)
+    except ValueError as error:
+        raise InputError(f"{name}: time must increase from row to row: {error}") from None
     return Flight(flight.title, flight.plant, {field: flight[field] for field in wanted})
 
 
@@ -170,23 +174,22 @@ def read_log(path: Path) -> Flight:
 def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None) -> Flight:
     from mjxball.baselines import LAWS, make_baseline
     from mjxball.evaluate.policies import load_policy, native_config
-    from mjxball.evaluate.scenarios import REFERENCE, standard_scenarios
+    from mjxball.evaluate.scenarios import standard_scenarios
     from mjxball.sim.rollout import simulate
 
-    setup, reference, path = plant_setup(plant), REFERENCE, Path(source)
-    if plant is not None:
-        reference = standard_scenarios(setup)[-1]
+    setup, path = plant_setup(plant), Path(source)
+    tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
     if source in LAWS:
         follower: Any = make_baseline(source, setup)
     else:
         file = _policy_file(path)
         native = native_config(file)
         if native is not None and plant is None:
-            setup, reference = native, standard_scenarios(native)[-1]
-        follower = load_policy(file, setup)
+            setup = native
+        seconds = tuples.get("seconds", standard_scenarios(setup)[-1].seconds)
+        follower = load_policy(file, setup, seconds=seconds)
         follower.name = path.name if path.is_dir() else follower.name
-    tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
-    scenario = dataclasses.replace(reference, **tuples)
+    scenario = dataclasses.replace(standard_scenarios(setup)[-1], **tuples)
     flown = simulate(setup, follower, scenario, physics)
     reach = "±" if len(setup.plant.directions) == 1 else "on a circle of "
     motion = f"CG {reach}{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s"

@@ -61,6 +61,9 @@ class LiveLog:
         records = self._tail.read()
         for record in records or ():
             self._take(record)
+        if self._tail.misplaced and self.level != "bad":
+            self.level, self._why = "bad", self._tail.misplaced
+            self.text = f"the log cannot be placed in time: {self._why}"
         return records is not None
 
     def close(self) -> None:

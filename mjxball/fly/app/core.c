@@ -1,18 +1,15 @@
 /* See core.h. No allocation, no globals but constants, no library; products and sums must not be contracted. */
 #include "core.h"
 
+#include "checks.h"
 #include "laws.h"
 #include "packets.h"
 #include "rig.h"
 
-#define CEILING 60000.0f      /* [thrust units] */
-#define FLOOR 10001.0f
 #define SPIN_THRUST 16000.0f
-#define SENT_TILT 0.2617994f  /* [rad] 15 degrees, of every setpoint */
 #define MOST_TILT 0.76604444f /* cosine of 40 degrees */
 #define LAPTOP_AGE 500u       /* [ms] */
 #define PEER_AGE 300u
-#define STATE_AGE 100u
 #define RAMP_TIME 1500u
 #define LAND_SPEED 0.25f      /* [m/s] */
 #define SINK_SPEED 0.4f
@@ -24,7 +21,6 @@
 #define BATTERY_TIME 5000u
 #define NEAR_GROUND 0.04f     /* [m] */
 #define STILL 0.12f           /* [m/s] */
-#define VARIANCE 5e-4f        /* [m2] */
 #define BRAKE_TILT 0.13962634f /* [rad] 8 degrees */
 
 const char *mjxball_text(int cause) {
@@ -56,11 +52,10 @@ static float hover_of(const mjxball_map *map) {
 }
 
 static void send_level(mjxball_setpoint *out, float roll, float pitch, float thrust) {
-    const float degrees = 57.295780f;
     out->active = true;
-    out->roll = degrees * clip(roll, -SENT_TILT, SENT_TILT);
-    out->pitch = -degrees * clip(pitch, -SENT_TILT, SENT_TILT);
-    out->thrust = (float)(int)(clip(thrust, FLOOR, CEILING) + 0.5f);
+    out->roll = DEGREES * clip(roll, -SENT_TILT, SENT_TILT);
+    out->pitch = -DEGREES * clip(pitch, -SENT_TILT, SENT_TILT);
+    out->thrust = clip(thrust, FLOOR, CEILING);
 }
 
 /* True if the thrust was cut. */
@@ -77,40 +72,6 @@ static bool send_command(const mjxball_app *app, const mjxball_map *map, mjxball
 
 /* The supervisor. */
 
-static bool in_fence(const float *place) {
-    for (int i = 0; i < 3; i++)
-        if (!(place[i] >= mjxball_rig.fence_low[i] && place[i] <= mjxball_rig.fence_high[i])) return false;
-    return true;
-}
-
-static bool goal_is_good(const mjxball_parameters *set) {
-    for (int drone = 0; drone < 2; drone++) {
-        float place[3];
-        for (int i = 0; i < 3; i++) place[i] = set->goal[i] + mjxball_rig.mount[drone][i];
-        if (!in_fence(place)) return false;
-    }
-    return true;
-}
-
-static bool mount_is_set(const mjxball_parameters *set) {
-    float size = 0;
-    for (int i = 0; i < 3; i++) size += set->mount[i] * set->mount[i];
-    return size > 1e-6f && size < 1;
-}
-
-static bool state_is_good(const mjxball_state *state, uint32_t now) {
-    const float *q = state->quaternion;
-    float size = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-    return all_finite(state->position, 3) && all_finite(state->velocity, 3) && all_finite(state->rates, 3) && size > 0.9f
-        && size < 1.1f && now - state->time <= STATE_AGE;
-}
-
-static bool estimate_is_good(const mjxball_state *state) {
-    for (int i = mjxball_rig.stand ? 2 : 0; i < 3; i++)
-        if (!(state->variance[i] <= VARIANCE)) return false;
-    return true;
-}
-
 static bool peer_is_heard(const mjxball_app *app) {
     return app->peer_time && app->now - app->peer_time <= PEER_AGE;
 }
@@ -120,14 +81,12 @@ static bool laptop_is_heard(const mjxball_app *app) {
 }
 
 /* Why it must not start. */
-static uint8_t refusal_of(const mjxball_app *app, const mjxball_parameters *set, const mjxball_state *state) {
-    if (!mount_is_set(set)) return MJXBALL_NO_MOUNT;
-    if (!goal_is_good(set)) return MJXBALL_BAD_GOAL;
-    if (set->curve > 1 || !mjxball_rig.maps[set->curve].known) return MJXBALL_BAD_CURVE;
+static uint8_t refusal_of(const mjxball_app *app, uint8_t fault, const mjxball_state *state) {
+    if (fault) return fault;
     if (!state_is_good(state, app->now)) return MJXBALL_BAD_STATE;
     if (!estimate_is_good(state)) return MJXBALL_ESTIMATOR;
     if (!state->can_fly) return MJXBALL_CANNOT_FLY;
-    if (!(state->voltage >= set->battery)) return MJXBALL_BATTERY;
+    if (!is_charged(app, state)) return MJXBALL_BATTERY;
     if (!peer_is_heard(app)) return MJXBALL_NO_PEER;
     if (app->peer.key != mjxball_rig.key) return MJXBALL_OTHER_POLICY;
     return app->peer.phase > MJXBALL_SPIN ? MJXBALL_PEER : MJXBALL_GOOD;
@@ -172,14 +131,13 @@ static void ask(wish *one, uint8_t phase, uint8_t cause) {
 
 static void judge_air(const mjxball_app *app, const seen *one, const mjxball_state *state, bool good, wish *to) {
     const bool guided = app->phase == MJXBALL_FLY || app->phase == MJXBALL_LAND;
-    const uint8_t gently = app->phase == MJXBALL_RAMP ? MJXBALL_DESCEND : MJXBALL_LAND;
     const uint32_t elapsed = app->now - app->since;
     float place[3], landing = (app->land_height + 0.3f) / LAND_SPEED + mjxball_rig.land_spare;
     for (int i = 0; i < 3; i++) place[i] = state->position[i] - app->origin[i];
-    if (!laptop_is_heard(app)) ask(to, gently, MJXBALL_NO_LAPTOP);
-    if (!peer_is_heard(app)) ask(to, gently, MJXBALL_NO_PEER);
-    if (app->late > 10) ask(to, gently, MJXBALL_LATE);
-    if (app->now - app->charged >= BATTERY_TIME) ask(to, gently, MJXBALL_BATTERY);
+    if (!laptop_is_heard(app)) ask(to, MJXBALL_LAND, MJXBALL_NO_LAPTOP);
+    if (!peer_is_heard(app)) ask(to, MJXBALL_LAND, MJXBALL_NO_PEER);
+    if (app->late > 10) ask(to, MJXBALL_LAND, MJXBALL_LATE);
+    if (app->now - app->charged >= BATTERY_TIME) ask(to, MJXBALL_LAND, MJXBALL_BATTERY);
     if (!good) ask(to, MJXBALL_DESCEND, MJXBALL_BAD_STATE);
     if (!app->trusted) ask(to, MJXBALL_DESCEND, MJXBALL_ESTIMATOR);
     if (good && !in_fence(place)) ask(to, MJXBALL_DESCEND, MJXBALL_FENCE);
@@ -197,13 +155,13 @@ static void judge_air(const mjxball_app *app, const seen *one, const mjxball_sta
     }
 }
 
-static void supervise(mjxball_app *app, const mjxball_parameters *set, const seen *one, const mjxball_state *state,
-    bool good, const mjxball_map *map) {
+static void supervise(mjxball_app *app, uint8_t fault, const seen *one, const mjxball_state *state, bool good,
+    const mjxball_map *map) {
     const uint32_t elapsed = app->now - app->since;
     const uint8_t order = laptop_is_heard(app) ? app->order : MJXBALL_IDLE;
     wish to = {app->phase, app->cause};
     if (app->phase == MJXBALL_IDLE) {
-        app->refusal = order == MJXBALL_SPIN ? refusal_of(app, set, state) : app->refusal;
+        app->refusal = order == MJXBALL_SPIN ? refusal_of(app, fault, state) : app->refusal;
         if (order == MJXBALL_SPIN && !app->refusal) enter(app, MJXBALL_SPIN, MJXBALL_ASKED, map);
         return;
     }
@@ -221,6 +179,9 @@ static void supervise(mjxball_app *app, const mjxball_parameters *set, const see
         if (app->phase == MJXBALL_RAMP && elapsed >= RAMP_TIME) ask(&to, MJXBALL_FLY, MJXBALL_ASKED);
         judge_air(app, one, state, good, &to);
     }
+    /* The law lands what it has flown. */
+    if (app->phase == MJXBALL_SPIN && to.phase > MJXBALL_FLY) to.phase = MJXBALL_STOP;
+    if (app->phase == MJXBALL_RAMP && to.phase == MJXBALL_LAND) to.phase = MJXBALL_DESCEND;
     if (to.phase != app->phase) enter(app, to.phase, to.cause, map);
 }
 
@@ -246,10 +207,21 @@ static void descend(mjxball_app *app, bool good, mjxball_setpoint *out) {
         app->trim * share);
 }
 
+/* Nothing that was computed can be believed: level, sinking as a model of the fall does. */
+static void distrust(mjxball_app *app, const mjxball_map *map, mjxball_setpoint *out) {
+    if (app->phase < MJXBALL_DESCEND) enter(app, MJXBALL_DESCEND, MJXBALL_BAD_COMMAND, map);
+    app->trusted = 0;
+    app->peer_time = 0; /* until it is heard again */
+    app->trim = hover_of(map);
+    if (!within(&app->climb, 1, MOST_SPEED)) app->climb = 0;
+    if (!within(&app->height, 1, MOST_PLACE)) app->height = mjxball_rig.fence_high[2];
+    descend(app, false, out);
+}
+
 static void fly(mjxball_app *app, const seen *one, const mjxball_map *map, mjxball_setpoint *out) {
     const float period = (float)mjxball_rig.period / 1000, hover = hover_of(map);
     float goal[3];
-    for (int i = 0; i < 3; i++) goal[i] = app->origin[i] + app->goal[i];
+    for (int i = 0; i < 3; i++) goal[i] = app->origin[i] + app->set.goal[i];
     if (mjxball_rig.stand) goal[0] = goal[1] = 0;
     if (app->phase == MJXBALL_LAND) {
         float sunk = LAND_SPEED * (float)(app->now - app->since) / 1000;
@@ -259,10 +231,8 @@ static void fly(mjxball_app *app, const seen *one, const mjxball_map *map, mjxba
         app->copying = 1;
         if (app->phase == MJXBALL_FLY) enter(app, MJXBALL_LAND, app->late > 10 ? MJXBALL_LATE : MJXBALL_BAD_COMMAND, map);
     }
-    if (!all_finite(app->command, 3)) {
-        app->trusted = 0;
-        enter(app, MJXBALL_DESCEND, MJXBALL_BAD_STATE, map);
-        descend(app, false, out);
+    if (!command_is_good(app)) {
+        distrust(app, map, out);
         return;
     }
     if (!send_command(app, map, out)) app->saturated_since = app->now;
@@ -283,11 +253,13 @@ void mjxball_start(mjxball_app *app, uint32_t now) {
     *app = fresh;
     app->now = app->since = app->charged = now;
     app->trusted = 1;
+    mjxball_defaults(&app->set);
 }
 
 void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball_state *state, uint32_t now,
     mjxball_setpoint *out) {
-    const mjxball_map *map = &mjxball_rig.maps[set->curve == 1];
+    const uint8_t fault = adopt(app, set);
+    const mjxball_map *map = &mjxball_rig.maps[app->set.curve == 1];
     const uint32_t gap = now - app->now;
     const bool good = state_is_good(state, now);
     seen one = {.level = 1};
@@ -296,20 +268,16 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
     app->late = 0.99f * app->late + (app->started && gap >= 2u * (uint32_t)mjxball_rig.period ? 1.0f : 0.0f);
     app->started = 1;
     app->now = now;
-    if (state->voltage >= set->battery) app->charged = now;
+    if (is_charged(app, state)) app->charged = now;
     if (good) {
-        look(set, state, &one);
+        look(app->set.mount, state, &one);
         for (int i = 0; i < 3; i++) {
             app->position[i] = one.position[i];
             app->velocity[i] = one.velocity[i];
         }
     }
     if (app->phase > MJXBALL_SPIN && !estimate_is_good(state)) app->trusted = 0;
-    if (goal_is_good(set))
-        for (int i = 0; i < 3; i++) app->goal[i] = set->goal[i];
-    else
-        app->refusal = MJXBALL_BAD_GOAL; /* the one before stays */
-    supervise(app, set, &one, state, good, map);
+    supervise(app, fault, &one, state, good, map);
     switch (app->phase) {
     case MJXBALL_IDLE:
         break;
@@ -330,5 +298,9 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
         break;
     default:
         out->active = true; /* thrust 0 */
+        return;
     }
+    /* The last step before the commander. */
+    if (out->active && !setpoint_is_good(out)) distrust(app, map, out);
+    out->thrust = (float)(int)(out->thrust + 0.5f);
 }

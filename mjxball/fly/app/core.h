@@ -41,7 +41,7 @@ typedef enum {
     MJXBALL_BAD_GOAL,
     MJXBALL_BAD_CURVE,
     MJXBALL_BAD_STATE,
-    MJXBALL_BAD_COMMAND, /* the network's: not finite */
+    MJXBALL_BAD_COMMAND, /* not finite, or beyond the limits */
     MJXBALL_ESTIMATOR,
     MJXBALL_FENCE,
     MJXBALL_TILT,
@@ -53,6 +53,7 @@ typedef enum {
     MJXBALL_BAD_UPLOAD,
     MJXBALL_NOT_ON_GROUND,
     MJXBALL_BATTERY,     /* low */
+    MJXBALL_BAD_BATTERY, /* the parameter */
     MJXBALL_CAUSES,
 } mjxball_cause;
 
@@ -127,7 +128,8 @@ typedef struct {
     uint8_t started;
     uint32_t since, now, laptop_time, peer_time, saturated_since, charged;
     float late;       /* ticks that came late, forgotten within a second or so */
-    float origin[3], goal[3], land_height;
+    mjxball_parameters set; /* in use */
+    float origin[3], land_height;
     float position[3], velocity[3]; /* of O */
     float integral[7];
     float trim;       /* thrust that hovers [thrust units] */

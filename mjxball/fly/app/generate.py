@@ -21,9 +21,9 @@ from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.handover import SAME
 from mjxball.fly.telemetry import Rig
 from mjxball.policy.file import PolicyFile
-from mjxball.policy.formats.c_header import c_header, float_bytes, footprint, weight_bytes
+from mjxball.policy.formats.c_header import APP, c_header, float_bytes, footprint, weight_bytes
 
-CORE = ("core.h", "core.c", "laws.h", "packets.h")  # no firmware types
+CORE = ("core.h", "core.c", "checks.h", "laws.h", "packets.h")  # no firmware types
 SOURCES = (*CORE, "glue.c")
 ROLES = ("leader", "follower")
 PERIODS = (5, 20)  # [ms] of laws that an app may keep
@@ -143,7 +143,7 @@ def files_of(policy: PolicyFile, name: str, int8: bool) -> Mapping[str, str]:
     config = check_policy(policy, name)
     cost = footprint(policy, int8)
     files = {f"src/{one}": (sources() / one).read_text(encoding="utf-8") for one in SOURCES}
-    files["src/policy.h"] = c_header(policy, name, int8)
+    files["src/policy.h"] = c_header(policy, name, int8, APP)
     files["src/rig.h"] = rig_header(policy, config, int8)
     for number, role in enumerate(ROLES):
         stack = STACK + (cost.stack if number else 0)
@@ -209,7 +209,7 @@ Made by `python -m mjxball.export POLICY DIR --crazyflie` (configuration {hash},
 constants, a law every {period} ms, number {ident}).
 
 `leader/` and `follower/` are out-of-tree apps for the Crazyflie firmware 2026.08; `src/` is what both share: `core.c`
-with `laws.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's interface, `policy.h`
+with `checks.h`, `laws.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's interface, `policy.h`
 and `rig.h` the policy.
 
     cd leader && make CRAZYFLIE_BASE=... cf2_defconfig && make CRAZYFLIE_BASE=... && make CRAZYFLIE_BASE=... cload

@@ -150,15 +150,18 @@ void appMain(void) {
         uint32_t now;
         mjxball_state state;
         mjxball_setpoint wanted;
+        mjxball_parameters asked;
         vTaskDelayUntil(&wake, M2T(mjxball_period()));
         begun = usecTimestamp();
-        now = T2M(xTaskGetTickCount());
-        receive(now);
         take(&state, &newest, sizeof state, &stateCount);
+        asked = set; /* which another task writes: one copy a period */
+        atomic_signal_fence(memory_order_seq_cst);
+        now = T2M(xTaskGetTickCount()); /* never before the state */
+        receive(now);
         for (int i = 0; i < 3; i++) state.variance[i] = logGetFloat(variances[i]);
         state.voltage = logGetFloat(voltage);
         state.can_fly = supervisorCanFly();
-        mjxball_tick(&core, &set, &state, now, &wanted);
+        mjxball_tick(&core, &asked, &state, now, &wanted);
         send(&wanted);
         say();
         if (tick % BEAT_TICKS == 0) {

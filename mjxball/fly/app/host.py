@@ -14,7 +14,10 @@ from mjxball.fly.app.generate import CORE, ROLES, files_of
 from mjxball.fly.app.protocol import BEAT_SIZE, REPLY_SIZE, Phase
 from mjxball.policy.file import PolicyFile
 
-FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Wall", "-Wextra", "-Werror")
+FLAGS = (
+    *("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-Werror"),
+    *("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic"),
+)
 # Beside the core: what Python must know of structs that it does not spell out.
 ACCESS = """\
 #include "core.c"

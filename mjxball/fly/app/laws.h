@@ -6,7 +6,8 @@
 
 #include "rig.h"
 
-#define MAX_LIFT_DIFFERENCE 1.5f
+#define MAX_LIFT_DIFFERENCE 1.5f /* [m/s2] */
+#define MOST_INTEGRAL 1000.0f    /* [m s] of the leader's error */
 
 /* Numbers. */
 
@@ -14,10 +15,10 @@ static float clip(float value, float low, float high) {
     return value < low ? low : value > high ? high : value;
 }
 
-/* NaN and infinity less themselves are not 0. */
-static bool all_finite(const float *values, int count) {
+/* False for NaN, too. */
+static bool within(const float *values, int count, float limit) {
     for (int k = 0; k < count; k++)
-        if (!(values[k] - values[k] == 0)) return false;
+        if (!(values[k] >= -limit && values[k] <= limit)) return false;
     return true;
 }
 
@@ -66,11 +67,6 @@ static void rotation(const float *q, float matrix[3][3]) {
     matrix[2][2] = 1 - 2 * (x * x + y * y);
 }
 
-static void rotate(const float matrix[3][3], const float *vector, float *to) {
-    for (int i = 0; i < 3; i++)
-        to[i] = matrix[i][0] * vector[0] + matrix[i][1] * vector[1] + matrix[i][2] * vector[2];
-}
-
 static void cross(const float *a, const float *b, float *to) {
     to[0] = a[1] * b[2] - a[2] * b[1];
     to[1] = a[2] * b[0] - a[0] * b[2];
@@ -84,13 +80,18 @@ typedef struct {
     float level; /* cosine of the drone's tilt */
 } seen;
 
-/* p_O = p - R r. On a stand nothing is believed of what is locked. */
-static void look(const mjxball_parameters *set, const mjxball_state *state, seen *to) {
+static void rotate(const seen *by, const float *vector, float *to) {
+    for (int i = 0; i < 3; i++)
+        to[i] = by->matrix[i][0] * vector[0] + by->matrix[i][1] * vector[1] + by->matrix[i][2] * vector[2];
+}
+
+/* p_O = p - R r, with r `mount`. On a stand nothing is believed of what is locked. */
+static void look(const float *mount, const mjxball_state *state, seen *to) {
     float arm[3], swing[3], sweep[3];
     rotation(state->quaternion, to->matrix);
-    rotate(to->matrix, set->mount, arm);
-    cross(state->rates, set->mount, swing);
-    rotate(to->matrix, swing, sweep);
+    rotate(to, mount, arm);
+    cross(state->rates, mount, swing);
+    rotate(to, swing, sweep);
     to->level = to->matrix[2][2];
     for (int i = 0; i < 3; i++) {
         to->position[i] = state->position[i] - arm[i];
@@ -111,9 +112,9 @@ static void look(const mjxball_parameters *set, const mjxball_state *state, seen
 /* A place and its motion relative to O, as the laws see them: 0 along what a stand locks. */
 static void arm_of(const seen *one, const float *mount, float *arm, float *sweep) {
     float swing[3];
-    rotate(one->matrix, mount, arm);
+    rotate(one, mount, arm);
     cross(one->rates, mount, swing);
-    rotate(one->matrix, swing, sweep);
+    rotate(one, swing, sweep);
     if (mjxball_rig.stand) arm[0] = arm[1] = sweep[0] = sweep[1] = 0;
 }
 
@@ -176,13 +177,18 @@ static void pid(const float *error, const float *rate, const float *integral, fl
     command_of(wanted, command);
 }
 
+/* Bound of the leader's integral of the stick's angle [rad s]. */
+static float most_turn(void) {
+    return mjxball_rig.tilt_gain > 0 ? MAX_LIFT_DIFFERENCE / mjxball_rig.tilt_gain : 0;
+}
+
 /* What this drone lifts more than the other one to turn the stick. */
 static float lift(const float *integral) {
     float side = MJXBALL_FOLLOWER ? -mjxball_rig.lift_sign : mjxball_rig.lift_sign;
     return side * mjxball_rig.tilt_gain * integral[3];
 }
 
-/* One period of this drone's law toward `goal`: `app->command`. False if the network's was not finite. */
+/* One period of this drone's law toward `goal`: `app->command`. False if the network had none. */
 static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
     const float period = (float)mjxball_rig.period / 1000;
     float error[3], rate[3], base[3], *command = app->command, *integral = app->integral;
@@ -198,10 +204,7 @@ static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
 #ifdef MJXBALL_MOUNT_ANGLE
         turn(observation, 18, mjxball_rig.mount_frame[0], -mjxball_rig.mount_frame[1]);
 #endif
-        if (!app->copying) {
-            mjxball_follow(&app->follower, observation, app->action, command);
-            good = all_finite(command, 3);
-        }
+        if (!app->copying) good = !mjxball_follow(&app->follower, observation, app->action, command);
         if (app->copying || !good) mjxball_copy_law(observation, command);
 #ifdef MJXBALL_MOUNT_ANGLE
         turn(command, 3, mjxball_rig.mount_frame[0], mjxball_rig.mount_frame[1]);
@@ -220,14 +223,15 @@ static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
 #else
     for (int i = 0; i < 3; i++) command[i] = base[i];
     if (mjxball_rig.shares) {
-        float most = mjxball_rig.tilt_gain > 0 ? MAX_LIFT_DIFFERENCE / mjxball_rig.tilt_gain : 0;
+        float most = most_turn();
         command[2] += lift(integral);
         clip_command(command);
         integral[3] = clip(integral[3] + period * (base[mjxball_rig.axis] - one->euler[mjxball_rig.axis]), -most, most);
     }
     for (int i = 0; i < 3; i++) {
         float ahead = error[i] + mjxball_rig.lead * rate[i];
-        integral[i] += period * clip(ahead, -mjxball_rig.band[i], mjxball_rig.band[i]);
+        ahead = clip(ahead, -mjxball_rig.band[i], mjxball_rig.band[i]);
+        integral[i] = clip(integral[i] + period * ahead, -MOST_INTEGRAL, MOST_INTEGRAL);
     }
 #endif
     return good;

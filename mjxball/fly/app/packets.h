@@ -4,6 +4,7 @@
 
 #include "core.h"
 
+#include "checks.h"
 #include "rig.h"
 
 /* Bytes, little-endian like every machine that this runs on. */
@@ -25,14 +26,16 @@ void mjxball_send(const mjxball_app *app, uint8_t out[MJXBALL_BEAT_SIZE]) {
 
 void mjxball_hear(mjxball_app *app, const uint8_t *data, int size, uint32_t now) {
     mjxball_beat beat;
-    if (size != MJXBALL_BEAT_SIZE || data[0] != 'M' || data[1] != !MJXBALL_FOLLOWER || data[2] > MJXBALL_STOP) return;
+    if (size != MJXBALL_BEAT_SIZE || data[0] != 'M' || data[1] != !MJXBALL_FOLLOWER) return;
+    if (data[2] > MJXBALL_STOP || data[3] > 1) return;
     beat.phase = data[2];
     beat.trusted = data[3];
     copy(&beat.key, data + 4, 4);
     if (app->phase != MJXBALL_IDLE && beat.key != mjxball_rig.key) return; /* of another pair */
     copy(beat.integral, data + 8, 16);
     copy(beat.velocity, data + 24, 12);
-    if (!all_finite(beat.integral, 4) || !all_finite(beat.velocity, 3)) return;
+    if (!within(beat.integral, 3, MOST_INTEGRAL) || !within(beat.integral + 3, 1, most_turn())) return;
+    if (!within(beat.velocity, 3, MOST_SPEED)) return;
     app->peer = beat;
     app->peer_time = now ? now : 1;
 }
@@ -53,6 +56,17 @@ static uint32_t word(const uint8_t *data) {
     uint32_t value;
     copy(&value, data, 4);
     return value;
+}
+
+/* The floats in front of the whole numbers are those of a policy file. */
+static bool weights_are_good(const uint8_t *memory) {
+    const float most = 1e6f;
+    float value;
+    for (uint32_t at = 0; at < __builtin_offsetof(mjxball_weights, weight_0); at += 4) {
+        copy(&value, memory + at, 4);
+        if (!within(&value, 1, most)) return false;
+    }
+    return true;
 }
 
 /* What of an upload is wrong: begin (key, size, CRC), chunk (offset, bytes), or commit. */
@@ -79,6 +93,7 @@ static uint8_t take(mjxball_app *app, const uint8_t *data, int size, uint8_t *me
     app->upload.ready = 0;
     if (app->upload.received != app->upload.size || crc32_of(memory, app->upload.size) != app->upload.crc)
         return MJXBALL_BAD_UPLOAD;
+    if (!weights_are_good(memory)) return MJXBALL_BAD_UPLOAD;
     app->follower.weights = (const mjxball_weights *)(const void *)memory;
     return MJXBALL_GOOD;
 }

@@ -51,11 +51,11 @@ CAUSES = (
     "the laptop is not heard",
     "the other drone is not heard",
     "the other drone flies another policy",
-    "the mount is not set",
+    "the mount is not set, or no length below 1 m",
     "the goal is beyond the fence or not finite",
     "the policy does not fly with this force curve",
     "the state is old or not finite",
-    "the network's command is not finite",
+    "the command is not finite",
     "the estimator's position cannot be trusted",
     "beyond the fence",
     "tilted beyond the limit",
@@ -65,8 +65,9 @@ CAUSES = (
     "the phase lasted too long",
     "on the ground",
     "weights refused: wrong rate, plant, format, size or CRC",
-    "weights refused: not on the ground",
+    "refused: weights, mount and curve change on the ground only",
     "the battery is low",
+    "the limit of the battery is not between 0 and 10 V",
 )
 
 

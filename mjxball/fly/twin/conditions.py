@@ -67,6 +67,7 @@ class Surroundings:
 
     noise: float = 1.0  # factor on the noise of IMU and pose
     pose_hz: float = 100.0  # poses of the positioning system [Hz]
+    pose_loss: float = 0.0  # share of these poses that never come
     deck: bool = True  # each drone has its own positioning; else poses come from the laptop, or none do
     delay: float = 0.0  # of every datagram each way, from the first one on [s]
     gains: tuple[float, float] = (1.0, 1.0)  # factors on the motor forces of leader and follower
@@ -195,7 +196,7 @@ class DroneFaults:
 class BodyFault(NamedTuple):
     """What happens to the body of a drone, see `Pair.disturb`."""
 
-    what: str  # "frozen", "lost", "jump": of its poses; "battery", "gain"
+    what: str  # of its poses, see `estimators.Positioning.disturb`; "battery", "fade", "gain"
     value: float
 
 
@@ -221,9 +222,12 @@ FAULT_KINDS: dict[str, What] = {
     "peer": DroneFaults(peer_silent=True),
     "killed": DroneFaults(stopped=True, restarts=False),
     "pose-frozen": BodyFault("frozen", 1.0),
+    "pose-axis": BodyFault("frozen z", 1.0),
+    "pose-repeated": BodyFault("repeated", 2.0),
     "pose-lost": BodyFault("lost", 1.0),
     "pose-jump": BodyFault("jump", 0.4),
     "sag": BodyFault("battery", 3.0),
+    "fade": BodyFault("fade", 0.5),  # [V/s]
     "weak": BodyFault("gain", 0.9),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import heapq
 import itertools
 import math
@@ -45,11 +46,16 @@ class TwinDrone:
         self.up, self.down = Channel(self._random), Channel(self._random)
         self._now = self._stamp = self._booted = 0.0  # [s]
         self._readings: Readings | None = None
-        self._pose = (0.0,) * 7
         self._estimated = 0  # [ms] of the estimate that an app sees
 
     def _new_peer(self) -> Peer:
-        return Peer(self.firmware, self._written, self._posed, self._estimator, self.app)
+        return Peer(
+            self.firmware,
+            self._written,
+            functools.partial(self._pair.receive_pose, self.number),
+            self._estimator,
+            self.app,
+        )
 
     def _new_app(self) -> App | None:
         self.beat = b""  # heartbeat that is on its way to the other drone
@@ -63,11 +69,6 @@ class TwinDrone:
         if self.app is not None and name.startswith(f"{GROUP}."):
             self.app.set(name.removeprefix(f"{GROUP}."), value)
         self._pair.set_parameter(self.number, name, value)
-
-    def _posed(self, position: np.ndarray, quaternion: np.ndarray | None) -> None:
-        turned = self._pose[3:] if quaternion is None else tuple(np.roll(quaternion, -1).tolist())
-        self._pose = (*position.tolist(), *turned)
-        self._pair.receive_pose(self.number, position, quaternion)
 
     def receive(self, datagram: bytes, now: float) -> None:
         """A datagram came from the laptop."""
@@ -162,7 +163,7 @@ class TwinDrone:
         voltage = float(state.battery[self.number]) + self.faults.battery
         setpoint = self.firmware.order.setpoint
         logged = {} if self.app is None else self.app.logged()
-        return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, self._pose, logged)
+        return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, logged)
 
     def send(self, now: float) -> list[bytes]:
         """Datagrams that leave for the laptop at `now`."""

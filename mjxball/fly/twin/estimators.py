@@ -249,20 +249,43 @@ class Positioning:
         self._every = max(round(1000 / surroundings.pose_hz), 1)
         self._noise, self._random = surroundings.noise, random
         self._phase = phase * self._every // 2
-        self.lost = not surroundings.deck
-        self.frozen = False
-        self.offset = np.zeros(3)  # [m]
-        self._last: Pose | None = None
+        self._loss = surroundings.pose_loss
+        self._lost = not surroundings.deck
+        self._frozen = np.zeros(7, bool)  # of x, y, z and the quaternion
+        self._repeats = 1  # poses in a row that are one
+        self._offset, self._count = np.zeros(3), 0
+        self._last: np.ndarray | None = None  # (7,) position [m], quaternion
+
+    def disturb(self, what: str, value: float) -> None:
+        """See `Pair.disturb`: "frozen" or "lost", "frozen z" alone, each "repeated" `value` times, a "jump"."""
+        match what:
+            case "frozen":
+                self._frozen[:] = bool(value)
+            case "frozen z":
+                self._frozen[2] = bool(value)
+            case "lost":
+                self._lost = bool(value)
+            case "repeated":
+                self._repeats = round(value)
+            case "jump":
+                self._offset = np.array([0.0, 0.0, value])
 
     def due(self, step: int) -> bool:
         """True if a pose comes at millisecond `step`."""
-        return not self.lost and (step + self._phase) % self._every == 0
+        return (
+            not self._lost
+            and (step + self._phase) % self._every == 0
+            and not (self._loss and self._random.random() < self._loss)
+        )
 
     def measure(self, position: np.ndarray, quaternion: np.ndarray) -> Pose:
         """The pose that is measured of the true `position` (3,) and `quaternion` (4,)."""
-        if self.frozen and self._last is not None:
-            return self._last
         drawn = self._noise * self._random.standard_normal(6)
         turned = product(quaternion, np.array([1.0, *(0.5 * ATTITUDE_NOISE * drawn[3:])]))
-        self._last = position + POSITION_NOISE * drawn[:3] + self.offset, turned / np.sqrt(turned @ turned)
-        return self._last
+        place = position + POSITION_NOISE * drawn[:3] + self._offset
+        found = np.concatenate([place, turned / np.sqrt(turned @ turned)])
+        self._count += 1
+        if self._last is not None:
+            found = self._last if self._count % self._repeats else np.where(self._frozen, self._last, found)
+        self._last = found
+        return found[:3], found[3:]

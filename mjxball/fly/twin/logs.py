@@ -53,7 +53,6 @@ class Snapshot(NamedTuple):
     info: int
     voltage: float  # [V]
     position: np.ndarray  # (3,) that is reported [m]
-    pose: tuple[float, ...]  # last pose from the laptop: x, y, z, qx, qy, qz, qw
     app: Mapping[str, float] = {}  # what the app on board logs
 
     @property
@@ -136,8 +135,8 @@ GROUPS: dict[str, Callable[[Snapshot], dict[str, float]]] = {
     },
     "acc": lambda one: _named("x y z", one.acceleration),
     "gyro": lambda one: _named("x y z", np.degrees(one.report.rates[one.drone])),
-    "ext_pos": lambda one: _named("X Y Z", one.pose[:3]),
-    "locSrv": lambda one: _named("x y z qx qy qz qw", one.pose),
+    "ext_pos": lambda one: _named("X Y Z", one.report.pose[one.drone, :3]),
+    "locSrv": lambda one: _named("x y z qx qy qz qw", one.report.pose[one.drone]),
     GROUP: lambda one: dict(one.app),
     "radio": lambda one: {"isConnected": 1.0, "rssi": 40.0},
 }

@@ -11,7 +11,7 @@ from mjxball.control import crazyflie, motors
 from mjxball.control.crazyflie import PARAMETERS, gains_of, with_gains
 from mjxball.fly.twin.conditions import OLDER_FORCE, Battery, DroneKind, Surroundings
 from mjxball.fly.twin.estimators import Complementary, Imu, Kalman, Positioning, euler_of
-from mjxball.fly.twin.physics import RUNNING, Modes, Report
+from mjxball.fly.twin.physics import RUNNING, Modes, Report, remembered
 
 TAKEN = 0.01  # share of the measured voltage that the firmware's low-pass filter takes, 1000 times a second
 FIRST = 4.2  # [V] that the filter starts from
@@ -24,6 +24,8 @@ class Power:
         self.kind, self.strength = kind, np.array(strength, float)[:, None]
         self._battery = battery
         self.charge = np.full(2, battery.full)  # [V] without load
+        self.sag = np.full(2, battery.sag)  # [V] at full power
+        self.fading = np.zeros(2)  # [V/s] that a cell loses whatever its load
         self._filtered = np.full((2, 1), FIRST)
         self.requested = np.zeros((2, 4))
         self.voltage = self.charge.copy()
@@ -51,8 +53,8 @@ class Power:
     def drain(self, pwm: np.ndarray, seconds: float) -> None:
         """Time goes on by `seconds` [s] at `pwm` (2, 4); the voltage follows the load at once."""
         load = pwm.mean(axis=1) / motors.FULL
-        self.charge = self.charge - self._battery.drain * seconds * load
-        self.voltage = self.charge - self._battery.sag * load
+        self.charge = self.charge - (self._battery.drain * load + self.fading) * seconds
+        self.voltage = self.charge - self.sag * load
         share = 1 - (1 - TAKEN) ** round(1000 * seconds)
         self._filtered = self._filtered + share * (self.voltage[:, None] - self._filtered)
 
@@ -81,6 +83,7 @@ class Onboard:
         self.positioning = [Positioning(surroundings, random, phase) for phase in range(2)]
         self.estimators = [KALMAN if surroundings.deck else COMPLEMENTARY] * 2
         self.deviations = [[0.01, 4.5e-3], [0.01, 4.5e-3]]  # of poses [m, rad]: locSrv.extPosStdDev, extQuatStdDev
+        self.poses = np.zeros((2, 7))
         self.idle = [float(kind.idle)] * 2
         self._autopilots = [autopilot] * 2
         self._arrange_gains()
@@ -122,8 +125,11 @@ class Onboard:
             self.deviations[drone][1] = max(value, 1e-6)
 
     def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
-        """A pose from the laptop; only the Kalman filter takes it."""
-        if self.estimators[drone] == KALMAN and not self._modes.held[drone]:
+        """A pose from outside; only the Kalman filter takes it."""
+        if self._modes.held[drone]:
+            return
+        self.poses[drone] = remembered(self.poses[drone], position, quaternion)
+        if self.estimators[drone] == KALMAN:
             std = self.deviations[drone]
             self.filters[drone].correct(position, quaternion, (std[0], std[1]))
             self._look(drone)
@@ -237,4 +243,5 @@ class Onboard:
         acceleration = self.imu.filtered[:, :3].copy()
         known = (self.estimators[0], self.estimators[1])
         drive = self.pwm, self.power.requested, self.thrust
-        return Report(position, velocity, attitude, rates.copy(), acceleration, variance, known, *drive)
+        poses = self.poses.copy()
+        return Report(position, velocity, attitude, rates.copy(), acceleration, variance, known, *drive, poses)

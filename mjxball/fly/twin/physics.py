@@ -31,6 +31,13 @@ class Report(NamedTuple):
     pwm: np.ndarray  # (2, 4) of the motors
     requested: np.ndarray  # (2, 4) the same before its bounds
     thrust: np.ndarray  # (2,) command of the controller [thrust units]
+    pose: np.ndarray  # (2, 7) newest pose from outside: x, y, z [m], quaternion (x, y, z, w); 0 before the first
+
+
+def remembered(before: np.ndarray, position: np.ndarray, quaternion: np.ndarray | None) -> np.ndarray:
+    """The row `before` of `Report.pose` after one more pose; without a `quaternion` (w, x, y, z) the old one stays."""
+    turned = before[3:] if quaternion is None else np.roll(quaternion, -1)
+    return np.concatenate([position, turned])
 
 
 class PairState(NamedTuple):
@@ -141,14 +148,15 @@ class StandIn:
         self._quaternion, self._rates = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
         self._thrust = np.zeros(2)  # of each drone [N]
         self._charge = np.full(2, self.plant.full)
-        self._commands = np.zeros(2)
+        self._commands, self._poses = np.zeros(2), np.zeros((2, 7))
         return self._state(np.zeros(3))
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
         """The stand-in has no gains."""
 
     def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
-        """The stand-in has no estimator."""
+        """The stand-in has no estimator, but says what came."""
+        self._poses[drone] = remembered(self._poses[drone], position, quaternion)
 
     def disturb(self, drone: int, what: str, value: float) -> None:
         """Of the faults, the stand-in knows the battery's."""
@@ -213,6 +221,8 @@ class StandIn:
         pwm = np.stack([motors.compensated(motors.MOTORS["2.1"], self._commands, battery)] * 4, axis=1)
         position, velocity = self._position + arms, self._velocity + swing
         quaternion, rates, force = (np.stack([one] * 2) for one in (self._quaternion, self._rates, felt))
+        motion = position, velocity, quaternion, rates, force
+        drive = pwm, pwm, self._commands
         return PairState(
             position=position,
             velocity=velocity,
@@ -220,9 +230,7 @@ class StandIn:
             rates=rates,
             specific_force=force,
             battery=battery,
-            report=Report(
-                position, velocity, quaternion, rates, force, np.full((2, 9), 1e-5), (2, 2), pwm, pwm, self._commands
-            ),
+            report=Report(*motion, np.full((2, 9), 1e-5), (2, 2), *drive, self._poses.copy()),
         )
 
 

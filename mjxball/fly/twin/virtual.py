@@ -25,7 +25,7 @@ from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.monitor import down_reason, tilt_angle
 from mjxball.fly.packets import Packet
 from mjxball.fly.supervisor import State, Supervisor
-from mjxball.fly.telemetry import HealthSample, Note, Rig, Telemetry
+from mjxball.fly.telemetry import HealthSample, Note, Rig, SensedSample, Telemetry
 from mjxball.fly.twin import logs
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.drone import TwinDrone, advance
@@ -36,9 +36,9 @@ from mjxball.policy import Policy
 
 STEP = 0.005  # [s] between two steps of the drones; delays are a whole number of them
 GROUNDED = 3e-3  # [m] above its rest below which the pair has touched down
-BLOCK, HEALTH_BLOCK, APP_BLOCK = 1, 2, 3  # log blocks of the state, of health, of the app
+BLOCK, HEALTH_BLOCK, APP_BLOCK, SENSED_BLOCK = 1, 2, 3, 4  # log blocks of state, health, app, what is sensed
 HEALTH = (*packets.VARIANCES, *packets.MOTORS[0], packets.ACTING_THRUST)
-_HEALTH = struct.Struct("<3f4Hf")
+_HEALTH, _SENSED = struct.Struct("<3f4Hf"), struct.Struct("<3e3f4e")
 
 
 class VirtualLink:
@@ -59,11 +59,11 @@ class VirtualLink:
         self.packets.append((now, packet))
         self.drone.receive(bytes([header(packet.port, packet.channel)]) + packet.data, now)
 
-    command = send
+    command = pose = send
 
     def stuck_for(self, now: float) -> float:
-        """How long nothing could be sent [s]: as long as a test says."""
-        return self.stuck
+        """How long nothing could be sent [s]: `stuck` now, as a test says."""
+        return max(self.stuck - (self._clock() - now), 0.0)
 
     def ask(self, port: int, channel: int, data: bytes) -> list[bytes]:
         """Answers to a request, without any delay or loss."""
@@ -80,9 +80,9 @@ class VirtualLink:
     write_later = write_parameters
 
     def start_states(self) -> None:
-        """Have the state logged at 100 Hz and health at 20 Hz."""
+        """Have the state logged at 100 Hz, what is sensed at 50 Hz, and health at 20 Hz."""
         names = [name for name, _ in logs.KNOWN]
-        blocks = [(BLOCK, packets.STATE_VARIABLES, 1), (HEALTH_BLOCK, HEALTH, 5)]
+        blocks = [(BLOCK, packets.STATE_VARIABLES, 1), (HEALTH_BLOCK, HEALTH, 5), (SENSED_BLOCK, packets.SENSED, 2)]
         blocks += [(APP_BLOCK, APP_VARIABLES, 2)] if self.drone.app is not None else []
         for block, variables, period in blocks:
             entries = [
@@ -101,11 +101,14 @@ class VirtualLink:
             health = packets.health_of(dict(values))
             self._note("health", t=now, drone=self.name, **health._asdict())
             self.telemetry.health = HealthSample(health, now)
+        elif logged and len(datagram) == 5 + _SENSED.size and datagram[1] == SENSED_BLOCK:
+            seen = zip((name for name, _ in packets.SENSED), _SENSED.unpack(datagram[5:]), strict=True)
+            self.telemetry.sensed = SensedSample(packets.sensed_of(dict(seen)), int.from_bytes(datagram[2:5], "little"))
         elif logged and len(datagram) == 5 + len(APP_VARIABLES) and datagram[1] == APP_BLOCK:
             self.telemetry.app = sample_of(
                 dict(zip((name for name, _ in APP_VARIABLES), datagram[5:], strict=True)), now
             )
-        elif logged and len(datagram) == 5 + packets.STATE_SIZE:
+        elif logged and len(datagram) == 5 + packets.STATE_SIZE and datagram[1] == BLOCK:
             try:
                 state = packets.unpack_state(datagram[5:])
             except packets.PacketError:

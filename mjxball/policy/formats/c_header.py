@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +24,7 @@ from mjxball.control.observation import (
 )
 from mjxball.control.offset_free import OffsetFreeLqg
 from mjxball.control.team_lqg import TeamLqg
+from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
 from mjxball.policy.formats.c_multi_model import MULTI_MODEL_LQG
@@ -30,6 +32,9 @@ from mjxball.policy.policy import known_context
 from mjxball.policy.quantize import Rows, rows_of
 
 FLOAT = 4  # bytes
+WIDEST_INT8 = 512  # products of 8 and 16 bits whose sum fits into 32
+LARGEST = 1e6  # of an observation's absolute sum: no flight comes near it, and floats can filter it
+APP = "mjxball"  # what the names in an app on board begin with, of which there is one a program
 # Of `MultiModelLqg`: a pair's numbers about roll, and those of every team that they replace.
 PAIR_ROLL = {"pair_roll_gain": "axis_gain", "pair_roll_certainty": "certainty", "pair_roll_prior": "prior"}
 MACROS = {"pair_roll_room", "rig_axes", "held_room", "by_size"}  # of `MultiModelLqg`, no arrays in a header
@@ -116,10 +121,11 @@ def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     return Footprint(FLOAT * constants, state, stack)
 
 
-def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
-    """The header's text. `mjxball_follow` computes what `mjxball.Policy` computes, in float.
+def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | None = None) -> str:
+    """The header's text. Its function `follow` computes what `mjxball.Policy` computes, in float.
 
-    With `int8` the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the
+    All names begin with `prefix`, `prefix_of(name)` by default, so that headers of several policies fit into one
+    program; one whose names are taken is a compiler's error, since its guard is that of its contents. With `int8` the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the
     same layout may be put in place at run time, `mjxball_follower.weights`. A policy of formats 3 and 4 is that of the
     one follower that `team` in its card names; InputError without it.
     """
@@ -127,6 +133,10 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
     law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)
     history = law.history
     sizes = [len(policy.observation_mean), *map(len, mean_layers(policy)[1])]
+    if int8 and max(sizes[:-1]) > WIDEST_INT8:
+        raise InputError(
+            f"{name} has a layer of {max(sizes[:-1])} inputs; with weights of 8 bits {WIDEST_INT8} at most"
+        )
     arrays = _float_arrays(policy) if not int8 else []
     tilt, vertical = card["command_limits"]
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
@@ -142,7 +152,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
     helpers += (c_texts.APPROACH if history.filters else "") + LQG_TEXTS[type(law.lqg)][0]
     layers = _network_int8(sizes) if int8 else _network(sizes)
-    return c_texts.HEADER.format(
+    text = c_texts.HEADER.format(
         name=_plain(name),
         origin=_plain(f"preset {card['preset']}, configuration {card['config_hash']}, {card['training_steps']} steps"),
         version=_plain(card["package_version"]),
@@ -156,6 +166,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
         size=sizes[0],
         widest=max(sizes[1:]),
         broadest=max(sizes),
+        largest=_number(LARGEST),
         int8="#define MJXBALL_INT8 1\n" if int8 else "",
         weights=", weights of 8 bits" if int8 else "",
         includes="#include <stdint.h>\n\n" if int8 else "",
@@ -176,6 +187,19 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False) -> str:
         network=layers,
         command=_command(law, card),
     )
+    return _named(text, prefix or prefix_of(name))
+
+
+def prefix_of(name: str) -> str:
+    """What the names in the header of a policy called `name` begin with; macros in upper case."""
+    return f"{APP}_{re.sub('[^a-z0-9]', '_', name.lower())}"
+
+
+def _named(text: str, prefix: str) -> str:
+    """`text` with its own names; `MJXBALL_REAL` is its user's."""
+    text = text.replace("MJXBALL_GUARD", f"MJXBALL_H_{zlib.crc32(text.encode()):08X}")
+    text = re.sub(r"\bmjxball_", f"{prefix}_", text)
+    return re.sub(r"\bMJXBALL_(?!REAL\b)", f"{prefix.upper()}_", text)
 
 
 def _team(team: dict[str, Any]) -> str:

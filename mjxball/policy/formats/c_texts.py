@@ -4,21 +4,25 @@ HEADER = """\
 /* Follower {name}, exported by mjxball {version}: {origin}.
  *
  *   mjxball_follower follower;
- *   mjxball_reset(&follower);                                   before every flight
- *   mjxball_follow(&follower, observation, action, command);    every {period} s
+ *   mjxball_reset(&follower);                                              before every flight
+ *   int status = mjxball_follow(&follower, observation, action, command);  every {period} s
  *
  * observation (18), SI units and radians, world axes, body rates in body axes:
 {observation}
  * action (3): the network's mean in [-1, 1]. command (3): roll [rad], pitch [rad], vertical acceleration [m/s2].
+ * status: 0, or else action and command are zeros, which is level. 1: a number of the observation is not finite, or
+ * their absolute sum is not below MJXBALL_LARGEST; the memory stays as it was. 2: the result is not finite; the next
+ * call starts a flight.
 {team} *
  * Network {layers}, ReLU, tanh{weights}. C99 without a library; no allocation, no globals but constants.
  * Bit for bit the same on every machine with IEEE floats if products and sums are not contracted (-ffp-contract=off).
  * Flash: {flash} bytes of constants, and the code. RAM: {state} bytes for mjxball_follower,
  * {stack} bytes of arrays on the stack during mjxball_follow.
  * Define MJXBALL_REAL as double before including this for arithmetic without rounding to float, at twice the RAM.
+ * Headers of several policies can be used together: names come from the file's name.
  */
-#ifndef MJXBALL_FOLLOWER_H
-#define MJXBALL_FOLLOWER_H
+#ifndef MJXBALL_GUARD
+#define MJXBALL_GUARD
 
 {includes}#ifndef MJXBALL_REAL
 #define MJXBALL_REAL float
@@ -29,6 +33,7 @@ typedef MJXBALL_REAL mjxball_real;
 #define MJXBALL_ACTION_SIZE 3
 #define MJXBALL_MEMORY_SIZE {memory_size}
 #define MJXBALL_WIDEST {broadest}
+#define MJXBALL_LARGEST {largest}
 {int8}#define MJXBALL_CONTROL_PERIOD {period}
 #define MJXBALL_GRAVITY {gravity}
 {mount_angle}
@@ -44,6 +49,12 @@ static inline void mjxball_copy(mjxball_real *to, const mjxball_real *from, int 
 static inline mjxball_real mjxball_clip(mjxball_real value, mjxball_real limit) {{
     return value < -limit ? -limit : value > limit ? limit : value;
 }}
+/* Whether the absolute sum is below `MJXBALL_LARGEST`: of numbers that are not finite it is not. */
+static inline int mjxball_is_sound(const mjxball_real *values, int count) {{
+    mjxball_real sum = 0;
+    for (int i = 0; i < count; i++) sum += values[i] < 0 ? -values[i] : values[i];
+    return sum < MJXBALL_LARGEST;
+}}
 {helpers}
 /* The leader's PD law on the observed error: what the `copy` follower commands. */
 static inline void mjxball_copy_law(const mjxball_real *observation, mjxball_real *to) {{
@@ -55,16 +66,24 @@ static inline void mjxball_reset(mjxball_follower *follower) {{
     follower->running = 0;
 }}
 
-static inline void mjxball_follow(
+static inline int mjxball_follow(
     mjxball_follower *follower, const mjxball_real observation[18], mjxball_real action[3], mjxball_real command[3]) {{
     mjxball_real input[{size}], hidden[2][{widest}];
 {memory_pointer}    int i;
+    for (i = 0; i < 3; i++) action[i] = command[i] = 0;
+    if (!mjxball_is_sound(observation, 18)) return 1;
     mjxball_copy(input, observation, 18);
 {history}
 {network}
     for (i = 0; i < 3; i++) action[i] = mjxball_tanh(action[i]);
 {command}
+    if (!mjxball_is_sound(action, 3) || !mjxball_is_sound(command, 3)) {{
+        for (i = 0; i < 3; i++) action[i] = command[i] = 0;
+        mjxball_reset(follower);
+        return 2;
+    }}
 {history_update}
+    return 0;
 }}
 
 #endif

@@ -1,4 +1,4 @@
-"""`python -m mjxball.rig.retrain`: retrains a policy for a load that is put on in flight; started by mjxball.fly.
+"""`python -m mjxball.commands.retrain`: retrains a policy for a load that is put on in flight; started by mjxball.fly.
 
 It reads the running flight's log, finds the load (`rig.load`), fine-tunes the policy for it from where the flight is
 (`train.fine_tune`), and prints lines of JSON: {"text"} while it compiles, {"what": "ready"}, then "identified", and
@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import json
 import os
+import select
 import sys
 import threading
 import time
@@ -41,12 +42,14 @@ GUIDED_NAMES = tuple(state.value for state in GUIDED)
 
 def main(arguments: Sequence[str]) -> int:
     """Compile, watch, identify, fine-tune; return the exit code."""
-    parser = make_parser("python -m mjxball.rig.retrain", "Retrain a policy in flight; started by mjxball.fly.")
+    parser = make_parser("python -m mjxball.commands.retrain", "Retrain a policy in flight; started by mjxball.fly.")
     parser.add_argument("policy", type=Path, metavar="POLICY.npz")
     parser.add_argument("log", type=Path, metavar="LOG", help="of the flight, may be yet to come")
     parser.add_argument("out", type=Path, metavar="OUT.npz", help="to be written")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="in which a policy is to be fine-tuned")
     options = parser.parse_args(arguments)
+    if _input_has_ended():
+        parser.error("standard input, whose end ends it, has ended; python -m mjxball.fly --retrain starts it with one")
     threading.Thread(target=_end_with_input, daemon=True).start()
     os.nice(NICE)
     collect_seldom()
@@ -109,10 +112,12 @@ def situation(load: IdentifiedLoad, watch: LoadWatch, replay: FlightReplay, conf
 
 
 def find(log: Path, watch: LoadWatch, replay: FlightReplay) -> IdentifiedLoad:
-    """Read the growing `log` until a load shows. Raises InputError if it is none."""
+    """Read the growing `log` until a load shows. Raises InputError if it is none or its clock goes back."""
     tail, looked = Tail(log), 0.0
     while True:
         records = tail.read()
+        if tail.misplaced:
+            raise InputError(f"flight log {log} cannot be placed in time: {tail.misplaced}")
         for record in records or ():
             watch.take(record)
             replay.take(record)
@@ -171,6 +176,14 @@ class FlightReplay:
         body = self._laws.body_from_observation(np.asarray(record["observation"], float), goal)
         self._controller.step(body, goal)
         self.place = Place(body, goal, self._controller.integral, self._controller.policy.memory)
+
+
+def _input_has_ended() -> bool:
+    """Whether there is no standard input, or none that stays open."""
+    try:
+        return bool(select.select([0], [], [], 0)[0]) and not os.read(0, 4096)
+    except OSError:
+        return True
 
 
 def _end_with_input() -> None:

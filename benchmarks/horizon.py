@@ -1,0 +1,118 @@
+"""Flights of ten minutes: each policy on its own plants, its load at rest and moving, beside the same of one minute.
+
+    python benchmarks/horizon.py [POLICY.npz ...] [--seconds 60 600] [--json FILE]
+
+A row is steady if the flight does not fail, no peak later than 20 s is more than 1.5 times that of the shortest flight
+and 5 mm, and a rotor is at its limit in less than a fifth of the time. A policy for any rig flies a pair and rings of
+three, four and six; one for teams rings of every number of drones between its smallest and its largest. Numbers are
+those of docs/metrics.md, computed in float32; ideal sensors.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from mjxball import cli
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.evaluate.batch import Batch
+from mjxball.evaluate.metrics import Metrics
+from mjxball.evaluate.policies import flies_any_rig, load_policy, native_config, team_sizes
+from mjxball.evaluate.scenarios import standard_scenarios
+from mjxball.plant.teams import ring_config
+from mjxball.policy import Policy
+from mjxball.policy.file import shipped_policies
+from mjxball.sim.scenario import Scenario
+
+MINUTE, TEN = 60.0, 600.0  # [s]
+SPEEDS = (0.31, 1.0)  # of the CG [rad/s]
+GROWTH, SLACK, LIMITED = 1.5, 0.005, 0.2  # of a steady flight: of its peaks, [m], share of the time
+PEAKS = ("x_peak", "y_peak", "z_peak")
+SHOWN = ("rotors_at_limit", "rotor_power", "command_spread")
+RIGS = ("pair", "team3", "team4", "team6")  # plants of a policy for any rig
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly, print, write."""
+    parser = cli.make_parser("python benchmarks/horizon.py", __doc__.split("\n\n")[0])
+    parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="default: every shipped one")
+    parser.add_argument("--seconds", nargs="+", type=float, default=[MINUTE, TEN], metavar="S")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    options = parser.parse_args(arguments)
+    rows: list[dict[str, Any]] = []
+    for path in options.policies or shipped_policies():
+        for label, setup in own_plants(path):
+            rows += flown(path, label, setup, sorted(options.seconds))
+    if options.json:
+        options.json.write_text(json.dumps({"rows": rows}, indent=1, allow_nan=False) + "\n")
+    return 0
+
+
+def own_plants(path: Path) -> Iterator[tuple[str, Config]]:
+    """(label, configuration) of every plant that a policy file is for."""
+    policy = Policy.load(path)
+    if flies_any_rig(policy):
+        for name in RIGS:
+            yield name, cli.plant_setup(Path(name))
+        return
+    own = native_config(path) or configs.preset("paper")
+    sizes = team_sizes(policy)
+    for size in range(min(sizes, default=0), max(sizes, default=-1) + 1):
+        yield f"ring of {size}", ring_config(own, size)
+    if not sizes:
+        yield own.preset, own
+
+
+def own_scenarios(setup: Config, seconds: float) -> list[Scenario]:
+    """The plant's reference load at rest, and moving at each of `SPEEDS`; a rolling ball from its start."""
+    reference = dataclasses.replace(standard_scenarios(setup)[-1], seconds=seconds)
+    if setup.motion.kind == "rolling" or not reference.amplitude:
+        return [reference]
+    return [
+        dataclasses.replace(reference, amplitude=0.0),
+        *(dataclasses.replace(reference, omega=speed) for speed in SPEEDS),
+    ]
+
+
+def flown(path: Path, label: str, setup: Config, horizons: Sequence[float]) -> list[dict[str, Any]]:
+    """One row for each scenario and horizon [s], the shortest first."""
+    batch, rows, first = Batch(setup, load_policy(path, setup)), [], []
+    for seconds in horizons:
+        scenarios = own_scenarios(setup, seconds)
+        found = batch.fly(scenarios)
+        first = first or found
+        for scenario, metrics, start in zip(scenarios, found, first, strict=True):
+            numbers = {name: getattr(metrics, name) for name in (*PEAKS, *SHOWN, "failed")}
+            motion = f"{scenario.omega:g} rad/s" if scenario.amplitude else "ball" if scenario.ball_start else "rest"
+            row = {"policy": path.stem, "plant": label, "drones": setup.plant.count, "motion": motion}
+            rows.append({**row, "seconds": seconds, **numbers, "steady": is_steady(metrics, start)})
+            show(rows[-1])
+    return rows
+
+
+def is_steady(metrics: Metrics, start: Metrics) -> bool:
+    """Whether a flight holds what its first minute `start` held."""
+    limited = metrics.rotors_at_limit
+    if metrics.failed or limited is None or limited >= LIMITED:
+        return False
+    pairs = [(getattr(metrics, name), getattr(start, name)) for name in PEAKS]
+    return all(None not in (late, early) and late <= GROWTH * early + SLACK for late, early in pairs)
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print a row."""
+    peaks = " ".join("      -" if row[name] is None else f"{1e3 * row[name]:7.1f}" for name in PEAKS)
+    rest = " ".join("     -" if row[name] is None else f"{row[name]:6.3f}" for name in SHOWN)
+    where = f"{row['policy']:16} {row['plant']:16} {row['motion']:10} {row['seconds']:5g} s"
+    print(
+        f"{where}  peaks {peaks} mm  limit, power, spread {rest}  {'steady' if row['steady'] else 'NOT STEADY'}",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    raise SystemExit(cli.run_command(main))

@@ -1,0 +1,164 @@
+"""Refuse plants whose proportions no rig has: one of their numbers is probably in another unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+from mjxball.config._plant import Drone, Plant
+from mjxball.config._settings import Config
+from mjxball.errors import InputError
+
+MOST_THRUST = 100.0  # times the weight; racing drones have 15
+WRONG_UNIT = 0.5  # below it a plant is not only too weak
+LONGEST_LAG = 1.0  # [s] of any rotor
+ARM_OF_SPACING = 1.0  # arm over the distance to the nearest drone; shipped plants have 0.15 to 0.43
+GYRATION = (0.02, 5.0)  # radius of gyration over the arm; shipped plants have 0.4 to 0.9
+SIZE_OF_REACH = 20.0  # longest edge of the object over the farthest mount; shipped plants have 1 to 2
+FASTEST = 0.5  # natural frequency times physics step, beyond which the sampled loop has too little phase
+
+
+def thrust_over_weight(plant: Plant, object_mass: float | None = None) -> float:
+    """Largest force of all rotors over the weight of all, with the plant's object or one of `object_mass` [kg]."""
+    force = 4 * sum(plant.of_drones("rotor_force_max"))
+    return force / (plant.gravity * total_mass(plant, object_mass))
+
+
+def total_mass(plant: Plant, object_mass: float | None = None) -> float:
+    """Mass of drones, carrier and object [kg]."""
+    load = plant.object_mass if object_mass is None else object_mass
+    return sum(drone.mass for drone in plant.drones) + plant.carrier_mass + load
+
+
+def check_units(config: Config) -> None:
+    """Raise InputError for proportions that no rig has; the sentence says which unit was probably meant.
+
+    Checked are thrust over weight, arm over spacing, radius of gyration over arm, object over mounts, rotor lag, and
+    the attitude loop's natural frequency against rotor lag, physics step and leader.
+    """
+    plant = config.plant
+    _check_sizes(plant)
+    _check_lags(plant)
+    _check_weight(config)
+    _check_inertia(plant)
+    if config.autopilot.kind == "ideal":
+        _check_loop(config)
+
+
+def _meant(value: float, unit: str, base: str, cured: bool = True) -> str:
+    """What `value` would be if it were given in thousandths of `base`; nothing if that would not be `cured`."""
+    return f"; {value:g} {unit} would be {value / 1000:g} {base}" if cured else ""
+
+
+def _check_sizes(plant: Plant) -> None:
+    mounts = [drone.mount for drone in plant.drones]
+    for number, (arm, mount) in enumerate(zip(plant.of_drones("arm"), mounts, strict=True)):
+        nearest = min(math.dist(mount, other) for other in mounts if other is not mount)
+        if arm > ARM_OF_SPACING * nearest:
+            hint = _meant(arm, "mm", "m", arm / 1000 <= ARM_OF_SPACING * nearest)
+            raise InputError(
+                f"{_place(plant, number, 'arm')} {arm:g} m is longer than the {nearest:.3g} m to the next drone{hint}"
+            )
+    reach, longest = max(math.hypot(*mount) for mount in mounts), max(plant.object_size)
+    if longest > SIZE_OF_REACH * reach:
+        hint = _meant(longest, "mm", "m", longest / 1000 <= SIZE_OF_REACH * reach)
+        raise InputError(
+            f"plant.object_size {longest:g} m is more than {SIZE_OF_REACH:g} times the {reach:.3g} m at which drones "
+            f"are mounted{hint}"
+        )
+
+
+def _check_lags(plant: Plant) -> None:
+    for number, lag in enumerate(plant.of_drones("rotor_lag")):
+        if lag > LONGEST_LAG:
+            hint = _meant(lag, "ms", "s", lag / 1000 <= LONGEST_LAG)
+            raise InputError(f"{_place(plant, number, 'rotor_lag')} {lag:g} s is more than {LONGEST_LAG:g} s{hint}")
+
+
+def _check_weight(config: Config) -> None:
+    """A plant lifts its own object and the heaviest that is drawn; on a pivot nothing is lifted."""
+    plant, force = config.plant, 4 * sum(config.plant.of_drones("rotor_force_max"))
+    if plant.stand == "pivot":
+        return
+    least = 1.0 if config.autopilot.kind == "ideal" else WRONG_UNIT  # a Crazyflie's margin is checked elsewhere
+    for mass in (plant.object_mass, config.scenario.object_mass[1]):
+        ratio = thrust_over_weight(plant, mass)
+        if least < ratio <= MOST_THRUST:
+            continue
+        weights = f"the rotors give {force:.4g} N, and {total_mass(plant, mass):.4g} kg weigh"
+        weighs = f"{weights} {plant.gravity * total_mass(plant, mass):.4g} N: thrust over weight is {ratio:.2g}"
+        hint = _weaker(plant, mass) if ratio > 1 else next(_stronger(plant, mass), "") if ratio < WRONG_UNIT else ""
+        raise InputError(f"{weighs}, where it must be between 1 and {MOST_THRUST:g}{hint}")
+
+
+def _stronger(plant: Plant, mass: float) -> Iterator[str]:
+    """Which masses were probably given in grams, or forces in kN: those that alone in SI units let the plant fly."""
+    light = replace(plant, drones=tuple(replace(drone, mass=drone.mass / 1000) for drone in plant.drones))
+    heaviest, force = max(drone.mass for drone in plant.drones), max(plant.of_drones("rotor_force_max"))
+    sound = all(_gyrates(drone, arm) for drone, arm in zip(light.drones, light.of_drones("arm"), strict=True))
+    carried = replace(plant, carrier_mass=plant.carrier_mass / 1000)
+    for name, value, changed, load in (
+        ("plant.object_mass", mass, plant, mass / 1000),
+        ("plant.carrier_mass", plant.carrier_mass, carried, mass),
+        *(
+            (("plant.drones' mass", heaviest, light, mass), ("every mass", heaviest, light, mass / 1000))
+            if sound
+            else ()
+        ),
+    ):
+        if 1.0 < thrust_over_weight(changed, load) <= MOST_THRUST:
+            yield f"; {name} was probably given in g: {value:g} g would be {value / 1000:g} kg"
+    if 1.0 < 1000 * thrust_over_weight(plant, mass) <= MOST_THRUST:
+        yield f"; rotor_force_max was probably given in kN: {force:g} kN would be {1000 * force:g} N"
+
+
+def _weaker(plant: Plant, mass: float) -> str:
+    force = max(plant.of_drones("rotor_force_max"))
+    cured = 1.0 < thrust_over_weight(plant, mass) / 1000 <= MOST_THRUST
+    return _meant(force, "mN", "N", cured) or f"; {force:g} gf would be {force * 9.81e-3:.3g} N"
+
+
+def _gyrates(drone: Drone, arm: float) -> bool:
+    return GYRATION[0] <= math.sqrt(max(drone.inertia) / drone.mass) / arm <= GYRATION[1]
+
+
+def _check_inertia(plant: Plant) -> None:
+    for number, (drone, arm) in enumerate(zip(plant.drones, plant.of_drones("arm"), strict=True)):
+        if _gyrates(drone, arm):
+            continue
+        radius = math.sqrt(max(drone.inertia) / drone.mass)
+        hint = ""
+        for unit, factor in (("g mm2", 1e-9), ("g cm2", 1e-7), ("kg mm2", 1e-6), ("g m2", 1e-3)):
+            if 0.2 <= math.sqrt(max(drone.inertia) * factor / drone.mass) / arm <= 2.0:
+                hint = f"; {max(drone.inertia):g} {unit} would be {max(drone.inertia) * factor:.3g} kg m2"
+        raise InputError(
+            f"plant.drones.{number}.inertia {max(drone.inertia):g} kg m2 with {drone.mass:g} kg makes a radius of "
+            f"gyration of {radius:.3g} m beside an arm of {arm:g} m{hint}; check mass, inertia and arm"
+        )
+
+
+def _check_loop(config: Config) -> None:
+    """The attitude loop is stable with the rotors' lag, slower than its steps, faster than the leader's loop."""
+    loop, lag, step = config.attitude, max(config.plant.of_drones("rotor_lag")), config.physics_step
+    slowest = math.sqrt(max(config.leader.kp[:2]))
+    for axis, frequency in zip(("roll", "pitch", "yaw"), loop.natural_frequency, strict=True):
+        named = f"attitude.natural_frequency {frequency:g} rad/s of {axis}"
+        if frequency * step > FASTEST:
+            raise InputError(
+                f"{named} is too fast for physics steps of {1e3 * step:.3g} ms: at most {FASTEST / step:g}"
+            )
+        if frequency * lag >= 2 * loop.damping:
+            raise InputError(
+                f"{named} is unstable with damping {loop.damping:g} and a rotor lag of {lag:g} s: it must be below "
+                f"{2 * loop.damping / lag:.3g} rad/s"
+            )
+        if axis != "yaw" and frequency < slowest:
+            raise InputError(
+                f"{named} is slower than the leader's position loop, {slowest:.3g} rad/s by leader.kp, and cannot "
+                "follow it"
+            )
+
+
+def _place(plant: Plant, number: int, name: str) -> str:
+    return f"plant.drones.{number}.{name}" if getattr(plant.drones[number], name) else f"plant.{name}"

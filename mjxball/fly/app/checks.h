@@ -1,0 +1,98 @@
+/* What is believed of what comes in, at every period, and what may leave. Part of core.c. */
+#ifndef MJXBALL_CHECKS_H
+#define MJXBALL_CHECKS_H
+
+#include "core.h"
+
+#include "laws.h"
+#include "rig.h"
+
+#define CEILING 60000.0f        /* [thrust units] */
+#define FLOOR 10001.0f
+#define SENT_TILT 0.2617994f    /* [rad] 15 degrees, of every setpoint */
+#define DEGREES 57.295780f      /* in a radian */
+#define STATE_AGE 100u          /* [ms] */
+#define VARIANCE 5e-4f          /* [m2] */
+#define MOST_PLACE 1000.0f      /* [m] of a state */
+#define MOST_SPEED 50.0f        /* [m/s] of a state and of a heartbeat */
+#define MOST_RATE 50.0f         /* [rad/s]; the gyroscope ends at 35 */
+#define MOST_VOLTAGE 10.0f      /* [V] */
+
+/* Parameters. */
+
+static bool in_fence(const float *place) {
+    for (int i = 0; i < 3; i++)
+        if (!(place[i] >= mjxball_rig.fence_low[i] && place[i] <= mjxball_rig.fence_high[i])) return false;
+    return true;
+}
+
+static bool goal_is_good(const mjxball_parameters *set) {
+    for (int drone = 0; drone < 2; drone++) {
+        float place[3];
+        for (int i = 0; i < 3; i++) place[i] = set->goal[i] + mjxball_rig.mount[drone][i];
+        if (!in_fence(place)) return false;
+    }
+    return true;
+}
+
+static bool mount_is_set(const mjxball_parameters *set) {
+    float size = 0;
+    for (int i = 0; i < 3; i++) size += set->mount[i] * set->mount[i];
+    return size > 1e-6f && size < 1;
+}
+
+/* What is wrong with parameters. */
+static uint8_t fault_of(const mjxball_parameters *set) {
+    if (!mount_is_set(set)) return MJXBALL_NO_MOUNT;
+    if (!goal_is_good(set)) return MJXBALL_BAD_GOAL;
+    if (set->curve > 1 || !mjxball_rig.maps[set->curve].known) return MJXBALL_BAD_CURVE;
+    return set->battery > 0 && set->battery <= MOST_VOLTAGE ? MJXBALL_GOOD : MJXBALL_BAD_BATTERY;
+}
+
+/* Parameters can change at any moment. While some are unsound the last sound ones stay in use, and in the air those
+ * that a flight begins with. Returns what is wrong. */
+static uint8_t adopt(mjxball_app *app, const mjxball_parameters *asked) {
+    const bool flying = app->phase != MJXBALL_IDLE;
+    uint8_t fault = fault_of(asked);
+    if (!fault && flying) {
+        for (int i = 0; i < 3; i++)
+            if (asked->mount[i] != app->set.mount[i]) fault = MJXBALL_NOT_ON_GROUND;
+        if (asked->curve != app->set.curve) fault = MJXBALL_NOT_ON_GROUND;
+    }
+    if (!fault) app->set = *asked;
+    if (fault && flying) app->refusal = fault;
+    return fault;
+}
+
+/* The state. */
+
+static bool state_is_good(const mjxball_state *state, uint32_t now) {
+    const float *q = state->quaternion;
+    float size = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+    return within(state->position, 3, MOST_PLACE) && within(state->velocity, 3, MOST_SPEED)
+        && within(state->rates, 3, MOST_RATE) && size > 0.9f && size < 1.1f && now - state->time <= STATE_AGE;
+}
+
+/* A variance of 0 is that of an estimator which does not run. */
+static bool estimate_is_good(const mjxball_state *state) {
+    for (int i = mjxball_rig.stand ? 2 : 0; i < 3; i++)
+        if (!(state->variance[i] > 0 && state->variance[i] <= VARIANCE)) return false;
+    return true;
+}
+
+static bool is_charged(const mjxball_app *app, const mjxball_state *state) {
+    return state->voltage >= app->set.battery && state->voltage <= MOST_VOLTAGE;
+}
+
+/* What the law commands, and what is sent. */
+
+static bool command_is_good(const mjxball_app *app) {
+    return within(app->command, 3, 1000);
+}
+
+static bool setpoint_is_good(const mjxball_setpoint *out) {
+    return within(&out->roll, 1, DEGREES * SENT_TILT) && within(&out->pitch, 1, DEGREES * SENT_TILT)
+        && out->thrust >= FLOOR && out->thrust <= CEILING;
+}
+
+#endif

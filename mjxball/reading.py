@@ -1,0 +1,60 @@
+"""What files of others must be: JSON that says everything once, and time that runs forward. Standard library only."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+LONGEST_NAME = 60  # characters of a key that a sentence shows
+GAP = 5.0  # steps from which on a recording has a hole
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text. Raises ValueError, also if an object has one key twice; RecursionError if too deep.
+
+    The standard leaves open which of both counts; Python would take the last one without a word.
+    """
+    return json.loads(text, object_pairs_hook=_once)
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        name = next(name for number, name in enumerate(names) if name in names[:number])
+        raise ValueError(f"the key {name[:LONGEST_NAME]!r} stands twice in one object")
+    return found
+
+
+def time_fault(before: float, after: float) -> str | None:
+    """What is wrong with a time [s] `after` another one; None if it is later."""
+    if not math.isfinite(after):
+        return "a time is not finite"
+    if after < before:
+        return f"the time goes back by {before - after:.3g} s"
+    return "a time stands twice" if after == before else None
+
+
+def check_times(times: Sequence[float], shortest: float = 0.0, longest: float = math.inf) -> list[str]:
+    """What a reader should know of `times` [s], two or more: a phrase if rows are missing, else nothing.
+
+    Raises ValueError with a phrase if they do not increase, or if the median step is not `shortest` to `longest`.
+    """
+    for number, (before, after) in enumerate(itertools.pairwise(times), start=2):
+        if (fault := time_fault(before, after)) is not None:
+            raise ValueError(f"row {number}: {fault}")
+    steps = [after - before for before, after in itertools.pairwise(times)]
+    usual = statistics.median(steps)
+    if not shortest <= usual <= longest:
+        hint = f"; {usual:g} ms would be {usual / 1000:g} s" if shortest <= usual / 1000 <= longest else ""
+        raise ValueError(f"its rows are {usual:.3g} s apart, not {shortest:g} to {longest:g} s{hint}")
+    holes = [(step, before) for step, before in zip(steps, times, strict=False) if step > GAP * usual]
+    if not holes:
+        return []
+    widest, begin = max(holes)
+    more = f", and {len(holes) - 1} shorter gaps" if len(holes) > 1 else ""
+    return [f"there is nothing for {widest:.3g} s from {begin - times[0]:.3g} s on{more}"]

@@ -1,0 +1,153 @@
+"""What a training takes at the least, from its settings alone; what cannot fit or end is refused before it compiles.
+
+Lower bounds: nothing that would work is refused. What they leave out (temporary arrays, other programs) is noticed
+later, see `mjxball.xla.explained`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from mjxball.config import Config
+from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
+from mjxball.errors import InputError
+from mjxball.xla import room_in_address_space
+
+NUMBER = 4  # [B] of one number
+STATE = 100  # numbers of an environment: two drones, a load, what the follower remembers
+ROW = 2 * OBSERVATION_SIZE + ACTION_SIZE + 3  # numbers of a recorded step
+COPIES = 2  # of the whole state: it trains on while a checkpoint of it is written
+PROGRAM = 0.5e9  # [B] of compiling and running the smallest training, beyond what imports have taken
+PHYSICS_STEP = 1e3  # operations of one physics step of one environment
+FASTEST = 1e14  # [1/s] operations of any device
+ONE_AFTER_ANOTHER = 1e-7  # [s] of steps that need each other's results, at the least
+YEAR = 365 * 86_400.0  # [s]
+MOST_STEPS = 2**31 - 1  # environment steps are counted in 32 bits
+
+
+class Required(NamedTuple):
+    """At the least, for all members."""
+
+    memory: float  # [B] on all devices together
+    seconds: float
+    steps: int  # environment steps of each member
+
+
+def required(config: Config, algorithm: str, members: int) -> Required:
+    """What `members` followers take, trained by `sac`, `ppo` or `gradient`."""
+    of = {"sac": _sac, "ppo": _ppo, "gradient": _gradient}[algorithm]
+    steps, rounds, state, data, operations = of(config)
+    physics = config.timing.physics_steps
+    memory = NUMBER * members * (COPIES * state + data)
+    operations += steps * physics * PHYSICS_STEP
+    return Required(memory, max(members * operations / FASTEST, rounds * physics * ONE_AFTER_ANOTHER), steps)
+
+
+def _weights(inputs: int, layers: Sequence[int], outputs: int) -> int:
+    return sum(a * b + b for a, b in itertools.pairwise((inputs, *layers, outputs)))
+
+
+# Each: environment steps, rounds of steps that follow each other, numbers of the state, of other arrays, operations.
+_Sizes = tuple[int, int, float, float, float]
+
+
+def _sac(config: Config) -> _Sizes:
+    sac = config.sac
+    policy = _weights(OBSERVATION_SIZE, sac.policy_layers, 2 * ACTION_SIZE)
+    critics = sac.num_critics * _weights(OBSERVATION_SIZE + ACTION_SIZE, sac.critic_layers, 1)
+    state = 4 * policy + 4 * critics + (sac.replay_size + sac.num_envs) * ROW + sac.num_envs * STATE
+    rounds = max(sac.total_steps // sac.num_envs, 1)
+    updates = max(sac.total_steps - sac.warmup_steps, 0) // sac.num_envs * sac.updates_per_step
+    operations = 6.0 * updates * sac.batch_size * (policy + critics)
+    return sac.total_steps, rounds + updates, state, sac.updates_per_step * sac.batch_size * ROW, operations
+
+
+def _ppo(config: Config) -> _Sizes:
+    ppo = config.ppo
+    policy = _weights(OBSERVATION_SIZE, ppo.policy_layers, 2 * ACTION_SIZE)
+    value = _weights(OBSERVATION_SIZE, ppo.value_layers, 1)
+    data = ppo.num_envs * ppo.unroll_length * ppo.unrolls * ROW
+    operations = 6.0 * ppo.total_steps * ppo.epochs * (policy + value)
+    rounds = max(ppo.total_steps // ppo.num_envs, 1)
+    return ppo.total_steps, rounds, 3 * (policy + value) + ppo.num_envs * STATE, data, operations
+
+
+def _gradient(config: Config) -> _Sizes:
+    gradient = config.gradient
+    policy = _weights(OBSERVATION_SIZE, gradient.policy_layers, 2 * ACTION_SIZE)
+    kept = sum(gradient.policy_layers) + STATE  # of every step, for the way back
+    rounds = gradient.gradient_steps * gradient.horizon
+    steps = rounds * gradient.num_envs
+    data = gradient.num_envs * gradient.horizon * kept
+    return steps, rounds, 3 * policy + gradient.num_envs * STATE, data, 6.0 * steps * policy
+
+
+def check(config: Config, algorithm: str, members: int) -> None:
+    """Refuse by InputError, with the numbers, what this computer's memory, 32 bits or a year do not hold."""
+    needs = required(config, algorithm, members)
+    if needs.steps > MOST_STEPS:
+        raise InputError(f"the run has {needs.steps:.3g} environment steps, and {MOST_STEPS:.3g} can be counted")
+    if needs.seconds > YEAR:
+        raise InputError(
+            f"the run would take at least {needs.seconds / YEAR:.3g} years on the fastest device; make it smaller"
+        )
+    room, where = room_for_arrays()
+    if needs.memory > room:
+        raise InputError(
+            f"the run needs at least {needs.memory / 1e9:.3g} GB of memory, and {room / 1e9:.3g} GB are free {where}; "
+            f"make {_largest(config, algorithm)} smaller"
+        )
+
+
+def _largest(config: Config, algorithm: str) -> str:
+    """Names of the settings that make a run large."""
+    own = getattr(config, algorithm)
+    names = ("num_envs", "replay_size", "batch_size", "horizon", "unroll_length", "unrolls")
+    names = (*names, "policy_layers", "critic_layers", "value_layers")
+    return ", ".join(f"{algorithm}.{name}" for name in names if hasattr(own, name)) + " or --num-seeds"
+
+
+def room_for_arrays() -> tuple[float, str]:
+    """Memory for arrays on JAX's devices [B], and where."""
+    devices: list[Any] = jax.local_devices()
+    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in devices]
+    if devices[0].platform != "cpu":
+        known = sum(filter(None, limits)) * max(jax.device_count() // len(devices), 1)
+        return (known, f"on {jax.device_count()} x {devices[0].device_kind}") if known else (float("inf"), "")
+    rooms = {"on this computer": _available(), "in its control group": _left_of_group()}
+    rooms["below the limit of ulimit -v"] = room_in_address_space()
+    where = min(rooms, key=lambda name: rooms[name])
+    return max(rooms[where] - PROGRAM, 0.0) * jax.process_count(), where
+
+
+def _available() -> float:
+    """What the kernel would give without ending programs, swap included [B]."""
+    found = {line.split(":")[0]: line.split()[1] for line in _lines(Path("/proc/meminfo"))}
+    known = [float(found[name]) * 1024 for name in ("MemAvailable", "SwapFree") if name in found]
+    return sum(known) if "MemAvailable" in found else float("inf")
+
+
+def _left_of_group() -> float:
+    """What a container or a job of a cluster may still take [B]."""
+    least = float("inf")
+    for folder, limit, used in (
+        (Path("/sys/fs/cgroup"), "memory.max", "memory.current"),
+        (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes"),
+    ):
+        numbers = [line for name in (limit, used) for line in _lines(folder / name)]
+        if len(numbers) == 2 and all(number.isdigit() for number in numbers):
+            cached = [line.split()[1] for line in _lines(folder / "memory.stat") if line.startswith("inactive_file ")]
+            least = min(least, float(numbers[0]) - float(numbers[1]) + sum(map(float, cached)))
+    return least
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="ascii").split("\n")[:-1]
+    except (OSError, UnicodeDecodeError):
+        return []

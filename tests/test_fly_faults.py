@@ -1,0 +1,159 @@
+"""Lost uplinks, batteries that give way, reboots: the coupled pair in virtual time, by its true state."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from fly_virtual import VirtualTwin as StandInTwin
+from tables import rows
+
+from mjxball.control import motors
+from mjxball.control.motors import MOTORS
+from mjxball.fly.card import command_maps, config_of
+from mjxball.fly.lift import LiftWatch
+from mjxball.fly.limits import FlightSettings
+from mjxball.fly.supervisor import Event, State
+from mjxball.fly.twin.conditions import FAULT_KINDS
+from mjxball.fly.twin.virtual import MemoryLog, Moment, VirtualTwin
+from mjxball.policy import Policy, load_file
+from mjxball.policy.file import shipped_policy
+
+FLIGHT = shipped_policy("flight")
+HEIGHT = 0.4  # [m] of the hover
+G = 9.81
+
+
+def hovering(seconds: float = 20.0) -> VirtualTwin:
+    """The pair of `flight`, 3 s under both laws."""
+    pytest.importorskip("mujoco")
+    settings = FlightSettings(seconds, (0.0, 0.0, HEIGHT))
+    world = VirtualTwin(Policy.load(FLIGHT), settings, log=MemoryLog(False), settle=1.0)
+    world.fly_until(State.FLY)
+    world.fly_for(3.0)
+    return world
+
+
+def after(world: VirtualTwin, kind: str, *drones: int) -> list[Moment]:
+    """What came of a fault `kind` of some drones, until all is off."""
+    for drone in drones:
+        world.drones[drone].inject(FAULT_KINDS[kind])
+    begin = len(world.track)
+    world.run(15.0)
+    assert not any(world.running())
+    return world.track[begin:]
+
+
+def cut(track: list[Moment]) -> Moment:
+    """The first moment at which no motor turns."""
+    return next(moment for moment in track if moment.pwm.max() == 0)
+
+
+@pytest.mark.parametrize("drone", [1, pytest.param(0, marks=pytest.mark.slow)])
+def test_both_stand_before_the_firmware_cuts_a_drone_that_hears_nothing(drone: int) -> None:
+    """It was found after 0.5 s, the plan thought that both sink, and the follower was cut at 0.2 m: 1.9 m/s."""
+    world = hovering()
+    began = world.now
+    track = after(world, "silent-up", drone)
+    held = next(moment for moment in track if moment.state == "hold")
+    assert held.time - began < 0.3  # four health packets, 50 ms apart, and the one before them
+    assert world.flight.supervisor.cause.event is Event.UNHEARD
+    assert cut(track).time - began == pytest.approx(2.0, abs=0.06)
+    assert cut(track).position[2] - world.rest < 0.02  # the lighter end of the stick may be up by twice as much
+    assert world.touchdown_speed() < 0.6
+    assert max(moment.tilt for moment in track) < math.radians(10)
+
+
+def test_an_uplink_that_comes_back_is_flown_through() -> None:
+    world = StandInTwin(FlightSettings(seconds=6.0))
+    world.fly_until(State.FLY)
+    world.fly_for(2.0)
+    for silent in (True, False):
+        world.fault_link(1, silent_up=silent)
+        world.fly_for(0.35)
+    world.fly_until(State.DONE)
+    assert world.log.transitions() == ["arm", "spin", "ramp", "fly", "hold", "fly", "land", "stop", "done"]
+    assert world.flight.supervisor.cause is None
+
+
+def lift(voltage: float) -> float:
+    """Share of its weight that a drone of `flight` lifts at full power and `voltage` [V]."""
+    own = command_maps(config_of(load_file(FLIGHT).card))[0]
+    full = 4 * motors.force(MOTORS["2.1"], np.float64(motors.FULL), np.float64(voltage))
+    return float(full) / (own.carried_mass * own.gravity)
+
+
+def test_a_battery_that_fades_is_noticed_before_lift_is_lost() -> None:
+    """0.5 V/s: from 3.85 V in hover there are two seconds until full power does not carry."""
+    world = hovering()
+    track = after(world, "fade", 1)
+    assert world.flight.supervisor.cause.event is Event.LIFT
+    flown = [moment for moment in track if moment.position[2] > world.rest + 0.01]
+    assert min(lift(moment.battery) for moment in flown) > 1.0
+    assert world.touchdown_speed() < 0.6
+    assert max(moment.tilt for moment in track) < math.radians(5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drones", [(0, 1), (1,)])
+def test_a_battery_that_gives_way_at_once_lets_the_pair_fall_level(drones: tuple[int, ...]) -> None:
+    """Thrust for 0.85 of the weight is left, and nothing cushions that; one drone alone turned the stick over."""
+    world = hovering()
+    began = world.now
+    track = after(world, "sag", *drones)
+    assert world.flight.supervisor.cause.event is Event.LIFT
+    assert next(moment for moment in track if moment.state == "descend").time - began < 0.1
+    left = min(lift(moment.battery) for moment in track)
+    assert 0.75 < left < 0.95
+    # 10 % more for the motors' lag, and for what the weaker drone spends on its attitude.
+    assert world.touchdown_speed() < 1.1 * math.sqrt(2 * G * (1 - left) * HEIGHT) + 0.1
+    assert max(moment.tilt for moment in track) < math.radians(10)
+
+
+# Voltage of one battery at a time [s], and whether lift is in danger within 2 s, from 0.4 m.
+BATTERIES = [
+    (lambda t: 3.85, False),
+    (lambda t: 3.15, False),  # low, which is not the same
+    (lambda t: 3.6 + 0.03 * math.sin(60 * t), False),  # noise, a propeller
+    (lambda t: 3.5 - (0.12 if t > 1 else 0.0), False),  # a step of the load
+    (lambda t: 3.3 - 0.01 * t, False),
+    (lambda t: 3.85 - 0.5 * max(t - 0.5, 0.0), True),
+    (lambda t: 3.2 - 0.25 * max(t - 0.5, 0.0), True),
+    (lambda t: 3.85 if t < 1.0 else 2.6, True),
+    (lambda t: 2.85, True),
+]
+
+
+@rows("voltage, danger", BATTERIES)
+def test_lift_is_in_danger_where_the_voltage_says_so(voltage, danger: bool) -> None:
+    maps = command_maps(config_of(load_file(FLIGHT).card))
+    watch, found = LiftWatch(MOTORS["2.1"]), []
+    for number in range(200):
+        now = 0.01 * number
+        faults = watch.update([3.8, voltage(now)], maps, HEIGHT, 0.4, now)
+        found += [(now, fault) for fault in faults]
+    assert bool(found) is danger
+    if danger:
+        assert {fault.event for _, fault in found} == {Event.LIFT}
+        assert all(fault.detail.startswith("follower") for _, fault in found)
+        assert watch.share == pytest.approx(lift(voltage(1.97)), rel=0.01)
+        # A second before full power does not carry, or at once.
+        gone = next((0.01 * n for n in range(1000) if lift(voltage(0.01 * n)) < 1), math.inf)
+        assert found[0][0] <= max(gone - 1.0, 0.1) or gone - found[0][0] > -0.05
+
+
+@pytest.mark.slow
+def test_flights_in_a_row_with_reboots_between_them() -> None:
+    """Six here, 30 with ten reboots in benchmarks/fly_firmware.py."""
+    world = hovering(1.0)
+    for number in range(6):
+        if number:
+            world.track.clear()
+            if number % 2:
+                world.drones[1].reboot()
+            world.next_flight(pause=1.5)
+        world.run(60.0)
+        assert world.flight.supervisor.cause is None, number
+        assert world.flight.lifted
+        assert world.touchdown_speed() < 0.5
