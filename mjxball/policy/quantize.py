@@ -29,5 +29,10 @@ def rows_of(weight: np.ndarray) -> Rows:
 
 def quantized(policy: PolicyFile) -> PolicyFile:
     """`policy` with the weights that its 8 bit export has, as floats: what it flies like, but for its activations."""
-    layers = [rows_of(weight) for weight in policy.weights]
-    return dataclasses.replace(policy, weights=tuple((one.weight * one.step[:, None]).T for one in layers))
+
+    def rounded(weight: np.ndarray) -> np.ndarray:
+        rows = rows_of(weight)
+        return (rows.weight * rows.step[:, None]).T
+
+    gru = policy.gru and (rounded(policy.gru[0]), rounded(policy.gru[1]), policy.gru[2])
+    return dataclasses.replace(policy, weights=tuple(map(rounded, policy.weights)), gru=gru)

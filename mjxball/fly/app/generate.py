@@ -44,7 +44,7 @@ def options(int8: bool) -> tuple[str, ...]:
 def key_of(policy: PolicyFile) -> int:
     """A number of everything but the weights: what follower, leader and an upload must agree in."""
     known = {name: policy.card.get(name) for name in SAME}
-    sizes = [weight.shape for weight in policy.weights]
+    sizes = [array.shape for array in (*policy.weights, *(policy.gru or ()))]
     return zlib.crc32(json.dumps([known, sizes], sort_keys=True).encode())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 import zlib
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.control import multi_model_lqg, swing, team_lqg
-from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, FollowerLaw
 from mjxball.control.multi_model_lqg import LEAST_ROOM, MultiModelLqg, is_pair
 from mjxball.control.observation import (
     ACTION_SIZE,
@@ -106,13 +105,14 @@ class Footprint:
 
 def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     """Bytes that the header of `policy` needs, see `c_header`."""
-    weights, biases = mean_layers(policy)
-    size = len(policy.observation_mean)
-    widest = max(len(bias) for bias in biases)
+    weights, biases = layers_of(policy)
+    size, units = len(policy.observation_mean), law_of(policy.card).units
+    widest = max(len(bias) for bias in biases[2 if units else 0 :])
     lqg, told = law_of(policy.card).lqg, policy.card.get("team")
     constants = 2 * ACTION_SIZE + sum(np.size(value) for value in _lqg_numbers(lqg, told and told["context"]).values())
     constants += {TeamLqg: team_lqg.CONTEXT, MultiModelLqg: multi_model_lqg.CONTEXT}.get(type(lqg), 0)
     own = OBSERVATION_SIZE + 2 * lqg.models + 4 if isinstance(lqg, MultiModelLqg) else 0  # `seen`, `known`
+    own += 11 * units + size if units else 0  # `given`, `kept`, `next`, `joined`, and behind both of `hidden`
     state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest + own)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
@@ -132,7 +132,9 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     context = known_context(policy.card, name)
     law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)
     history = law.history
-    sizes = [len(policy.observation_mean), *map(len, mean_layers(policy)[1])]
+    shapes = [weight.shape for weight in layers_of(policy)[0]]
+    sizes = [len(policy.observation_mean), *(outputs for _, outputs in shapes)]
+    widest = max(sizes[3:]) + law.units if law.units else max(sizes[1:])
     if int8 and max(sizes[:-1]) > WIDEST_INT8:
         raise InputError(
             f"{name} has a layer of {max(sizes[:-1])} inputs; with weights of 8 bits {WIDEST_INT8} at most"
@@ -151,7 +153,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         arrays += _rooms_and_axes(law.lqg, context, numbers)
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
     helpers += (c_texts.APPROACH if history.filters else "") + LQG_TEXTS[type(law.lqg)][0]
-    layers = _network_int8(sizes) if int8 else _network(sizes)
+    helpers += c_texts.GRU if law.units else ""
     text = c_texts.HEADER.format(
         name=_plain(name),
         origin=_plain(f"preset {card['preset']}, configuration {card['config_hash']}, {card['training_steps']} steps"),
@@ -164,14 +166,14 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         state=cost.state,
         stack=cost.stack,
         size=sizes[0],
-        widest=max(sizes[1:]),
-        broadest=max(sizes),
+        widest=widest,
+        broadest=max(*sizes, *(inputs for inputs, _ in shapes)),
         largest=_number(LARGEST),
         int8="#define MJXBALL_INT8 1\n" if int8 else "",
         weights=", weights of 8 bits" if int8 else "",
         includes="#include <stdint.h>\n\n" if int8 else "",
         weights_field="    const mjxball_weights *weights;  /* 0: those compiled in */\n" if int8 else "",
-        weights_type=_weights_type(sizes) if int8 else "",
+        weights_type=_weights_type(sizes[0], shapes) if int8 else "",
         compiled=_compiled(policy) if int8 else "",
         leader="\n".join(["    int i;", *_leader(card, "to")]),
         memory_size=law.size,
@@ -184,7 +186,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         arrays="\n".join(arrays),
         history=_history(law, card),
         history_update=_history_update(law),
-        network=layers,
+        network=_network(law, sizes[0], shapes, int8),
         command=_command(law, card),
     )
     return _named(text, prefix or prefix_of(name))
@@ -210,15 +212,22 @@ def _team(team: dict[str, Any]) -> str:
     )
 
 
-def mean_layers(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Weights and biases without the last layer's second half, which exploration alone uses."""
+def layers_of(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Weights and biases without the last layer's second half, which exploration alone uses.
+
+    Before them those of a GRU: for what is seen, and for its state, which has no bias of its own.
+    """
     weights = [*policy.weights[:-1], policy.weights[-1][:, :ACTION_SIZE]]
-    return weights, [*policy.biases[:-1], policy.biases[-1][:ACTION_SIZE]]
+    biases = [*policy.biases[:-1], policy.biases[-1][:ACTION_SIZE]]
+    if policy.gru is None:
+        return weights, biases
+    kernel, recurrent, bias = policy.gru
+    return [kernel, recurrent, *weights], [bias, np.zeros_like(bias), *biases]
 
 
 def _float_arrays(policy: PolicyFile) -> list[str]:
     arrays = [_array("mean", policy.observation_mean), _array("scale", policy.observation_scale)]
-    for number, (weight, bias) in enumerate(zip(*mean_layers(policy), strict=True)):
+    for number, (weight, bias) in enumerate(zip(*layers_of(policy), strict=True)):
         arrays += [_array(f"weight_{number}", weight.T), _array(f"bias_{number}", bias)]
     return arrays
 
@@ -263,11 +272,16 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
         lines += [f"        mjxball_copy(memory + {older + k * width}, observation, {OBSERVATION_SIZE});"]
     if law.lqg is not None:
         lines += [f"        mjxball_lqg_start(memory + {history.size}, {seen});"]
+    if law.geometry:
+        place = f"memory[{history.size + law.units} + i]"
+        lines += [f"        for (i = 0; i < {law.told}; i++) {place} = mjxball_lqg_context[i];"]
     lines += ["        follower->running = 1;", "    }"]
     lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
     for k in range(len(history.filters)):
         place = OBSERVATION_SIZE + older + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
+    if law.units:
+        lines += _saturated(law, OBSERVATION_SIZE + history.size)
     if law.lqg is not None:
         known = _known(law)
         lines = ["    mjxball_real led[3];", f"    mjxball_copy_law({seen}, led);", *lines]
@@ -282,6 +296,18 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
         head = [f"mjxball_real {seen}[{OBSERVATION_SIZE}];", f"mjxball_copy({seen}, observation, {OBSERVATION_SIZE});"]
         lines = [*(f"    {line}" for line in (*head, turned)), *lines]
     return "\n".join(lines)
+
+
+def _saturated(law: FollowerLaw, place: int) -> list[str]:
+    """Lines that put what a recurrent network sees besides behind the first `place` numbers of `input`."""
+    lines = []
+    for part, scale in ((ERROR, NEAR_ERROR), (ERROR_RATE, NEAR_ERROR_RATE)):
+        small = f"observation[{part.start} + i] * (mjxball_real){1 / scale!r}"
+        lines += [f"    for (i = 0; i < 3; i++) input[{place} + i] = mjxball_tanh({small});"]
+        place += 3
+    if law.geometry:
+        lines += [f"    mjxball_copy(input + {place}, memory + {law.history.size + law.units}, {law.told});"]
+    return lines
 
 
 def _known(law: FollowerLaw) -> str:
@@ -304,6 +330,8 @@ def _history_update(law: FollowerLaw) -> str:
         lines += [f"    mjxball_approach(memory + {place + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
     if history.previous_action:
         lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
+    if law.units:
+        lines += [f"    mjxball_copy(memory + {history.size}, next, {law.units});"]
     if isinstance(law.lqg, MultiModelLqg):
         lines += [f"    mjxball_lqg_next(memory + {history.size}, led, own, command);"]
     elif isinstance(law.lqg, TeamLqg):
@@ -313,36 +341,42 @@ def _history_update(law: FollowerLaw) -> str:
     return "\n".join(lines)
 
 
-def _network(sizes: Sequence[int]) -> str:
-    """Lines that scale `input` and call the layers."""
-    scale = f"    for (i = 0; i < {sizes[0]}; i++) input[i] = (input[i] - mjxball_mean[i]) * mjxball_scale[i];"
-    calls = [
-        f"mjxball_layer(mjxball_weight_{n}, mjxball_bias_{n}, {inputs}, {outputs}"
-        for n, (inputs, outputs) in enumerate(itertools.pairwise(sizes))
-    ]
-    return "\n".join([scale, *_layers(sizes, calls)])
-
-
-def _network_int8(sizes: Sequence[int]) -> str:
-    """The same for weights of 8 bits."""
-    weights = "    const mjxball_weights *w = follower->weights ? follower->weights : &mjxball_compiled;"
-    scale = f"    for (i = 0; i < {sizes[0]}; i++) input[i] = (input[i] - w->mean[i]) * w->scale[i];"
+def _network(law: FollowerLaw, size: int, shapes: Sequence[tuple[int, int]], int8: bool) -> str:
+    """Lines that scale `input` (`size`,) and call the layers, which have `shapes` (inputs, outputs)."""
+    mean, scale = ("w->mean", "w->scale") if int8 else ("mjxball_mean", "mjxball_scale")
+    lines = (
+        ["    const mjxball_weights *w = follower->weights ? follower->weights : &mjxball_compiled;"] if int8 else []
+    )
+    lines += [f"    for (i = 0; i < {size}; i++) input[i] = (input[i] - {mean}[i]) * {scale}[i];"]
     calls = [
         f"mjxball_layer(w->weight_{n}, w->step_{n}, w->bias_{n}, {inputs}, {outputs}, {stride(inputs)}"
-        for n, (inputs, outputs) in enumerate(itertools.pairwise(sizes))
+        if int8
+        else f"mjxball_layer(mjxball_weight_{n}, mjxball_bias_{n}, {inputs}, {outputs}"
+        for n, (inputs, outputs) in enumerate(shapes)
     ]
-    return "\n".join([weights, scale, *_layers(sizes, calls)])
+    if not law.units:
+        return "\n".join([*lines, *_layers(shapes, calls, "input")])
+    units, state = law.units, f"memory + {law.history.size}"
+    lines += [f"    mjxball_real given[{3 * units}], kept[{3 * units}], next[{units}], joined[{size + 2 * units}];"]
+    lines += [f"    {calls[0]}, input, given);", f"    {calls[1]}, {state}, kept);"]
+    lines += [f"    mjxball_gru(given, kept, {state}, {units}, next);"]
+    lines += [f"    mjxball_copy(joined, next, {units});", f"    mjxball_copy(joined + {units}, input, {size});"]
+    return "\n".join([*lines, *_layers(shapes[2:], calls[2:], "joined", units)])
 
 
-def _layers(sizes: Sequence[int], calls: Sequence[str]) -> list[str]:
-    """`calls` of the layers, from `input` through two buffers in turn to `action`."""
-    lines, source = [], "input"
-    last = len(sizes) - 2
-    for number, call in enumerate(calls):
+def _layers(shapes: Sequence[tuple[int, int]], calls: Sequence[str], source: str, units: int = 0) -> list[str]:
+    """`calls` of the layers, from `source` through two buffers in turn to `action`.
+
+    The last one also sees the `units` numbers of `next`.
+    """
+    lines, last = [], len(shapes) - 1
+    for number, (call, (inputs, outputs)) in enumerate(zip(calls, shapes, strict=True)):
         target = "action" if number == last else f"hidden[{number % 2}]"
+        if number == last and units:
+            lines.append(f"    mjxball_copy({source} + {inputs - units}, next, {units});")
         lines.append(f"    {call}, {source}, {target});")
         if number < last:
-            lines.append(f"    for (i = 0; i < {sizes[number + 1]}; i++) if ({target}[i] < 0) {target}[i] = 0;")
+            lines.append(f"    for (i = 0; i < {outputs}; i++) if ({target}[i] < 0) {target}[i] = 0;")
         source = target
     return lines
 
@@ -357,20 +391,17 @@ def rows_up(outputs: int) -> int:
     return -(-outputs // 4) * 4
 
 
-def _weights_type(sizes: Sequence[int]) -> str:
+def _weights_type(size: int, shapes: Sequence[tuple[int, int]]) -> str:
     """The struct whose bytes are `weight_bytes`."""
-    floats = [f"mean[{sizes[0]}]", f"scale[{sizes[0]}]"]
-    floats += [f"{kind}_{n}[{outputs}]" for n, outputs in enumerate(sizes[1:]) for kind in ("step", "bias")]
-    whole = [
-        f"weight_{n}[{rows_up(outputs) * stride(inputs)}]"
-        for n, (inputs, outputs) in enumerate(itertools.pairwise(sizes))
-    ]
+    floats = [f"mean[{size}]", f"scale[{size}]"]
+    floats += [f"{kind}_{n}[{outputs}]" for n, (_, outputs) in enumerate(shapes) for kind in ("step", "bias")]
+    whole = [f"weight_{n}[{rows_up(outputs) * stride(inputs)}]" for n, (inputs, outputs) in enumerate(shapes)]
     fields = [*(f"float {one}" for one in floats), *(f"int8_t {one}" for one in whole)]
     return "typedef struct {\n" + "".join(f"    {one};\n" for one in fields) + "} mjxball_weights;\n\n"
 
 
 def _layers_int8(policy: PolicyFile) -> tuple[list[Rows], list[np.ndarray]]:
-    weights, biases = mean_layers(policy)
+    weights, biases = layers_of(policy)
     return [rows_of(weight) for weight in weights], biases
 
 
@@ -386,7 +417,7 @@ def weight_bytes(policy: PolicyFile) -> bytes:
 
 def float_bytes(policy: PolicyFile) -> bytes:
     """What the network computes with, as a little-endian machine holds it."""
-    weights, biases = mean_layers(policy)
+    weights, biases = layers_of(policy)
     parts = [*_scaling(policy), *(part for one in zip(weights, biases, strict=True) for part in one)]
     return b"".join(np.asarray(part, "<f4").tobytes() for part in parts)
 

@@ -409,6 +409,19 @@ static inline mjxball_real mjxball_tanh(mjxball_real x) {
     return x < 0 ? -size : x >= 0 ? size : x;
 }
 """
+GRU = """
+/* The next state of a gated recurrent unit: reset gates, update gates and candidates, given and of what it kept. */
+static inline void mjxball_gru(
+    const mjxball_real *given, const mjxball_real *kept, const mjxball_real *state, int units, mjxball_real *next) {
+    const mjxball_real half = (mjxball_real)0.5;
+    for (int k = 0; k < units; k++) {
+        mjxball_real reset = half + half * mjxball_tanh(half * (given[k] + kept[k]));
+        mjxball_real update = half + half * mjxball_tanh(half * (given[units + k] + kept[units + k]));
+        mjxball_real candidate = mjxball_tanh(given[2 * units + k] + reset * kept[2 * units + k]);
+        next[k] = candidate + update * (state[k] - candidate);
+    }
+}
+"""
 COSINE = """
 /* Angles in radians of any size; turns beyond 1e6 are not counted. */
 static inline mjxball_real mjxball_cos(mjxball_real x) {
