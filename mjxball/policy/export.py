@@ -105,11 +105,11 @@ def _layers(learnt: Any) -> tuple[list[np.ndarray], list[np.ndarray]]:
     return tuple([np.asarray(layer[part], np.float32) for layer in layers] for part in ("kernel", "bias"))  # type: ignore[return-value]
 
 
-def _gru(learnt: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _gru(learnt: Any) -> tuple[np.ndarray, ...] | None:
     """Kernel, recurrent weights and bias of the GRU, float32; None if there is none."""
     if "gru" not in learnt.layers:
         return None
-    return tuple(np.asarray(learnt.layers["gru"][part], np.float32) for part in ("kernel", "recurrent", "bias"))  # type: ignore[return-value]
+    return tuple(np.asarray(learnt.layers["gru"][part], np.float32) for part in ("kernel", "recurrent", "bias"))
 
 
 def network_file(path: Path, learnt: Any, steps: int, origin: dict[str, Any]) -> bool:

@@ -67,7 +67,7 @@ class PolicyFile:
     observation_scale: np.ndarray  # (n,) float32, 1 / standard deviation, 0 for a slot that is not used
     action_scale: np.ndarray  # (3,) float32: [-1, 1] -> rad, rad, m/s2
     card: dict[str, Any]
-    gru: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # GRU_ARRAYS, float32: (n, 3 H), (H, 3 H), (3 H,)
+    gru: tuple[np.ndarray, ...] | None = None  # GRU_ARRAYS, float32: (n, 3 H), (H, 3 H), (3 H,)
 
 
 def law_of(card: dict[str, Any]) -> FollowerLaw:
@@ -142,7 +142,7 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
         observation_scale=arrays["observation_scale"],
         action_scale=arrays["action_scale"],
         card=card,
-        gru=tuple(arrays[label] for label in GRU_ARRAYS) if recurrent else None,  # type: ignore[arg-type]
+        gru=tuple(arrays[label] for label in GRU_ARRAYS) if recurrent else None,
     )
     check(policy, name)
     return policy

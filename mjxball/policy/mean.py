@@ -35,7 +35,7 @@ def mean_policy(policies: Sequence[PolicyFile]) -> PolicyFile:
         first,
         weights=tuple(_mean([policy.weights[layer] for policy in policies]) for layer in range(len(first.weights))),
         biases=tuple(_mean([policy.biases[layer] for policy in policies]) for layer in range(len(first.biases))),
-        gru=None if first.gru is None else tuple(_mean([policy.gru[k] for policy in policies]) for k in range(3)),  # type: ignore[index]
+        gru=first.gru and tuple(_mean(list(same)) for same in zip(*(one.gru or () for one in policies), strict=True)),
         card={**card, "mean_of_seeds": seeds},
     )
 

@@ -273,8 +273,8 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
     if law.lqg is not None:
         lines += [f"        mjxball_lqg_start(memory + {history.size}, {seen});"]
     if law.geometry:
-        place = f"memory[{history.size + law.units} + i]"
-        lines += [f"        for (i = 0; i < {law.told}; i++) {place} = mjxball_lqg_context[i];"]
+        kept = f"memory[{history.size + law.units} + i]"
+        lines += [f"        for (i = 0; i < {law.told}; i++) {kept} = mjxball_lqg_context[i];"]
     lines += ["        follower->running = 1;", "    }"]
     lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
     for k in range(len(history.filters)):
