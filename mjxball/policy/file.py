@@ -251,7 +251,7 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     check_lqg(card, name)
     _check_flown(card.get("flown"), name)
     units, most = card.get("recurrent_units", 0), MAX_UNITS if card["format_version"] == 5 else 0
-    if isinstance(units, bool) or not isinstance(units, int) or not min(most, 1) <= units <= most:
+    if type(units) is not int or not min(most, 1) <= units <= most:
         raise PolicyFileError(
             f"{name}: card field recurrent_units must be 1 to {MAX_UNITS} in format 5, and absent in others"
         )
