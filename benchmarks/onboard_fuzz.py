@@ -48,7 +48,9 @@ def fuzz(files: Mapping[str, str], role: int, ticks: int, seed: int) -> dict[str
         done = subprocess.run(command, cwd=place, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
-        return {"report": next((line for line in lines if "error" in line), lines[-1] if lines else str(done.returncode))}
+        return {
+            "report": next((line for line in lines if "rror" in line), lines[-1] if lines else str(done.returncode))
+        }
     found = json.loads(done.stdout)
     found["phases"] = dict(zip((phase.name.lower() for phase in Phase), found["phases"], strict=True))
     for kind in ("causes", "refusals"):

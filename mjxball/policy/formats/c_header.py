@@ -134,7 +134,9 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     history = law.history
     sizes = [len(policy.observation_mean), *map(len, mean_layers(policy)[1])]
     if int8 and max(sizes[:-1]) > WIDEST_INT8:
-        raise InputError(f"{name} has a layer of {max(sizes[:-1])} inputs; with weights of 8 bits {WIDEST_INT8} at most")
+        raise InputError(
+            f"{name} has a layer of {max(sizes[:-1])} inputs; with weights of 8 bits {WIDEST_INT8} at most"
+        )
     arrays = _float_arrays(policy) if not int8 else []
     tilt, vertical = card["command_limits"]
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
