@@ -2,10 +2,10 @@
 
 `python benchmarks/stock_sac.py OUT.npz [--seed N] [--steps N] [--num-envs N] ... [--physics mjx|newton-euler]`
 
-The other side of `benchmarks/training.py`. Brax 0.14.2 calls `jax.device_put_replicated`, which JAX has removed;
-`mjxball.gym.brax_trainers` supplies it. Brax's own evaluations are left out, which makes it faster. Besides OUT.npz, written at the end, there is
-OUT-<steps>.npz at each of `--snapshots` equal parts of the way; the files' times tell when each was reached. What the
-networks see, how actions are bounded and what is rewarded are the preset's, exactly as in `train.py`.
+The other side of `benchmarks/training.py`. Brax's evaluations are left out, which makes it faster. Besides OUT.npz,
+written at the end, there is OUT-<steps>.npz at each of `--snapshots` equal parts of the way; the files' times tell when
+each was reached. What the networks see, how actions are bounded and what is rewarded are the preset's, exactly as in
+`train.py`.
 """
 
 from __future__ import annotations
