@@ -266,7 +266,6 @@ def test_brax_takes_it_for_its_own(transport):
     assert isinstance(TransportEnv(transport, "newton-euler"), base)
 
 
-@pytest.mark.slow
 class TestStockBrax:
     """Brax's own trainers run on the environment, as docs/gym.md says."""
 
@@ -276,12 +275,14 @@ class TestStockBrax:
         monkeypatch.setattr(jax, "device_put_replicated", None, raising=False)
         monkeypatch.delattr(jax, "device_put_replicated")
 
+    @pytest.mark.slow
     def test_what_brax_would_randomise_is_refused(self, transport):
         with pytest.raises(InputError, match="every reset draws a world"):
             brax_trainer("ppo")(TransportEnv(transport, "newton-euler"), randomization_fn=lambda sys, rng: (sys, rng))
         with pytest.raises(InputError, match="ppo, sac"):
             brax_trainer("es")
 
+    @pytest.mark.release
     def test_ppo_trains(self, transport):
         seen = []
         _, parameters, _ = brax_trainer("ppo")(
@@ -303,6 +304,7 @@ class TestStockBrax:
         assert all(np.isfinite(reward) and reward < 0 for _, reward in seen)
         assert finite(parameters)
 
+    @pytest.mark.release
     def test_sac_trains(self, transport):
         _, parameters, _ = brax_trainer("sac")(
             TransportEnv(transport, "newton-euler"),
