@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -169,7 +170,7 @@ class Policy:
         law, memory = self.law, self.memory if remembers else None
         with np.errstate(all="ignore"):  # what is not finite is refused below
             action, command, memory = law.answer(law.start(observation) if memory is None else memory, observation)
-        if not (np.isfinite(command).all() and np.isfinite(memory).all()):
+        if not math.isfinite(float(command.sum()) + float(memory.sum())):
             raise InputError(f"policy {self.name} has no answer to an observation: what it computes is not finite")
         if remembers:
             self._memory, self._ahead = memory, False
@@ -230,10 +231,13 @@ class NetworkLaw:
         """(action in [-1, 1] (..., 3), command (..., 3), memory of the next step) at `observation` (..., 18)."""
         xp = observation.__array_namespace__()
         weights, biases, mean, scale = self._parts
-        mean, scale = (xp.asarray(part, dtype=observation.dtype) for part in (mean, scale))
-        weights, biases = ([xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases))
+        if not isinstance(observation, np.ndarray) or observation.dtype != mean.dtype:
+            mean, scale = (xp.asarray(part, dtype=observation.dtype) for part in (mean, scale))
+            weights, biases = (
+                [xp.asarray(part, dtype=observation.dtype) for part in parts] for parts in (weights, biases)
+            )
         known = self._law.known(observation, memory)
-        seen = self._law.network_input(observation, memory, known)
+        seen = self._law.network_input(observation, memory, known) if self._law.size else observation
         scaled = mean_action(weights, biases, mean, scale, seen)
         command = self._law.command(scaled, observation, memory, known)
         return scaled, command, self._law.next(memory, observation, scaled, command, known)
