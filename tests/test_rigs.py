@@ -225,7 +225,7 @@ class TestUniversal:
             assert felt[half].mean() > 0.3
 
     def test_a_rig_outside_is_flown_with_a_warning(self, capsys: pytest.CaptureFixture[str]) -> None:
-        load_policy(POLICY, with_plant(UNIVERSAL, "team4"))
+        load_policy(POLICY, with_plant(UNIVERSAL, "team3"))
         paper = preset("paper")
         load_policy(POLICY, paper)
         assert capsys.readouterr().err == ""
