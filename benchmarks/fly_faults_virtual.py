@@ -1,13 +1,18 @@
-"""Faults of the twin in virtual time: hover at 0.4 m, a fault at a random moment of the flight or the landing.
+"""Faults of the twin in virtual time: hover at 0.4 m, a fault at a random moment, at the leader and at the follower.
+
+`python benchmarks/fly_faults_virtual.py [--policy FILE] [--trials 1] [--jobs 2] [--only FAULT ...] [--json FILE]`
 
 Measured are the seconds until each drone's motors are off, speed at the first contact, largest tilt and drift between
-the fault and then. Run by `fly_firmware.py --parts faults`; `fly_faults.py` is the same by the clock, with sockets.
+the fault and then. The table in docs/flying.md is made from benchmarks/results/fly_faults_virtual.json.
+`fly_faults.py` is the same by the clock, with sockets.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 import statistics
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +22,8 @@ import numpy as np
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import FAULT_KINDS
 from mjxball.fly.twin.virtual import Moment, VirtualTwin
-from virtual_flight import Row, code_of, world_of
+from mjxball.policy.file import shipped_policy
+from virtual_flight import Row, campaign, code_of, world_of
 
 Injection = Callable[[VirtualTwin, int], None]
 
@@ -109,17 +115,20 @@ FAULTS: dict[str, Injection] = {
 }
 
 
+HOVER = 6.0  # [s] under both laws
+
+
 def fault(path: Path, kind: str, drone: int, number: int, onboard: str = "") -> list[Row]:
     """One flight with one fault; `onboard` as for `world_of`."""
     random = np.random.default_rng([list(FAULTS).index(kind), drone, number])
-    world = world_of(path, 6.0, onboard=onboard, seed=number)
+    world = world_of(path, HOVER, onboard=onboard, seed=number)
     world.killed = False  # type: ignore[attr-defined]
     world.later = (math.inf, None)  # type: ignore[attr-defined]
     world.fly_until(State.FLY)
-    world.fly_for(float(random.uniform(3.0, 7.0)))
+    world.fly_for(float(random.uniform(3.0, HOVER - 1.0)))
     at = world.now
     FAULTS[kind](world, drone)
-    while world.now < at + 25.0:
+    while world.now < at + 15.0:
         if world.now >= world.later[0]:  # type: ignore[attr-defined]
             world.later[1]()  # type: ignore[attr-defined]
             world.later = (math.inf, None)  # type: ignore[attr-defined]
@@ -128,7 +137,7 @@ def fault(path: Path, kind: str, drone: int, number: int, onboard: str = "") -> 
             world.track.append(world.moment())
         elif not world.tick():
             break
-    for _ in range(250):  # whatever turns must stop by itself
+    for _ in range(125):  # whatever turns must stop by itself
         world.advance(0.02)
         world.track.append(world.moment())
     after = [moment for moment in world.track if moment.time >= at]
@@ -143,16 +152,19 @@ def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
     down = next((i for i, moment in enumerate(after) if moment.position[2] < world.rest + 0.006), len(after) - 1)
     until = after[: down + 1]
     cause = world.flight.supervisor.cause
-    return {
+    found = {
         "height": float(start[2] - world.rest),
-        "off": off,
+        "off": [round(one, 4) for one in off],
         "stopped": not running[-1].any(),
         "speed": float(max(0.0, *(-moment.velocity[2] for moment in after[max(down - 3, 0) : down + 1]))),
         "tilt": math.degrees(max(moment.tilt for moment in until)),
         "drift": float(np.linalg.norm(after[down].position[:2] - start[:2])),
         "cause": "" if cause is None else cause.event.name,
+        "way": [one["after"] for one in world.log.records if one["kind"] == "transition" and one["t"] >= at],
+        "told": world.flight.how_it_ended(),
         "code": code_of(world),
     }
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in found.items()}
 
 
 def table(rows: Sequence[Row]) -> None:
@@ -167,3 +179,22 @@ def table(rows: Sequence[Row]) -> None:
         ]
         bad = "" if all(row["stopped"] for row in own) else "  A MOTOR STILL TURNS"
         print(f"{' '.join((name[1], name[0])):32} {off[0]:6.2f} / {off[1]:5.2f} {parts[0]} {parts[1]} {parts[2]}{bad}")
+
+
+def main() -> int:
+    """Run the campaign; returns 1 if a motor still turned."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--policy", type=Path, default=shipped_policy("flight"), metavar="FILE")
+    parser.add_argument("--trials", type=int, default=1, help="flights of each fault at each drone")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--only", nargs="+", choices=FAULTS, default=[one for one in FAULTS if one not in ONBOARD])
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    options = parser.parse_args()
+    options.parts = ["faults"]
+    flown = [(kind, drone, number) for kind in options.only for drone in range(2) for number in range(options.trials)]
+    jobs = [("faults", fault, (options.policy, *one)) for one in flown]
+    return campaign("fly_faults_virtual", options, jobs, lambda part, rows: table(rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
