@@ -10,7 +10,9 @@ the fault and then. The table in docs/flying.md is made from benchmarks/results/
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import multiprocessing
 import statistics
 import sys
 from collections.abc import Callable, Sequence
@@ -23,7 +25,7 @@ from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import FAULT_KINDS
 from mjxball.fly.twin.virtual import Moment, VirtualTwin
 from mjxball.policy.file import shipped_policy
-from virtual_flight import Row, campaign, code_of, world_of
+from virtual_flight import Row, code_of, world_of
 
 Injection = Callable[[VirtualTwin, int], None]
 
@@ -115,17 +117,34 @@ FAULTS: dict[str, Injection] = {
 }
 
 
-HOVER = 6.0  # [s] under both laws
+SETTLED, HOVER = 3.0, 6.0  # [s] under both laws, until a fault may come and until the flight lands
 
 
 def fault(path: Path, kind: str, drone: int, number: int, onboard: str = "") -> list[Row]:
     """One flight with one fault; `onboard` as for `world_of`."""
+    world = hovering(path, number, onboard)
+    world.fly_for(moment_of(kind, drone, number))
+    return finish(world, path, kind, drone)
+
+
+def moment_of(kind: str, drone: int, number: int) -> float:
+    """When a fault comes, after `SETTLED` [s]: at random."""
     random = np.random.default_rng([list(FAULTS).index(kind), drone, number])
+    return float(random.uniform(0.0, HOVER - SETTLED - 1.0))
+
+
+def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
+    """The pair `SETTLED` [s] under both laws."""
     world = world_of(path, HOVER, onboard=onboard, seed=number)
     world.killed = False  # type: ignore[attr-defined]
     world.later = (math.inf, None)  # type: ignore[attr-defined]
     world.fly_until(State.FLY)
-    world.fly_for(float(random.uniform(3.0, HOVER - 1.0)))
+    world.fly_for(SETTLED)
+    return world
+
+
+def finish(world: VirtualTwin, path: Path, kind: str, drone: int) -> list[Row]:
+    """The rest of the flight, with the fault now."""
     at = world.now
     FAULTS[kind](world, drone)
     while world.now < at + 15.0:
@@ -142,6 +161,42 @@ def fault(path: Path, kind: str, drone: int, number: int, onboard: str = "") -> 
         world.track.append(world.moment())
     after = [moment for moment in world.track if moment.time >= at]
     return [{"policy": path.stem, "fault": kind, "drone": ("leader", "follower")[drone], **evaluated(world, after, at)}]
+
+
+def all_of(options: argparse.Namespace) -> list[Row]:
+    """Every fault at each drone, in processes that branch off one hover for each trial; written as far as it came."""
+    context, rows = multiprocessing.get_context("fork"), []
+    for number in range(options.trials):
+        flown = sorted((moment_of(kind, drone, number), kind, drone) for kind in options.only for drone in range(2))
+        world, passed = hovering(options.policy, number), 0.0
+        running: list[Any] = []
+        for moment, kind, drone in [*flown, (math.inf, "", 0)]:
+            while running and (len(running) >= options.jobs or math.isinf(moment)):
+                child, end = running.pop(0)
+                rows += end.recv()
+                child.join()
+                print(f"\r{len(rows)} of {len(flown) * options.trials}", end="", file=sys.stderr, flush=True)
+                write(options.json, sorted(rows, key=lambda row: list(FAULTS).index(row["fault"])))
+            if math.isfinite(moment):
+                world.fly_for(moment - passed)
+                passed = moment
+                ours, theirs = context.Pipe(duplex=False)
+                child = context.Process(target=_send, args=(theirs, world, options.policy, kind, drone))
+                child.start()
+                theirs.close()
+                running.append((child, ours))
+    return rows
+
+
+def _send(end: Any, *arguments: Any) -> None:
+    end.send(finish(*arguments))
+
+
+def write(path: Path | None, rows: Sequence[Row]) -> None:
+    """Put `rows` into the file at `path`, if one is wanted."""
+    if path is not None:
+        command = f"python benchmarks/fly_faults_virtual.py {' '.join(sys.argv[1:])}"
+        path.write_text(json.dumps({"command": command, "faults": rows}, indent=1) + "\n", encoding="utf-8")
 
 
 def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
@@ -190,10 +245,9 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=FAULTS, default=[one for one in FAULTS if one not in ONBOARD])
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
-    options.parts = ["faults"]
-    flown = [(kind, drone, number) for kind in options.only for drone in range(2) for number in range(options.trials)]
-    jobs = [("faults", fault, (options.policy, *one)) for one in flown]
-    return campaign("fly_faults_virtual", options, jobs, lambda part, rows: table(rows))
+    rows = all_of(options)
+    table(sorted(rows, key=lambda row: list(FAULTS).index(row["fault"])))
+    return 0 if all(row["stopped"] for row in rows) else 1
 
 
 if __name__ == "__main__":
