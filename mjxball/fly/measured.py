@@ -63,7 +63,7 @@ class Repeats:
 WINDOW = 1.2  # [s] over which turns and ways are compared
 TURN = 0.035  # [rad] by which the measured turn may differ from the gyroscope's
 LATE = 0.04  # [s] that the measured attitude may be late against the gyroscope
-WAY, BIAS, DOUBT = 0.02, 0.1, 4.0  # likewise of the way, see `ImuWatch._felt`: [m], [m/s2], standard deviations
+WAY, BIAS, DOUBT = 0.012, 0.1, 4.0  # likewise of the way, see `ImuWatch._felt`: [m], [m/s2], standard deviations
 CONTRADICTING = 0.1  # [s] for which it must differ
 
 
