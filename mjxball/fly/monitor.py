@@ -134,7 +134,9 @@ class Monitor:
                 still = still or repeated
             own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and phase in GUIDED else []
             own += [Fault(Event.FRAME, f"{name}: {wrong}")] if wrong and phase in RISING else []
-            if own and not self._settings.dry_run:
+            if self._settings.dry_run:  # carried by hand it shows its axes as well; at rest it may be quiet
+                own = [fault for fault in own if fault.event is Event.FRAME]
+            if own:
                 self.estimators.trusted[number] = False
                 found += own
         return found
