@@ -18,6 +18,7 @@ from mjxball.fly.monitor import Monitor, Sustained, UplinkWatch, link_faults, ti
 from mjxball.fly.packets import ZERO, PacketError, Setpoint
 from mjxball.fly.preflight import SpinCheck
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, Event, Fault, State, Supervisor
+from mjxball.fly.takeoff import TakeOff
 from mjxball.fly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
 from mjxball.fly.watchdog import Watchdog
 
@@ -64,6 +65,7 @@ class Flight:
         self._shares = [1.0]  # of the trims, tick by tick, where the height is not measured
         self._land_height = 0.0
         self._highest_place = 0.0  # of O above where it stood, under the laws [m]
+        self._take_off = TakeOff(rig, settings.times, settings.period, self._lifts_at, settings.stand)
 
     @property
     def maps(self) -> tuple[CommandMap, CommandMap]:
@@ -74,7 +76,11 @@ class Flight:
     @property
     def lifted(self) -> bool:
         """True if the pair left the ground, or was not to."""
-        return self._highest_place >= min(LIFTED, self.settings.goal[2] / 2)
+        return self._highest_place >= self._lifts_at
+
+    @property
+    def _lifts_at(self) -> float:
+        return min(LIFTED, self.settings.goal[2] / 2)
 
     @property
     def elapsed(self) -> float:
@@ -153,6 +159,11 @@ class Flight:
         seen, times = self._trusted(), self.settings.times
         return seen is not None and self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
 
+    def _is_off(self) -> bool:
+        """True once the legs carry nothing, so that the laws may take over."""
+        seen = self._trusted()
+        return self.settings.dry_run or (seen is not None and self._height(seen) >= self._lifts_at)
+
     # What the laws want.
 
     def _command(self) -> tuple[list[Mapped] | None, list[Fault]]:
@@ -197,7 +208,7 @@ class Flight:
         resumes = all(self._fresh) and self.supervisor.may_resume and not hindered
         reached = {
             Event.ARMED: state is State.ARM and elapsed >= times.arm and armed,
-            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp,
+            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp and self._is_off(),
             Event.TIME_UP: state is State.FLY and elapsed >= self.settings.seconds,
             Event.TOUCHED_DOWN: state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._stands(),
             Event.RESUMED: state is State.HOLD and self._back.update(resumes, self._now),
@@ -210,7 +221,9 @@ class Flight:
             known = [Fault(Event.CURVE_KNOWN, "dry run")] if dry else None
             events += known or self.spin.update(self.supervisor.since + times.spin / 2, self._now, self.note)
         if elapsed >= self._limit(state):
-            events.append(Fault(Event.TIMEOUT, f"{state.value} lasted {elapsed:.1f} s"))
+            stuck = state is State.RAMP and not self._is_off()
+            text = self._take_off.stuck(self.maps) if stuck else f"{state.value} lasted {elapsed:.1f} s"
+            events.append(Fault(Event.TIMEOUT, text))
         return events
 
     def _limit(self, state: State) -> float:
@@ -258,7 +271,8 @@ class Flight:
         if state is State.SPIN:
             return [command.level(SPIN_THRUST)] * 2
         if state is State.RAMP:
-            return [command.ramp(self.elapsed, self.settings.times, constants) for constants in self.maps]
+            seen = self._object()
+            return self._take_off.wanted(self.elapsed, seen, self._height(seen), self.maps)
         if state not in (State.DESCEND, State.HOLD):
             return [ZERO, ZERO]
         # Both drones alike: braking sideways by what is measured; sinking by it in DESCEND, else by the clock.
