@@ -288,7 +288,8 @@ class Flight:
     def _transmit(self, wanted: list[Setpoint]) -> None:
         state, dry = self.supervisor.state, self.settings.dry_run
         if state is State.RAMP:
-            self._trims = [float(value.thrust) for value in wanted]
+            parts = zip(wanted, self.maps, strict=True)
+            self._trims = [min(float(s.thrust), command.MOST_TRIM * c.hover_thrust) for s, c in parts]
         elif state in GUIDED:
             parts = zip(self._trims, wanted, self.maps, strict=True)
             period = self.settings.period
