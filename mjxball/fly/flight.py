@@ -271,8 +271,8 @@ class Flight:
         if state is State.SPIN:
             return [command.level(SPIN_THRUST)] * 2
         if state is State.RAMP:
-            seen = self._object()
-            return self._take_off.wanted(self.elapsed, seen, self._height(seen), self.maps)
+            rising = self._object()
+            return self._take_off.wanted(self.elapsed, rising, self._height(rising), self.maps)
         if state not in (State.DESCEND, State.HOLD):
             return [ZERO, ZERO]
         # Both drones alike: braking sideways by what is measured; sinking by it in DESCEND, else by the clock.
@@ -288,8 +288,8 @@ class Flight:
     def _transmit(self, wanted: list[Setpoint]) -> None:
         state, dry = self.supervisor.state, self.settings.dry_run
         if state is State.RAMP:
-            parts = zip(wanted, self.maps, strict=True)
-            self._trims = [min(float(s.thrust), command.MOST_TRIM * c.hover_thrust) for s, c in parts]
+            rises = zip(wanted, self.maps, strict=True)
+            self._trims = [min(float(s.thrust), command.MOST_TRIM * c.hover_thrust) for s, c in rises]
         elif state in GUIDED:
             parts = zip(self._trims, wanted, self.maps, strict=True)
             period = self.settings.period
