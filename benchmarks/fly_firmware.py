@@ -1,12 +1,14 @@
-"""The runner on the twin in virtual time: landings in a row, hover under bad conditions, the stand.
+"""The runner on the twin in virtual time: landings in a row, take-offs, hover under bad conditions, the stand.
 
-`python benchmarks/fly_firmware.py [--parts flights hover stand] [--flight FILE] [--stand FILE] [--jobs N]
-[--starts 100] [--json FILE]`
+`python benchmarks/fly_firmware.py [--parts flights ground hover stand] [--flight FILE] [--stand FILE]
+[--universal FILE] [--jobs N] [--starts 100] [--trials 4] [--json FILE]`
 
 The runner's own flight (supervisor, laws, watches) flies the twin of a pair of Crazyflie 2.1 as delivered, without
 sockets or clock. Numbers are of the twin's true state.
 
 - flights: 30 in a row of the same two drones, one of which reboots before ten; landed below 0.5 m/s, exit code 0.
+- ground: 8 s from legs on the ground, with random noise, delay and load: `--stand` with the ball at rest
+  anywhere within 6 cm; `--flight` and `--universal`. How far O goes sideways, and above its goal.
 - hover: 20 s at 0.4 m, errors from 5 s on, for link delay, force curve, sensor noise, pose rate and thrust gains; the
   steady command is the mean of what a drone is sent less what the pair flies, the larger of roll and pitch.
 - stand: 60 s from random balls, rolls and heights (ranges of the preset `stand`); kept if the ball touches no stop.
@@ -28,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from mjxball.config import preset
-from mjxball.fly.card import Controller
+from mjxball.fly.card import Controller, load_policy
 from mjxball.fly.twin.conditions import Conditions, Surroundings
 from mjxball.fly.twin.virtual import MemoryLog, VirtualTwin
 from mjxball.physics.step import start_state
@@ -71,6 +73,48 @@ def flights_in_a_row(path: Path, count: int, drone: int) -> list[Row]:
             }
         )
     return rows
+
+
+BALL_ON_GROUND = 0.06  # [m] from the middle
+
+
+def ground_start(path: Path, number: int) -> list[Row]:
+    """8 s from legs on the ground, with what an owner cannot choose at random."""
+    policy, random = Policy(load_policy(path), path.stem), np.random.default_rng([2, number])
+    config = Controller(policy).config
+    conditions = Conditions.of(config)
+    ball = random.uniform(-1, 1) * BALL_ON_GROUND if config.motion.kind == "rolling" else 0.0
+    conditions = replace(conditions, ball=ball, cg_amplitude=random.uniform(0, 1) * conditions.cg_amplitude)
+    noise, delay = random.uniform(0, 2), round(random.uniform(0, 4)) * 0.005
+    world = VirtualTwin(
+        policy,
+        settings_of(policy, 8.0),
+        conditions=conditions,
+        surroundings=Surroundings(seed=number, noise=noise, delay=delay),
+        log=MemoryLog(False),
+        settle=SETTLE,
+    )
+    begin = world.state.position.mean(axis=0)
+    world.run(60.0)
+    up = [moment for moment in world.track if moment.state in ("ramp", "fly")]
+    flown = [moment for moment in up if moment.state == "fly"]
+    gone = np.array([moment.position for moment in up]) - begin
+    farthest = max(abs(moment.ball) for moment in up) / config.plant.moving_fraction
+    seconds = flown[-1].time - flown[0].time if flown else 0.0
+    row = {"policy": path.stem, "start": number, "ball": ball, "noise": noise, "delay": delay, "seconds": seconds}
+    return [
+        {
+            **row,
+            "lifted": world.flight.lifted,
+            "farthest": farthest,
+            "kept": bool(seconds > 7.0 and (not config.plant.ball_stop or farthest < config.plant.ball_stop)),
+            "aside": float(np.hypot(gone[:, 0], gone[:, 1]).max()),
+            "over": float(gone[:, 2].max() - world.settings.goal[2]),
+            "tilt": math.degrees(max(moment.tilt for moment in up)),
+            "cause": cause_of(world),
+            "code": code_of(world),
+        }
+    ]
 
 
 HOVERS: list[tuple[str, dict[str, Any]]] = [
@@ -173,6 +217,12 @@ def jobs_of(options: argparse.Namespace) -> Iterator[Job]:
             ("stand", stand_start, (options.stand, number))
             for number in range(options.first, options.first + options.starts)
         )
+    if "ground" in options.parts:
+        yield from (
+            ("ground", ground_start, (path, number))
+            for path in (options.stand, options.flight, options.universal)
+            for number in range(options.first, options.first + options.starts)
+        )
     if "hover" in options.parts:
         yield from (
             ("hover", hover, (options.flight, name, around, seed))
@@ -192,6 +242,16 @@ def table(part: str, rows: Sequence[Row]) -> None:
             reboots = sum(bool(row["reboots"]) for row in own)
             text = f"{good} of {len(own)} with exit code 0, {reboots} after a reboot"
             print(f"{name:10} {text}, hardest touchdown {fastest:.2f} m/s")
+    elif part == "ground":
+        for name in dict.fromkeys(row["policy"] for row in rows):
+            own = [row for row in rows if row["policy"] == name]
+            lifted, kept = (sum(row[key] for row in own) for key in ("lifted", "kept"))
+            aside, over = (100 * max(row[key] for row in own) for key in ("aside", "over"))
+            farthest = 1e3 * max(row["farthest"] for row in own)
+            print(
+                f"{name:10} lifted {lifted}, kept {kept} of {len(own)}; farthest ball {farthest:.0f} mm; "
+                f"{aside:.1f} cm sideways, {over:.1f} cm above the goal"
+            )
     elif part == "hover":
         print(f"{'case':34} {'RMSE mm':>8} {'along':>6} {'height':>6} {'tilt':>6} {'steady':>7}  worst of the seeds")
         for name in dict.fromkeys(row["case"] for row in rows):
@@ -212,9 +272,10 @@ def table(part: str, rows: Sequence[Row]) -> None:
 def main() -> int:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", nargs="+", default=["flights", "hover", "stand"])
+    parser.add_argument("--parts", nargs="+", default=["flights", "ground", "hover", "stand"])
     parser.add_argument("--flight", type=Path, default=shipped_policy("flight"))
     parser.add_argument("--stand", type=Path, default=shipped_policy("stand"))
+    parser.add_argument("--universal", type=Path, default=shipped_policy("universal"))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--starts", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="number of the stand's first random start")

@@ -69,7 +69,7 @@ def bounds() -> str:
         "height above the goal, on a stand": f"{100 * STAND_SPARE:.0f} cm",
         "sent roll and pitch": f"±{math.degrees(law.tilt_limit):.0f} degrees",
         "sent thrust": f"{THRUST_FLOOR} .. {THRUST_CEILING} units",
-        "ramp to hover": f"{times.ramp:g} s",
+        "ramp to hover": f"{times.ramp:g} s, and at most {times.lift:g} s more until the pair is off the ground",
         "landing speed of the goal": f"{times.land_speed:g} m/s",
         "descent": f"{times.descend_speed:g} m/s for at most {times.descend_limit:g} s",
         "*hold* ends after the last word of a drone by": f"{times.drone_watchdog:g} s",
