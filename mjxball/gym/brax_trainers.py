@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -36,6 +36,6 @@ def brax_trainer(agent: str) -> Callable[..., Any]:
     return train
 
 
-def _replicated(tree: Any, devices: list[Any]) -> Any:
+def _replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """A copy for every device along a new leading axis."""
     return jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * len(devices)), tree)
