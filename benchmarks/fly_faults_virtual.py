@@ -1,13 +1,20 @@
-"""Faults of the twin in virtual time: hover at 0.4 m, a fault at a random moment of the flight or the landing.
+"""Faults of the twin in virtual time: hover at 0.4 m, a fault at a random moment, at the leader and at the follower.
+
+`python benchmarks/fly_faults_virtual.py [--policy FILE] [--trials 1] [--jobs 2] [--only FAULT ...] [--json FILE]`
 
 Measured are the seconds until each drone's motors are off, speed at the first contact, largest tilt and drift between
-the fault and then. Run by `fly_firmware.py --parts faults`; `fly_faults.py` is the same by the clock, with sockets.
+the fault and then. The table in docs/flying.md is made from benchmarks/results/fly_faults_virtual.json.
+`fly_faults.py` is the same by the clock, with sockets.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import math
+import multiprocessing
 import statistics
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +24,7 @@ import numpy as np
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import FAULT_KINDS
 from mjxball.fly.twin.virtual import Moment, VirtualTwin
+from mjxball.policy.file import shipped_policy
 from virtual_flight import Row, code_of, world_of
 
 Injection = Callable[[VirtualTwin, int], None]
@@ -109,17 +117,37 @@ FAULTS: dict[str, Injection] = {
 }
 
 
+SETTLED, HOVER = 3.0, 6.0  # [s] under both laws, until a fault may come and until the flight lands
+
+
 def fault(path: Path, kind: str, drone: int, number: int, onboard: str = "") -> list[Row]:
     """One flight with one fault; `onboard` as for `world_of`."""
+    world = hovering(path, number, onboard)
+    world.fly_for(moment_of(kind, drone, number))
+    return finish(world, path, kind, drone)
+
+
+def moment_of(kind: str, drone: int, number: int) -> float:
+    """When a fault comes, after `SETTLED` [s]: at random."""
     random = np.random.default_rng([list(FAULTS).index(kind), drone, number])
-    world = world_of(path, 6.0, onboard=onboard, seed=number)
+    return float(random.uniform(0.0, HOVER - SETTLED - 1.0))
+
+
+def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
+    """The pair `SETTLED` [s] under both laws."""
+    world = world_of(path, HOVER, onboard=onboard, seed=number)
     world.killed = False  # type: ignore[attr-defined]
     world.later = (math.inf, None)  # type: ignore[attr-defined]
     world.fly_until(State.FLY)
-    world.fly_for(float(random.uniform(3.0, 7.0)))
+    world.fly_for(SETTLED)
+    return world
+
+
+def finish(world: VirtualTwin, path: Path, kind: str, drone: int) -> list[Row]:
+    """The rest of the flight, with the fault now."""
     at = world.now
     FAULTS[kind](world, drone)
-    while world.now < at + 25.0:
+    while world.now < at + 15.0:
         if world.now >= world.later[0]:  # type: ignore[attr-defined]
             world.later[1]()  # type: ignore[attr-defined]
             world.later = (math.inf, None)  # type: ignore[attr-defined]
@@ -128,11 +156,47 @@ def fault(path: Path, kind: str, drone: int, number: int, onboard: str = "") -> 
             world.track.append(world.moment())
         elif not world.tick():
             break
-    for _ in range(250):  # whatever turns must stop by itself
+    for _ in range(125):  # whatever turns must stop by itself
         world.advance(0.02)
         world.track.append(world.moment())
     after = [moment for moment in world.track if moment.time >= at]
     return [{"policy": path.stem, "fault": kind, "drone": ("leader", "follower")[drone], **evaluated(world, after, at)}]
+
+
+def all_of(options: argparse.Namespace) -> list[Row]:
+    """Every fault at each drone, in processes that branch off one hover for each trial; written as far as it came."""
+    context, rows = multiprocessing.get_context("fork"), []
+    for number in range(options.trials):
+        flown = sorted((moment_of(kind, drone, number), kind, drone) for kind in options.only for drone in range(2))
+        world, passed = hovering(options.policy, number), 0.0
+        running: list[Any] = []
+        for moment, kind, drone in [*flown, (math.inf, "", 0)]:
+            while running and (len(running) >= options.jobs or math.isinf(moment)):
+                child, end = running.pop(0)
+                rows += end.recv()
+                child.join()
+                print(f"\r{len(rows)} of {len(flown) * options.trials}", end="", file=sys.stderr, flush=True)
+                write(options.json, sorted(rows, key=lambda row: list(FAULTS).index(row["fault"])))
+            if math.isfinite(moment):
+                world.fly_for(moment - passed)
+                passed = moment
+                ours, theirs = context.Pipe(duplex=False)
+                child = context.Process(target=_send, args=(theirs, world, options.policy, kind, drone))
+                child.start()
+                theirs.close()
+                running.append((child, ours))
+    return rows
+
+
+def _send(end: Any, *arguments: Any) -> None:
+    end.send(finish(*arguments))
+
+
+def write(path: Path | None, rows: Sequence[Row]) -> None:
+    """Put `rows` into the file at `path`, if one is wanted."""
+    if path is not None:
+        command = f"python benchmarks/fly_faults_virtual.py {' '.join(sys.argv[1:])}"
+        path.write_text(json.dumps({"command": command, "faults": rows}, indent=1) + "\n", encoding="utf-8")
 
 
 def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
@@ -143,16 +207,19 @@ def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
     down = next((i for i, moment in enumerate(after) if moment.position[2] < world.rest + 0.006), len(after) - 1)
     until = after[: down + 1]
     cause = world.flight.supervisor.cause
-    return {
+    found = {
         "height": float(start[2] - world.rest),
-        "off": off,
+        "off": [round(one, 4) for one in off],
         "stopped": not running[-1].any(),
         "speed": float(max(0.0, *(-moment.velocity[2] for moment in after[max(down - 3, 0) : down + 1]))),
         "tilt": math.degrees(max(moment.tilt for moment in until)),
         "drift": float(np.linalg.norm(after[down].position[:2] - start[:2])),
         "cause": "" if cause is None else cause.event.name,
+        "way": [one["after"] for one in world.log.records if one["kind"] == "transition" and one["t"] >= at],
+        "told": world.flight.how_it_ended(),
         "code": code_of(world),
     }
+    return {name: round(value, 4) if isinstance(value, float) else value for name, value in found.items()}
 
 
 def table(rows: Sequence[Row]) -> None:
@@ -167,3 +234,21 @@ def table(rows: Sequence[Row]) -> None:
         ]
         bad = "" if all(row["stopped"] for row in own) else "  A MOTOR STILL TURNS"
         print(f"{' '.join((name[1], name[0])):32} {off[0]:6.2f} / {off[1]:5.2f} {parts[0]} {parts[1]} {parts[2]}{bad}")
+
+
+def main() -> int:
+    """Run the campaign; returns 1 if a motor still turned."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--policy", type=Path, default=shipped_policy("flight"), metavar="FILE")
+    parser.add_argument("--trials", type=int, default=1, help="flights of each fault at each drone")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--only", nargs="+", choices=FAULTS, default=[one for one in FAULTS if one not in ONBOARD])
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    options = parser.parse_args()
+    rows = all_of(options)
+    table(sorted(rows, key=lambda row: list(FAULTS).index(row["fault"])))
+    return 0 if all(row["stopped"] for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,16 +1,19 @@
-"""The runner on the twin in virtual time: landings in a row, hover under bad conditions, the stand, faults.
+"""The runner on the twin in virtual time: landings in a row, take-offs, hover under bad conditions, the stand.
 
-`python benchmarks/fly_firmware.py [--parts flights hover stand faults] [--flight FILE] [--stand FILE] [--jobs N]
-[--starts 100] [--trials 4] [--json FILE]`
+`python benchmarks/fly_firmware.py [--parts flights ground hover stand] [--flight FILE] [--stand FILE]
+[--universal FILE] [--jobs N] [--starts 100] [--trials 4] [--json FILE]`
 
 The runner's own flight (supervisor, laws, watches) flies the twin of a pair of Crazyflie 2.1 as delivered, without
 sockets or clock. Numbers are of the twin's true state.
 
-- flights: 20 in a row of the same two drones without reboot; landed below 0.5 m/s, exit code 0.
+- flights: 30 in a row of the same two drones, one of which reboots before ten; landed below 0.5 m/s, exit code 0.
+- ground: 8 s from legs on the ground, with random noise, delay and load: `--stand` with the ball at rest
+  anywhere within 6 cm; `--flight` and `--universal`. How far O goes sideways, and above its goal.
 - hover: 20 s at 0.4 m, errors from 5 s on, for link delay, force curve, sensor noise, pose rate and thrust gains; the
   steady command is the mean of what a drone is sent less what the pair flies, the larger of roll and pitch.
 - stand: 60 s from random balls, rolls and heights (ranges of the preset `stand`); kept if the ball touches no stop.
-- faults: see `fly_faults_virtual.py`.
+
+Faults: see `fly_faults_virtual.py`.
 """
 
 from __future__ import annotations
@@ -26,9 +29,8 @@ from typing import Any
 
 import numpy as np
 
-import fly_faults_virtual
 from mjxball.config import preset
-from mjxball.fly.card import Controller
+from mjxball.fly.card import Controller, load_policy
 from mjxball.fly.twin.conditions import Conditions, Surroundings
 from mjxball.fly.twin.virtual import MemoryLog, VirtualTwin
 from mjxball.physics.step import start_state
@@ -42,18 +44,28 @@ SETTLED, HOVER = 5.0, 20.0  # [s]
 # Parts: each yields jobs (function, arguments), each of which returns a row.
 
 
-def flights_in_a_row(path: Path, count: int) -> list[Row]:
-    """Take off, fly 5 s, land, `count` times with the same drones."""
+FLIGHTS, EVERY = 30, 3  # flights in a row; before each third one a drone reboots
+
+
+def flights_in_a_row(path: Path, count: int, drone: int) -> list[Row]:
+    """Take off, fly 5 s, land, `count` times with the same drones; `drone` reboots at times, 0.1 to 3 s before."""
     world, rows = world_of(path, 5.0), []
+    random = np.random.default_rng(drone)
     for number in range(count):
-        if number:
+        reboots = number % EVERY == EVERY - 1
+        if number or reboots:
             world.track.clear()
-            world.next_flight()
+            before = float(random.uniform(0.0, 2.9)) if reboots else 0.0
+            world.advance(before)
+            if reboots:
+                world.drones[drone].reboot()
+            world.next_flight(pause=3.0 - before)
         world.run(60.0)
         rows.append(
             {
                 "policy": path.stem,
                 "flight": number + 1,
+                "reboots": ("leader", "follower")[drone] if reboots else "",
                 "code": code_of(world),
                 "cause": cause_of(world),
                 "touchdown": world.touchdown_speed(),
@@ -61,6 +73,48 @@ def flights_in_a_row(path: Path, count: int) -> list[Row]:
             }
         )
     return rows
+
+
+BALL_ON_GROUND = 0.06  # [m] from the middle
+
+
+def ground_start(path: Path, number: int) -> list[Row]:
+    """8 s from legs on the ground, with what an owner cannot choose at random."""
+    policy, random = Policy(load_policy(path), path.stem), np.random.default_rng([2, number])
+    config = Controller(policy).config
+    conditions = Conditions.of(config)
+    ball = random.uniform(-1, 1) * BALL_ON_GROUND if config.motion.kind == "rolling" else 0.0
+    conditions = replace(conditions, ball=ball, cg_amplitude=random.uniform(0, 1) * conditions.cg_amplitude)
+    noise, delay = random.uniform(0, 2), round(random.uniform(0, 4)) * 0.005
+    world = VirtualTwin(
+        policy,
+        settings_of(policy, 8.0),
+        conditions=conditions,
+        surroundings=Surroundings(seed=number, noise=noise, delay=delay),
+        log=MemoryLog(False),
+        settle=SETTLE,
+    )
+    begin = world.state.position.mean(axis=0)
+    world.run(60.0)
+    up = [moment for moment in world.track if moment.state in ("ramp", "fly")]
+    flown = [moment for moment in up if moment.state == "fly"]
+    gone = np.array([moment.position for moment in up]) - begin
+    farthest = max(abs(moment.ball) for moment in up) / config.plant.moving_fraction
+    seconds = flown[-1].time - flown[0].time if flown else 0.0
+    row = {"policy": path.stem, "start": number, "ball": ball, "noise": noise, "delay": delay, "seconds": seconds}
+    return [
+        {
+            **row,
+            "lifted": world.flight.lifted,
+            "farthest": farthest,
+            "kept": bool(seconds > 7.0 and (not config.plant.ball_stop or farthest < config.plant.ball_stop)),
+            "aside": float(np.hypot(gone[:, 0], gone[:, 1]).max()),
+            "over": float(gone[:, 2].max() - world.settings.goal[2]),
+            "tilt": math.degrees(max(moment.tilt for moment in up)),
+            "cause": cause_of(world),
+            "code": code_of(world),
+        }
+    ]
 
 
 HOVERS: list[tuple[str, dict[str, Any]]] = [
@@ -156,10 +210,17 @@ def _rms(values: Sequence[float]) -> float:
 def jobs_of(options: argparse.Namespace) -> Iterator[Job]:
     """(part, function, arguments) of everything that is asked for, the longest first."""
     if "flights" in options.parts:
-        yield from (("flights", flights_in_a_row, (path, 20)) for path in (options.stand, options.flight))
+        pairs = ((options.stand, 0), (options.flight, 1))
+        yield from (("flights", flights_in_a_row, (path, FLIGHTS, drone)) for path, drone in pairs)
     if "stand" in options.parts:
         yield from (
             ("stand", stand_start, (options.stand, number))
+            for number in range(options.first, options.first + options.starts)
+        )
+    if "ground" in options.parts:
+        yield from (
+            ("ground", ground_start, (path, number))
+            for path in (options.stand, options.flight, options.universal)
             for number in range(options.first, options.first + options.starts)
         )
     if "hover" in options.parts:
@@ -167,14 +228,6 @@ def jobs_of(options: argparse.Namespace) -> Iterator[Job]:
             ("hover", hover, (options.flight, name, around, seed))
             for name, around in HOVERS
             for seed in range(options.seeds)
-        )
-    if "faults" in options.parts:
-        yield from (
-            ("faults", fly_faults_virtual.fault, (options.flight, kind, drone, number))
-            for kind in fly_faults_virtual.FAULTS
-            if kind not in fly_faults_virtual.ONBOARD
-            for drone in range(2)
-            for number in range(options.trials)
         )
 
 
@@ -186,7 +239,19 @@ def table(part: str, rows: Sequence[Row]) -> None:
             own = [row for row in rows if row["policy"] == name]
             fastest = max(row["touchdown"] for row in own)
             good = sum(row["code"] == 0 for row in own)
-            print(f"{name:10} {good} of {len(own)} with exit code 0, hardest touchdown {fastest:.2f} m/s")
+            reboots = sum(bool(row["reboots"]) for row in own)
+            text = f"{good} of {len(own)} with exit code 0, {reboots} after a reboot"
+            print(f"{name:10} {text}, hardest touchdown {fastest:.2f} m/s")
+    elif part == "ground":
+        for name in dict.fromkeys(row["policy"] for row in rows):
+            own = [row for row in rows if row["policy"] == name]
+            lifted, kept = (sum(row[key] for row in own) for key in ("lifted", "kept"))
+            aside, over = (100 * max(row[key] for row in own) for key in ("aside", "over"))
+            farthest = 1e3 * max(row["farthest"] for row in own)
+            print(
+                f"{name:10} lifted {lifted}, kept {kept} of {len(own)}; farthest ball {farthest:.0f} mm; "
+                f"{aside:.1f} cm sideways, {over:.1f} cm above the goal"
+            )
     elif part == "hover":
         print(f"{'case':34} {'RMSE mm':>8} {'along':>6} {'height':>6} {'tilt':>6} {'steady':>7}  worst of the seeds")
         for name in dict.fromkeys(row["case"] for row in rows):
@@ -195,28 +260,26 @@ def table(part: str, rows: Sequence[Row]) -> None:
                 key: max(row.get(key, math.inf) for row in own) for key in ("rmse", "along", "height", "tilt", "steady")
             }
             print(f"{name:34} " + "{rmse:8.1f} {along:6.1f} {height:6.1f} {tilt:6.1f} {steady:7.1f}".format(**worst))
-    elif part == "stand":
+    else:
         kept = sum(row["kept"] for row in rows)
         rms = statistics.median(row["ball_rms"] for row in rows if row["kept"]) if kept else math.nan
         print(f"ball kept in {kept} of {len(rows)}; ball {1e3 * rms:.1f} mm rms (median of those)")
         landed = [row["touchdown"] for row in rows if math.isfinite(row["touchdown"])]
         good = sum(row["code"] == 0 for row in rows)
         print(f"exit code 0 in {good}, hardest touchdown {max(landed, default=math.nan):.2f} m/s")
-    else:
-        fly_faults_virtual.table(rows)
 
 
 def main() -> int:
-    """Run what is asked for; returns 1 if a motor still turned."""
+    """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--parts", nargs="+", default=["flights", "hover", "stand", "faults"])
+    parser.add_argument("--parts", nargs="+", default=["flights", "ground", "hover", "stand"])
     parser.add_argument("--flight", type=Path, default=shipped_policy("flight"))
     parser.add_argument("--stand", type=Path, default=shipped_policy("stand"))
+    parser.add_argument("--universal", type=Path, default=shipped_policy("universal"))
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--starts", type=int, default=100)
     parser.add_argument("--first", type=int, default=0, help="number of the stand's first random start")
     parser.add_argument("--seeds", type=int, default=3, help="of every hover")
-    parser.add_argument("--trials", type=int, default=4)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     return campaign("fly_firmware", options, jobs_of(options), table)

@@ -21,7 +21,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hostile import ROOT, Case, every_case, prepare, spread
+from hostile import Case, every_case, prepare, spread
+from hostile_files import ROOT
 from mjxball import cli
 
 LINES, SECONDS, MEMORY = 250, 20.0, 3.0e9  # [s] of a line, [bytes] resident at most

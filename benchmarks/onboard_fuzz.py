@@ -49,7 +49,7 @@ def fuzz(files: Mapping[str, str], role: int, ticks: int, seed: int) -> dict[str
     if done.returncode:
         lines = [line for line in (done.stderr + done.stdout).splitlines() if line.strip()]
         return {
-            "report": next((line for line in lines if "error" in line), lines[-1] if lines else str(done.returncode))
+            "report": next((line for line in lines if "rror" in line), lines[-1] if lines else str(done.returncode))
         }
     found = json.loads(done.stdout)
     found["phases"] = dict(zip((phase.name.lower() for phase in Phase), found["phases"], strict=True))

@@ -2,10 +2,10 @@
 
 `python benchmarks/stock_sac.py OUT.npz [--seed N] [--steps N] [--num-envs N] ... [--physics mjx|newton-euler]`
 
-The other side of `benchmarks/training.py`. Brax 0.14.2 calls `jax.device_put_replicated`, which JAX has removed; it is
-supplied here. Brax's own evaluations are left out, which makes it faster. Besides OUT.npz, written at the end, there is
-OUT-<steps>.npz at each of `--snapshots` equal parts of the way; the files' times tell when each was reached. What the
-networks see, how actions are bounded and what is rewarded are the preset's, exactly as in `train.py`.
+The other side of `benchmarks/training.py`. Brax's evaluations are left out, which makes it faster. Besides OUT.npz,
+written at the end, there is OUT-<steps>.npz at each of `--snapshots` equal parts of the way; the files' times tell when
+each was reached. What the networks see, how actions are bounded and what is rewarded are the preset's, exactly as in
+`train.py`.
 """
 
 from __future__ import annotations
@@ -23,15 +23,10 @@ from mjxball import config as configs
 from mjxball.algorithms.base import PolicyNetwork
 from mjxball.cache import enable_compilation_cache
 from mjxball.env import TransportEnv
+from mjxball.gym.brax_trainers import brax_trainer
 from mjxball.policy import save_file
 from mjxball.policy.export import policy_file
-from mjxball.quiet import import_brax_env
 from mjxball.sim.follower import follower_law
-
-
-def replicated(tree: Any, devices: list[Any]) -> Any:
-    """What `jax.device_put_replicated` did: a copy for every device along a new leading axis."""
-    return jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * len(devices)), tree)
 
 
 class Masked:
@@ -56,12 +51,11 @@ class Masked:
 
 def train(config: configs.Config, options: argparse.Namespace, export: Callable[[int, Any], None]) -> None:
     """Train; `export(environment steps, (observation statistics, policy parameters))` at every snapshot."""
-    import_brax_env()
+    train = brax_trainer("sac")
     from brax.envs.wrappers import training as wrappers
     from brax.training import acting
-    from brax.training.agents.sac import networks, train
+    from brax.training.agents.sac import networks
 
-    jax.device_put_replicated = replicated
     newest: list[Any] = [None]
 
     def look(self: Any, parameters: Any, training_metrics: dict[str, Any], **_: Any) -> dict[str, Any]:
@@ -71,7 +65,7 @@ def train(config: configs.Config, options: argparse.Namespace, export: Callable[
     acting.Evaluator.run_evaluation = look
     layers = tuple(int(size) for size in options.layers.split(","))
     with jax.default_matmul_precision("highest"):
-        train.train(
+        train(
             environment=Masked(TransportEnv(config, options.physics)),
             wrap_env_fn=wrappers.wrap,
             num_timesteps=options.steps,

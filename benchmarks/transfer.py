@@ -36,11 +36,11 @@ from jax.experimental.compilation_cache import compilation_cache
 from mjxball import config as configs
 from mjxball.algorithms.ppo import ProximalPolicyOptimization
 from mjxball.algorithms.sac import SoftActorCritic
+from mjxball.gym.brax_trainers import brax_trainer
 from mjxball.quiet import import_brax_env
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions
 from mjxball.train.population import Executables, Population
-from stock_sac import replicated
 from training import say, versions
 
 EPISODE, EPISODES = 1000, 128
@@ -148,13 +148,10 @@ def ours(env: Any, algorithm: str, given: dict[str, Any]) -> Callable[[int], Pol
 
 def stock(env: Any, algorithm: str, given: dict[str, Any]) -> Callable[[int], Policy]:
     """The same with Brax's trainer, which is called for every seed."""
-    from brax.training.agents.ppo import train as ppo
-    from brax.training.agents.sac import train as sac
-
-    jax.device_put_replicated = replicated  # which JAX has removed
+    train = brax_trainer(algorithm)
 
     def one(seed: int) -> Policy:
-        make_policy, parameters, _ = {"sac": sac, "ppo": ppo}[algorithm].train(
+        make_policy, parameters, _ = train(
             environment=env,
             episode_length=EPISODE,
             normalize_observations=True,

@@ -9,22 +9,15 @@ from __future__ import annotations
 import functools
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from mjxball import config as configs
 from mjxball.cli import make_parser, output_file, plant_setup, quit_on_interrupt, run_command
-from mjxball.config import Config
-from mjxball.control.motors import firmware
-from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
 from mjxball.files import write_whole
-from mjxball.policy.file import PolicyFile, law_of, load_file, save_file
+from mjxball.policy import team
+from mjxball.policy.file import PolicyFile, load_file, save_file
 from mjxball.policy.mean import mean_policy
-from mjxball.policy.policy import context_of, not_told
 
 
 def policy_of_run(run: Path) -> PolicyFile:
@@ -53,42 +46,8 @@ def contents_of(source: Path, mean: bool = False) -> PolicyFile:
 
 
 def in_team(policy: PolicyFile, name: str, plant: Path | None, drone: int | None = None) -> PolicyFile:
-    """`policy` as `drone` of the team on the plant file `plant` flies it; itself if it is told nothing of its team.
-
-    Its card then has `team`, and plant and configuration of that team. Raises InputError for what does not fit.
-    """
-    if not law_of(policy.card).needs_context:
-        if plant is not None or drone is not None:
-            raise InputError(f"{name} is told nothing of its team: leave --plant and --drone out")
-        return policy
-    if plant is None and drone is None and "team" in policy.card:
-        return policy
-    config = None if plant is None else plant_setup(plant)
-    followers: tuple[int, ...] = (1,) if config is None else config.plant.followers
-    if drone not in (followers if len(followers) > 1 else (None, *followers)):
-        raise InputError(f"--drone must be a follower of --plant: {', '.join(map(str, followers))}")
-    place = 0 if drone is None else followers.index(drone)
-    if config is None:
-        raise not_told(name)
-    context = context_of(name, policy.card, config.plant, config.attitude)
-    told = context.reshape(-1, context.shape[-1])[place].tolist()
-    team = {
-        "drone": followers[place],
-        "mount_angle": float(np.ravel(mount_frames(config.plant))[place]),
-        "context": told,
-    }
-    return replace(policy, card={**policy.card, **_card_of(config, policy.card), "team": team})
-
-
-def _card_of(config: Config, card: dict[str, Any]) -> dict[str, Any]:
-    """What `card` says of plant and configuration where its policy flies on the plant of `config`."""
-    own = configs.from_record({"plant": {}, **card.get("config", {})})
-    timing = replace(own.timing, physics_steps=round(own.timing.control_period / config.physics_step))
-    flown = configs.validate(
-        replace(config, preset=own.preset, leader=own.leader, command=own.command, follower=own.follower, timing=timing)
-    )
-    drones = {"firmware": firmware(config)} if config.autopilot.kind == "crazyflie" else {}
-    return {"plant": configs.to_dict(config.plant), "config": configs.to_dict(flown), **drones}
+    """`policy.team.in_team` on the plant file `plant`."""
+    return team.in_team(policy, name, None if plant is None else plant_setup(plant), drone)
 
 
 def _write_onnx(out: Path, policy: PolicyFile) -> None:
@@ -109,7 +68,6 @@ def _write_header(out: Path, policy: PolicyFile, int8: bool = False) -> None:
     write_whole(out, c_header(policy, out.stem, int8).encode("ascii"))
 
 
-CRAZYFLIES = Path("crazyflie")  # the plant of apps of a policy for any rig
 Writer = Callable[[Path, PolicyFile], None]
 WRITERS: dict[str, Writer] = {".npz": save_file, ".onnx": _write_onnx, ".h": _write_header}
 ROUNDED: dict[str, Writer] = {".npz": _save_rounded, ".h": functools.partial(_write_header, int8=True)}  # with --int8
@@ -140,9 +98,8 @@ def export(
         from mjxball.fly.app.generate import check_place, write_app
 
         check_place(out)
-        card = contents_of(source, mean).card
-        if plant is None and card["format_version"] == 4 and "team" not in card:
-            plant = CRAZYFLIES
+        if plant is None and team.is_for_any(contents_of(source, mean).card):
+            plant = team.CRAZYFLIES
         drones = 2 if plant is None else plant_setup(plant).plant.count
         if drones != 2:
             raise InputError(f"an app is for pairs of Crazyflies, and {plant} has {drones} drones")

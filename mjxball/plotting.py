@@ -10,10 +10,11 @@ from mjxball.files import write_whole
 
 
 def pyplot() -> Any:
-    """Matplotlib's pyplot on the file-only backend."""
+    """Matplotlib's pyplot on the file-only backend. Dollars in a name are dollars, and begin no formula."""
     import matplotlib as mpl
 
     mpl.use("Agg")
+    mpl.rcParams["text.parse_math"] = False
     import matplotlib.pyplot as plt
 
     return plt

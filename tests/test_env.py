@@ -11,6 +11,7 @@ from conftest import CompiledEnv, with_settings
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
+from mjxball.gym.brax_trainers import brax_trainer
 from mjxball.quiet import import_brax_env
 
 import_brax_env()  # silently, before Brax's wrappers import it with its notes
@@ -265,22 +266,26 @@ def test_brax_takes_it_for_its_own(transport):
     assert isinstance(TransportEnv(transport, "newton-euler"), base)
 
 
-@pytest.mark.release
 class TestStockBrax:
-    """Brax's own trainers run on the environment, given the function that JAX has removed."""
+    """Brax's own trainers run on the environment, as docs/gym.md says."""
 
     @pytest.fixture(autouse=True)
-    def put_replicated(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        def copies(tree: Any, devices: list[Any]) -> Any:
-            return jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * len(devices)), tree)
+    def without_the_function_again(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """What a trainer gives JAX back is taken away after each test."""
+        monkeypatch.setattr(jax, "device_put_replicated", None, raising=False)
+        monkeypatch.delattr(jax, "device_put_replicated")
 
-        monkeypatch.setattr(jax, "device_put_replicated", copies, raising=False)
+    @pytest.mark.slow
+    def test_what_brax_would_randomise_is_refused(self, transport):
+        with pytest.raises(InputError, match="every reset draws a world"):
+            brax_trainer("ppo")(TransportEnv(transport, "newton-euler"), randomization_fn=lambda sys, rng: (sys, rng))
+        with pytest.raises(InputError, match="ppo, sac"):
+            brax_trainer("es")
 
+    @pytest.mark.release
     def test_ppo_trains(self, transport):
-        from brax.training.agents.ppo import train as ppo
-
         seen = []
-        _, parameters, _ = ppo.train(
+        _, parameters, _ = brax_trainer("ppo")(
             TransportEnv(transport, "newton-euler"),
             num_timesteps=1024,
             episode_length=40,
@@ -299,10 +304,9 @@ class TestStockBrax:
         assert all(np.isfinite(reward) and reward < 0 for _, reward in seen)
         assert finite(parameters)
 
+    @pytest.mark.release
     def test_sac_trains(self, transport):
-        from brax.training.agents.sac import train as sac
-
-        _, parameters, _ = sac.train(
+        _, parameters, _ = brax_trainer("sac")(
             TransportEnv(transport, "newton-euler"),
             num_timesteps=512,
             episode_length=40,

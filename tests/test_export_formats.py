@@ -39,23 +39,23 @@ HARNESS = """
 
 /* Each record: start (int), memory, observation -> action, command, memory, in MJXBALL_REAL. */
 int main(void) {
-    mjxball_follower follower;
-    mjxball_real seen[18], action[3], command[3];
+    mjxball_follower_follower follower;
+    mjxball_follower_real seen[18], action[3], command[3];
     int start;
     fprintf(stderr, "%d", (int)sizeof follower);
-    mjxball_reset(&follower);
+    mjxball_follower_reset(&follower);
     while (fread(&start, sizeof start, 1, stdin) == 1) {
-        if (start) mjxball_reset(&follower);
-#if MJXBALL_MEMORY_SIZE > 0
-        mjxball_real memory[MJXBALL_MEMORY_SIZE];
+        if (start) mjxball_follower_reset(&follower);
+#if MJXBALL_FOLLOWER_MEMORY_SIZE > 0
+        mjxball_follower_real memory[MJXBALL_FOLLOWER_MEMORY_SIZE];
         if (fread(memory, sizeof memory, 1, stdin) != 1) return 1;
-        if (!start) mjxball_copy(follower.memory, memory, MJXBALL_MEMORY_SIZE);
+        if (!start) mjxball_follower_copy(follower.memory, memory, MJXBALL_FOLLOWER_MEMORY_SIZE);
 #endif
         if (fread(seen, sizeof seen, 1, stdin) != 1) return 1;
-        mjxball_follow(&follower, seen, action, command);
+        if (mjxball_follower_follow(&follower, seen, action, command)) return 1;
         fwrite(action, sizeof action, 1, stdout);
         fwrite(command, sizeof command, 1, stdout);
-#if MJXBALL_MEMORY_SIZE > 0
+#if MJXBALL_FOLLOWER_MEMORY_SIZE > 0
         fwrite(follower.memory, sizeof follower.memory, 1, stdout);
 #endif
     }
@@ -231,10 +231,13 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert 4 * sum(arrays) == cost.flash
     assert f"Flash: {cost.flash} bytes" in text
     assert f"RAM: {cost.state} bytes" in text
-    size, widest = map(int, re.search(r"mjxball_real input\[(\d+)\], hidden\[2\]\[(\d+)\];", text).groups())
-    lqg = law_of(contents.card).lqg
+    size, widest = map(int, re.search(r"mjxball_follower_real input\[(\d+)\], hidden\[2\]\[(\d+)\];", text).groups())
+    lqg, units = law_of(contents.card).lqg, law_of(contents.card).units
     own = 18 + 2 * lqg.models + 4 if isinstance(lqg, MultiModelLqg) else 0
-    assert ("mjxball_real seen[18];" in text) == ("mjxball_known known;" in text) == bool(own)
+    assert ("mjxball_follower_real seen[18];" in text) == ("mjxball_follower_known known;" in text) == bool(own)
+    gates = re.search(r"given\[(\d+)\], kept\[(\d+)\], next\[(\d+)\], joined\[(\d+)\];", text)
+    assert (gates is None) == (units == 0)
+    own += sum(map(int, gates.groups())) if gates else 0
     assert 4 * (size + 2 * widest + own) == cost.stack
     assert f"{cost.stack} bytes of arrays on the stack" in text
     assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
@@ -247,18 +250,18 @@ def test_only_a_pair_pays_for_filters_of_its_own_about_roll():
     own, other = (c_header(made, "follower").splitlines() for made in of_three)
     found = [pair for pair in zip(own, other, strict=True) if pair[0] != pair[1]]
     assert [line.rpartition(" ")[0] for pair in found for line in pair] == [
-        *["#define MJXBALL_RIG_COS"] * 2,
-        *["#define MJXBALL_RIG_SIN"] * 2,
+        *["#define MJXBALL_FOLLOWER_RIG_COS"] * 2,
+        *["#define MJXBALL_FOLLOWER_RIG_SIN"] * 2,
     ]
     pairs = [in_team(made, "pair", Path("pair"), None) for made in (more, less)]
     texts, costs = [c_header(made, "follower") for made in pairs], [footprint(made) for made in pairs]
     assert costs[0].flash - costs[1].flash == 4 * (5 * 2 + 3 + 1) * law_of(more.card).lqg.models
     assert ["pair_roll" in text for text in texts] == [True, False]
     assert not any("nanf" in text for text in texts)  # what a law lacks
-    assert "#define MJXBALL_ROLL_ROOM 1.0e+00f\n" in texts[1]
+    assert "#define MJXBALL_FOLLOWER_ROLL_ROOM 1.0e+00f\n" in texts[1]
     for text in (*texts, c_header(of_three[1], "follower")):
-        assert "#define MJXBALL_RIG_COS 1.0e+00f\n#define MJXBALL_RIG_SIN" in text
-        assert re.search(r"#define MJXBALL_RIG_SIN -?0\.0e\+00f\n", text)
+        assert "#define MJXBALL_FOLLOWER_RIG_COS 1.0e+00f\n#define MJXBALL_FOLLOWER_RIG_SIN" in text
+        assert re.search(r"#define MJXBALL_FOLLOWER_RIG_SIN -?0\.0e\+00f\n", text)
 
 
 @pytest.mark.parametrize(("share", "weight", "room"), [(2.0, 1.0, "1.3e+01f"), (1.75, 0.5, "7.0e+00f")])
@@ -268,11 +271,13 @@ def test_a_pairs_header_has_its_numbers_about_roll(share: float, weight: float, 
     pair.card["team"]["context"][0] = share
     text, lqg = c_header(pair, "follower"), pair.card["lqg"]
     for own, every in (("roll_gain", "axis_gain"), ("roll_certainty", "certainty"), ("roll_prior", "prior")):
-        numbers = re.search(rf"mjxball_lqg_pair_{own}\[\d+\] = {{([^}}]*)}}", text)[1].replace("f", "").split(",")
+        numbers = (
+            re.search(rf"mjxball_follower_lqg_pair_{own}\[\d+\] = {{([^}}]*)}}", text)[1].replace("f", "").split(",")
+        )
         wanted = weight * np.ravel(lqg[f"pair_{own}"]) + (1.0 - weight) * np.ravel(lqg[every])
         np.testing.assert_allclose([float(number) for number in numbers], wanted, rtol=1e-6)
-        assert f"#define MJXBALL_{own.upper()} mjxball_lqg_pair_{own}\n" in text
-    assert f"#define MJXBALL_ROLL_ROOM {room}\n" in text
+        assert f"#define MJXBALL_FOLLOWER_{own.upper()} mjxball_follower_lqg_pair_{own}\n" in text
+    assert f"#define MJXBALL_FOLLOWER_ROLL_ROOM {room}\n" in text
 
 
 def test_a_header_has_the_factors_of_its_teams_size():
@@ -285,7 +290,7 @@ def test_a_header_has_the_factors_of_its_teams_size():
         found = {
             name: [
                 float(number.rstrip("f"))
-                for number in re.search(rf"mjxball_lqg_{name}\[\d+\] = {{([^}}]*)}}", text)[1].split(",")
+                for number in re.search(rf"mjxball_follower_lqg_{name}\[\d+\] = {{([^}}]*)}}", text)[1].split(",")
             ]
             for name in ("tilts", "small")
         }

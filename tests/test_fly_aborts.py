@@ -172,8 +172,8 @@ def test_a_drone_that_hears_nothing_but_is_heard_is_found_by_what_it_acts_on() -
     silence_up(world, 1)
     began = world.now
     world.fly_until(State.HOLD)
-    # Its echo is too old after 0.3 s, and four packets of 50 ms must miss it; its own motors stop after 2 s.
-    assert world.now - began < 0.6
+    # Four packets of 50 ms must show a thrust that stands still and was not sent for 0.1 s; its motors stop after 2 s.
+    assert world.now - began < 0.35
     assert world.flight.supervisor.cause.event is Event.UNHEARD
     world.fly_until(State.STOP)
     assert world.now - began == pytest.approx(2.0, abs=0.1)

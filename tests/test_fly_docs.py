@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import sys
 
+import pytest
 from command_line import REPOSITORY
 
 from mjxball.fly.supervisor import State
 
 DOCS = REPOSITORY / "docs"
-SUPERVISOR, MEASURED = ((DOCS / name).read_text(encoding="utf-8") for name in ("supervisor.md", "archive/flying.md"))
+SUPERVISOR = (DOCS / "supervisor.md").read_text(encoding="utf-8")
+sys.path.append(str(DOCS / "_site"))
+import flight_tables  # noqa: E402
 
 
 def test_every_state_is_explained() -> None:
@@ -17,14 +22,26 @@ def test_every_state_is_explained() -> None:
 
 
 def test_faults_are_those_that_were_measured() -> None:
-    """Of each fault the flight with the harder touchdown."""
-    found = json.loads((REPOSITORY / "benchmarks" / "results" / "fly_firmware.json").read_text())["faults"]
-    names = dict.fromkeys(one["fault"] for one in found)
-    worst = {name: max((one for one in found if one["fault"] == name), key=lambda one: one["speed"]) for name in names}
-    section = MEASURED.split("## Faults on the twin")[1].split("\n## ")[0]
-    expected = {
-        name: (", ".join(f"{off:.2f}" for off in one["off"]), f"{one['speed']:.2f}", f"{one['tilt']:.0f}°")
-        for name, one in worst.items()
-    }
-    rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line.startswith("| ")]
-    assert {row[0]: (row[2], row[3], row[4]) for row in rows if row[0] in worst} == expected
+    """The page's table has a row for each fault of the benchmark, with the harder touchdown of its flights."""
+    found = json.loads(flight_tables.FAULTS.read_text(encoding="utf-8"))["faults"]
+    listed = ast.parse((REPOSITORY / "benchmarks" / "fly_faults_virtual.py").read_text(encoding="utf-8"))
+    tables = {node.target.id: node.value for node in listed.body if isinstance(node, ast.AnnAssign)}
+    names = {key.value for key in tables["FAULTS"].keys if key is not None}
+    assert {row["fault"] for row in found} == names
+    assert all(row["stopped"] for row in found)
+    lines = flight_tables.faults().splitlines()[2:]
+    assert len(lines) == len(names)
+    for line in lines:
+        cells = line.strip("| ").split(" | ")
+        own = [row for row in found if cells[0].startswith(f"{row['fault']} (")]
+        assert float(cells[3].removesuffix(" m/s")) == pytest.approx(max(row["speed"] for row in own), abs=0.005)
+
+
+def test_every_flight_in_a_row_was_good() -> None:
+    """30 of each policy, ten of them after a reboot of one drone."""
+    flown = json.loads((REPOSITORY / "benchmarks" / "results" / "fly_firmware.json").read_text())["flights"]
+    for policy in ("flight", "stand"):
+        own = [row for row in flown if row["policy"] == policy]
+        assert [row["flight"] for row in own] == list(range(1, 31))
+        assert sum(bool(row["reboots"]) for row in own) == 10
+        assert all(row["code"] == 0 and row["touchdown"] < 0.5 for row in own)

@@ -106,8 +106,9 @@ def test_a_battery_that_gives_way_at_once_lets_the_pair_fall_level(drones: tuple
     assert next(moment for moment in track if moment.state == "descend").time - began < 0.1
     left = min(lift(moment.battery) for moment in track)
     assert 0.75 < left < 0.95
-    # 10 % more for the motors' lag, and for what the weaker drone spends on its attitude.
-    assert world.touchdown_speed() < 1.1 * math.sqrt(2 * G * (1 - left) * HEIGHT) + 0.1
+    # A fall under what is left; a weak drone alone spends a tenth of its thrust on its attitude.
+    left -= 0.1 if len(drones) == 1 else 0.02
+    assert world.touchdown_speed() < 1.1 * math.sqrt(2 * G * (1 - left) * HEIGHT)
     assert max(moment.tilt for moment in track) < math.radians(10)
 
 

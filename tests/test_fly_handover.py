@@ -11,7 +11,7 @@ import pytest
 from command_line import TRANSPORT
 from fly_virtual import VirtualTwin
 
-from mjxball.fly.handover import AWAY, BLEND, Handover, difference
+from mjxball.fly.handover import AWAY, BLEND, LEAST, SETTLING, Handover, HandoverMonitor, difference
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
 from mjxball.policy import Policy, PolicyFile, load_file
@@ -143,3 +143,18 @@ def test_in_flight(trained: Any) -> None:
     assert same.flight.supervisor.state is State.DONE
     assert set(same.flight.succession.figures) <= {"first policy", "second policy"}
     assert world.flight.succession.figures == {}
+
+
+def test_figures_are_of_two_seconds_at_least_and_show_the_motors(flown: PolicyFile) -> None:
+    """Motors that give 8 % more and 8 % less are sent 7 % less and 9 % more; what is settling counts for nothing."""
+    monitor = HandoverMonitor(Handover(Policy(flown, "first")), None, lambda *given, **fields: None)
+    for tick in range(round(100 * (SETTLING + LEAST)) + 10):
+        settled = tick >= 100 * SETTLING
+        shares = (1 / 1.08, 1 / 0.92) if settled else (0.5, 0.5)
+        monitor.update(10 + tick / 100, tick / 100, 0.02 if settled else 1.0, 0.01, shares)
+        if tick < 100 * (SETTLING + LEAST) - 1:
+            assert monitor.figures == {}
+    (figures,) = monitor.figures.values()
+    assert figures.error_rms == pytest.approx(0.02)
+    np.testing.assert_allclose(figures.thrust, shares)
+    assert "thrust -7 / +9 %" in str(figures)

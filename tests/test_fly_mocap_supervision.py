@@ -72,7 +72,7 @@ STANDING: list[tuple[str, Callable[[int], Frame], str]] = [
     ("1.2 times", lambda n: frame(n, tuple(tuple(1.2 * x for x in place) for place in PLACES)), "is the scale 1.20"),
     (
         "a height that stands still",
-        lambda n: tuple(with_z_of(p, q) for p, q in zip(frame(n), frame(0))),
+        lambda n: tuple(with_z_of(p, q) for p, q in zip(frame(n), frame(0), strict=True)),
         "its z stands",
     ),
     # The right angle of a body defined with its x axis to the left, and a world with y up.
@@ -129,7 +129,7 @@ FLYING: list[tuple[str, Callable[[int, Frame], Frame], int, float | None, str]] 
     ),
     ("takes the leader's pose", lambda n, f: (f[0], f[0]), 0, LIMITS.lost, "0.30 m from where the drone believes"),
     # One coordinate is not sent from 0.2 s on, and the age of the last pose that was counts from there.
-    ("z stands still", lambda n, f: (f[0], with_z_of(f[1], HELD)), 19, 0.2 + LIMITS.lost, "its z stands still"),
+    ("z stands still", lambda n, f: (f[0], with_z_of(f[1], HELD)), 20, 0.2 + LIMITS.lost, "its z stands still"),
     ("every second one repeated", lambda n, f: frame(n - n % 2), 30, None, ""),
     # 1 m/s sideways while the leader and both estimates stand: sent until the rig's line is 10 cm wrong.
     ("creeps away", lambda n, f: (f[0], moved(f[1], 0.01 * (n - 99))), 10, 0.1 + LIMITS.lost, "believes to be"),

@@ -2,19 +2,32 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from tables import rows
 
+from mjxball.control import rotations
 from mjxball.fly.command import CommandMap, Variant
 from mjxball.fly.connection import READ, Deadlines, Element, Identity, LinkError, Parameters, connect
-from mjxball.fly.packets import Health, Packet
-from mjxball.fly.preflight import Preflight, check_kind, prepare, reset_estimator
-from mjxball.fly.telemetry import HealthSample
+from mjxball.fly.limits import Limits
+from mjxball.fly.packets import DroneState, Health, Packet, Sensed
+from mjxball.fly.preflight import (
+    Preflight,
+    check_kind,
+    gravity_checks,
+    heading_check,
+    prepare,
+    reset_estimator,
+    stick_check,
+)
+from mjxball.fly.telemetry import HealthSample, Rig, SensedSample
 
 KALMAN, COMPLEMENTARY = 2.0, 1.0
 ASKED = Preflight(reset=0.0, converge=1.0)
@@ -130,3 +143,46 @@ def test_tables_of_contents_are_cached_below_the_users_cache(tmp_path: Path, mon
         connect("radio://0/80/2M", "leader", Deadlines(), print, print, print)
     assert caches == [str(tmp_path / "mjxball" / "crazyflie")]
     assert Path(caches[0]).is_dir()
+
+
+RIG = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
+
+
+def standing(number: int, scale: float = 1.0, roll: float = 0.0, yaw: float = 0.0) -> DroneState:
+    """A drone of the pair at its mount, with attitude angles in degrees."""
+    quaternion = rotations.quaternion_from_euler(np.radians([roll, 0.0, yaw]))
+    return DroneState(scale * RIG.mounts[number], np.zeros(3), quaternion, np.zeros(3), 0, 4.0)
+
+
+@rows("scale, passed", [(1.0, True), (1.08, True), (1.2, False), (0.85, False)])
+def test_two_drones_that_stand_are_as_far_apart_as_their_stick_is_long(scale: float, passed: bool) -> None:
+    found = stick_check([standing(number, scale) for number in range(2)], RIG, Limits(), Preflight())
+    assert found.passed is passed
+    assert f"{0.3 * scale:.3f} m long, 0.300 m needed" in found.found
+
+
+@rows("yaw, passed, text", [(0.0, True, "+0.0"), (5.0, True, "+5.0 degrees"), (-12.0, False, "-12.0 degrees")])
+def test_the_yaw_between_both_is_told_with_what_it_costs(yaw: float, passed: bool, text: str) -> None:
+    found = heading_check([standing(0, yaw=yaw), standing(1)], Preflight())
+    assert found.passed is passed
+    assert text in found.found
+    assert "6 mm" in found.found
+
+
+@rows(
+    "roll, force, passed",
+    [
+        (0.0, (0.0, 0.0, 9.81), True),
+        (7.0, (0.0, 9.81 * math.sin(math.radians(7)), 9.81 * math.cos(math.radians(7))), True),  # it does stand so
+        (7.0, (0.0, 0.0, 9.81), False),  # a body that was defined while it stood oblique
+        (0.0, (0.0, 9.81, 0.0), False),
+        (0.0, (0.0, 0.0, -9.81), False),
+        (0.0, (0.0, 0.0, 6.0), False),
+    ],
+)
+def test_gravity_is_felt_where_the_attitude_says(roll: float, force: tuple[float, ...], passed: bool) -> None:
+    sensed = SensedSample(Sensed(force, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), 0)
+    link = SimpleNamespace(name="leader", telemetry=SimpleNamespace(sensed=sensed))
+    assert [one.passed for one in gravity_checks(link, standing(0, roll=roll), Preflight())] == [passed]
+    link.telemetry.sensed = None
+    assert gravity_checks(link, standing(0), Preflight()) == []

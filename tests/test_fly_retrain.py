@@ -215,3 +215,22 @@ def test_a_card_says_what_it_was_retrained_for(tmp_path: Path) -> None:
     contents: PolicyFile = with_origin(load_file(FLIGHT), load, {"steps": 3})
     save_file(tmp_path / "new.npz", contents)
     assert load_file(tmp_path / "new.npz").card["retrained"] == {"mass": 0.004, "offset": 0.05, "steps": 3}
+
+
+def test_without_standard_input_it_says_so(tmp_path: Path) -> None:
+    """Whose end ends it: closed, or ended before it began."""
+    for closed in ("<&-", "</dev/null"):
+        command = f'exec "$@" {closed}'
+        words = [sys.executable, "-m", "mjxball.rig.retrain", str(FLIGHT), "log.jsonl", str(tmp_path / "out.npz")]
+        done = subprocess.run(
+            ["bash", "-c", command, "_", *words],
+            cwd=REPOSITORY,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert done.returncode == 2, closed
+        assert done.stderr.count("\n") == 1
+        assert "standard input" in done.stderr

@@ -8,6 +8,8 @@ import itertools
 import json
 import os
 import random
+import shutil
+import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
@@ -18,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
-from command_line import REPOSITORY, TRANSPORT
+from command_line import REPOSITORY, TRANSPORT, environment
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -238,6 +240,47 @@ class TestCheckpoints:
         with contextlib.suppress(InputError), contextlib.closing(Checkpoints(run)) as checkpoints:
             return checkpoints.restore(self.state, lambda text: None, discard=False)
         return None
+
+    def test_one_that_cannot_be_written_is_a_sentence(self, tmp_path: Path) -> None:
+        """Orbax writes in the background; what went wrong there is told when all is to be on disk."""
+        checkpoints = Checkpoints(tmp_path / "run")
+        shutil.rmtree(tmp_path / "run")
+        (tmp_path / "run").touch()  # no directory can be made there
+        with pytest.raises(InputError, match="checkpoints cannot be written"), contextlib.closing(checkpoints):
+            checkpoints.save(self.state)
+
+    def test_reading_leaves_the_one_that_is_being_written(self, written: Path) -> None:
+        """Another process writes it: whoever exports a run that is trained must not clean up."""
+        unfinished = written / "checkpoints" / "9.orbax-checkpoint-tmp"
+        unfinished.mkdir()
+        (unfinished / "part").write_bytes(b"part")
+        with contextlib.closing(Checkpoints(written, reading=True)) as checkpoints:
+            self.assert_whole(checkpoints.restore(self.state, lambda text: None, discard=False))
+        assert (unfinished / "part").read_bytes() == b"part"
+
+    def test_a_damaged_one_is_one_warning_and_no_traceback(self, tmp_path: Path, written: Path) -> None:
+        """TensorStore's threads answer reads after the first failure has ended them; that is nobody's business."""
+        script = f"""
+import contextlib, shutil, sys
+from pathlib import Path
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from test_fuzz import TestCheckpoints
+from mjxball.train.checkpoint import Checkpoints
+run = Path({str(written)!r})
+files = [path.relative_to(run) for path in run.rglob("*") if path.is_file()]
+for name in files:
+    shutil.copytree(run, run.with_name("other"))
+    (run.with_name("other") / name).unlink()
+    with contextlib.suppress(Exception), contextlib.closing(Checkpoints(run.with_name("other"))) as checkpoints:
+        checkpoints.restore(TestCheckpoints.state, print, discard=False)
+    shutil.rmtree(run.with_name("other"))
+"""
+        done = subprocess.run(
+            [sys.executable, "-c", script], env=environment(), capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        assert "cannot be read" in done.stdout
 
     def assert_whole(self, found: State) -> None:
         for mine, other in zip(self.state, found, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import sys
@@ -13,6 +14,7 @@ import pytest
 from command_line import REPOSITORY, call
 from tables import rows
 
+from mjxball.baselines import make_baseline
 from mjxball.cli import plant_setup
 from mjxball.commands import evaluate
 from mjxball.config import preset
@@ -20,6 +22,7 @@ from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.policies import beyond_card, load_policy
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policies, shipped_policy
+from mjxball.sim.scenario import Scenario
 from mjxball.view import command as view
 
 CARD = {"flown": {"drones": [2, 3], "seconds": 60}}
@@ -82,36 +85,31 @@ def horizon() -> ModuleType:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", shipped_policies(), ids=lambda path: path.stem)
-def test_ten_minutes_are_as_good_as_one(path: Path, horizon: ModuleType) -> None:
-    """On every plant of its card, as long as its card says; the load at rest, and moving slowly and quickly."""
+def test_ten_minutes_of_every_policy(path: Path, horizon: ModuleType) -> None:
+    """Its load at rest, and moving slowly and quickly: nothing is lost, and what its card is good for stays steady."""
     flown = Policy.load(path).card["flown"]
     plants = [setup for _, setup in horizon.own_plants(path) if setup.plant.count in flown["drones"]]
-    assert plants
-    largest = max(plants, key=lambda setup: setup.plant.count)
-    for setup in plants if path == UNIVERSAL else [largest]:
-        batch = Batch(setup, load_policy(path, setup))
-        early, late = (batch.fly(horizon.own_scenarios(setup, t)) for t in (horizon.MINUTE, flown["seconds"]))
-        for first, whole in zip(early, late, strict=True):
-            assert horizon.is_steady(whole, first), (setup.preset, setup.plant.count, first, whole)
+    setup = max(plants, key=lambda one: one.plant.count)
+    batch = Batch(setup, load_policy(path, setup))
+    early, late = (batch.fly(horizon.own_scenarios(setup, seconds)) for seconds in (horizon.MINUTE, horizon.TEN))
+    good = late if flown["seconds"] >= horizon.TEN else early
+    for first, last, held in zip(early, late, good, strict=True):
+        assert not last.failed
+        assert horizon.is_steady(held, first), (first, held)
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="universal drifts apart: the followers' integrals pull against each other")
-@pytest.mark.parametrize("plant", ["team3", "team4", "team6"])
-def test_universal_holds_a_team_for_ten_minutes(plant: str, horizon: ModuleType) -> None:
-    """The flights that its card warns of: 23, 139 and 1081 mm high at 1 rad/s, a rotor at its limit 39 to 100 %."""
+@pytest.mark.xfail(strict=True, reason="universal drifts apart: its followers pull against each other")
+@pytest.mark.parametrize("plant", ["team4", "team6"])
+def test_universal_holds_larger_teams_for_ten_minutes(plant: str, horizon: ModuleType) -> None:
+    """Its card warns of these: 139 and 1081 mm off in height, a rotor at its limit 87 and 100 % of the time."""
     setup = plant_setup(Path(plant))
     batch = Batch(setup, load_policy(UNIVERSAL, setup))
-    early, late = (batch.fly(horizon.own_scenarios(setup, seconds)[-1:]) for seconds in (60.0, 600.0))
+    early, late = (batch.fly(horizon.own_scenarios(setup, seconds)[-1:]) for seconds in (horizon.MINUTE, horizon.TEN))
     assert horizon.is_steady(late[0], early[0])
 
 
 def test_a_flight_that_grows_or_saturates_is_not_steady(horizon: ModuleType) -> None:
-    import dataclasses
-
-    from mjxball.baselines import make_baseline
-    from mjxball.sim.scenario import Scenario
-
     config = preset("paper")
     found = Batch(config, make_baseline("lqg", config)).fly([Scenario(seconds=22.0)])[0]
     assert horizon.is_steady(found, found)

@@ -23,7 +23,7 @@ def trained_on(policy: PolicyFile, seed: int, **changes: object) -> PolicyFile:
         tuple((array + 0.1 * random.standard_normal(array.shape)).astype(np.float32) for array in arrays)
         for arrays in (policy.weights, policy.biases)
     )
-    card = {**policy.card, "seed": seed, "curve": {"steps": [seed]}}
+    card = {**policy.card, "seed": seed, "curve": {"steps": [seed]}, "population": {"seed": [seed]}}
     return dataclasses.replace(policy, weights=weights, biases=biases, card=card, **changes)
 
 
@@ -42,7 +42,7 @@ def test_weights_and_biases_are_means(start: PolicyFile) -> None:
             np.testing.assert_allclose(array, wanted, rtol=1e-6, atol=1e-7)
     np.testing.assert_array_equal(found.observation_scale, start.observation_scale)
     assert found.card["mean_of_seeds"] == [3, 4, 9]
-    assert not {"seed", "curve"} & found.card.keys()
+    assert not {"seed", "curve", "population"} & found.card.keys()
 
 
 def test_policies_that_began_apart_have_no_mean(start: PolicyFile) -> None:

@@ -71,10 +71,11 @@ def test_the_laptop_turns_into_mount_frames_as_teams_do():
 
 
 REFUSED: tuple[tuple[str, Any], ...] = (
-    ("the mount is not set", lambda bench: bench.apps[0].set("mountY", 0.0)),
+    ("the mount is not set, or no length below 1 m", lambda bench: bench.apps[0].set("mountY", 0.0)),
     ("the goal is beyond the fence or not finite", lambda bench: bench.apps[0].set("goalZ", 9.0)),
     ("the goal is beyond the fence or not finite", lambda bench: bench.apps[0].set("goalX", float("nan"))),
     ("the policy does not fly with this force curve", lambda bench: bench.apps[0].set("curve", 2)),
+    ("the limit of the battery is not between 0 and 10 V", lambda bench: bench.apps[0].set("battery", float("nan"))),
 )
 
 
@@ -96,6 +97,7 @@ def test_an_app_refuses_to_start():
         ({"voltage": 3.1}, "the battery is low"),
         ({"position": [float("nan")] * 3}, "the state is old or not finite"),
         ({"variance": [1.0] * 3}, "the estimator's position cannot be trusted"),
+        ({"variance": [0.0] * 3}, "the estimator's position cannot be trusted"),  # it does not run
     ):
         for _ in range(3):
             bench.tick(Phase.SPIN, **wrong)
@@ -140,6 +142,17 @@ def test_one_abort_lands_both():
         bench.tick(None)
     assert bench.phases == [Phase.LAND] * 2
     assert "the laptop is not heard" in (bench.cause(0), bench.cause(1))
+
+
+@needs_gcc
+def test_nobody_lands_who_has_not_flown():
+    """An order to land stops motors that spin; on a ramp it ends in the descent, which needs no law."""
+    for periods, phase in ((3, Phase.STOP), (50, Phase.DESCEND)):
+        bench = Bench(cores_of(), Rig.of_card(policy_of("flight").card))
+        for number in range(periods):
+            bench.tick(Phase.IDLE if number == 0 else Phase.SPIN if number < 3 else Phase.RAMP)
+        bench.tick(Phase.LAND)
+        assert bench.phases == [phase] * 2
 
 
 @needs_gcc

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -25,7 +26,10 @@ needs_arm = pytest.mark.skipif(bool(cortex.missing()), reason=f"not installed: {
 
 
 INTERFACE = Path(__file__).parent / "firmware" / "interface.h"
-STRICT = ("-std=c11", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion")
+STRICT = (
+    *("-std=c11", "-Wall", "-Wextra", "-Werror"),
+    *("-Wdouble-promotion", "-Wconversion", "-Wshadow", "-pedantic"),
+)
 FIRMWARE = (  # its Kbuild's, release 2026.08: gcc's dialect has functions of its own such as finite
     *("-std=gnu11", "-Os", "-Wall", "-Wmissing-braces", "-Wdouble-promotion", "-Werror", "-Werror=implicit-int"),
     *("-fno-strict-aliasing", "-ffunction-sections", "-fdata-sections", "-fno-strict-overflow", "-fno-math-errno"),
@@ -43,8 +47,12 @@ def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsy
     (tmp_path / "include").mkdir()
     for header in set(re.findall(r'#include "(\w+\.h)"', glue)) - {"core.h"}:
         (tmp_path / "include" / header).write_text(f'#include "{INTERFACE}"\n')
-    include = ["-I", str(tmp_path / "include"), "-c"]
-    compilers = [["gcc"], *([[*cortex.ARM]] if not cortex.missing() else [])]
+    include = ["-isystem", str(tmp_path / "include"), "-c"]  # the firmware warns in its own dialect
+    compilers = [
+        ["gcc"],
+        *([["clang"]] if shutil.which("clang") else []),
+        *([[*cortex.ARM]] if not cortex.missing() else []),
+    ]
     for compiler, flags, (number, role) in itertools.product(compilers, (STRICT, FIRMWARE), enumerate(generate.ROLES)):
         kbuild = (tmp_path / "app" / role / "src/Kbuild").read_text()
         for source in ("core", "glue"):

@@ -76,6 +76,11 @@ def test_weights_are_uploaded_on_the_ground_only():
     broken = [*packets[:7], packets[7]._replace(data=packets[7].data[:-1] + b"\x55"), *packets[8:]]
     assert upload(broken) == bad
     assert follower.ident == generate.ident_of(policy, True)
+    for at, value in ((0, np.nan), (4, np.inf), (400, -3e38), (0, 2e6)):  # whole, and no numbers of a policy file
+        wild = bytearray(data)
+        wild[at : at + 4] = np.float32(value).tobytes()
+        assert upload(protocol.upload(bytes(wild), key)) == bad
+    assert follower.ident == generate.ident_of(policy, True)
     assert upload([*packets[:5], *packets[3:]]) == 0  # repeated ones do no harm
     assert follower.ident == generate.ident_of(other, True)
     bench.take_off()
@@ -83,7 +88,9 @@ def test_weights_are_uploaded_on_the_ground_only():
     new = Bench(compile_pair(other, "flight", int8=True), bench.rig)
     new.take_off()
     assert [one.thrust for one in flown] == [new.tick(Phase.FLY)[1].thrust for _ in range(3)]
-    assert upload(protocol.upload(data, key)) == CAUSES.index("weights refused: not on the ground")
+    assert upload(protocol.upload(data, key)) == CAUSES.index(
+        "refused: weights, mount and curve change on the ground only"
+    )
 
 
 class FakeLink:

@@ -22,7 +22,7 @@ from mjxball.policy.file import load_file, shipped_policy
 from mjxball.reading import check_times, parse_json
 from mjxball.train.curves import training_curve
 from mjxball.train.progress import COMMON, Progress
-from mjxball.train.run_directory import read_config, read_sweep, write_config
+from mjxball.train.run_directory import read_config, read_rows, read_sweep, write_config
 from mjxball.view.flight import Flight, load_flight, save_flight, shapes
 
 
@@ -151,6 +151,9 @@ def test_rows_of_a_run_that_do_not_follow_are_left_out_and_told(
     curve = training_curve(tmp_path, 0)
     assert (curve["steps"], curve["episode_return"]) == ([100, 200, 300], [1.0, 2.0, 3.0])
     assert "3 of 6 rows do not follow" in capsys.readouterr().err
+    (tmp_path / "other.csv").write_text("steps,seconds,steps\n1,2,3\n")
+    with pytest.raises(InputError, match="stands twice"):
+        read_rows(tmp_path / "other.csv")
     progress = Progress(path, names, 1000, resumed_at=250)
     progress.close()
     assert progress.before == 2.0

@@ -72,6 +72,8 @@ def test_error_cost_has_a_finite_gradient_at_the_goal():
         ({"steady_action": 3.0}, {"action_average": [1.0, 0.5, 0.0]}, -3.75),
         ({"tilt_disagreement": 3.0}, {"tilt_disagreement": -0.5}, -0.75),
         ({"ball": 3.0}, {"ball": [-0.5]}, -0.75),
+        ({"command_change": 3.0}, {"command_change": [1.0, -0.5, 0.0]}, -3.75),
+        ({"command_change": 3.0}, {"command_change": [0.0, 0.0, 2.0]}, -0.12),  # a hundredth for 1 (m/s2)^2
         ({"smoothness": 3.0}, {"action": [1.0, 0.5, 0.0], "last_action": [0.0, 0.5, -1.0]}, -6.0),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,

@@ -238,7 +238,8 @@ def test_log_and_arrays_tell_the_same(logs: dict[str, Path], tmp_path: Path) -> 
     assert count > 5 / 0.002
     guided = [record["t"] for record in read(path) if record["kind"] == "tick" and record["state"] == "fly"]
     used = np.flatnonzero(flown.usable)
-    assert begin < used[0] < begin + 1000  # the ramp is not used, nor what is on the ground
+    # The ramp is not used, to a tick; both laws take over off the ground.
+    assert begin - 5 <= used[0] < begin + 1000
     assert used[-1] <= begin + (guided[-1] - guided[0]) / 0.002 + 10  # nor the landing
 
 

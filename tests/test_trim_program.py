@@ -12,14 +12,17 @@ import pytest
 from plants import team
 from tables import rows
 
+from mjxball.baselines import make_baseline
 from mjxball.config import Attitude, Config, Drone, Plant, preset, replace, with_plant
 from mjxball.control.attitude import rotor_commands
 from mjxball.control.constants import trim_limit
 from mjxball.control.mixer import torque_per_force
 from mjxball.errors import InputError
+from mjxball.evaluate.batch import Batch
 from mjxball.physics.engine import total_wrench
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import Trim, largest_amplitude, largest_margin, safe_radius
+from mjxball.sim.scenario import CgPath, Scenario
 
 PAPER = Plant()
 TEAMS = {name: with_plant(preset("paper"), name).plant for name in ("team3", "team4", "team6")}
@@ -213,6 +216,20 @@ def test_a_pair_whose_roll_command_is_too_large_is_not_trimmed() -> None:
     along = largest_amplitude(IN_PLANE, 0.2, 0.15, (1.0, 0.0))
     assert along == pytest.approx(largest_amplitude(IN_PLANE.plant, 0.2, 0.15, (1.0, 0.0)))
     assert largest_margin(replace(IN_PLANE, "command.tilt_limit", 1.2), 0.2, (0.0, 0.1)).margin > 0.15
+
+
+@pytest.mark.slow
+def test_a_pair_holds_what_its_roll_commands_trim_and_loses_what_they_do_not() -> None:
+    """The load rests beside the line of a pair that `oracle`, which knows where it is, flies; 5 % below, 20 % above."""
+    wide = replace(IN_PLANE, "plant.object_size", (0.34, 0.3, 0.05))
+    most = largest_amplitude(wide, 0.2, 0.0, (0.0, 1.0))
+    assert most == pytest.approx(0.0939, abs=1e-4)
+    rest = Scenario(omega=0.0, phase=math.pi / 2, path=CgPath(direction=math.pi / 2), seconds=22.0)
+    flights = [dataclasses.replace(rest, amplitude=share * most) for share in (0.95, 1.2)]
+    held, lost = Batch(wide, make_baseline("oracle", wide)).fly(flights)
+    assert (held.failed, held.y_peak) == (False, pytest.approx(0.0, abs=1e-3))
+    assert lost.y_peak is not None
+    assert lost.y_peak > 0.5
 
 
 def test_an_unknown_mass_takes_vertical_commands() -> None:

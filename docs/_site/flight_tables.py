@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
+from typing import Any
 
-from mjxball.fly import command
+from mjxball.fly import command, lift
 from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import STAND_SPARE, Limits, Times
 from mjxball.fly.log_schema import KINDS
@@ -59,17 +62,47 @@ def bounds() -> str:
         "tilt of the stick by both positions": f"{math.degrees(limits.stick_tilt):.0f} degrees",
         "length of the stick by both positions": f"±{100 * limits.stick_error:.0f} cm",
         "battery": f"{limits.battery:g} V for {limits.battery_time:g} s",
+        "battery in hover": f"{lift.RESERVE:g} V above that at which full power just carries, at the end of a landing",
         "thrust at its bound": f"{limits.saturation_time:g} s",
         "missed deadlines in a second": f"{limits.missed_deadlines}",
         "gap between two ticks": f"{1000 * limits.longest_gap:.0f} ms",
         "height above the goal, on a stand": f"{100 * STAND_SPARE:.0f} cm",
         "sent roll and pitch": f"±{math.degrees(law.tilt_limit):.0f} degrees",
         "sent thrust": f"{THRUST_FLOOR} .. {THRUST_CEILING} units",
-        "ramp to hover": f"{times.ramp:g} s",
+        "ramp to hover": f"{times.ramp:g} s, and at most {times.lift:g} s more until the pair is off the ground",
         "landing speed of the goal": f"{times.land_speed:g} m/s",
         "descent": f"{times.descend_speed:g} m/s for at most {times.descend_limit:g} s",
         "*hold* ends after the last word of a drone by": f"{times.drone_watchdog:g} s",
-        "thrust in *hold* below hover": f"up to {100 * command.GENTLE / command.GRAVITY:.0f} %",
+        "thrust in *hold* below hover": f"up to {100 * command.UNEVEN / command.GRAVITY:.0f} %, "
+        f"{100 * command.GENTLE / command.GRAVITY:.0f} % where neither drone is heard",
         "no good pose of a drone (motion capture)": f"{MocapLimits().lost:g} s",
     }
     return "\n".join(["| bound | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+
+
+FAULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "fly_faults_virtual.json"
+TURNED = 90  # [degrees] of tilt, from which on the pair lies on its back
+
+
+def faults() -> str:
+    """What `benchmarks/fly_faults_virtual.py` found: of each fault the flight with the harder touchdown."""
+    rows = json.loads(FAULTS.read_text(encoding="utf-8"))["faults"]
+    lines = ["| fault | then | motors off [s] | touchdown | tilt | drift |", "|---|---|---|---|---|---|"]
+    for name in dict.fromkeys(row["fault"] for row in rows):
+        worst = max((row for row in rows if row["fault"] == name), key=lambda row: row["speed"])
+        off = ", ".join(f"{value:.2f}" for value in worst["off"])
+        numbers = f"{worst['speed']:.2f} m/s | {worst['tilt']:.0f}° | {worst['drift']:.2f} m"
+        lines.append(f"| {name} ({worst['drone']}) | {reaction(worst)} | {off} | {numbers} |")
+    return "\n".join(lines)
+
+
+def reaction(row: dict[str, Any]) -> str:
+    """What the supervisor did, in words."""
+    states = [state for state in row["way"] if state not in ("done", "stop")]
+    if not row["cause"] and states[-1:] == ["land"]:
+        asked = "as asked" in row["told"][0]
+        text = "lands as asked" if asked else "hold, flies on" if "hold" in states else "flies on"
+    else:
+        text = ", ".join(dict.fromkeys(states)) or "stop"
+    stopped = f" ({row['cause'].lower().replace('_', ' ')})" if row["cause"] else ""
+    return text + stopped + ("; **turns over**" if row["tilt"] > TURNED else "")

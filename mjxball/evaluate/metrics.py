@@ -95,7 +95,8 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
     no_peaks = xp.concat([none, none[:, :1]], axis=-1)
     scalar = xp.sum(zero[:0])
     return RunningMetrics(
-        *(scalar, scalar, scalar, *[zero] * 9, zero > 1),
+        *(scalar, scalar, scalar, zero, zero, zero, zero, zero, zero, zero, zero, zero),
+        zero > 1,
         initial=_norm(target - position),
         leg=zero,
         steady_from=zero + STEADY_AFTER,

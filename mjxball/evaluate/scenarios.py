@@ -55,11 +55,12 @@ def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
 def rig_line(settings: Config) -> str:
     """What a user should see of a rig before its results: mass, thrust over weight, trim."""
     plant, margin = settings.plant, settings.scenario.trim_margin
-    offset = largest_amplitude(plant, plant.object_mass, margin)
+    offset = largest_amplitude(settings, plant.object_mass, margin)
     trimmed = f"CG trimmed up to {offset:.3g} m" if offset >= 0 else "CG not trimmed even at O"
     return (
         f"rig: {plant.count} drones, {total_mass(plant):.4g} kg with an object of {plant.object_mass:g} kg, "
-        f"thrust over weight {thrust_over_weight(plant):.3g}, {trimmed} with {margin:.0%} of the rotors' range left"
+        f"thrust over weight {thrust_over_weight(plant):.3g}, {trimmed} with {margin:.0%} of what rotors and commands "
+        "reach left"
     )
 
 

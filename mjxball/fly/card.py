@@ -1,14 +1,16 @@
-"""What a policy's card says about how it is flown: configuration, gains, command maps, goal; and its two laws. Pure."""
+"""What a policy's card says about how it is flown: configuration, gains, command maps, goal; and its two laws."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from mjxball import config as configs
+from mjxball.cli import plant_setup
 from mjxball.config import Config
 from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import PairGains
@@ -17,13 +19,21 @@ from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, Force
 from mjxball.fly.handover import Handover
 from mjxball.fly.limits import Limits, Times
 from mjxball.fly.telemetry import Rig
-from mjxball.policy import Policy
+from mjxball.policy import Policy, PolicyFile, load_file, team
 from mjxball.sim.laws import Body, Laws
 
 GOAL = (0.0, 0.0, 0.4)  # of O, from where it stands at the start [m]
 STAND_GOAL = (0.0, 0.0, 0.08)  # the stand's: level at the paper's p_l^d [m]
 LOW_BATTERY = {"brushless": 3.35}  # [V], where it is not that of `Limits`
 UNKNOWN_MASS = 0.07  # of all that flies, where the card's plant is not a pair of Crazyflies [kg]
+
+
+def load_policy(path: Path) -> PolicyFile:
+    """The policy in the file `path`, one for any rig told that it flies two Crazyflies. Raises PolicyFileError."""
+    contents = load_file(path)
+    if not team.is_for_any(contents.card):
+        return contents
+    return team.in_team(contents, path.stem, plant_setup(team.CRAZYFLIES))
 
 
 def config_of(card: Mapping[str, Any]) -> Config:

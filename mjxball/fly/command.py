@@ -26,6 +26,7 @@ GRAVITY = 9.81
 BRAKE_TILT = math.radians(8)  # of a descent that brakes sideways
 BLIND_SPEED = 0.5  # [m/s] at which a blind descent sinks
 BLIND_LIMIT = 2.5  # [s] that it lasts at most
+MOST_TRIM = 1.15  # of what should hover, in any thrust that is taken for the one that does
 BRISK, GENTLE = 3.0, 0.7  # [m/s2] downward at most: where both drones hear, and where one may not
 UNEVEN = 1.5  # [m/s2] likewise of the one that hears, measured: the stick bears the moment of so much less thrust
 STAND_BY = 0.4  # [s] before the firmware stops a drone by which the pair is to stand
@@ -157,7 +158,7 @@ def smoothed(trim: float, thrust: float, period: float, hover: float) -> float:
     A climb that has just begun must not pass for hovering: the bound keeps what is flown blind near the truth.
     """
     moved = trim - math.expm1(-period) * (thrust - trim)
-    return min(max(moved, 0.85 * hover), 1.15 * hover)
+    return min(max(moved, 0.85 * hover), MOST_TRIM * hover)
 
 
 class LastKnownState(NamedTuple):

@@ -20,6 +20,7 @@ from mjxball.fly.monitor import Monitor, Sustained, UplinkWatch, link_faults, ti
 from mjxball.fly.packets import ZERO, PacketError, Setpoint
 from mjxball.fly.preflight import SpinCheck
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State, Supervisor
+from mjxball.fly.takeoff import TakeOff
 from mjxball.fly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
 from mjxball.fly.watchdog import Watchdog
 
@@ -68,6 +69,7 @@ class Flight:
         self._shares = [1.0]  # of the trims, tick by tick, where the height is not measured
         self._land_height = 0.0
         self._highest_place = 0.0  # of O above where it stood, under the laws [m]
+        self._take_off = TakeOff(rig, settings.times, settings.period, self._lifts_at, settings.stand)
 
     @property
     def maps(self) -> tuple[CommandMap, CommandMap]:
@@ -181,6 +183,11 @@ class Flight:
             return self.elapsed >= len(self._shares) * self.settings.period + times.settled
         return self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
 
+    def _is_off(self) -> bool:
+        """True once the legs carry nothing, so that the laws may take over."""
+        seen = self._trusted()
+        return self.settings.dry_run or (seen is not None and self._height(seen) >= self._lifts_at)
+
     # What the laws want.
 
     def _command(self) -> tuple[list[Mapped] | None, list[Fault]]:
@@ -237,7 +244,7 @@ class Flight:
         resumes = heard and self.supervisor.may_resume and not (hindered or self._stands())
         reached = {
             Event.ARMED: state is State.ARM and elapsed >= times.arm and armed,
-            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp,
+            Event.HOVERING: state is State.RAMP and elapsed >= times.ramp and self._is_off(),
             Event.TIME_UP: state is State.FLY and elapsed >= self.settings.seconds,
             Event.TOUCHED_DOWN: state in (State.LAND, State.DESCEND) and elapsed >= times.settled and self._stands(),
             Event.RESUMED: state is State.HOLD and self._back.update(resumes, self._now),
@@ -250,7 +257,9 @@ class Flight:
             known = [Fault(Event.CURVE_KNOWN, "dry run")] if dry else None
             events += known or self.spin.update(self.supervisor.since + times.spin / 2, self._now, self.note)
         if elapsed >= self._limit(state):
-            events.append(Fault(Event.TIMEOUT, f"{state.value} lasted {elapsed:.1f} s"))
+            stuck = state is State.RAMP and not self._is_off()
+            text = self._take_off.stuck(self.maps) if stuck else f"{state.value} lasted {elapsed:.1f} s"
+            events.append(Fault(Event.TIMEOUT, text))
         return events
 
     def _limit(self, state: State) -> float:
@@ -298,7 +307,8 @@ class Flight:
         if state is State.SPIN:
             return [command.level(SPIN_THRUST)] * 2
         if state is State.RAMP:
-            return [command.ramp(self.elapsed, self.settings.times, constants) for constants in self.maps]
+            rising = self._object()
+            return self._take_off.wanted(self.elapsed, rising, self._height(rising), self.maps)
         if state not in (State.DESCEND, State.HOLD):
             return [ZERO, ZERO]
         # Both drones alike: braking sideways by what is measured; sinking by it in DESCEND, else by the clock.
@@ -317,7 +327,8 @@ class Flight:
     def _transmit(self, wanted: list[Setpoint]) -> None:
         state, dry = self.supervisor.state, self.settings.dry_run
         if state is State.RAMP:
-            self._trims = [float(value.thrust) for value in wanted]
+            rises = zip(wanted, self.maps, strict=True)
+            self._trims = [min(float(s.thrust), command.MOST_TRIM * c.hover_thrust) for s, c in rises]
         elif state in GUIDED:
             parts = zip(self._trims, wanted, self.maps, strict=True)
             period = self.settings.period

@@ -57,6 +57,7 @@ class Times:
     spin: float = 0.3  # at a third of hover before the motors are checked [s]
     spin_limit: float = 4.0  # [s]: gains may have to be written
     ramp: float = 1.5  # thrust from nothing to hover [s]
+    lift: float = 4.0  # more, until the pair is off the ground [s]
     land_speed: float = 0.25  # at which the goal sinks [m/s]
     land_spare: float = 6.0  # beyond the time the goal takes to the ground [s]
     descend_speed: float = 0.4  # [m/s]
@@ -74,7 +75,7 @@ class Times:
         return {
             State.ARM: self.arm_limit,
             State.SPIN: self.spin_limit,
-            State.RAMP: self.ramp + 1.0,
+            State.RAMP: self.ramp + self.lift,
             State.DESCEND: self.descend_limit,
             State.STOP: self.stop_limit,
             State.KILL: self.stop,

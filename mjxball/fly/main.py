@@ -27,6 +27,7 @@ from mjxball.fly.card import (
     goal_of,
     is_crazyflie,
     limits_of,
+    load_policy,
     motor_of,
     times_of,
     variants,
@@ -41,7 +42,7 @@ from mjxball.fly.retrain import Retrainer
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
-from mjxball.policy import Policy, load_file
+from mjxball.policy import Policy
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.reading import parse_json
 
@@ -206,10 +207,15 @@ def check_twin_options(options: argparse.Namespace) -> None:
         read_fault(fault)
 
 
-def check_loaded(config: Config, retrains: bool) -> None:
-    """Raise InputError if the twin of `config` cannot be loaded in flight, or its policy not be retrained there."""
+def check_loaded(config: Config, retrains: bool, of_any: bool = False) -> None:
+    """Raise InputError if the twin of `config` cannot be loaded in flight, or its policy not be retrained there.
+
+    `of_any`: the policy is for any rig.
+    """
     if not is_crazyflie(config):
         raise InputError("--twin-load is for policies that were trained on Crazyflies, such as flight")
+    if retrains and of_any:
+        raise InputError("--retrain is for policies of one rig, such as flight, and this one is for any")
     if retrains and (config.plant.stand != "free" or config.plant.cg_axis != "y" or config.motion.kind != "sine"):
         raise InputError("--retrain is for pairs in free flight along y whose CG follows a sine, such as flight")
 
@@ -234,7 +240,7 @@ def on_board(
     """The flight for --onboard. Raises InputError for a policy that cannot fly there."""
     if options.thrust or options.hover or options.mass:
         raise InputError("--onboard flies the thrust law in the app: leave --thrust, --hover and --mass out")
-    policy, name = load_file(options.policy), options.policy.stem
+    policy, name = load_policy(options.policy), options.policy.stem
     generate.check_policy(policy, name)
     idents = [generate.ident_of(policy, int8) for int8 in (False, True)]
     weights = (weight_bytes(policy), generate.key_of(policy)) if options.upload else None
@@ -256,12 +262,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.twin_load = list(RETRAINED)
         capture = mocap_settings(options)
         log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
-        policy = Policy.load(options.policy)
+        policy = Policy(load_policy(options.policy), options.policy.stem)
         controller = Controller(policy)
         config = controller.config
         more = read_gains(options.gains) if options.gains else ({}, {})
         if options.twin_load is not None:
-            check_loaded(config, options.retrain)
+            check_loaded(config, options.retrain, "team" in policy.card)
         rig = Rig.of_card(policy.card)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)
         goal = tuple(options.goal or goal_of(config))

@@ -63,7 +63,7 @@ class Repeats:
 WINDOW = 1.2  # [s] over which turns and ways are compared
 TURN = 0.035  # [rad] by which the measured turn may differ from the gyroscope's
 LATE = 0.04  # [s] that the measured attitude may be late against the gyroscope
-WAY = 0.08  # [m] likewise of the way beyond a steady speed, from the accelerometer
+WAY, BIAS, DOUBT = 0.012, 0.1, 4.0  # likewise of the way, see `ImuWatch._felt`: [m], [m/s2], standard deviations
 CONTRADICTING = 0.1  # [s] for which it must differ
 
 
@@ -136,23 +136,36 @@ class ImuWatch:
         return f"its attitude turned {math.degrees(angle):.1f} degrees otherwise than its gyroscope within {WINDOW:g} s"
 
     def _way_fault(self, known: Sequence[_Moment]) -> str:
-        """The second difference of the position over half a window against the accelerometer's."""
-        first, last = known[0], known[-1]
-        middle = min(known, key=lambda one: abs(one.time - 0.5 * (first.time + last.time)))
-        if not 0.5 <= (last.time - middle.time) / max(middle.time - first.time, 1e-9) <= 2.0:
-            return ""
-        felt_by = [one for one in self._moments if one.time >= first.time]
-        times = np.array([one.time for one in felt_by])
-        after, before = last.time - middle.time, middle.time - first.time
-        way = last.position - middle.position - (middle.position - first.position) * after / before
+        """The second difference of the position against the accelerometer's, over the window and over its last half."""
+        last = known[-1]
+        for share in (0.5, 1.0):
+            begin = next(one for one in known if last.time - one.time <= share * WINDOW)
+            middle = min(known, key=lambda one: abs(one.time - 0.5 * (begin.time + last.time)))
+            before, after = middle.time - begin.time, last.time - middle.time
+            if min(before, after) < 0.15 * share * WINDOW or not 0.5 <= after / before <= 2.0:
+                continue
+            way = last.position - middle.position - (middle.position - begin.position) * after / before
+            felt, limit = self._felt(begin.time, middle.time, last.time)
+            beside = (way - felt)[self._axes]
+            size = math.sqrt(float(beside @ beside))
+            if size > limit:
+                return f"it moved {1000 * size:.0f} mm otherwise than its accelerometer within {share * WINDOW:g} s"
+        return ""
+
+    def _felt(self, begin: float, middle: float, end: float) -> tuple[np.ndarray, float]:
+        """(way (3,) from `begin` over `middle` to `end` [s] by the accelerometer, by how much it may be wrong) [m].
+
+        The limit is that of an accelerometer with a `BIAS` and the noise that it has in the window.
+        """
+        seen = [one for one in self._moments if one.time >= begin]
+        times, felt = np.array([one.time for one in seen]), np.array([one.acceleration for one in seen])
         # What an acceleration at each moment adds to that way [s]: it rises from the first to the middle, then falls.
-        share = np.where(times > middle.time, last.time - times, (times - first.time) * after / before)
-        felt = np.trapezoid(share[:, None] * np.array([one.acceleration for one in felt_by]), times, axis=0)
-        beside = (way - felt)[self._axes]
-        size = math.sqrt(float(beside @ beside))
-        if size <= WAY:
-            return ""
-        return f"it moved {1000 * size:.0f} mm otherwise than its accelerometer within {WINDOW:g} s"
+        ratio = (end - middle) / (middle - begin)
+        share = np.where(times > middle, end - times, (times - begin) * ratio)[:, None]
+        noise = math.sqrt(0.5 * float(np.square(np.diff(felt, axis=0)).sum(axis=1).mean()))
+        step = (end - begin) / max(len(seen) - 1, 1)
+        limit = WAY + BIAS * float(share.sum()) * step + DOUBT * noise * step * math.sqrt(float(np.square(share).sum()))
+        return np.trapezoid(share * felt, times, axis=0), limit
 
 
 class DroneWatch:

@@ -30,7 +30,7 @@ LASTING = 0.25  # [s] that heights or climbs must disagree
 APART, DOUBT = 0.015, 4.0  # the same along any axis against its mean: [m], and in standard deviations of the filters
 USUAL = 10.0  # [s] of that mean
 ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
-RECENT = 0.1  # [s] within which a thrust that was sent must move for the one in force to have to move
+RECENT = 0.1  # [s] within which a thrust in force that stands still must have been sent
 SAME = 1.5  # [thrust units] within which two thrusts are one, rounded
 RISING = (State.RAMP, State.FLY)  # a drone that touches the ground feels more than its packets tell
 UNHEARD = 4  # health packets in a row without such an echo, or with one that stands still
@@ -134,7 +134,9 @@ class Monitor:
                 still = still or repeated
             own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and phase in GUIDED else []
             own += [Fault(Event.FRAME, f"{name}: {wrong}")] if wrong and phase in RISING else []
-            if own and not self._settings.dry_run:
+            if self._settings.dry_run:  # carried by hand it shows its axes as well; at rest it may be quiet
+                own = [fault for fault in own if fault.event is Event.FRAME]
+            if own:
                 self.estimators.trusted[number] = False
                 found += own
         return found
@@ -261,9 +263,9 @@ class EstimatorWatch:
 
 
 class UplinkWatch:
-    """Whether one drone acts on what it is sent: its thrust in force was sent a moment ago, and moves as that does.
+    """Whether one drone acts on what it is sent: its thrust in force was sent a moment ago.
 
-    A thrust that stands still while what is sent moves tells a lost uplink 0.3 s before it is too old.
+    One that stands still while other ones are sent tells a lost uplink 0.3 s before it is too old.
     """
 
     def __init__(self, name: str):
@@ -272,7 +274,7 @@ class UplinkWatch:
         self._missing = 0
         self._checked, self._before = -math.inf, math.nan
         self.heard = -math.inf  # [s] when the last thrust that it acted on was sent
-        self.hears = True  # by the newest health packet
+        self.hears = True  # by the newest health packet, beyond what chance may match
 
     def sent(self, thrust: int, now: float) -> None:
         """`thrust` [units] goes out at `now` [s]."""
@@ -285,12 +287,12 @@ class UplinkWatch:
         self._checked = arrival
         while self._sent and self._sent[0][0] < arrival - ECHO:
             self._sent.popleft()
-        before, self._before = self._before, health.thrust
+        moved, self._before = health.thrust != self._before, health.thrust
         times = [time for time, thrust in self._sent if time <= arrival and abs(thrust - health.thrust) < SAME]
         recent = [thrust for time, thrust in self._sent if time >= arrival - RECENT]
         steady = not recent or max(recent) - min(recent) < SAME
-        self.hears = bool(times) and (steady or health.thrust != before)
-        if self.hears:
+        self.hears = bool(times) and (moved or steady)
+        if times and (moved or times[-1] >= arrival - RECENT):
             self._missing, self.heard = 0, max(self.heard, times[-1])
             return []
         self._missing += 1

@@ -137,6 +137,9 @@ class OnboardFlight(Flight):
                 self.succession.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
         return None, []
 
+    def _is_off(self) -> bool:
+        return True  # the apps take over by the clock
+
     def _wanted(self, mapped: list[Mapped] | None) -> list[Setpoint]:
         return [ZERO, ZERO]
 

@@ -186,16 +186,17 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
             Check(f"{link.name} heading", abs(yaw) <= required.yaw, f"{math.degrees(yaw):.0f} degrees from +x"),
         ]
         checks += gravity_checks(link, state, required)
-    beside = yaw_of(states[0]) - yaw_of(states[1])
-    beside = math.remainder(beside, 2 * math.pi)
-    text = (
-        f"leader {math.degrees(beside):+.1f} degrees from the follower; each one costs {YAW_COST:g} mm of hover error"
-    )
-    checks.append(Check("headings", abs(beside) <= required.apart, text))
-    return [*checks, stick_check(states, rig, bounds, required)]
+    return [*checks, heading_check(states, required), stick_check(states, rig, bounds, required)]
 
 
 YAW_COST = 6  # [mm] of hover error for each degree between both yaws: 29 mm for 5 on the real firmware
+
+
+def heading_check(states: Sequence[DroneState], required: Preflight) -> Check:
+    """Whether both drones, which one stick holds, measure one yaw; the difference is the frames' or the bodies'."""
+    beside = math.degrees(math.remainder(yaw_of(states[0]) - yaw_of(states[1]), 2 * math.pi))
+    text = f"leader {beside:+.1f} degrees from the follower; each one costs {YAW_COST:g} mm of hover error"
+    return Check("headings", abs(beside) <= math.degrees(required.apart), text)
 
 
 def gravity_checks(link: Link, state: DroneState, required: Preflight) -> list[Check]:

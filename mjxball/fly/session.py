@@ -181,7 +181,7 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     for text in told:
         _say(text)
     if cause is None and stayed:
-        _say("it did not lift: is the thrust that hovers right for this rig (--thrust, --hover, --mass)?")
+        _say("it did not lift: is it heavier than its plant, or does a propeller give less?")
     if flight.settings.dry_run and flight.highest:
         text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
         _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")

@@ -16,7 +16,7 @@ class State(Enum):
     CHECK = "check"  # zeros, while the checks before flight run
     ARM = "arm"  # zeros, which open the firmware's thrust lock while it arms
     SPIN = "spin"  # level, a third of hover: what the motors get shows which force curve the firmware has
-    RAMP = "ramp"  # level, thrust rising to hover
+    RAMP = "ramp"  # level, thrust rising until the pair is off the ground
     FLY = "fly"  # leader PID and follower policy
     LAND = "land"  # the same laws toward a goal that sinks
     DESCEND = "descend"  # level, thrust held to a sinking speed where it is known, else ramped down
@@ -39,7 +39,7 @@ class Event(Enum):
     ARMED = "both drones armed with the thrust lock open"
     CURVE_KNOWN = "the force curves of both firmwares are known"
     CURVE_UNKNOWN = "a firmware's force curve is not one that can be flown"
-    HOVERING = "the thrust ramp ended"
+    HOVERING = "the pair is off the ground"
     TIME_UP = "the flight time is over"
     INTERRUPT = "Ctrl-C or SIGTERM"
     KEY_KILL = "kill key, or Ctrl-C again"

@@ -72,7 +72,7 @@ def spaces(pair: TransportEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.B
     return observations, gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 
 
-def checked_action(action: Array, shape: tuple[int, ...]) -> np.ndarray:
+def checked_action(action: Array, shape: tuple[int, ...] | None) -> np.ndarray:
     """`action` as float32, which the environment clips to the box [-1, 1].
 
     Raises InputError unless it is finite and of `shape`, and of real numbers.

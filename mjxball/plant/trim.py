@@ -266,7 +266,7 @@ def _hover(
     unit = lift / (4 * acts.sum())
     believes = np.array(plant.known_masses) + np.array(plant.load_shares) * believed
     answer = np.flatnonzero(acts & (limit > 0))
-    twist, asked, level_command = asked_rows(plant, commands, answer, factor, believes)
+    twist, commands_asked, level_command = asked_rows(plant, commands, answer, factor, believes)
     columns = np.repeat(acts, 4)
     return _Hover(
         effect=np.vstack([np.column_stack(drones), twist])[:, columns],
@@ -277,7 +277,7 @@ def _hover(
         acts=acts,
         leader_force=leader,
         unit=unit,
-        asked=unit * asked[:, columns],
+        asked=unit * commands_asked[:, columns],
         level_command=level_command,
     )
 

@@ -269,8 +269,8 @@ def _check_flown(flown: Any, name: str) -> None:
     """`flown`, if a card has it: the numbers of drones and the seconds up to which flights were found good."""
     if flown is None:
         return
-    fields = flown if isinstance(flown, dict) else {}
-    drones, seconds = fields.get("drones"), fields.get("seconds")
+    fields: dict[str, Any] = flown if isinstance(flown, dict) else {}
+    drones, seconds = fields.get("drones"), fields.get("seconds", 0.0)
     counts = isinstance(drones, list) and drones and all(type(count) is int and count > 1 for count in drones)
     if not (counts and is_finite(seconds) and seconds > 0):
         raise PolicyFileError(f"{name}: card field flown must hold drones, numbers above 1, and positive seconds")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -156,7 +157,7 @@ class Policy:
         law, memory = self.law, self.memory if remembers else None
         with np.errstate(all="ignore"):  # what is not finite is refused below
             action, command, memory = law.answer(law.start(observation) if memory is None else memory, observation)
-        if not (np.isfinite(command).all() and np.isfinite(memory).all()):
+        if not math.isfinite(float(command.sum()) + float(memory.sum())):
             raise InputError(f"policy {self.name} has no answer to an observation: what it computes is not finite")
         if remembers:
             self._memory, self._ahead = memory, False
@@ -216,7 +217,7 @@ class NetworkLaw:
     def answer(self, memory: Array, observation: Array) -> tuple[Array, Array, Array]:
         """(action in [-1, 1] (..., 3), command (..., 3), memory of the next step) at `observation` (..., 18)."""
         known = self._law.known(observation, memory)
-        seen = self._law.network_input(observation, memory, known)
+        seen = self._law.network_input(observation, memory, known) if self._law.size else observation
         answer = self._network.like(observation)(seen)
         command = self._law.command(answer, observation, memory, known)
         remembered = self._law.next(memory, observation, answer, command, known)

@@ -66,7 +66,7 @@ def of_plant(config: Config, scenario: Scenario) -> Scenario:
     """
     ranges, plant = config.scenario, config.plant
     distance = min(GOAL, ranges.goal_range)
-    own = {
+    own: dict[str, Any] = {
         "mass": plant.object_mass,
         "amplitude": min(AMPLITUDE, cg_limit(plant), ranges.cg_amplitude[1]),
         "goal": tuple(distance * free for free in MOVES[plant.stand]),

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +26,27 @@ from mjxball.train.run_directory import CHECKPOINTS, read_config
 KEEP = 2
 CHECKSUMS = "checksums"
 # What is wrong with a checkpoint is said here, in one line.
-for chatty in ("absl", "asyncio"):
-    logging.getLogger(chatty).setLevel(logging.CRITICAL)
+logging.getLogger("absl").setLevel(logging.CRITICAL)
+
+
+def _without_late_answers(before: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """`sys.unraisablehook` that is silent where TensorStore answers a read that another one's failure has ended."""
+
+    def hook(unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            before(unraisable)
+
+    return hook
+
+
+sys.unraisablehook = _without_late_answers(sys.unraisablehook)
 
 
 class Checkpoints:
     """The checkpoints of one run directory, numbered by environment steps."""
 
-    def __init__(self, run: Path):
+    def __init__(self, run: Path, reading: bool = False):
+        """`reading` leaves everything there as it is: another process may be writing the next one."""
         # Of several processes each acts for itself: process 0 writes, all read.
         alone = ocp.options.MultiprocessingOptions(
             primary_host=jax.process_index(),
@@ -41,10 +54,15 @@ class Checkpoints:
             barrier_sync_key_prefix=str(jax.process_index()),
         )
         options = ocp.CheckpointManagerOptions(
-            max_to_keep=KEEP, enable_async_checkpointing=True, multiprocessing_options=alone, create=False
+            max_to_keep=KEEP,
+            enable_async_checkpointing=True,
+            multiprocessing_options=alone,
+            create=False,
+            read_only=reading,
         )
         place = (run / CHECKPOINTS).absolute()
-        place.mkdir(parents=True, exist_ok=True)
+        if not reading:
+            place.mkdir(parents=True, exist_ok=True)
         try:
             self._manager = ocp.CheckpointManager(place, options=options)
         except (ValueError, OSError, RecursionError) as error:
@@ -58,8 +76,9 @@ class Checkpoints:
             return
         arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(state).items()}
         arrays[CHECKSUMS] = _checksums(arrays)
-        if not self._manager.save(step, args=ocp.args.StandardSave(arrays)):
-            raise RuntimeError(f"Orbax refused to save checkpoint {step}")
+        with self._written():
+            if not self._manager.save(step, args=ocp.args.StandardSave(arrays)):
+                raise RuntimeError(f"Orbax refused to save checkpoint {step}")
 
     def steps(self) -> list[int]:
         """Environment steps of every complete checkpoint, newest first."""
@@ -100,8 +119,18 @@ class Checkpoints:
 
     def close(self) -> None:
         """Wait until everything is on disk."""
-        self._manager.wait_until_finished()
-        self._manager.close()
+        with self._written():
+            self._manager.wait_until_finished()
+            self._manager.close()
+
+    @contextlib.contextmanager
+    def _written(self) -> Iterator[None]:
+        """Orbax raises here what went wrong while it wrote, now or before: InputError, which names the directory."""
+        try:
+            yield
+        except Exception as error:  # of many kinds: a full disk is a ValueError
+            why = (str(error).splitlines() or [type(error).__name__])[0][:200]
+            raise InputError(f"a checkpoint in {self._manager.directory} cannot be written: {why}") from None
 
 
 def _checksums(arrays: dict[str, Any]) -> np.ndarray:
@@ -150,7 +179,7 @@ def restore_state(run: Path, config: Config, origin: dict[str, Any]) -> tuple[Tr
 def _restore(run: Path, population: Population, discard: bool) -> TrainState | None:
     if not (run / CHECKPOINTS).is_dir():
         return None
-    with contextlib.closing(Checkpoints(run)) as checkpoints:
+    with contextlib.closing(Checkpoints(run, reading=not discard)) as checkpoints:
         if not checkpoints.steps():
             return None
         say = lambda text: print(f"warning: {text}", file=sys.stderr)  # noqa: E731, T201

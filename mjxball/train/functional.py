@@ -37,7 +37,7 @@ def train(
     (`num_evaluations`,): `steps`, `episode_return` (exploring), the algorithm's metrics, `eval_return`, and the
     means of the environment's metrics as `eval_<name>`. Without `evaluate` it trains in one stretch, and what is named
     `eval_` holds nothing. `mjxball.train.compilation.compiler_options()` are the options with which `train.py` compiles
-    sooner. Raises InputError if one of them does not fit.
+    sooner. `jax.shard_map` of it needs `check_vma=False`. Raises InputError if one of them does not fit.
     """
     with jax.enable_x64(False):  # float32 throughout, also where the user's own program is not
         return _train(config, key, physics, Extensions(env, reward, algorithm), overrides, evaluate)

@@ -77,8 +77,11 @@ class Progress:
         """Record `row` and show it."""
         if self._silent:
             return
-        self._writer.writerow(row)
-        self._file.flush()
+        try:
+            self._writer.writerow(row)
+            self._file.flush()
+        except OSError as error:  # of a full disk it does not say where
+            raise OSError(error.errno, error.strerror, self._file.name) from None
         for name, value in row.items():
             if value is not None and name != "steps":
                 self._events.add_scalar(name, value, row["steps"])

@@ -107,8 +107,8 @@ def check(config: Config, algorithm: str, members: int) -> None:
 def _largest(config: Config, algorithm: str) -> str:
     """Names of the settings that make a run large."""
     own = getattr(config, algorithm)
-    names = ("num_envs", "replay_size", "batch_size", "horizon", "unroll_length", "unrolls")
-    names = (*names, "policy_layers", "critic_layers", "value_layers")
+    layers = ("policy_layers", "critic_layers", "value_layers")
+    names = ("num_envs", "replay_size", "batch_size", "horizon", "unroll_length", "unrolls", *layers)
     return ", ".join(f"{algorithm}.{name}" for name in names if hasattr(own, name)) + " or --num-seeds"
 
 

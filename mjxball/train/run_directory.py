@@ -45,13 +45,16 @@ def read_json(path: Path, called: str) -> Any:
 def read_rows(path: Path) -> list[dict[str, str]]:
     """The rows of a CSV file with a header; a row that is cut short or too long is left out.
 
-    MissingFileError if there is no such file, InputError if it cannot be read.
+    MissingFileError if there is no such file, InputError if it cannot be read or has a column twice.
     """
     lines = read_text(path).splitlines()
     try:
-        rows = list(csv.DictReader(lines))
+        reader = csv.DictReader(lines)
+        rows, names = list(reader), list(reader.fieldnames or ())
     except csv.Error as error:
         raise _refusal(path, "", error) from None
+    if len(set(names)) < len(names):
+        raise _refusal(path, "", "a column stands twice in its header")
     return [row for row in rows if None not in row and None not in row.values()]
 
 

@@ -6,6 +6,7 @@ import base64
 import html
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +33,15 @@ def live_page(title: str, token: str) -> str:
 
 def _page(title: str, data: Any, start: str) -> str:
     script = "\n".join((PARTS / name).read_text(encoding="utf-8") for name in (*SCRIPTS, start))
-    return (
-        (PARTS / "page.html")
-        .read_text(encoding="utf-8")
-        .replace("{{title}}", html.escape(title))
-        .replace("{{style}}", (PARTS / "style.css").read_text(encoding="utf-8"))
-        .replace("{{data}}", _json(data))
-        .replace("{{script}}", script)
-    )
+    parts = {
+        "title": html.escape(title),
+        "style": (PARTS / "style.css").read_text(encoding="utf-8"),
+        "data": _json(data),
+        "script": script,
+    }
+    page = (PARTS / "page.html").read_text(encoding="utf-8")
+    # In one pass: what is put in is text, and a title may look like a part.
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)
 
 
 def page_contents(flight: Flight) -> dict[str, Any]:

@@ -212,6 +212,8 @@ static void distrust(mjxball_app *app, const mjxball_map *map, mjxball_setpoint 
     if (app->phase < MJXBALL_DESCEND) enter(app, MJXBALL_DESCEND, MJXBALL_BAD_COMMAND, map);
     app->trusted = 0;
     app->peer_time = 0; /* until it is heard again */
+    for (int i = 0; i < 7; i++) app->integral[i] = 0; /* the other drone hears numbers only */
+    if (!within(app->velocity, 3, MOST_SPEED)) app->velocity[0] = app->velocity[1] = app->velocity[2] = 0;
     app->trim = hover_of(map);
     if (!within(&app->climb, 1, MOST_SPEED)) app->climb = 0;
     if (!within(&app->height, 1, MOST_PLACE)) app->height = mjxball_rig.fence_high[2];

@@ -209,8 +209,8 @@ Made by `python -m mjxball.export POLICY DIR --crazyflie` (configuration {hash},
 constants, a law every {period} ms, number {ident}).
 
 `leader/` and `follower/` are out-of-tree apps for the Crazyflie firmware 2026.08; `src/` is what both share: `core.c`
-with `checks.h`, `laws.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's interface, `policy.h`
-and `rig.h` the policy.
+with `checks.h`, `laws.h` and `packets.h` is the flight (plain C, no firmware types), `glue.c` the firmware's
+interface, `policy.h` and `rig.h` the policy.
 
     cd leader && make CRAZYFLIE_BASE=... cf2_defconfig && make CRAZYFLIE_BASE=... && make CRAZYFLIE_BASE=... cload
 

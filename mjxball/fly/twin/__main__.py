@@ -14,11 +14,11 @@ from pathlib import Path
 
 from mjxball.cli import make_parser, run_command
 from mjxball.fly.app.host import compile_pair
+from mjxball.fly.card import load_policy
 from mjxball.fly.process import urgent
 from mjxball.fly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin
-from mjxball.policy import load_file
 
 
 def main() -> int:
@@ -37,7 +37,7 @@ def main() -> int:
 
 def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` ask for until standard input ends."""
-    policy = load_file(options.policy) if options.policy else None
+    policy = load_policy(options.policy) if options.policy else None
     card = policy.card if policy else None
     cores = compile_pair(policy, options.policy.stem, options.onboard == "int8") if policy and options.onboard else None
     kind = drone_kind(options.twin_drone or "2.1", options.twin_curve or "linear")

@@ -67,13 +67,13 @@ class Surroundings:
 
     noise: float = 1.0  # factor on the noise of IMU and pose
     pose_hz: float = 100.0  # poses of the positioning system [Hz]
-    pose_loss: float = 0.0  # share of these poses that never come
     deck: bool = True  # each drone has its own positioning; else poses come from the laptop, or none do
     delay: float = 0.0  # of every datagram each way, from the first one on [s]
     gains: tuple[float, float] = (1.0, 1.0)  # factors on the motor forces of leader and follower
     exact: bool = False  # the estimates are the truth: for comparisons with the simulation
     load: AddedLoad | None = None  # put on in flight
     seed: int = 0
+    pose_loss: float = 0.0  # share of the positioning system's poses that never come
 
 
 DELIVERED = DroneKind()

@@ -125,9 +125,10 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     """The header's text. Its function `follow` computes what `mjxball.Policy` computes, in float.
 
     All names begin with `prefix`, `prefix_of(name)` by default, so that headers of several policies fit into one
-    program; one whose names are taken is a compiler's error, since its guard is that of its contents. With `int8` the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the
-    same layout may be put in place at run time, `mjxball_follower.weights`. A policy of formats 3 and 4 is that of the
-    one follower that `team` in its card names; InputError without it.
+    program; of two with the same names a compiler says so, since a header's guard is that of its contents. With `int8`
+    the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the same layout
+    may be put in place at run time, `follower.weights`. A policy of formats 3 and 4 is that of the one follower that
+    `team` in its card names; InputError without it, and for layers too wide for `int8`.
     """
     context = known_context(policy.card, name)
     law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)

@@ -148,10 +148,10 @@ class Player {
     const labels = { thrust: `thrust, ${scaleOf('thrust')}`, contact: `contact forces, ${scaleOf('contact')}`, weight: 'object’s weight at the CG', path: 'path' };
     for (const [kind, text] of Object.entries(labels)) {
       if (!this.flight.has(NEEDED[kind])) continue;
-      const label = document.createElement('label');
-      label.innerHTML = `<input type="checkbox" checked><i class="swatch" style="background:${COLOURS[kind]}"></i>${text}`;
-      label.firstChild.id = `show-${kind}`;
-      label.firstChild.onchange = (event) => { this.scene.shown[kind] = event.target.checked; this.draw(); };
+      const label = element('label'), box = element('input');
+      Object.assign(box, { type: 'checkbox', checked: true, id: `show-${kind}` });
+      box.onchange = (event) => { this.scene.shown[kind] = event.target.checked; this.draw(); };
+      label.append(box, swatch(COLOURS[kind]), text);
       parent.append(label);
     }
   }

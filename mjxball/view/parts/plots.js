@@ -12,20 +12,37 @@ function ticks(low, high, count) {
 
 const short = (value) => String(+value.toPrecision(3)).replace('-', '−');
 
+// Names are text: nothing is written as HTML.
+function element(kind, text = '') {
+  const made = document.createElement(kind);
+  made.textContent = text;
+  return made;
+}
+
+function swatch(colour) {
+  const made = element('i');
+  made.className = 'swatch';
+  made.style.background = colour;
+  return made;
+}
+
 class Plot {
   // series: [{ name, colour, values, dash }]
   constructor(parent, title, unit, time, series, seek) {
     Object.assign(this, { time, series });
     const block = document.createElement('div');
     block.className = 'plot';
-    block.innerHTML = `<h2>${title} <small>[${unit}]</small></h2><div class="legend"></div><canvas></canvas>`;
+    const head = element('h2', `${title} `), legend = element('div');
+    head.append(element('small', `[${unit}]`));
+    legend.className = 'legend';
+    this.canvas = element('canvas');
+    block.append(head, legend, this.canvas);
     parent.append(block);
-    this.canvas = block.querySelector('canvas');
     this.readouts = series.map(({ name, colour }) => {
-      const label = document.createElement('span');
-      label.innerHTML = `<i class="swatch" style="background:${colour}"></i>${name} <b></b>`;
-      block.querySelector('.legend').append(label);
-      return label.querySelector('b');
+      const label = element('span'), value = element('b');
+      label.append(swatch(colour), `${name} `, value);
+      legend.append(label);
+      return value;
     });
     this.range();
     this.span(time[0], time[time.length - 1]);

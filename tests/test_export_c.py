@@ -1,0 +1,149 @@
+"""Exported C99 headers: several in one program, and observations that cannot be."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import call
+from onboard_bench import needs_gcc
+
+from mjxball.errors import InputError
+from mjxball.export import in_team, main
+from mjxball.policy import Policy, PolicyFile, load_file
+from mjxball.policy.file import shipped_policy
+from mjxball.policy.formats import c_header
+
+STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Werror", "-O1")
+TWO = """
+#include <stdio.h>
+#include "first.h"
+#include "Other-2.h"
+#include "first.h"
+
+int main(void) {
+    mjxball_first_follower first;
+    mjxball_other_2_follower other;
+    float seen[18], action[3], command[2][3];
+    mjxball_first_reset(&first);
+    mjxball_other_2_reset(&other);
+    while (fread(seen, sizeof seen, 1, stdin) == 1) {
+        if (mjxball_first_follow(&first, seen, action, command[0])) return 1;
+        if (mjxball_other_2_follow(&other, seen, action, command[1])) return 1;
+        fwrite(command, sizeof command, 1, stdout);
+    }
+    return 0;
+}
+"""
+# Each record: observation -> status, action, command.
+ONE = """
+#include <stdio.h>
+#include "first.h"
+
+int main(void) {
+    mjxball_first_follower first;
+    float seen[18], out[7];
+    mjxball_first_reset(&first);
+    while (fread(seen, sizeof seen, 1, stdin) == 1) {
+        out[0] = (float)mjxball_first_follow(&first, seen, out + 1, out + 4);
+        fwrite(out, sizeof out, 1, stdout);
+    }
+    return 0;
+}
+"""
+
+
+def answers(place: Path, main_c: str, seen: np.ndarray) -> np.ndarray:
+    """What the program answers to each observation of `seen` (T, 18)."""
+    (place / "main.c").write_text(main_c)
+    built = subprocess.run(
+        ["gcc", *STRICT, "main.c", "-o", "main"], cwd=place, capture_output=True, text=True, check=False
+    )
+    assert built.returncode == 0, built.stderr
+    done = subprocess.run(
+        ["./main"], cwd=place, input=seen.astype(np.float32).tobytes(), capture_output=True, check=True
+    )
+    return np.frombuffer(done.stdout, np.float32).reshape(len(seen), -1)
+
+
+def observations(steps: int = 40) -> np.ndarray:
+    return np.cumsum(np.random.default_rng(7).normal(scale=0.02, size=(steps, 18)), axis=0).astype(np.float32)
+
+
+@needs_gcc
+def test_two_policies_in_one_program(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Each gives its own numbers, also with names that only an identifier has; a header is included twice."""
+    names = {"first.h": "balance", "Other-2.h": "flight"}
+    for file, name in names.items():
+        assert call(main, [shipped_policy(name), tmp_path / file]) == 0
+    seen = observations()
+    found = answers(tmp_path, TWO, seen)
+    wanted = []
+    for name in names.values():
+        policy = Policy.load(shipped_policy(name))
+        wanted.append(np.array([policy(one) for one in seen]))
+    np.testing.assert_allclose(found, np.hstack(wanted), rtol=0, atol=1e-5)
+    assert np.abs(wanted[0] - wanted[1]).max() > 0.01
+
+
+@needs_gcc
+def test_two_policies_of_one_name_do_not_compile(tmp_path: Path, capsys: pytest.CaptureFixture):
+    for folder, name in (("a", "balance"), ("b", "flight")):
+        (tmp_path / folder).mkdir()
+        assert call(main, [shipped_policy(name), tmp_path / folder / "same.h"]) == 0
+    (tmp_path / "main.c").write_text('#include "a/same.h"\n#include "b/same.h"\nint main(void) { return 0; }\n')
+    built = subprocess.run(["gcc", "main.c"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert built.returncode != 0
+    assert "redefinition" in built.stderr
+
+
+def spoilt(value: float, slot: int) -> np.ndarray:
+    one = observations()[10].copy()
+    one[slot] = value
+    return one
+
+
+@pytest.mark.slow
+@needs_gcc
+@pytest.mark.parametrize("name", ["balance", "flight", "paper", "robust", "team", "universal"])
+@pytest.mark.parametrize("int8", [False, True])
+def test_an_observation_that_cannot_be_leaves_no_trace(name: str, int8: bool, tmp_path: Path):
+    """Status 1, level, and every later answer is that of a flight which has not seen it."""
+    policy: PolicyFile = load_file(shipped_policy(name))
+    policy = in_team(policy, name, Path("pair")) if name in ("team", "universal") else policy
+    (tmp_path / "first.h").write_text(c_header.c_header(policy, "first", int8))
+    seen = observations()
+    odd = [spoilt(value, slot) for value in (np.nan, np.inf, -np.inf, 1e38, 1e7) for slot in (0, 3, 9, 14, 17)]
+    calm = answers(tmp_path, ONE, seen)
+    assert (calm[:, 0] == 0).all()
+    mixed: list[Any] = [*odd[:3], *seen[:20], *odd, *seen[20:]]
+    found = answers(tmp_path, ONE, np.array(mixed))
+    bad = np.array([*[True] * 3, *[False] * 20, *[True] * len(odd), *[False] * 20])
+    np.testing.assert_array_equal(found[~bad], calm)
+    assert (found[bad, 0] == 1).all()
+    assert (found[bad, 1:] == 0).all()
+
+
+@needs_gcc
+def test_a_network_without_an_answer_says_so(tmp_path: Path):
+    """Weights whose products overflow: status 2 and level, never a number that is not one."""
+    policy = load_file(shipped_policy("flight"))
+    huge = tuple(np.full_like(weight, 3e37) * np.sign(weight) for weight in policy.weights)
+    broken = PolicyFile(**{**policy.__dict__, "weights": huge})
+    (tmp_path / "first.h").write_text(c_header.c_header(broken, "first"))
+    found = answers(tmp_path, ONE, observations())
+    assert (found[:, 0] == 2).all()
+    assert (found[:, 1:] == 0).all()
+
+
+def test_sums_of_wide_layers_must_fit_into_32_bits(monkeypatch: pytest.MonkeyPatch):
+    policy = load_file(shipped_policy("balance"))
+    bound = c_header.WIDEST_INT8
+    assert 128 * 32767 * bound < 2**31 <= 128 * 32767 * (bound + 8)
+    monkeypatch.setattr(c_header, "WIDEST_INT8", 63)  # of its hidden layers of 64
+    c_header.c_header(policy, "balance")
+    with pytest.raises(InputError, match="8 bits 63 at most"):
+        c_header.c_header(policy, "balance", int8=True)

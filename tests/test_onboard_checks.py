@@ -1,0 +1,191 @@
+"""Followers on board: numbers that cannot be, in whatever can change in flight, and what leaves for the commander."""
+
+from __future__ import annotations
+
+import functools
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from onboard_bench import AT_REST, Bench, cores_of, needs_gcc, policy_of
+from tables import rows
+
+from mjxball.fly.app.host import App
+from mjxball.fly.app.protocol import CAUSES, Phase
+from mjxball.fly.telemetry import Rig
+
+WILD = (math.nan, math.inf, -3e38)
+AFTER = {"mount": "the mount is not set, or no length below 1 m", "goal": "the goal is beyond the fence or not finite"}
+IN_FLIGHT = "refused: weights, mount and curve change on the ground only"
+OLD = "the state is old or not finite"
+HIGH = AT_REST._replace(position=np.array([0.0, 0.0, 0.4]))  # where the goal is
+LIMIT, LEAST, MOST = 15.001, 10001, 60000  # [deg], [thrust units] of what is sent in the air
+
+
+@functools.cache
+def taken_off() -> Bench:
+    """A pair in the first period of its laws."""
+    bench = Bench(cores_of(), Rig.of_card(policy_of("flight").card))
+    bench.take_off()
+    assert bench.phases == [Phase.FLY] * 2
+    return bench
+
+
+def flying() -> Bench:
+    """Another one in the same state."""
+    bench, before = Bench(cores_of(), taken_off().rig), taken_off()
+    bench.now = before.now
+    for app, old in zip(bench.apps, before.apps, strict=True):
+        app._core.raw = old._core.raw
+    return bench
+
+
+def numbers(sent: list[Any]) -> list[tuple[float, float, float]]:
+    return [(one.roll, one.pitch, one.thrust) for one in sent]
+
+
+def assert_within_limits(sent: list[Any]) -> None:
+    for roll, pitch, thrust in numbers(sent):
+        assert abs(roll) <= LIMIT
+        assert abs(pitch) <= LIMIT
+        assert LEAST <= thrust <= MOST
+
+
+def refusal(app: App) -> str:
+    return CAUSES[int(app.logged()["refusal"])]
+
+
+@needs_gcc
+@rows("phase", [Phase.FLY, Phase.DESCEND])
+def test_parameters_that_cannot_be_leave_the_last_ones_in_use(phase: Phase):
+    """Every period of a pair with one wild parameter is that of a pair without, in both roles."""
+    spoilt: list[tuple[str, float, str]] = [
+        (f"{what}{axis}", value, text) for what, text in AFTER.items() for axis in "XYZ" for value in WILD
+    ]
+    spoilt += [("battery", value, "the limit of the battery is not between 0 and 10 V") for value in (*WILD, 0.0, -1.0)]
+    spoilt += [("curve", value, "the policy does not fly with this force curve") for value in (2, 255)]
+    spoilt += [("mountX", 0.1, IN_FLIGHT), ("mountY", -0.1, IN_FLIGHT)]  # sound, but another one
+    for role in range(2):
+        calm = flying()
+        wanted = [numbers(calm.tick(phase)) for _ in range(12)]
+        for name, value, text in spoilt:
+            bench = flying()
+            bench.apps[role].set(name, value)
+            found = [numbers(bench.tick(phase)) for _ in range(12)]
+            assert found == wanted, (role, name, value)
+            assert refusal(bench.apps[role]) == text
+            assert bench.phases == calm.phases
+
+
+@needs_gcc
+def test_a_goal_can_change_in_flight():
+    bench, calm = flying(), flying()
+    for app in bench.apps:
+        app.set("goalZ", 0.2)
+    assert numbers(bench.tick(Phase.FLY)) != numbers(calm.tick(Phase.FLY))
+    assert bench.phases == [Phase.FLY] * 2
+
+
+@needs_gcc
+def test_states_that_cannot_be_end_in_a_descent():
+    """Also finite ones; nothing of them is left for the descent itself."""
+    for name, size in (("position", 3), ("velocity", 3), ("rates", 3), ("quaternion", 4)):
+        for value in (*WILD, 1e4):
+            for slot in range(size):
+                bench = flying()
+                wrong = [0.01] * size if name != "quaternion" else [1.0, 0.0, 0.0, 0.0]
+                wrong[slot] = value
+                sent = [bench.tick(Phase.FLY, **{name: wrong}) for _ in range(12)]
+                for one in sent:
+                    assert_within_limits(one)
+                assert bench.phases == [Phase.DESCEND] * 2, (name, value)
+                assert bench.cause(0) == OLD
+    for value in WILD:  # of a battery's voltage: as good as none
+        bench = flying()
+        for _ in range(520):
+            bench.tick(Phase.FLY, HIGH, voltage=value)
+        assert bench.cause(0) == "the battery is low", value
+
+
+@needs_gcc
+def test_a_state_from_the_future_is_none():
+    bench = flying()
+    state = bench.state(AT_REST, bench.rig.mounts[0])
+    state.time = bench.now + 1
+    bench.apps[0].tick(state, bench.now)
+    assert bench.cause(0) == OLD
+
+
+# Of a heartbeat: bytes 0 to 3 M, role, phase, trusted; key; integrals (4), velocity (3) and position (2) as floats.
+BEATS: tuple[tuple[str, Callable[[bytearray], None]], ...] = (
+    *((f"integral {k}", lambda beat, k=k: struct.pack_into("<f", beat, 8 + 4 * k, 2000.0)) for k in range(4)),
+    *((f"velocity {k}", lambda beat, k=k: struct.pack_into("<f", beat, 24 + 4 * k, -60.0)) for k in range(3)),
+    *(
+        (f"{value} at {at}", lambda beat, at=at, value=value: struct.pack_into("<f", beat, at, value))
+        for at in range(8, 36, 4)
+        for value in WILD
+    ),
+    ("phase", lambda beat: beat.__setitem__(2, 7)),
+    ("trusted", lambda beat: beat.__setitem__(3, 2)),
+    ("role", lambda beat: beat.__setitem__(1, 2)),
+    ("letter", lambda beat: beat.__setitem__(0, 0)),
+    ("size", lambda beat: beat.pop()),
+)
+
+
+@needs_gcc
+def test_heartbeats_that_cannot_be_are_not_heard():
+    """Their sender counts as silent: both land after 0.3 s. One is not enough for that."""
+    for what, spoil in BEATS:
+        bench = flying()
+        for number in range(40):
+            if number == 25:
+                assert bench.phases == [Phase.FLY] * 2, what
+            beats = [bytearray(app.send()) for app in bench.apps[::-1]]
+            spoil(beats[1])
+            bench.now += bench.apps[0].period
+            for app, beat, mount in zip(bench.apps, beats, bench.rig.mounts, strict=True):
+                app.hear(bytes(beat), bench.now)
+                app.laptop(bytes([1, Phase.FLY]), bench.now)
+                assert_within_limits([app.tick(bench.state(AT_REST, mount), bench.now)])
+        assert bench.cause(1) == "the other drone is not heard", what
+        assert bench.phases == [Phase.LAND] * 2
+
+
+@needs_gcc
+def test_what_an_app_computes_is_checked_before_it_leaves():
+    """Its own numbers are spoilt, which no input can do: level at once, sinking, and the other one is told."""
+    level = flying()
+    for _ in range(2):
+        calm = level.tick(Phase.FLY)
+    for value in (math.nan, math.inf):
+        for slot in range(3):
+            bench = flying()
+            leader = bench.apps[0]
+            bench.tick(Phase.FLY)
+            leader._c.integral(leader._core)[slot] = value
+            sent = bench.tick(Phase.FLY)
+            assert_within_limits(sent)
+            if math.isinf(value):  # clipped, as any large command
+                continue
+            assert leader.phase is Phase.DESCEND
+            assert bench.cause(0) == "the command is not finite"
+            assert (sent[0].roll, sent[0].pitch) == (0.0, 0.0)
+            assert 0.7 * calm[0].thrust < sent[0].thrust < calm[0].thrust
+            assert_within_limits(bench.tick(Phase.FLY))
+            assert bench.phases == [Phase.DESCEND] * 2
+
+
+@needs_gcc
+def test_the_leaders_integral_is_bounded():
+    """Held off its goal for hours it still says what the follower believes."""
+    bench = flying()
+    leader = bench.apps[0]
+    for slot in range(3):
+        leader._c.integral(leader._core)[slot] = 1000.0
+    for _ in range(5):
+        bench.tick(Phase.FLY)
+    assert max(leader.integral[:3]) <= 1000.0
+    assert bench.phases == [Phase.FLY] * 2
