@@ -24,7 +24,7 @@ def brax_trainer(agent: str) -> Callable[..., Any]:
     if agent not in AGENTS:
         raise InputError(f"Brax's trainer must be one of {', '.join(AGENTS)}, not {agent!r}")
     if not hasattr(jax, "device_put_replicated"):
-        jax.device_put_replicated = _replicated
+        setattr(jax, "device_put_replicated", _replicated)  # noqa: B010
     import_brax_env()
     brax_train = importlib.import_module(f"brax.training.agents.{agent}.train").train
 
