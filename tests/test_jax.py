@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 from command_line import REPOSITORY, assert_one_line, environment, listing, script, tiny
+from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, PartitionSpec
 
 from mjxball import cli, entry
@@ -43,7 +44,7 @@ def small() -> Config:
 def trained(key: jax.Array) -> jax.Array:
     """All weights of a policy, trained in one stretch."""
     policy, _ = train(small(), key, physics="newton-euler", evaluate=False)
-    return jax.flatten_util.ravel_pytree(policy.parameters)[0]
+    return ravel_pytree(jax.tree.leaves(policy))[0]
 
 
 @pytest.mark.parametrize("platform", ["cuda", "nonsense"])
