@@ -70,11 +70,11 @@ def judge(found: list[tuple[float, Path]]) -> list[dict[str, Any]]:
     import jax.numpy as jnp
 
     from mjxball.config import preset
+    from mjxball.control.network import Network
     from mjxball.evaluate.policies import load_policy
     from mjxball.evaluate.results import fly_scenarios
     from mjxball.evaluate.scenarios import REFERENCE
     from mjxball.policy.file import load_file
-    from mjxball.policy.network import Network
     from mjxball.train.program import Program
 
     settings = preset("transport")

@@ -35,11 +35,11 @@ from hover_stability import linearised
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
+from mjxball.control.network import Network
 from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy
-from mjxball.policy.network import Network
 from mjxball.policy.policy import NetworkLaw
 from mjxball.reading import parse_json
 from mjxball.sim.scenario import Scenario

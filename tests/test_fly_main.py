@@ -43,7 +43,7 @@ REFUSALS = [
     ([TRANSPORT, "--rehearse", "--fault", "rain:leader@1"], "no KIND:DRONE@S"),
     ([TRANSPORT, "--rehearse", "--fault", "crash:both@1"], "no KIND:DRONE@S"),
     ([TRANSPORT, *URIS, "--battery", "9"], "--battery must be 2.5 to 4.2"),
-    ([TRANSPORT, *URIS, "--gains", "/no/such/gains.json"], "cannot be read"),
+    ([TRANSPORT, *URIS, "--gains", "/no/such/gains.json"], "does not exist"),
     ([TRANSPORT, *URIS, "--thrust", "guess"], "invalid choice"),
     ([], "POLICY.npz"),
 ]

@@ -221,7 +221,7 @@ def test_without_standard_input_it_says_so(tmp_path: Path) -> None:
     """Whose end ends it: closed, or ended before it began."""
     for closed in ("<&-", "</dev/null"):
         command = f'exec "$@" {closed}'
-        words = [sys.executable, "-m", "mjxball.rig.retrain", str(FLIGHT), "log.jsonl", str(tmp_path / "out.npz")]
+        words = [sys.executable, "-m", "mjxball.commands.retrain", str(FLIGHT), "log.jsonl", str(tmp_path / "out.npz")]
         done = subprocess.run(
             ["bash", "-c", command, "_", *words],
             cwd=REPOSITORY,

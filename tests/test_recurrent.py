@@ -21,7 +21,7 @@ from mjxball.algorithms.base import Shards
 from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.commands.train import main
 from mjxball.config import Config
-from mjxball.control.gru import gru_cell
+from mjxball.control.network import gru_cell
 from mjxball.env import TransportEnv
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.mean import mean_policy

@@ -176,5 +176,5 @@ class TestCommand:
         assert said in capsys.readouterr().err
 
     def test_missing_plant_file(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="does not exist"):
             read_plant(tmp_path / "none.json")

@@ -11,8 +11,8 @@ import numpy as np
 from jax import Array
 
 from mjxball.config import Config
+from mjxball.control.network import Network
 from mjxball.errors import InputError
-from mjxball.policy.network import Network
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -71,7 +71,7 @@ class RecurrentNetwork(PolicyNetwork):
     """A GRU below the ReLU layers; `layers` holds it as "gru": {"kernel", "recurrent", "bias"}.
 
     An observation holds the GRU's state behind the network's inputs, and an answer the next state behind the action
-    (`mjxball.policy.network.Network`, which computes it).
+    (`mjxball.control.network.Network`, which computes it).
     """
 
     def __call__(self, observation: Float[Array, "... n"]) -> Float[Array, "... answer"]:

@@ -14,11 +14,11 @@ from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.followers import OneThread, checked_observation
 from mjxball.control.multi_model_lqg import MultiModelLqg, team_geometry
+from mjxball.control.network import Network
 from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import PolicyFile, law_of, load_file
-from mjxball.policy.network import Network
 from mjxball.policy.single import SingleFollower, remembers_one
 
 Array = Any

@@ -35,7 +35,7 @@ class SingleFollower:
     """Network, law and memory of one follower; names are those of `MultiModelLqg`."""
 
     def __init__(self, law: FollowerLaw, lqg: MultiModelLqg, network: tuple[Any, ...]):
-        """Prepare `law`, with `lqg` in it, and `network`: the first four fields of `policy.network.Network`."""
+        """Prepare `law`, with `lqg` in it, and `network`: the first four fields of `control.network.Network`."""
         self._filters, self._network = _Filters(lqg), _Network(law, lqg.shown, *network)
         self._swings, self._held_room = _Swings(lqg) if lqg.swings else None, float(lqg.held_room)
         self._height, self._height_gain = lqg.height.tolist(), lqg.height_gain.tolist()

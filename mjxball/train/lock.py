@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.errors import InputError
+from mjxball.reading import parse_json
 
 LOCK = ".lock"  # in the run directory
 RENEWED = 10.0  # [s] between two renewals
@@ -114,7 +115,7 @@ def _in_use(path: Path, holder: dict[str, Any], more: str = "") -> InputError:
 def _holder(handle: int) -> dict[str, Any]:
     """What the file says of its holder; nothing if it is being written."""
     try:
-        found = json.loads(os.pread(handle, 4096, 0))
+        found = parse_json(os.pread(handle, 4096, 0))
     except (ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}

@@ -28,6 +28,7 @@ from mjxball.policy.file import PolicyFile, load_file
 from mjxball.reading import parse_json
 
 LONGEST_COUNT = 20  # digits of a number of steps
+SINCE = {"recurrent_units": 0}  # settings of followers that older policies do not name, and what these have
 
 
 def read_json(path: Path, called: str) -> Any:
@@ -109,7 +110,7 @@ def start_policy(start: dict[str, str], config: Config) -> PolicyFile:
         raise InputError(f"{path} is not the policy that the run was to start from: its SHA-256 has changed")
     own = parse_json(json.dumps(configs.to_dict(config)["follower"]))
     trained = configs.with_current_names(contents.card.get("config", {})).get("follower", {})
-    changed = [f"follower.{name}" for name in own if own[name] != trained.get(name)]
+    changed = [f"follower.{name}" for name in own if own[name] != trained.get(name, SINCE.get(name))]
     if changed:
         raise InputError(f"{path} was trained with other settings than the run's: {', '.join(changed)}")
     return contents

@@ -1,4 +1,7 @@
-"""The network of a policy file: its inputs normalised, ReLU layers, and in format 5 a GRU below them. NumPy alone."""
+"""A follower's network: inputs normalised, ReLU layers, and perhaps a gated recurrent unit below them.
+
+Written once, for training and for flight; runs on NumPy and on JAX arrays.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.control.gru import gru_cell
-
 Array = Any
+
+
+def gru_cell(hidden: Array, seen: Array, kernel: Array, recurrent: Array, bias: Array) -> Array:
+    """The next state (..., H) of a GRU in state `hidden` (..., H) at the input `seen` (..., n).
+
+    `kernel` (n, 3 H), `recurrent` (H, 3 H) and `bias` (3 H,) hold, side by side, the reset gate, the update gate and
+    the candidate. After Cho et al. 2014, the reset gate applied behind the product, as cuDNN and Flax do; an update
+    gate of 1 keeps the state.
+    """
+    xp, size = hidden.__array_namespace__(), hidden.shape[-1]
+    given, kept = seen @ kernel + bias, hidden @ recurrent
+    # The logistic function as a hyperbolic tangent, which does not overflow.
+    gates = 0.5 + 0.5 * xp.tanh(0.5 * (given[..., : 2 * size] + kept[..., : 2 * size]))
+    reset, update = gates[..., :size], gates[..., size:]
+    candidate = xp.tanh(given[..., 2 * size :] + reset * kept[..., 2 * size :])
+    return candidate + update * (hidden - candidate)
 
 
 class Network(NamedTuple):
@@ -23,7 +40,7 @@ class Network(NamedTuple):
     biases: Sequence[Array]
     mean: Array  # (n,) of the inputs, without the GRU's state
     scale: Array  # (n,) 1 / deviation, 0 for an input that is not used
-    gru: tuple[Array, Array, Array] | None = None  # `control.gru.gru_cell`'s kernel, recurrent, bias
+    gru: tuple[Array, Array, Array] | None = None  # `gru_cell`'s kernel, recurrent, bias
 
     def __call__(self, seen: Array) -> Array:
         """Action in [-1, 1] (..., 3) for the input `seen` (..., n), and behind it the next state (..., H) of a GRU."""
