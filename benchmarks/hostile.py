@@ -7,7 +7,6 @@ A case is a command line that is sound but for one flaw. It starts in a director
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,13 +16,11 @@ from typing import Any
 from hostile_files import ODD_FILES, ROOT, Content, logs, policies, rigs, series, sweeps
 from mjxball import cli, export
 from mjxball import config as configs
-from mjxball.commands import evaluate, train
+from mjxball.commands import evaluate, retrain, train
 from mjxball.fly import main as fly
 from mjxball.policy.file import shipped_policy
 from mjxball.rig import gains, identify
 from mjxball.view import command as view
-
-RETRAIN = next(name for name in ("mjxball.commands.retrain", "mjxball.rig.retrain") if importlib.util.find_spec(name))
 
 
 @dataclass(frozen=True)
@@ -75,7 +72,6 @@ def programs() -> list[Program]:
     text = frozenset(
         {"--env", "--reward", "--twin-load", "--mocap-option", "--bodies", "--mocap-host", "--coordinator"}
     )
-    retraining = importlib.import_module(RETRAIN)
     learning = ("paper", "--physics", "newton-euler", "--out", "run")
     short = ("copy", "--seconds", "1", "--physics", "newton-euler")
     return [
@@ -86,7 +82,13 @@ def programs() -> list[Program]:
         Program("export", module("export"), (balance, "out.npz"), parser_in(export.main), text),
         Program("gains", module("rig.gains"), ("--out", "gains.json"), gains.parser(), text),
         Program("identify", module("rig.identify"), ("flight.jsonl", "--out", "plant.json"), identify.parser(), text),
-        Program("retrain", ("-m", RETRAIN), (flight, "flight.jsonl", "out.npz"), parser_in(retraining.main), text),
+        Program(
+            "retrain",
+            ("-m", "mjxball.commands.retrain"),
+            (flight, "flight.jsonl", "out.npz"),
+            parser_in(retrain.main),
+            text,
+        ),
     ]
 
 

@@ -181,6 +181,7 @@ SOURCES = (
     "sim",
     "algorithms",
     "train",
+    "xla.py",
 )
 LIBRARIES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
 

@@ -107,9 +107,11 @@ def check_flight(flight: Flight, name: str) -> Flight:
         if not np.isfinite(array).all():
             raise InputError(f"{name}: {field} holds a value that is not finite")
     try:
-        check_times(flight["time"].tolist(), *STEPS)
+        told = check_times(flight["time"].tolist(), *STEPS)
     except ValueError as error:
         raise InputError(f"{name}: time must increase from row to row: {error}") from None
+    for phrase in told:
+        print(f"warning: {name}: {phrase}", file=sys.stderr)  # noqa: T201
     return Flight(flight.title, flight.plant, {field: flight[field] for field in wanted})
 
 
