@@ -14,6 +14,7 @@ from tables import rows
 
 from mjxball.fly.app.host import App
 from mjxball.fly.app.protocol import CAUSES, Phase
+from mjxball.fly.card import config_of, variants
 from mjxball.fly.telemetry import Rig
 
 WILD = (math.nan, math.inf, -3e38)
@@ -77,6 +78,31 @@ def test_parameters_that_cannot_be_leave_the_last_ones_in_use(phase: Phase):
             assert found == wanted, (role, name, value)
             assert refusal(bench.apps[role]) == text
             assert bench.phases == calm.phases
+
+
+@needs_gcc
+def test_the_curve_that_spinning_motors_show_is_flown():
+    """It comes in SPIN; every later period is that of a pair that had it before, up to the trim of a descent."""
+    known, found = (Bench(cores_of(), taken_off().rig) for _ in range(2))
+    for bench, before in ((known, True), (found, False)):
+        for phase, periods in ((Phase.IDLE, 3), (Phase.SPIN, 5)):
+            for _ in range(periods):
+                bench.tick(phase)
+            for app in bench.apps if before is (phase is Phase.IDLE) else ():
+                app.set("curve", 1)
+        assert bench.phases == [Phase.SPIN] * 2
+    sent = [[numbers(bench.tick(Phase.RAMP)) for _ in range(150)] for bench in (known, found)]
+    hovers = [own["older"].map.hover_thrust for own in variants(config_of(policy_of("flight").card))]
+    np.testing.assert_allclose([thrust for _, _, thrust in sent[1][-1]], hovers, rtol=0.01)
+    assert sent[1] == sent[0]
+    assert [numbers(found.tick(Phase.DESCEND)) for _ in range(5)] == [
+        numbers(known.tick(Phase.DESCEND)) for _ in range(5)
+    ]
+    assert [refusal(app) for app in found.apps] == [CAUSES[0]] * 2
+    late = flying()
+    late.apps[0].set("curve", 1)
+    late.tick(Phase.FLY)
+    assert refusal(late.apps[0]) == IN_FLIGHT
 
 
 @needs_gcc

@@ -9,17 +9,18 @@ from onboard_bench import cores_of, needs_gcc
 
 from mjxball.fly.app.protocol import Phase
 from mjxball.fly.supervisor import State as Laptop
-from mjxball.fly.twin.conditions import Surroundings
+from mjxball.fly.twin.conditions import FAULT_KINDS, Surroundings, drone_kind
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from virtual_flight import SETTLE, cause_of, code_of, settings_of
 
 
-def world(seconds: float = 6.0, **around: Any) -> VirtualTwin:
+def world(seconds: float = 6.0, curve: str = "linear", **around: Any) -> VirtualTwin:
     policy = Policy.load(shipped_policy("flight"))
     settings = settings_of(policy, seconds)
-    return VirtualTwin(policy, settings, surroundings=Surroundings(**around), settle=SETTLE, cores=cores_of())
+    kind, outside = drone_kind("2.1", curve), Surroundings(**around)
+    return VirtualTwin(policy, settings, kind=kind, surroundings=outside, settle=SETTLE, cores=cores_of())
 
 
 @needs_gcc
@@ -76,3 +77,36 @@ def test_a_low_battery_lands_both():
     assert cause_of(twin).startswith("APP_LANDS")
     assert twin.touchdown_speed() < 0.4
     assert twin.running() == [False, False]
+
+
+@needs_gcc
+def test_firmware_of_the_older_curve_is_flown_with_its_map():
+    """The laptop finds the curve while the motors spin, and tells the apps."""
+    twin = world(seconds=2.0, curve="older")
+    twin.run()
+    assert code_of(twin) == 0
+    assert twin.flight.spin.curves == ["older"] * 2
+    assert {one["refusal"] for one in twin.log.records if one["kind"] == "app"} == {"good"}
+
+
+@needs_gcc
+def test_why_a_flight_ended_is_what_laptop_and_apps_act_on():
+    """Not what the apps see to: their thrust is none that the laptop sent."""
+    twin = world(seconds=30.0)
+    twin.fly_until(Laptop.FLY)
+    twin.fly_for(1.0)
+    twin.drones[1].inject(FAULT_KINDS["peer"])
+    twin.run()
+    told = " ".join(twin.flight.how_it_ended())
+    assert "the other drone is not heard" in told
+    assert "unheard" not in told
+    assert "that led to" not in told
+
+    twin = world(seconds=30.0)
+    twin.fly_until(Laptop.FLY)
+    twin.fly_for(1.0)
+    twin.links[0].lost = "unplugged"
+    twin.run()
+    told = " ".join(twin.flight.how_it_ended())
+    assert told.startswith("ended early: link lost: leader: unplugged")
+    assert "unheard" not in told

@@ -123,8 +123,10 @@ def test_the_laptop_refuses_other_apps():
 
 def test_flags_that_contradict_onboard_are_refused(capsys: pytest.CaptureFixture):
     flight = shipped_policy("flight")
+    pair = ["--leader", "udp://127.0.0.1:9", "--follower", "udp://127.0.0.1:10"]
     for flags, text in (
         ([flight, "--rehearse", "--upload"], "--upload takes weights of 8 bits"),
+        ([flight, *pair, "--onboard", "--mocap", "vicon"], "the axes of --mocap"),
         ([flight, "--rehearse", "--onboard", "--mass", "0.07"], "leave --thrust, --hover and --mass out"),
         ([flight, "--rehearse", "--onboard", "--goal", "0", "0", "9"], "beyond the fence"),
         ([shipped_policy("balance"), "--rehearse", "--onboard"], "another plant than a pair of Crazyflies"),

@@ -202,6 +202,8 @@ def check_twin_options(options: argparse.Namespace) -> None:
         raise InputError("--upload takes weights of 8 bits: --onboard int8 --upload")
     if options.onboard and options.retrain:
         raise InputError("--retrain changes laws on the laptop: leave --onboard out")
+    if options.onboard and options.mocap:
+        raise InputError("--onboard cannot show that the axes of --mocap are right: leave one of them out")
     check_twin(options)
     for fault in options.fault:
         read_fault(fault)

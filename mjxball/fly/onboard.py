@@ -125,6 +125,7 @@ class OnboardFlight(Flight):
     def begin(self, now: float) -> None:
         """See `Flight.begin`."""
         self._noted: dict[str, tuple[object, ...]] = {}
+        self._of_apps: list[Fault] = []  # of this tick
         super().begin(now)
 
     def _command(self) -> tuple[list[Mapped] | None, list[Fault]]:
@@ -151,7 +152,12 @@ class OnboardFlight(Flight):
             link.send(order(wanted))
 
     def _advance(self, faults: list[Fault]) -> None:
-        super()._advance([one for fault in faults if (one := self._translated(fault))] + self._from_apps())
+        self._of_apps = self._from_apps()
+        super()._advance([one for fault in faults if (one := self._translated(fault))] + self._of_apps)
+
+    def _note_ending(self, faults: list[Fault], gap: float) -> None:
+        """What the apps say; nothing that they see to."""
+        super()._note_ending([fault for fault in faults if fault.event not in THEIRS] + self._of_apps, gap)
 
     def _translated(self, fault: Fault) -> Fault | None:
         """What a fault is to a flight on board."""
@@ -179,7 +185,7 @@ class OnboardFlight(Flight):
             if app is None:
                 continue
             self._note_app(name, app)
-            if state is State.SPIN and self.elapsed > STATE_AGE and app.phase is Phase.IDLE and app.refusal:
+            if state is State.SPIN and self.elapsed > STATE_AGE and app.phase <= Phase.SPIN and app.refusal:
                 found.append(Fault(Event.APP_REFUSES, f"{name}: {reason(app.refusal)}"))
             elif state in AIRBORNE and app.phase in NEWS and self.elapsed > STATE_AGE / 2:
                 ended = app.phase in (Phase.STOP, Phase.IDLE) and state in (State.LAND, State.DESCEND)

@@ -49,18 +49,16 @@ static uint8_t fault_of(const mjxball_parameters *set) {
     return set->battery > 0 && set->battery <= MOST_VOLTAGE ? MJXBALL_GOOD : MJXBALL_BAD_BATTERY;
 }
 
-/* Parameters can change at any moment. While some are unsound the last sound ones stay in use, and in the air those
- * that a flight begins with. Returns what is wrong. */
+/* Parameters can change at any moment. While some are unsound the last sound ones stay in use. Mount and curve are those
+ * that the motors start and the ramp begins with: spinning motors show the laptop the curve. Returns what is wrong. */
 static uint8_t adopt(mjxball_app *app, const mjxball_parameters *asked) {
-    const bool flying = app->phase != MJXBALL_IDLE;
+    const bool running = app->phase != MJXBALL_IDLE;
     uint8_t fault = fault_of(asked);
-    if (!fault && flying) {
-        for (int i = 0; i < 3; i++)
-            if (asked->mount[i] != app->set.mount[i]) fault = MJXBALL_NOT_ON_GROUND;
-        if (asked->curve != app->set.curve) fault = MJXBALL_NOT_ON_GROUND;
-    }
+    for (int i = 0; i < 3; i++)
+        if (!fault && running && asked->mount[i] != app->set.mount[i]) fault = MJXBALL_NOT_ON_GROUND;
+    if (!fault && app->phase > MJXBALL_SPIN && asked->curve != app->set.curve) fault = MJXBALL_NOT_ON_GROUND;
     if (!fault) app->set = *asked;
-    if (fault && flying) app->refusal = fault;
+    if (fault && running) app->refusal = fault;
     return fault;
 }
 

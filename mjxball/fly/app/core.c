@@ -97,12 +97,12 @@ static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_
     app->phase = phase;
     app->cause = cause;
     app->since = app->now;
+    if (phase <= MJXBALL_FLY) app->trim = hover_of(map);
     if (phase == MJXBALL_SPIN) {
         for (int i = 0; i < 3; i++) app->origin[i] = app->position[i];
         app->copying = 0;
         app->trusted = 1;
         app->late = 0;
-        app->trim = hover_of(map);
     } else if (phase == MJXBALL_FLY) {
         for (int i = 0; i < 7; i++) app->integral[i] = 0;
         app->saturated_since = app->now;
