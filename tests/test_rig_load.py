@@ -20,7 +20,7 @@ from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy, shipped_policy
 from mjxball.rig.load import LONGEST, IdentifiedLoad, LoadWatch
 
-LATE = 12.0  # [s] after the motors first turn
+LATE = 13.5  # [s] after the motors first turn
 TURNED = 0.4  # [s] after which they do
 POLICY = Policy.load(shipped_policy("flight"))
 # Mass [kg], place from O [m], and what else differs; then how far off mass [kg] and moment [kg m] may be. One standard
