@@ -28,10 +28,10 @@ def test_a_rehearsal_finds_its_load_and_fine_tunes(tmp_path: Path) -> None:
         "--twin-load",
         "0.006",
         "-0.04",
-        "7",
+        "8.5",
     ]
     done = subprocess.run(
-        [sys.executable, *map(str, command), "--seconds", "19", "--log", str(log)],
+        [sys.executable, *map(str, command), "--seconds", "20.5", "--log", str(log)],
         cwd=tmp_path,
         env={**environment(), "PYTHONPATH": str(REPOSITORY)},
         stdin=subprocess.DEVNULL,
