@@ -293,7 +293,8 @@ class Flight:
         self._back = Sustained(self.settings.limits.fresh)
         age = max((value for value in self._ages if math.isfinite(value)), default=0.0)
         if any(fault.event is Event.UNHEARD for fault in faults):
-            age = self._now - min(watch.heard for watch in self._monitor.uplinks if math.isfinite(watch.heard))
+            heard = [watch.heard for watch in self._monitor.uplinks if math.isfinite(watch.heard)]
+            age = self._now - min(heard, default=self._now)
         self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
         # Gently: a drone that does not hear keeps its thrust, and the other must not sink away from it.
         self._shares = command.blind_shares(self._last_known_state(), age, self.settings.period, command.GENTLE)

@@ -32,6 +32,7 @@ USUAL = 10.0  # [s] of that mean
 ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
 RECENT = 0.1  # [s] within which a thrust in force that stands still must have been sent
 SAME = 1.5  # [thrust units] within which two thrusts are one, rounded
+CLOSED = (State.RAMP, *GUIDED)  # what is measured decides on the thrust; before, a pair at rest may be quiet
 RISING = (State.RAMP, State.FLY)  # a drone that touches the ground feels more than its packets tell
 UNHEARD = 4  # health packets in a row without such an echo, or with one that stands still
 
@@ -132,7 +133,7 @@ class Monitor:
             if sensed is not None:
                 repeated, wrong = watch.sensed(sensed.sensed, clock.seconds(sensed.stamp))
                 still = still or repeated
-            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and phase in GUIDED else []
+            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and phase in CLOSED else []
             own += [Fault(Event.FRAME, f"{name}: {wrong}")] if wrong and phase in RISING else []
             if self._settings.dry_run:  # carried by hand it shows its axes as well; at rest it may be quiet
                 own = [fault for fault in own if fault.event is Event.FRAME]

@@ -18,7 +18,7 @@ from mjxball.errors import InputError
 from mjxball.fly import flight_log
 from mjxball.fly.card import ThrustChoice, command_maps, drone_of, gains_of, with_curve
 from mjxball.fly.command import CURVE_NAMES, CurveName, ForceCurve
-from mjxball.fly.limits import NAMES
+from mjxball.fly.limits import NAMES, ticks_per_command
 from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
 from mjxball.fly.supervisor import State
@@ -147,13 +147,14 @@ def load(path: Path) -> FlightLog:
 
 
 def _tick_remarks(times: list[float], config: Config) -> list[str]:
-    """What a reader should know of the ticks' times: holes, and another period than the policy's."""
+    """What a reader should know of the ticks' times: holes, and another period than the policy's calls for."""
     if len(times) < 2:
         return []
-    period, usual = config.timing.control_period, float(np.median(np.diff(times)))
+    period = config.timing.control_period / ticks_per_command(config.timing.control_period)
+    usual = float(np.median(np.diff(times)))
     found = [f"of its ticks {phrase}, where what was sent is held" for phrase in check_times(times)]
     if abs(usual - period) > OFF_RATE * period:
-        found.append(f"its ticks are {1e3 * usual:.3g} ms apart, and the policy's period is {1e3 * period:.3g} ms")
+        found.append(f"its ticks are {1e3 * usual:.3g} ms apart, and the policy's are {1e3 * period:.3g} ms")
     return found
 
 

@@ -33,7 +33,6 @@ from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.watchdog import NOTHING, Watchdog
 
-ENOUGH = 2.0  # [s] of data, below which an error says nothing
 SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
 
 
@@ -190,8 +189,6 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     if supervisor.cause is None and not (flown or flight.settings.dry_run):
         _say(f"no error of the flight: it takes {SETTLING:g} s to settle and {LEAST:g} s to measure (--seconds)")
     for name, figures in flight.succession.figures.items():
-        if figures.ticks * flight.settings.period < ENOUGH:
-            continue
         _say(f"{name}: {figures}" if len(flight.succession.figures) > 1 else str(figures))
     if journal.failure:
         _say(f"the log is not complete: {journal.failure}")

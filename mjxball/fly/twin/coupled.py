@@ -284,6 +284,7 @@ class CoupledPair:
         velocity = self._velocity(matrix)
         both, turning = np.stack([quaternion] * 2), np.stack([self._rates()] * 2)
         if self.surroundings.exact:
+            self.onboard.imu.settle(self._sensed())
             report = self.onboard.reported(position, velocity, both, turning, np.full((2, 9), 1e-5))
         else:
             report = self.onboard.report()

@@ -149,7 +149,7 @@ class StandIn:
         self._thrust = np.zeros(2)  # of each drone [N]
         self._charge = np.full(2, self.plant.full)
         self._commands, self._poses = np.zeros(2), np.zeros((2, 7))
-        return self._state(np.zeros(3))
+        return self._state(np.zeros(3), np.zeros(3))
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
         """The stand-in has no gains."""
@@ -175,13 +175,15 @@ class StandIn:
         self._charge = self._charge - dt * plant.drain * self._thrust / plant.curve.force(65535)
         matrix = rotations.matrix_from_quaternion(self._quaternion)
         force = self._thrust.sum() * matrix[:, 2] / plant.mass - np.array([0.0, 0.0, plant.gravity])
-        self._rates = np.clip(self._rates + dt * self._turning(setpoints, matrix), -FASTEST, FASTEST)
+        before = self._rates
+        self._rates = np.clip(before + dt * self._turning(setpoints, matrix), -FASTEST, FASTEST)
+        turning = (self._rates - before) / dt
         self._quaternion = rotations.integrate_quaternion(self._quaternion, dt * self._rates)
         self._velocity = self._velocity + dt * force
         self._position = self._position + dt * self._velocity
         if self._position[2] <= 0:
-            force = self._rest(force)
-        return self._state(force)
+            force, turning = self._rest(force), np.zeros(3)
+        return self._state(force, turning)
 
     def _turning(self, setpoints: np.ndarray, matrix: np.ndarray) -> np.ndarray:
         """Angular acceleration (3,) [rad/s2]: both drones' attitude loops, and the moment of unequal thrusts."""
@@ -211,16 +213,18 @@ class StandIn:
         self._rates = np.zeros(3)
         return force if lifting else np.zeros(3)
 
-    def _state(self, acceleration: np.ndarray) -> PairState:
+    def _state(self, acceleration: np.ndarray, turning: np.ndarray) -> PairState:
+        """With O at `acceleration` (3,) in the world [m/s2], the pair `turning` (3,) in body axes [rad/s2]."""
         plant, matrix = self.plant, rotations.matrix_from_quaternion(self._quaternion)
         arms = self._mounts @ matrix.T
         swing = rotations.cross(self._rates, self._mounts) @ matrix.T
         load = self._thrust / plant.curve.force(65535)
-        felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        force = rotations.cross(turning, self._mounts) + rotations.cross(self._rates, rotations.cross(self._rates, self._mounts))
+        force = force + matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
         battery = self._charge - plant.sag * load
         pwm = np.stack([motors.compensated(motors.MOTORS["2.1"], self._commands, battery)] * 4, axis=1)
         position, velocity = self._position + arms, self._velocity + swing
-        quaternion, rates, force = (np.stack([one] * 2) for one in (self._quaternion, self._rates, felt))
+        quaternion, rates = (np.stack([one] * 2) for one in (self._quaternion, self._rates))
         motion = position, velocity, quaternion, rates, force
         drive = pwm, pwm, self._commands
         return PairState(
