@@ -12,6 +12,10 @@ from fly_virtual import VirtualTwin, thrusts
 from mjxball.fly.limits import FlightSettings, Times
 from mjxball.fly.packets import THRUST_CEILING
 from mjxball.fly.supervisor import Event, State
+from mjxball.fly.twin.conditions import FAULT_KINDS
+from mjxball.fly.twin.virtual import MemoryLog
+from mjxball.fly.twin.virtual import VirtualTwin as CoupledTwin
+from mjxball.policy import Policy, shipped_policy
 
 
 def silence_down(world: VirtualTwin, number: int) -> None:
@@ -48,7 +52,9 @@ def away(world: VirtualTwin, number: int) -> None:
 
 
 def empty(world: VirtualTwin, number: int) -> None:
-    world.fault_drone(number, battery=-1.2)
+    for step in range(1, 15):  # slowly: one that drops at once is about to carry nothing
+        world.fault_drone(number, battery=-0.05 * step)
+        world.fly_for(0.3)
 
 
 def crash(world: VirtualTwin, number: int) -> None:
@@ -235,3 +241,32 @@ def test_a_frozen_estimator_is_found() -> None:
     world.fly_until(State.DONE)
     assert world.flight.supervisor.cause is not None
     assert world.running() == [False, False]
+
+
+def test_poses_that_stand_still_in_the_ramp_end_it_on_the_ground() -> None:
+    """Its thrust follows the measured height: it rose to 3 m while none was measured, and fell at 5.8 m/s."""
+    pytest.importorskip("mujoco")
+    policy = Policy.load(shipped_policy("flight"))
+    world = CoupledTwin(policy, FlightSettings(seconds=5.0), log=MemoryLog(False), settle=1.0)
+    world.fly_until(State.RAMP)
+    world.fly_for(0.2)
+    for drone in world.drones:
+        drone.inject(FAULT_KINDS["pose-frozen"])
+    world.run(15.0)
+    assert world.flight.supervisor.cause.event is Event.ESTIMATOR
+    assert max(moment.position[2] for moment in world.track) - world.rest < 0.005
+    assert world.running() == [False, False]
+
+
+def test_a_pair_that_never_acted_on_a_thrust_is_held_for_the_whole_time_of_its_watchdogs() -> None:
+    """Nobody knows when it heard the last one: that raised an error, and locked both drones."""
+    world = VirtualTwin(FlightSettings(seconds=5.0))
+    for watch in world.flight._monitor.uplinks:
+        watch.sent = lambda thrust, now: None
+    world.fly_until(State.HOLD)
+    began = world.now
+    world.fly_until(State.STOP)
+    assert world.flight.supervisor.cause.event is Event.UNHEARD
+    assert 0.2 < world.now - began <= world.flight.settings.times.drone_watchdog + 0.02
+    world.fly_until(State.DONE)
+    assert [drone.firmware.locked for drone in world.drones] == [False, False]

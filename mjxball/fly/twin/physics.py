@@ -105,6 +105,8 @@ class Pair(Protocol):
 
 
 CURVE = ForceCurve()
+# What the stand-in's drones report is that uncertain: no real stream repeats bit by bit. Standard deviations.
+VELOCITY_NOISE, RATE_NOISE = 1e-3, 5e-3  # [m/s], [rad/s]
 FASTEST = 30.0  # [rad/s] bound on the body rates: beyond it the oscillator is no model of anything
 
 
@@ -139,6 +141,7 @@ class StandIn:
     ):
         self.plant, self.kind, self.surroundings = plant, kind, surroundings
         self._mounts = np.array(plant.mounts)
+        self._random = np.random.default_rng(surroundings.seed)
         self._span = self._mounts[1] - self._mounts[0]
         self.start()
 
@@ -175,9 +178,8 @@ class StandIn:
         self._charge = self._charge - dt * plant.drain * self._thrust / plant.curve.force(65535)
         matrix = rotations.matrix_from_quaternion(self._quaternion)
         force = self._thrust.sum() * matrix[:, 2] / plant.mass - np.array([0.0, 0.0, plant.gravity])
-        before = self._rates
-        self._rates = np.clip(before + dt * self._turning(setpoints, matrix), -FASTEST, FASTEST)
-        turning = (self._rates - before) / dt
+        turning = self._turning(setpoints, matrix)
+        self._rates = np.clip(self._rates + dt * turning, -FASTEST, FASTEST)
         self._quaternion = rotations.integrate_quaternion(self._quaternion, dt * self._rates)
         self._velocity = self._velocity + dt * force
         self._position = self._position + dt * self._velocity
@@ -219,13 +221,15 @@ class StandIn:
         arms = self._mounts @ matrix.T
         swing = rotations.cross(self._rates, self._mounts) @ matrix.T
         load = self._thrust / plant.curve.force(65535)
-        force = rotations.cross(turning, self._mounts) + rotations.cross(self._rates, rotations.cross(self._rates, self._mounts))
-        force = force + matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        circling = rotations.cross(self._rates, rotations.cross(self._rates, self._mounts))
+        felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        force = felt + rotations.cross(turning, self._mounts) + circling
         battery = self._charge - plant.sag * load
         pwm = np.stack([motors.compensated(motors.MOTORS["2.1"], self._commands, battery)] * 4, axis=1)
         position, velocity = self._position + arms, self._velocity + swing
         quaternion, rates = (np.stack([one] * 2) for one in (self._quaternion, self._rates))
-        motion = position, velocity, quaternion, rates, force
+        noise = self._random.standard_normal((2, 2, 3))
+        seen = velocity + VELOCITY_NOISE * noise[0], quaternion, rates + RATE_NOISE * noise[1]
         drive = pwm, pwm, self._commands
         return PairState(
             position=position,
@@ -234,7 +238,7 @@ class StandIn:
             rates=rates,
             specific_force=force,
             battery=battery,
-            report=Report(*motion, np.full((2, 9), 1e-5), (2, 2), *drive, self._poses.copy()),
+            report=Report(position, *seen, force, np.full((2, 9), 1e-5), (2, 2), *drive, self._poses.copy()),
         )
 
 
