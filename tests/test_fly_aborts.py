@@ -52,7 +52,9 @@ def away(world: VirtualTwin, number: int) -> None:
 
 
 def empty(world: VirtualTwin, number: int) -> None:
-    world.fault_drone(number, battery=-1.2)
+    for step in range(1, 15):  # slowly: one that drops at once is about to carry nothing
+        world.fault_drone(number, battery=-0.05 * step)
+        world.fly_for(0.3)
 
 
 def crash(world: VirtualTwin, number: int) -> None:
@@ -241,8 +243,7 @@ def test_a_frozen_estimator_is_found() -> None:
     assert world.running() == [False, False]
 
 
-@pytest.mark.parametrize("kind", ["pose-frozen", "frozen"])
-def test_streams_that_stand_still_in_the_ramp_end_it_on_the_ground(kind: str) -> None:
+def test_poses_that_stand_still_in_the_ramp_end_it_on_the_ground() -> None:
     """Its thrust follows the measured height: it rose to 3 m while none was measured, and fell at 5.8 m/s."""
     pytest.importorskip("mujoco")
     policy = Policy.load(shipped_policy("flight"))
@@ -250,7 +251,7 @@ def test_streams_that_stand_still_in_the_ramp_end_it_on_the_ground(kind: str) ->
     world.fly_until(State.RAMP)
     world.fly_for(0.2)
     for drone in world.drones:
-        drone.inject(FAULT_KINDS[kind])
+        drone.inject(FAULT_KINDS["pose-frozen"])
     world.run(15.0)
     assert world.flight.supervisor.cause.event is Event.ESTIMATOR
     assert max(moment.position[2] for moment in world.track) - world.rest < 0.005

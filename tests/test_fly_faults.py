@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -12,6 +13,7 @@ from tables import rows
 from mjxball.control import motors
 from mjxball.control.motors import MOTORS
 from mjxball.fly.card import command_maps, config_of
+from mjxball.fly.command import CommandMap
 from mjxball.fly.lift import LiftWatch
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import Event, State
@@ -77,9 +79,15 @@ def test_an_uplink_that_comes_back_is_flown_through() -> None:
     assert world.flight.supervisor.cause is None
 
 
+@functools.cache
+def carried() -> CommandMap:
+    """What a drone of `flight` lifts."""
+    return command_maps(config_of(load_file(FLIGHT).card))[0]
+
+
 def lift(voltage: float) -> float:
     """Share of its weight that a drone of `flight` lifts at full power and `voltage` [V]."""
-    own = command_maps(config_of(load_file(FLIGHT).card))[0]
+    own = carried()
     full = 4 * motors.force(MOTORS["2.1"], np.float64(motors.FULL), np.float64(voltage))
     return float(full) / (own.carried_mass * own.gravity)
 

@@ -18,11 +18,11 @@ from mjxball.control import rotations
 from mjxball.fly import card
 from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import FlightSettings
-from mjxball.fly.recording import Recording, fly_again, read_recording
+from mjxball.fly.recording import Recording, _tick_remarks, fly_again, read_recording
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.conditions import Conditions, Surroundings, drone_kind
 from mjxball.fly.twin.physics import make_pair
-from mjxball.policy import Policy
+from mjxball.policy import Policy, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 from mjxball.view.command import main as view
@@ -139,9 +139,18 @@ def test_what_is_damaged_in_a_log_is_left_out(log: Path, recording: Recording, t
     assert "no end" in said[1]
     assert said[2:] == ["there is no state of the leader"]
     shared = np.isin(recording.time, found.time)
-    held = (recording.time[shared] > 1.0) & (recording.time[shared] < 3.5)
+    flown = recording.time[shared] - recording.time[recording.phase.index("fly")]
+    held = (flown > 0.99) & (flown < 1.43)  # the next state comes a tick later
     np.testing.assert_array_equal(found.position[~held], recording.position[shared][~held])
     assert np.abs(found.position - recording.position[shared]).max() > 1e-3
+
+
+def test_ticks_are_held_against_those_that_the_policy_is_flown_with() -> None:
+    """`universal` commands every 20 ms, in every second tick: each log of it was said to be off its period."""
+    config = card.config_of(card.load_policy(shipped_policy("universal")).card)
+    assert config.timing.control_period == 0.02
+    for step, remarked in ((0.01, False), (0.02, True), (0.013, True)):
+        assert bool(_tick_remarks([step * number for number in range(100)], config)) is remarked
 
 
 def test_other_plants_fly_again_on_the_stand_in(recording: Recording) -> None:

@@ -83,4 +83,5 @@ class TakeOff:
             elif share >= MOST - 0.01:
                 bound = ", the most that is tried"
             found.append(f"the {name} was sent {thrust:.0f} units ({share:.2f} of what should hover{bound})")
-        return f"the pair is not seen to leave the ground: {' and '.join(found)}; is it heavier, or does a propeller give less?"
+        why = "is it heavier, or does a propeller give less?"
+        return f"the pair is not seen to leave the ground: {' and '.join(found)}; {why}"

@@ -178,9 +178,8 @@ class StandIn:
         self._charge = self._charge - dt * plant.drain * self._thrust / plant.curve.force(65535)
         matrix = rotations.matrix_from_quaternion(self._quaternion)
         force = self._thrust.sum() * matrix[:, 2] / plant.mass - np.array([0.0, 0.0, plant.gravity])
-        before = self._rates
-        self._rates = np.clip(before + dt * self._turning(setpoints, matrix), -FASTEST, FASTEST)
-        turning = (self._rates - before) / dt
+        turning = self._turning(setpoints, matrix)
+        self._rates = np.clip(self._rates + dt * turning, -FASTEST, FASTEST)
         self._quaternion = rotations.integrate_quaternion(self._quaternion, dt * self._rates)
         self._velocity = self._velocity + dt * force
         self._position = self._position + dt * self._velocity
@@ -222,8 +221,9 @@ class StandIn:
         arms = self._mounts @ matrix.T
         swing = rotations.cross(self._rates, self._mounts) @ matrix.T
         load = self._thrust / plant.curve.force(65535)
-        force = rotations.cross(turning, self._mounts) + rotations.cross(self._rates, rotations.cross(self._rates, self._mounts))
-        force = force + matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        circling = rotations.cross(self._rates, rotations.cross(self._rates, self._mounts))
+        felt = matrix.T @ (acceleration + np.array([0.0, 0.0, plant.gravity]))
+        force = felt + rotations.cross(turning, self._mounts) + circling
         battery = self._charge - plant.sag * load
         pwm = np.stack([motors.compensated(motors.MOTORS["2.1"], self._commands, battery)] * 4, axis=1)
         position, velocity = self._position + arms, self._velocity + swing
