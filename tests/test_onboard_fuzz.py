@@ -16,7 +16,12 @@ FAULTS = (
     ("packets.h", "at + count > app->upload.size", "false", (1,)),
     ("packets.h", "if (!weights_are_good(memory)) return MJXBALL_BAD_UPLOAD;", "(void)weights_are_good;", (1,)),
     ("packets.h", "if (app->phase != MJXBALL_IDLE) return MJXBALL_NOT_ON_GROUND;", "", (1,)),
-    ("core.c", "if (out->active && !setpoint_is_good(out)) distrust(app, map, out);", "(void)setpoint_is_good;", (0, 1)),
+    (
+        "core.c",
+        "if (out->active && !setpoint_is_good(out)) distrust(app, map, out);",
+        "(void)setpoint_is_good;",
+        (0, 1),
+    ),
 )
 
 

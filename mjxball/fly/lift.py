@@ -24,6 +24,7 @@ WINDOW = 0.5  # [s] over which a voltage falls, or does not
 SCARCE = 1.05  # of its weight, below which a drone is given all that it can lift
 ALL = 1.2  # share of hover that is asked of it then
 LEVELLING = (2.5, 1.0)  # shares of hover by which an end of the stick is let down, per m and per m/s that it is up
+CLIMBS = 0.25  # [m/s] upward that a pair without lift cannot reach
 SETTLE = 0.5  # [s] that a landing takes beyond its way down
 
 
@@ -35,6 +36,7 @@ class LiftWatch:
         self._raw = [collections.deque[float](maxlen=SAMPLES) for _ in NAMES]
         self._seen: list[collections.deque[tuple[float, float]]] = [collections.deque() for _ in NAMES]
         self.shares = [np.inf, np.inf]  # of what it carries, the most that each drone can lift
+        self._disproved = False  # whether a pair without lift was seen to climb
 
     @property
     def share(self) -> float:
@@ -72,9 +74,11 @@ class LiftWatch:
 
         Where lift is scarce a drone that lacks it gives all it has, since to sink at leisure would cost speed. One that
         does not lack it lifts no more than the other, or the stick turns over. What a weak drone gives lags, and is
-        spent on its attitude too, so the end of the stick that is `seen` to rise is let down.
+        spent on its attitude too, so the end of the stick that is `seen` to rise is let down. A pair that is `seen` to
+        climb has lift enough, whatever its voltage reads, for the rest of the flight.
         """
-        if self.share > SCARCE:
+        self._disproved = self._disproved or (seen is not None and float(seen.velocity[2]) > CLIMBS)
+        if self.share > SCARCE or self._disproved:
             return [wanted, wanted]
         up, rising = 0.0, 0.0  # the leader above the follower [m], and how fast [m/s]
         if seen is not None:
