@@ -248,7 +248,7 @@ def test_only_a_pair_pays_for_filters_of_its_own_about_roll():
     of_three = [in_team(made, "three", Path("team3"), 1) for made in (more, less)]
     assert footprint(of_three[0]) == footprint(of_three[1])
     own, other = (c_header(made, "follower").splitlines() for made in of_three)
-    found = [pair for pair in zip(own, other, strict=True) if pair[0] != pair[1] and "MJXBALL_H_" not in pair[0]]
+    found = [pair for pair in zip(own, other, strict=True) if pair[0] != pair[1] and "_H_" not in pair[0]]
     assert [line.rpartition(" ")[0] for pair in found for line in pair] == [
         *["#define MJXBALL_FOLLOWER_RIG_COS"] * 2,
         *["#define MJXBALL_FOLLOWER_RIG_SIN"] * 2,
