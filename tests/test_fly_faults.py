@@ -14,9 +14,10 @@ from mjxball.control import motors
 from mjxball.control.motors import MOTORS
 from mjxball.fly.card import command_maps, config_of
 from mjxball.fly.command import CommandMap
-from mjxball.fly.lift import LiftWatch
+from mjxball.fly.lift import ALL, LiftWatch
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import Event, State
+from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS
 from mjxball.fly.twin.virtual import MemoryLog, Moment, VirtualTwin
 from mjxball.policy import Policy, load_file
@@ -120,6 +121,18 @@ def test_a_battery_that_gives_way_at_once_lets_the_pair_fall_level(drones: tuple
     assert max(moment.tilt for moment in track) < math.radians(10)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("drones", [(0, 1), (1,)])
+def test_voltages_that_read_wrongly_low_do_not_make_a_descent_climb(drones: tuple[int, ...]) -> None:
+    """Both were given all power, and rose to 17 m."""
+    world = hovering()
+    track = after(world, "battery", *drones)
+    assert world.flight.supervisor.cause.event is Event.LIFT
+    assert max(moment.position[2] for moment in track) - world.rest < HEIGHT + 0.1
+    assert world.touchdown_speed() < 0.6
+    assert max(moment.tilt for moment in track) < math.radians(12)
+
+
 # Voltage of one battery at a time [s]; where lift is lost, how long before or after that it is said at least [s].
 BEFORE, AFTER = 1.0, -0.05  # a battery that fades, one that gives way at once
 BATTERIES = [
@@ -150,6 +163,19 @@ def test_lift_is_in_danger_where_the_voltage_says_so(voltage, spare: float | Non
         assert watch.share == pytest.approx(lift(voltage(1.97)), rel=0.01)
         gone = next((0.01 * n for n in range(1000) if lift(voltage(0.01 * n)) < 1), math.inf)
         assert gone - found[0][0] >= spare
+
+
+def test_a_pair_without_lift_that_climbs_has_lift() -> None:
+    watch = LiftWatch(MOTORS["2.1"])
+    rig = Rig((0.0, 0.15, 0.0), (0.0, -0.15, 0.0))
+    maps = command_maps(config_of(load_file(FLIGHT).card))
+    for number in range(5):
+        watch.update([2.6, 2.6], maps, HEIGHT, 0.4, 0.01 * number)
+    seen = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
+    assert watch.shared(0.98, seen, rig) == [ALL, ALL]
+    for speed, shares in ((0.2, [ALL, ALL]), (0.3, [0.98, 0.98]), (-0.4, [0.98, 0.98])):
+        rising = seen._replace(velocity=np.array([0.0, 0.0, speed]))
+        assert watch.shared(0.98, rising, rig) == shares
 
 
 @pytest.mark.slow

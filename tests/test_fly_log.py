@@ -285,7 +285,7 @@ def test_missing_ticks_and_another_rate_are_told(tmp_path: Path) -> None:
     path = tmp_path / "slow.jsonl"
     path.write_text("".join(json.dumps(one) + "\n" for one in slow))
     (remark,) = load(path).remarks
-    assert "30 ms apart, and the policy's period is 10 ms" in remark
+    assert "30 ms apart, and the policy's are 10 ms" in remark
 
 
 def test_it_never_overwrites(tmp_path: Path) -> None:

@@ -84,7 +84,8 @@ class Flight:
 
     @property
     def _lifts_at(self) -> float:
-        return min(LIFTED, self.settings.goal[2] / 2)
+        highest = LIFTED if self._mocap is None else probe.LIFTED
+        return min(highest, self.settings.goal[2] / 2)
 
     @property
     def elapsed(self) -> float:

@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 TIME = 1.0  # [s]
+LIFTED = 0.025  # [m] at which the laws take over, still climbing: axes are to be shown below 5 cm
 HEIGHT = 0.04  # [m] of the goal meanwhile
 TILT = math.radians(4)  # amplitude of roll or pitch
 BEGIN, PERIOD = 0.3, 0.6  # [s] one cosine, which leaves neither speed nor offset behind
