@@ -410,9 +410,17 @@ class TransportEnv:
             leader_command=commands.leader,
             follower_command=commands.follower,
             tilt_disagreement=(commands.follower - commands.leader)[..., self._unloaded],
+            spread=self._spread(commands.follower, after.rig) if self._followers else None,
             ball=jnp.atleast_1d(plant.ball_offset / self._ball_limit),
             terminated=terminated,
         )
+
+    def _spread(self, commands: Float[Array, "followers 3"], rig: Any) -> Float[Array, "followers 3"]:
+        """Commands less their mean over the followers that fly."""
+        if rig == ():
+            return commands - commands.mean(axis=0)
+        flies = (rig.drone_mass[np.array(self.config.plant.followers)] > 0)[:, None]
+        return flies * (commands - (flies * commands).sum(axis=0) / flies.sum())
 
     @staticmethod
     def report(totals: Any, peaks: Any, count: float, evaluation: bool) -> dict[str, Any]:

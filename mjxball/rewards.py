@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 class Transition(NamedTuple):
     """What a reward may depend on: the truth after one control step, and what was commanded in it.
 
-    Of several followers `action`, `last_action`, `action_average`, `follower_command` and `tilt_disagreement` have an
-    axis for them, and so has the reward.
+    Of several followers `action`, `last_action`, `action_average`, `follower_command`, `tilt_disagreement` and `spread`
+    have an axis for them, and so has the reward.
     """
 
     error: Vector  # e_o, goal less position of O [m]
@@ -30,6 +30,7 @@ class Transition(NamedTuple):
     leader_command: Vector  # roll, pitch [rad], vertical acceleration [m/s2]
     follower_command: Vector  # likewise
     tilt_disagreement: Scalar  # follower's less leader's command about the axis that no load turns [rad]
+    spread: Vector | None  # a follower's command less the mean of all followers' [rad, m/s2]; None: there is one
     ball: Float[Array, "... directions"]  # a rolling ball's offset along the load's directions over its end stop's
     terminated: Bool[Array, "..."]  # whether the episode ended by leaving the termination distance or by diverging
 
@@ -59,10 +60,14 @@ def task_reward(weights: Reward, step: Transition) -> Scalar:
         + weights.effort * square(step.action)
         + weights.smoothness * square(step.action - step.last_action)
     )
+
+    def of_command(difference: Vector) -> Scalar:
+        return square(difference[..., :2]) + 0.01 * difference[..., 2] ** 2
+
     if _used(weights.command_change):
-        total = total - weights.command_change * (
-            square(step.command_change[..., :2]) + 0.01 * step.command_change[..., 2] ** 2
-        )
+        total = total - weights.command_change * of_command(step.command_change)
+    if _used(weights.spread) and step.spread is not None:
+        total = total - weights.spread * of_command(step.spread)
     if _used(weights.tilt_disagreement):
         total = total - weights.tilt_disagreement * step.tilt_disagreement**2
     if _used(weights.ball):

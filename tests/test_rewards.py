@@ -12,7 +12,7 @@ ZERO = np.zeros(3)
 ERROR_ONLY = Reward(error=2.0, error_scale=0.1, velocity=0, tilt=0, rates=0, effort=0, smoothness=0)
 
 
-STILL = Transition(*[ZERO] * 10, tilt_disagreement=0.0, ball=ZERO[:1], terminated=np.array(False))
+STILL = Transition(*[ZERO] * 10, tilt_disagreement=0.0, spread=ZERO, ball=ZERO[:1], terminated=np.array(False))
 
 
 def task(weights=ERROR_ONLY, **parts):
@@ -71,6 +71,7 @@ def test_error_cost_has_a_finite_gradient_at_the_goal():
         ({"effort": 3.0}, {"action": [1.0, 0.0, -1.0], "last_action": [1.0, 0.0, -1.0]}, -6.0),
         ({"steady_action": 3.0}, {"action_average": [1.0, 0.5, 0.0]}, -3.75),
         ({"tilt_disagreement": 3.0}, {"tilt_disagreement": -0.5}, -0.75),
+        ({"spread": 3.0}, {"spread": [1.0, -0.5, 2.0]}, -3.87),
         ({"ball": 3.0}, {"ball": [-0.5]}, -0.75),
         ({"command_change": 3.0}, {"command_change": [1.0, -0.5, 0.0]}, -3.75),
         ({"command_change": 3.0}, {"command_change": [0.0, 0.0, 2.0]}, -0.12),  # a hundredth for 1 (m/s2)^2

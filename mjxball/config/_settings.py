@@ -267,6 +267,12 @@ class Reward:
     tilt_disagreement: float = setting(
         0.0, "weight of the squared difference of both drones' tilt commands about the axis that no load turns", low=0
     )
+    spread: float = setting(
+        0.0,
+        "weight of the squared differences of a follower's roll, pitch [1/rad2] and vertical [1e-2 s4/m2] command to "
+        "the mean of all followers: they are not to work against each other",
+        low=0,
+    )
     termination: float = setting(50.0, "cost of leaving termination_distance, once", low=0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import math
 from collections.abc import Sequence
 
@@ -68,6 +69,7 @@ class Flight:
         self._hold_for = settings.times.drone_watchdog
         self._shares = [1.0]  # of the trims, tick by tick, where the height is not measured
         self._land_height = 0.0
+        self._heights = collections.deque([math.inf], round(settings.times.rest / settings.period) + 1)  # of O [m]
         self._highest_place = 0.0  # of O above where it stood, under the laws [m]
         self._take_off = TakeOff(rig, settings.times, settings.period, self._lifts_at, settings.stand)
 
@@ -109,6 +111,7 @@ class Flight:
         faults += self._monitor.update(self.supervisor.state, self.links, self._ages, now)
         if self._mocap is not None and any(fault.event is Event.FRAME for fault in faults):
             self._mocap.halt()
+        self._heights.append(self._height(self._object()))
         mapped, broken = self._command()
         self._advance(faults + broken + self._progress())
         self._note_ending(faults + broken, gap)
@@ -182,7 +185,8 @@ class Flight:
         seen, times = self._trusted(), self.settings.times
         if seen is None:  # nothing tells: by the time that the blind way down takes, with some to spare
             return self.elapsed >= len(self._shares) * self.settings.period + times.settled
-        return self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
+        low = self._height(seen) < times.near_ground and abs(seen.velocity[2]) < times.still
+        return low and self._heights[0] - self._heights[-1] < times.rest_sunk
 
     def _is_off(self) -> bool:
         """True once the legs carry nothing, so that the laws may take over."""

@@ -68,6 +68,8 @@ class Times:
     settled: float = 0.3  # a landing is believed after this [s]
     near_ground: float = 0.04  # of O above where it stood [m]
     still: float = 0.12  # vertical speed below which it stands [m/s]
+    rest: float = 0.15  # that it must not have sunk in [s]
+    rest_sunk: float = 0.005  # by more than that [m]: a slow landing is as slow, and is not over
 
     @property
     def limits(self) -> dict[State, float]:
