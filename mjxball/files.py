@@ -30,7 +30,8 @@ def read_bytes(path: str | os.PathLike[str], kind: str = "", limit: int = MAX_BY
         if not stat.S_ISREG(status.st_mode):
             raise InputError(f"{called} is not a regular file")
         if status.st_size > limit:
-            raise InputError(f"{called} cannot be read: it is larger than {limit >> 20} MiB")
+            most = f"{limit >> 20} MiB" if limit >= 2**20 else f"{limit >> 10} KiB"
+            raise InputError(f"{called} cannot be read: it is larger than {most}")
         with open(path, "rb") as stream:
             return stream.read(status.st_size)
     except InputError:

@@ -20,7 +20,7 @@ from mjxball.fly.preflight import read_gains
 from mjxball.policy import load_file
 from mjxball.rig.log import read_log
 from mjxball.train.run_directory import file_hash, read_config, read_json, read_rows
-from mjxball.view.flight import load_flight
+from mjxball.view.flight import flight_from, load_flight
 
 READERS = {
     "policy": load_file,
@@ -31,6 +31,7 @@ READERS = {
     "table": read_rows,
     "gains": read_gains,
     "flight": load_flight,
+    "what is viewed": lambda path: flight_from(str(path.rename(path.with_suffix(".npz"))), {}, "newton-euler"),
     "arrays of a log": lambda path: read_log(path.rename(path.with_suffix(".npz"))),
 }
 HOLE = 2**32  # [B] beyond what any reader takes

@@ -125,6 +125,8 @@ REFUSED = {
     "negative mass": (RING + "mass = -1.0", "drones.2.mass must be greater than 0"),
     "mass is not a number": (RING + "mass = nan", "drones.2.mass must be finite"),
     "mass is a word": (RING + 'mass = "heavy"', "drones.2.mass takes numbers"),
+    "object_mass is a word": (RING.replace("[plant]", '[plant]\nobject_mass = "0.3"', 1), "object_mass takes numbers"),
+    "ten thousand drones": (RING + "[[plant.drones]]\nmount = [0.1, 0.1, 0.0]\n" * 10_000, "is larger than 64 KiB"),
     "rim off the carrier": (RING.replace("[plant]", "[plant]\nball_stop = 0.3", 1), "lies off the object"),
     "load outside its carrier": (RING + "[scenario]\ncg_amplitude = [0.0, 0.3]", "leaves the object"),
     "the follower first": ('base = "pair"\n[plant]\nleader = 1\n', "must lie ahead"),

@@ -12,7 +12,7 @@ from mjxball.config._plant import Plant
 from mjxball.config._renamed import current_name
 from mjxball.config._settings import Config
 from mjxball.config._tree import apply_overrides, leaves, override
-from mjxball.config._validate import validate
+from mjxball.config._validate import check_leaves, validate
 from mjxball.errors import InputError
 from mjxball.files import MissingFileError, read_text
 from mjxball.reading import parse_json
@@ -21,6 +21,7 @@ PLANT_PARTS = ("plant", "attitude", "autopilot", "scenario", "motion")  # what a
 SHIPPED = Path(__file__).parent / "plants"
 PLANTS = tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))  # names that `--plant` takes
 DRONES = "plant.drones"
+MAX_PLANT = 2**16  # bytes of a plant file; TOML of thousands of drones takes minutes to read
 
 
 class PlantFile(NamedTuple):
@@ -63,7 +64,7 @@ def read_plant(source: Path | str) -> PlantFile:
 def _parsed(path: Path) -> dict[str, Any]:
     kind = "TOML" if path.suffix == ".toml" else "JSON"
     try:
-        text = read_text(path, "plant file")
+        text = read_text(path, "plant file", MAX_PLANT)
     except MissingFileError as error:
         raise InputError(f"{error}; by name there are {', '.join(PLANTS)}") from None
     try:
@@ -103,6 +104,7 @@ def with_plant(config: Config, source: Path | str | None, flags: Mapping[str, st
         changed = apply_overrides(config, settings)
         for path, text in flags.items():
             changed = override(changed, path, text)
+        check_leaves(changed)
         said = {current_name(path) for path in (*settings, *flags)}
         changed = validate(follow_plant(changed, config.plant, said))
         if DRONES in settings:

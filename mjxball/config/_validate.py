@@ -63,14 +63,19 @@ def _check_number(path: str, number: Any, kind: type, bounds: Any) -> None:
         raise InputError(f"{path} must be at most {bounds['high']:g}, not {number:g}")
 
 
-def validate(config: Config) -> Config:
-    """Return `config` if every leaf and every relation between leaves is sound, else raise InputError."""
+def check_leaves(config: Config) -> None:
+    """Raise InputError unless every setting is of its type and within its own bounds."""
     for path, value, item in leaves(config):
         owner: Any = config
         for part in path.split(".")[:-1]:
             owner = owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
         kind: Any = type(owner)  # hashable, which no type checker knows of `type[Any]`
         _check_leaf(path, value, item, _types_of(kind)[item.name])
+
+
+def validate(config: Config) -> Config:
+    """Return `config` if every leaf and every relation between leaves is sound, else raise InputError."""
+    check_leaves(config)
     _validate_plant(config.plant)
     check_units(config)
     _validate_team(config)

@@ -133,7 +133,7 @@ def flight_from(source: str, changes: Mapping[str, Any], physics: str, plant: Pa
     it is none of these.
     """
     path = Path(source)
-    if path.suffix == ".npz" and is_flight(path):
+    if path.suffix == ".npz" and path.is_file() and is_flight(path):
         return load_flight(path)
     if path.is_file() and path.suffix != ".npz":
         return read_log(path)
