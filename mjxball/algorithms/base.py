@@ -12,7 +12,6 @@ from jax import Array
 
 from mjxball.config import Config
 from mjxball.control.network import Network
-from mjxball.errors import InputError
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -78,6 +77,11 @@ class RecurrentNetwork(PolicyNetwork):
         """Mean action in [-1, 1] at `observation`, and the GRU's next state."""
         return self.network()(observation[..., : self.inputs + self.units])
 
+    def outputs(self, observation: Float[Array, "... n"]) -> tuple[Array, Array]:
+        """(mean and deviation of the action before tanh, the GRU's next state)."""
+        value, state = self.network(deviations=True).outputs(observation[..., : self.inputs + self.units])
+        return value, jnp.asarray(state)
+
     @property
     def inputs(self) -> int:
         """Of the network, the GRU's state not counted."""
@@ -88,14 +92,15 @@ class RecurrentNetwork(PolicyNetwork):
         """Of the GRU."""
         return self.layers["gru"]["recurrent"].shape[-2]
 
-    def network(self) -> Network:
-        """As a policy file has it, without the deviations of the action."""
+    def network(self, deviations: bool = False) -> Network:
+        """As a policy file has it, without the `deviations` of the action."""
         names = sorted(self.layers.keys() - {"gru"}, key=lambda name: int(name.rsplit("_", 1)[1]))
         weights, biases = ([self.layers[name][part] for name in names] for part in ("kernel", "bias"))
-        half, own, gru = weights[-1].shape[-1] // 2, slice(self.inputs), self.layers["gru"]
+        columns, own, gru = weights[-1].shape[-1], slice(self.inputs), self.layers["gru"]
+        told = slice(columns if deviations else columns // 2)
         return Network(
-            weights=(*weights[:-1], weights[-1][..., :half]),
-            biases=(*biases[:-1], biases[-1][..., :half]),
+            weights=(*weights[:-1], weights[-1][..., told]),
+            biases=(*biases[:-1], biases[-1][..., told]),
             mean=self.mean[..., own],
             scale=(self.mask[..., own] / self.deviation[..., own]),
             gru=(gru["kernel"], gru["recurrent"], gru["bias"]),
@@ -127,13 +132,6 @@ class Shards(NamedTuple):
     def total(self, value: Any) -> Any:
         """Sum over the shards."""
         return jax.lax.psum(value, self.axis) if self.axis else value
-
-
-def without_recurrence(environments: Environments, name: str) -> None:
-    """Raise InputError if a recurrent policy is to be trained by the algorithm `name`, which learns step by step."""
-    slots = environments.recurrent_slots
-    if slots.stop > slots.start:
-        raise InputError(f"follower.recurrent_units is for --algorithm gradient, not for {name}")
 
 
 class Transition(NamedTuple):

@@ -11,6 +11,7 @@ import numpy as np
 import optax
 
 from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
+from mjxball.algorithms.recurrent import fresh_layers
 from mjxball.algorithms.scalar_form import scalar_form
 from mjxball.config import Config
 from mjxball.errors import InputError
@@ -18,8 +19,6 @@ from mjxball.policy.file import PolicyFile
 
 Array = Any
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
-SHORTEST_MEMORY, LONGEST_MEMORY = 1.5, 150.0  # control steps that units of a GRU keep their state for at the start
-RECURRENT_GAIN = 0.7  # of a GRU's orthogonal recurrent weights at the start
 
 
 class GradientState(NamedTuple):
@@ -67,19 +66,9 @@ class FirstOrderGradient:
         self._mask: Any = np.asarray(environments.policy_mask, np.float32)
 
     def init(self, key: Array) -> GradientState:
-        """Weights as Flax draws them (LeCun's), near 0 in the last layer: the first policy adds hardly anything."""
-        layers = {}
-        if self._units:
-            key, own = jax.random.split(key)
-            layers["gru"] = _fresh_gru(own, self._slots.start, self._units)
-        pairs = list(zip(self._sizes[:-1], self._sizes[1:], strict=True))
-        for number, (rows, columns) in enumerate(pairs):
-            key, own = jax.random.split(key)
-            last = number == len(pairs) - 1
-            first = self._slots.stop if self._units and number == 0 else rows  # what is seen, and a GRU's state
-            shape = first + (self._units if last else 0), columns
-            kernel = jax.nn.initializers.lecun_uniform()(own, shape)
-            layers[f"hidden_{number}"] = {"kernel": kernel * (0.01 if last else 1.0), "bias": jnp.zeros(columns)}
+        """A policy that adds hardly anything."""
+        seen = self._slots.start if self._units else self._sizes[0]
+        layers = fresh_layers(key, seen, self._units, self._sizes[1:])
         zero, none = jnp.zeros(()), jnp.zeros(self._sizes[0])
         slope = jax.tree.map(jnp.zeros_like, layers)
         return GradientState(layers, self._adam.init(layers), slope, zero, none, none, zero, jnp.zeros((), jnp.int32))
@@ -210,20 +199,6 @@ class FirstOrderGradient:
                 f"gradient.num_envs = {self._config.num_envs} cannot be split over {parts} devices evenly; "
                 "make it a multiple"
             )
-
-
-def _fresh_gru(key: Array, inputs: int, units: int) -> dict[str, Array]:
-    """A GRU at the start: orthogonal recurrent weights, and units that forget within 1.5 to 150 control steps."""
-    kernel, recurrent, memory = jax.random.split(key, 3)
-    square = jax.nn.initializers.orthogonal(RECURRENT_GAIN)
-    blocks = [square(own, (units, units)) for own in jax.random.split(recurrent, 3)]
-    low, high = np.log(SHORTEST_MEMORY), np.log(LONGEST_MEMORY)
-    steps = jnp.exp(jax.random.uniform(memory, (units,), minval=low, maxval=high))
-    return {
-        "kernel": jax.nn.initializers.lecun_uniform()(kernel, (inputs, 3 * units)),
-        "recurrent": jnp.concatenate(blocks, axis=1),
-        "bias": jnp.concatenate([jnp.zeros(units), jnp.log(steps - 1.0), jnp.zeros(units)]),
-    }
 
 
 def _forget(envs: Any) -> Any:

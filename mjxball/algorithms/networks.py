@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from mjxball.algorithms.recurrent import RecurrentPolicy
 from mjxball.config import Sac
 from mjxball.quiet import import_brax_training
 
@@ -17,7 +18,7 @@ brax = import_brax_training()
 
 
 class Networks(NamedTuple):
-    """Brax's `SACNetworks` and a state-value network, None unless `state_value`."""
+    """Brax's `SACNetworks`, perhaps with a recurrent policy, and a state-value network, None unless `state_value`."""
 
     policy_network: Any
     q_network: Any
@@ -25,11 +26,13 @@ class Networks(NamedTuple):
     parametric_action_distribution: Any
 
 
-def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = None) -> Networks:
+def make_networks(
+    config: Sac, mask: Any, action_size: int, critic_mask: Any = None, recurrent_slots: slice | None = None
+) -> Networks:
     """Brax's SAC networks: tanh-squashed Gaussian policy and critics, ReLU, on normalised observations.
 
     `mask` (n,) of 0 and 1 hides slots of the observation from the policy, `critic_mask` from critics and value
-    (None: the same).
+    (None: the same). With `recurrent_slots` of the observation the policy is a `RecurrentPolicy`.
     """
     distribution = TanhGaussian(event_size=action_size)
     observation_size = len(mask)
@@ -37,14 +40,18 @@ def make_networks(config: Sac, mask: Any, action_size: int, critic_mask: Any = N
     value_network = brax.networks.make_value_network(
         observation_size, preprocess_observations_fn=normalise_all, hidden_layer_sizes=config.critic_layers
     )
-    return Networks(
-        policy_network=brax.networks.make_policy_network(
+    if recurrent_slots is not None:
+        policy: Any = RecurrentPolicy(recurrent_slots, (*config.policy_layers, distribution.param_size), mask)
+    else:
+        policy = brax.networks.make_policy_network(
             distribution.param_size,
             observation_size,
             preprocess_observations_fn=normalise,
             hidden_layer_sizes=config.policy_layers,
             activation=jax.nn.relu,
-        ),
+        )
+    return Networks(
+        policy_network=policy,
         q_network=_critics(config, observation_size, action_size, normalise_all),
         value_network=value_network if config.state_value else None,
         parametric_action_distribution=distribution,

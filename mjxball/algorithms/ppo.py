@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import jax
@@ -14,12 +15,13 @@ from mjxball.algorithms.base import (
     Environments,
     Phase,
     PolicyNetwork,
+    RecurrentNetwork,
     Schedule,
     SwishNetwork,
     Transition,
-    without_recurrence,
 )
 from mjxball.algorithms.networks import normaliser
+from mjxball.algorithms.recurrent import RecurrentPolicy
 from mjxball.config import Config, Ppo
 from mjxball.errors import InputError
 from mjxball.quiet import import_brax_ppo, import_brax_training
@@ -51,15 +53,21 @@ class ProximalPolicyOptimization:
     update_keys = 1
 
     def __init__(self, config: Config, environments: Environments):
-        without_recurrence(environments, "ppo")
-        ppo = config.ppo
+        ppo, slots = config.ppo, environments.recurrent_slots
+        self._units = slots.stop - slots.start
         self._config, self._environments, self._shards = ppo, environments, environments.shards
         self.steps_per_collect = ppo.unrolls * ppo.unroll_length
         self._count = environments.count * ppo.unrolls
         self.schedule = Schedule(ppo.total_steps, ppo.num_envs, 0, ppo.num_evaluations, 0.0)
         self._mask = environments.policy_mask
-        self._sizes = (environments.observation_size, environments.action_size)
+        self._sizes = (environments.observation_size, environments.action_size - self._units)
         self.networks = make_networks(ppo, self._mask, self._sizes[1], environments.critic_mask)
+        self._of_unrolls = self.networks  # as the loss sees them: one answer for each step of an unroll
+        if self._units:
+            parameters = self.networks.parametric_action_distribution.param_size
+            policy = RecurrentPolicy(slots, (*ppo.policy_layers, parameters), self._mask)
+            self.networks = self.networks.replace(policy_network=policy)
+            self._of_unrolls = self.networks.replace(policy_network=SimpleNamespace(apply=policy.unroll))
 
     def init(self, key: Array) -> PpoState:
         """Fresh networks, and a rollout of zeros."""
@@ -81,11 +89,15 @@ class ProximalPolicyOptimization:
         distribution = self.networks.parametric_action_distribution
 
         def step(envs: Any, key: Array) -> tuple[Any, Any]:
-            parameters = self.networks.policy_network.apply(state.normaliser, state.parameters.policy, envs.states.obs)
+            network, arguments = self.networks.policy_network, (state.normaliser, state.parameters.policy)
+            if self._units:
+                parameters, memory = network.step(*arguments, envs.states.obs)
+            else:
+                parameters, memory = network.apply(*arguments, envs.states.obs), envs.states.obs[..., :0]
             raw = distribution.sample_no_postprocessing(parameters, self._shards.own(key))
             action = jnp.where(phase.evaluate, distribution.mode(parameters), distribution.postprocess(raw))
-            envs, seen = self._environments.step(envs, action, None, fresh)
-            return envs, _rollout(seen, parameters, raw, distribution.log_prob(parameters, raw))
+            envs, seen = self._environments.step(envs, jnp.concatenate([action, memory], axis=-1), None, fresh)
+            return envs, _rollout(seen._replace(action=action), parameters, raw, distribution.log_prob(parameters, raw))
 
         envs, flown = jax.lax.scan(step, envs, act_keys)
 
@@ -116,7 +128,7 @@ class ProximalPolicyOptimization:
                 state.normaliser,
                 batch,
                 key,
-                self.networks,
+                self._of_unrolls,
                 entropy_cost=ppo.entropy_cost,
                 discounting=ppo.discount,
                 reward_scaling=ppo.reward_scale,
@@ -144,6 +156,7 @@ class ProximalPolicyOptimization:
         """The policy, and what it knows of its observations."""
         mask = jnp.asarray(self._mask, jnp.float32)
         kind = {"relu": PolicyNetwork, "swish": SwishNetwork}[self._config.activation]
+        kind = RecurrentNetwork if self._units else kind
         return kind(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> PpoState:

@@ -65,11 +65,7 @@ def sample(
     The buffer must hold at least `steps` steps of all worlds.
     """
     capacity = replay.rows.shape[0] - num_envs
-    size = jnp.minimum(replay.inserted, capacity)
-    oldest = jnp.where(replay.inserted < capacity, 0, replay.inserted)
-    found = jnp.maximum(size - (steps - 1) * num_envs, 1)
-    age = (draws % found.astype(draws.dtype)).astype(found.dtype)  # uneven by less than `found` / 2^32
-    first = oldest + age
+    first = _starts(replay, draws, num_envs, steps)
     rows = _unpack(replay.rows[first % capacity], observation_size, action_size)
     reward, factor, last, bootstrap = rows.reward, jnp.ones(len(draws)), rows.last, rows
     for step in range(1, steps):
@@ -91,6 +87,25 @@ def sample(
         next_observation=bootstrap.next_observation,
         last=last,
     )
+
+
+def observations(
+    replay: Replay, draws: UInt[Array, " batch"], num_envs: int, observation_size: int, steps: int
+) -> Float[Array, "steps batch n"]:
+    """Observations of `steps` steps in a row of one world, whose episode may end among them, for each of `draws`."""
+    capacity = replay.rows.shape[0] - num_envs
+    following = _starts(replay, draws, num_envs, steps) + num_envs * jnp.arange(steps)[:, None]
+    return replay.rows[following % capacity, :observation_size]
+
+
+def _starts(replay: Replay, draws: UInt[Array, " batch"], num_envs: int, steps: int) -> Int[Array, " batch"]:
+    """Rows, before they are folded at the capacity, from which on `steps` steps are recorded."""
+    capacity = replay.rows.shape[0] - num_envs
+    size = jnp.minimum(replay.inserted, capacity)
+    oldest = jnp.where(replay.inserted < capacity, 0, replay.inserted)
+    found = jnp.maximum(size - (steps - 1) * num_envs, 1)
+    age = (draws % found.astype(draws.dtype)).astype(found.dtype)  # uneven by less than `found` / 2^32
+    return oldest + age
 
 
 def _unpack(rows: Float[Array, "batch width"], observation_size: int, action_size: int) -> Transitions:

@@ -13,7 +13,7 @@ import optax
 from jax import Array
 
 from mjxball.algorithms import replay
-from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, Schedule, without_recurrence
+from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
 from mjxball.algorithms.networks import Networks, make_networks
 from mjxball.algorithms.replay import Replay, Transitions
 from mjxball.config import Config, Sac
@@ -76,8 +76,9 @@ def create(networks: Networks, config: Sac, observation_size: int, key: Array) -
 def make_update(
     networks: Networks, config: Sac, action_size: int, mean: Callable[[Any], Any] = lambda value: value
 ) -> Any:
-    """Return `update(learner, transitions, noise, rate) -> (learner, losses)`; `rate` scales all learning rates.
+    """Return `update(learner, transitions, noise, rate, seen) -> (learner, losses)`; `rate` scales all learning rates.
 
+    A recurrent policy learns from what is `seen` in sequences, as many observations as there are `transitions`.
     `noise` (2, batch, actions) is standard normal: one part for the critic's next actions, one for the policy's.
     `mean` averages gradients and entropies over learners that share their parameters (data parallel).
     """
@@ -112,13 +113,24 @@ def make_update(
         target = optax.incremental_update(critic, learner.target, config.tau)
         return learner._replace(critic=critic, critic_adam=adam, target=target), value
 
+    def outputs(policy: Any, normaliser: Any, seen: Float[Array, "... n"]) -> Float[Array, "batch parameters"]:
+        """Of every step of sequences, if there are any: the policy's answers by what it remembers of them itself."""
+        if seen.ndim == 2:
+            return networks.policy_network.apply(normaliser, policy, seen)
+        found = networks.policy_network.unroll(normaliser, policy, seen)
+        return found.reshape(-1, found.shape[-1])
+
     def policy_step(
-        before: Learner, learner: Learner, batch: Any, noise: Float[Array, "batch actions"], rate: Float[Array, ""]
+        before: Learner,
+        learner: Learner,
+        seen: Float[Array, "... n"],
+        batch: Any,
+        noise: Float[Array, "batch actions"],
+        rate: Float[Array, ""],
     ) -> tuple[Learner, Losses]:
         """Policy and temperature move against the critic `before` the batch's own critic step, as in Brax."""
-        output, back = jax.vjp(
-            lambda policy: networks.policy_network.apply(before.normaliser, policy, batch.observation), before.policy
-        )
+        output, back = jax.vjp(lambda policy: outputs(policy, before.normaliser, seen), before.policy)
+        batch = batch._replace(observation=seen.reshape(-1, seen.shape[-1]))
         action = distribution.sample_no_postprocessing(output, noise)
         alpha, entropy = jnp.exp(before.log_alpha), -mean(jnp.mean(distribution.log_prob(output, action)))
         value, slope = jax.value_and_grad(policy_loss)(output, before.normaliser, before.critic, alpha, batch, noise)
@@ -138,12 +150,18 @@ def make_update(
         return moved, Losses(jnp.zeros(()), value, entropy)
 
     def update(
-        learner: Learner, batch: Transitions, noise: Float[Array, "2 batch actions"], rate: Float[Array, ""]
+        learner: Learner,
+        batch: Transitions,
+        noise: Float[Array, "2 batch actions"],
+        rate: Float[Array, ""],
+        seen: Float[Array, "steps sequences n"] | None = None,
     ) -> tuple[Learner, Losses]:
         transitions = _brax_transitions(batch)
         evaluate = value_step if config.state_value else critic_step
         moved, critic_value = evaluate(learner, transitions, noise[0], rate * config.learning_rate)
-        moved, losses = policy_step(learner, moved, transitions, noise[1], rate)
+        moved, losses = policy_step(
+            learner, moved, batch.observation if seen is None else seen, transitions, noise[1], rate
+        )
         return moved, losses._replace(critic=critic_value)
 
     return update
@@ -212,17 +230,21 @@ class SoftActorCritic:
     steps_per_collect = 1
 
     def __init__(self, config: Config, environments: Environments):
-        without_recurrence(environments, "sac")
         self._config, self._environments, self._shards = config.sac, environments, environments.shards
         sac = config.sac
         # At least one batch and one n-step window must be recorded before the first update.
-        first = max(math.ceil(sac.warmup_steps / sac.num_envs), math.ceil(sac.batch_size / sac.num_envs), sac.n_step)
+        slots = environments.recurrent_slots
+        self._units = slots.stop - slots.start
+        self._steps = sac.recurrent_steps if self._units else 0
+        needed = max(sac.n_step, self._steps)
+        first = max(math.ceil(sac.warmup_steps / sac.num_envs), math.ceil(sac.batch_size / sac.num_envs), needed)
         self.schedule = Schedule(
             sac.total_steps, sac.num_envs, first * sac.num_envs, sac.num_evaluations, sac.curriculum
         )
-        self._sizes = (environments.observation_size, environments.action_size)
+        self._sizes = (environments.observation_size, environments.action_size - self._units)
         self._mask = environments.policy_mask
-        self.networks = make_networks(sac, self._mask, self._sizes[1], environments.critic_mask)
+        recurrent = slots if self._units else None
+        self.networks = make_networks(sac, self._mask, self._sizes[1], environments.critic_mask, recurrent)
         self._update = make_update(self.networks, sac, self._sizes[1], self._shards.mean)
 
     def init(self, key: Array) -> SacState:
@@ -236,8 +258,8 @@ class SoftActorCritic:
     def collect(self, state: SacState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[SacState, Any]:
         """One step of all environments into the replay and the normaliser."""
         learner, (*act_keys, reset_key) = state.learner, keys
-        action = self._act(learner, envs.states.obs, act_keys, phase)
-        envs, transition = self._environments.step(envs, action, reset_key)
+        action, answer = self._act(learner, envs.states.obs, act_keys, phase)
+        envs, transition = self._environments.step(envs, answer, reset_key)
         transitions = Transitions(
             transition.observation,
             action,
@@ -255,16 +277,22 @@ class SoftActorCritic:
 
     def _act(
         self, learner: Learner, observation: Float[Array, "envs n"], keys: Sequence[Array], phase: Phase
-    ) -> Float[Array, "envs actions"]:
+    ) -> tuple[Float[Array, "envs actions"], Float[Array, "envs answer"]]:
+        """(actions, and behind them the next states of a recurrent policy)."""
         sample_key, random_key = map(self._shards.own, keys)
         policy = jax.tree.map(lambda mean, new: jnp.where(phase.evaluate, mean, new), learner.average, learner.policy)
-        parameters = self.networks.policy_network.apply(learner.normaliser, policy, observation)
+        network = self.networks.policy_network
+        if self._units:
+            parameters, memory = network.step(learner.normaliser, policy, observation)
+        else:
+            parameters, memory = network.apply(learner.normaliser, policy, observation), observation[..., :0]
         distribution = self.networks.parametric_action_distribution
         shape = (self._environments.count, self._sizes[1])
         sampled = distribution.sample(parameters, jax.random.normal(sample_key, shape))
         uniform = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
         chosen = jnp.where(phase.random, uniform, sampled)
-        return jnp.where(phase.evaluate, distribution.mode(parameters), chosen)
+        action = jnp.where(phase.evaluate, distribution.mode(parameters), chosen)
+        return action, jnp.concatenate([action, memory], axis=-1)
 
     def update(
         self, state: SacState, keys: Sequence[Array], progress: Float[Array, ""], phase: Phase
@@ -293,20 +321,29 @@ class SoftActorCritic:
                 state.replay, drawn, self._environments.count, *self._sizes, sac.n_step, sac.discount
             )
         )(draws)
+        seen = self._sequences(state.replay, draws) if self._units else None
         # Drawn once for all updates, and kept: XLA would draw, gather and sum anew wherever a number is used.
-        batches, noise = jax.lax.optimization_barrier((batches, noise))
+        batches, noise, seen = jax.lax.optimization_barrier((batches, noise, seen))
 
         def one(number: Int[Array, ""], carry: tuple[Learner, Losses]) -> tuple[Learner, Losses]:
-            return self._update(carry[0], jax.tree.map(lambda part: part[number], batches), noise[number], rate)
+            own, sequences = jax.tree.map(lambda part: part[number], (batches, seen))
+            return self._update(carry[0], own, noise[number], rate, sequences)
 
         zero = jnp.zeros(())
         return jax.lax.fori_loop(0, sac.updates_per_step, one, (state.learner, Losses(zero, zero, zero)))
+
+    def _sequences(self, memory: Replay, draws: Array) -> Float[Array, "updates steps sequences n"]:
+        """Observations in sequences, a batch of them in all for each update."""
+        firsts = draws[:, : draws.shape[1] // self._steps]
+        count, size, steps = self._environments.count, self._sizes[0], self._steps
+        return jax.vmap(lambda drawn: replay.observations(memory, drawn, count, size, steps))(firsts)
 
     def policy(self, state: SacState) -> PolicyNetwork:
         """The running average of the policy, and what it knows of its observations."""
         learner = state.learner
         mask = jnp.asarray(self._mask, jnp.float32)
-        return PolicyNetwork(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
+        kind = RecurrentNetwork if self._units else PolicyNetwork
+        return kind(learner.average["params"], learner.normaliser.mean, learner.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> SacState:
         """The replay's rows are cut, the learner is whole."""
@@ -317,10 +354,12 @@ class SoftActorCritic:
         sac = self._config
         for name, whole in (
             ("num_envs", parts),
-            ("batch_size", parts),
+            ("batch_size", parts * max(self._steps, 1)),
             ("replay_size", parts * max(sac.num_envs // parts, 1)),
         ):
             if getattr(sac, name) % whole:
+                steps = f" in sequences of {self._steps} steps" if name == "batch_size" and self._steps else ""
                 raise InputError(
-                    f"sac.{name} = {getattr(sac, name)} cannot be split over {parts} devices evenly; make it a multiple"
+                    f"sac.{name} = {getattr(sac, name)} cannot be split over {parts} devices{steps} evenly; "
+                    f"make it a multiple of {whole}"
                 )

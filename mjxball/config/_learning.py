@@ -19,6 +19,9 @@ class Sac:
     warmup_steps: int = setting(12_800, "environment steps with random actions before the first update", low=0)
     replay_size: int = setting(1_024_000, "transitions kept, a multiple of num_envs", low=1)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
+    recurrent_steps: int = setting(
+        16, "steps in a row from which a recurrent policy learns what to remember; batch_size is a multiple", low=1
+    )
     critic_layers: tuple[int, ...] = setting((64, 64), "hidden layers of each critic", low=1)
     critic_layer_norm: bool = setting(False, "LayerNorm in the critics")
     num_critics: int = setting(2, "Q networks, of which the smallest value counts", low=1, high=2)

@@ -44,12 +44,18 @@ class Network(NamedTuple):
 
     def __call__(self, seen: Array) -> Array:
         """Action in [-1, 1] (..., 3) for the input `seen` (..., n), and behind it the next state (..., H) of a GRU."""
+        xp = seen.__array_namespace__()
+        value, hidden = self.outputs(seen)
+        return xp.tanh(value) if hidden is None else xp.concat([xp.tanh(value), hidden], axis=-1)
+
+    def outputs(self, seen: Array) -> tuple[Array, Array | None]:
+        """(the last layer before its tanh, the next state of a GRU or None)."""
         xp, width = seen.__array_namespace__(), self.mean.shape[-1]
         below = (seen[..., :width] - self.mean) * self.scale
         if self.gru is None:
-            return xp.tanh(self._head(below))
+            return self._head(below), None
         hidden = gru_cell(seen[..., width:], below, *self.gru)
-        return xp.concat([xp.tanh(self._head(xp.concat([hidden, below], axis=-1), hidden)), hidden], axis=-1)
+        return self._head(xp.concat([hidden, below], axis=-1), hidden), hidden
 
     def _head(self, below: Array, hidden: Array | None = None) -> Array:
         xp = below.__array_namespace__()
