@@ -13,13 +13,13 @@ from mjxball.config import LEAST_LIFTING, Attitude, Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.followers import OneThread, checked_observation
-from mjxball.control.multi_model_lqg import MultiModelLqg, team_geometry
+from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg, team_geometry
 from mjxball.control.network import Network
 from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import PolicyFile, law_of, load_file
-from mjxball.policy.single import SingleFollower, remembers_one
+from mjxball.policy.single import SingleFollower, SinglePdFollower, single_follower
 
 Array = Any
 
@@ -88,7 +88,8 @@ class Policy:
         self._context: Array | None = np.array(card["team"]["context"], dtype) if told else None
         self._memory: Array | None = None
         self._thread = OneThread()
-        self._single: SingleFollower | None = None
+        self._single: SingleFollower | SinglePdFollower | None = None
+        self._answers_alone = True  # as far as is known
         self._ahead = False  # whether `_single` has the memory, newer than `_memory`
 
     @classmethod
@@ -150,8 +151,8 @@ class Policy:
         remembers = self._law.size > 0
         if remembers:
             self._thread.check(self.name)
-        if observation.ndim == 1 and isinstance(self._law.lqg, MultiModelLqg):
-            alone = self._answer_alone(observation, self._law.lqg)
+        if observation.ndim == 1 and remembers and self._answers_alone:
+            alone = self._answer_alone(observation)
             if alone is not None:
                 return alone
         law, memory = self.law, self.memory if remembers else None
@@ -163,14 +164,17 @@ class Policy:
             self._memory, self._ahead = memory, False
         return action, command
 
-    def _answer_alone(self, observation: Array, lqg: MultiModelLqg) -> tuple[Array, Array] | None:
+    def _answer_alone(self, observation: Array) -> tuple[Array, Array] | None:
         """`_answer` to one observation (18,), by a `SingleFollower`; None if that cannot answer it."""
         if self._single is None:
-            network = (self._weights, self._biases, self._mean, self._scale)
-            self._single = SingleFollower(self._law, lqg, network)
+            self._single = single_follower(self._law, self._network)
+            self._answers_alone = self._single is not None
+        if self._single is None:
+            return None
         if not self._ahead:
             memory = self.law.start(observation) if self._memory is None else self._memory
-            if not remembers_one(memory):
+            # Of several followers, or one whose share of the command is 0, by which it divides.
+            if memory.ndim > 1 or (isinstance(self._law.lqg, MultiModelLqg) and memory[-CONTEXT] <= 0):
                 return None
             self._single.memory = memory
         found = self._single.answer(observation)
