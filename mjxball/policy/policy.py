@@ -22,6 +22,7 @@ from mjxball.policy.file import PolicyFile, law_of, load_file
 from mjxball.policy.single import SingleFollower, SinglePdFollower, single_follower
 
 Array = Any
+ROUNDED = 1e-5  # that a GRU's state may be beyond 1
 
 
 def not_told(name: str) -> InputError:
@@ -125,7 +126,7 @@ class Policy:
 
     @memory.setter
     def memory(self, memory: Array) -> None:
-        """Raises InputError, and keeps the old one, unless `memory` is of m finite numbers."""
+        """Raises InputError, and keeps the old one, unless `memory` is of m finite numbers, of a GRU up to 1."""
         self._memory, self._ahead = None if memory is None else self._checked(memory), False
         self._thread.forget()
 
@@ -184,7 +185,7 @@ class Policy:
         return np.array(found[0], self._dtype), np.array(found[1], self._dtype)
 
     def _checked(self, memory: Array) -> Array:
-        """A copy of `memory`, or InputError unless it is of m finite numbers."""
+        """A copy of `memory`, or InputError unless it is one that this policy may have."""
         given, size = np.asarray(memory), self._law.size
         if given.dtype.kind not in "fiu" or given.shape[-1:] != (size,):
             raise InputError(f"policy {self.name} remembers {size} numbers, not {given.dtype} of shape {given.shape}")
@@ -192,6 +193,9 @@ class Policy:
             own = np.array(given, self._dtype)
         if not np.isfinite(own).all():
             raise InputError(f"a memory of policy {self.name} must be finite, and this one is not finite")
+        first = self._law.history.size
+        if (np.abs(own[..., first : first + self._law.units]) > 1 + ROUNDED).any():
+            raise InputError(f"a memory of policy {self.name} has a GRU's state beyond 1: it is another policy's")
         return own
 
 
@@ -212,6 +216,15 @@ class NetworkLaw:
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
         return self._law.start(observation, _known(self.name, self._law, self._context))
+
+    @property
+    def units(self) -> int:
+        """H of the network's GRU, whose state ends what is `shown`; 0 without one."""
+        return self._law.units
+
+    def shown(self, observation: Array, memory: Array) -> Array:
+        """What the network sees of its `memory` (..., s)."""
+        return self._law.network_input(observation, memory)[..., layout.OBSERVATION_SIZE :]
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""
