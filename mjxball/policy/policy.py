@@ -19,7 +19,8 @@ from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import PolicyFile, law_of, load_file
-from mjxball.policy.single import SingleFollower, SinglePdFollower, single_follower
+from mjxball.policy.single import SingleFollower, single_follower
+from mjxball.policy.single_network import SinglePdFollower
 
 Array = Any
 ROUNDED = 1e-5  # that a GRU's state may be beyond 1
