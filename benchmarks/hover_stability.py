@@ -4,7 +4,8 @@ With the CG at rest at an offset, the loop over one control step is a smooth map
 object's position, attitude, velocity and rates, the rotors, the follower's memory, and the observations under way if
 its measurements are late. Its fixed point is found by flying and by Newton's method, its Jacobian there by JAX, in
 float64. A network with ReLU units is linear around almost every point, so the eigenvalues say what a small error
-does, no more.
+does, no more. A recurrent follower may have several fixed points, and circle about one with millimetres: the one
+nearest to the flight's mean is taken.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from mjxball.sim.disturbances import Sample, SensorModel, SensorState
 from mjxball.sim.scenario import Scenario
 
 Array = Any
-SETTLE, NEWTON = 3000, 8  # control steps flown towards the fixed point, then steps of Newton's method
+SETTLE, WATCHED = 3000, 1000  # control steps flown towards the fixed point, and those whose mean is taken
+NEWTON, HALVINGS = 40, 12  # then steps of Newton's method, each as short as makes the residual smallest
 SOUND = 1e-8  # largest change over a control step, in SI units, of what counts as a fixed point
 NEUTRAL = 1e-6  # a memory that the loop does not use keeps its value: eigenvalue 1
 
@@ -47,6 +49,9 @@ class Hover:
     error: float  # |e_o| at the fixed point [m]
     tilt: float  # hypot(roll, pitch) there [rad]
     radius: float  # largest |eigenvalue| of the map over one control step
+    swing: (
+        float  # half of what the position still moves after `SETTLE` steps of flight, of the axis that moves most [m]
+    )
 
     @property
     def stable(self) -> bool:
@@ -72,7 +77,7 @@ def linearised(
         ]
         loads = jax.tree.map(jnp.asarray, rollout.load_of(config, scenarios))
 
-        def of_one(own: Any) -> tuple[Array, Array, Array]:
+        def of_one(own: Any) -> tuple[Array, Array, Array, Array]:
             start, step = closed_loop(config, law(own), delay)
             return jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load)))(loads)
 
@@ -80,9 +85,10 @@ def linearised(
     return [
         [
             Hover(
-                offset, mass, delay, float(left), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4])), _radius(j)
+                *(offset, mass, delay, float(left), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4]))),
+                *(_radius(jacobian), float(swing)),
             )
-            for (offset, mass, _), z, left, j in zip(cases, *one, strict=True)
+            for (offset, mass, _), z, left, jacobian, swing in zip(cases, *one, strict=True)
         ]
         for one in zip(*found, strict=True)
     ]
@@ -149,22 +155,29 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
     return start, step
 
 
-def _linearise(start: Array, step: Callable[[Array], Array]) -> tuple[Array, Array, Array]:
-    """(fixed point, its residual, Jacobian there) of `step`, found from `start`."""
+def _linearise(start: Array, step: Callable[[Array], Array]) -> tuple[Array, Array, Array, Array]:
+    """(fixed point, its residual, Jacobian there, swing flown [m]) of `step`, found from `start`.
+
+    A flight that never comes to rest circles about its fixed point: its mean is nearer to it than any of its states.
+    """
     z = jax.lax.fori_loop(0, SETTLE, lambda _, z: step(z), start)
+
+    def watch(_: Array, seen: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        z, total, low, high = seen
+        return step(z), total + z, jnp.minimum(low, z), jnp.maximum(high, z)
+
+    _, total, low, high = jax.lax.fori_loop(0, WATCHED, watch, (z, jnp.zeros_like(z), z, z))
     still = jnp.eye(len(z))
     slopes = jax.jacfwd(lambda z: (step(z) - z,) * 2, has_aux=True)
+    shares = jnp.append(0.5 ** jnp.arange(HALVINGS), 0.0)  # of Newton's step
 
-    def polish(count: Array, found: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        """The better of `found` (point, its change over a step, the change's Jacobian) and Newton's next point.
+    def polish(_: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
+        point = found[0]
+        slope, change = slopes(point)
+        tried = point - shares[:, None] * jnp.linalg.solve(slope, change)
+        left = jax.vmap(lambda z: jnp.linalg.norm(step(z) - z))(tried)
+        return tried[jnp.nanargmin(left)], point, change, slope
 
-        The first of them is the point itself: so `slopes`, long to compile, stands in the program once.
-        """
-        point, change, slope = found
-        there = point - jnp.linalg.solve(slope, change)
-        slope_there, change_there = slopes(there)
-        nearer = (count == 0) | (jnp.abs(change_there).max() < jnp.abs(change).max())
-        return jax.tree.map(lambda new, old: jnp.where(nearer, new, old), (there, change_there, slope_there), found)
-
-    z, change, slope = jax.lax.fori_loop(0, NEWTON + 1, polish, (z, jnp.zeros_like(z), still))
-    return z, jnp.abs(change).max(), slope + still
+    mean = total / WATCHED
+    _, z, change, slope = jax.lax.fori_loop(0, NEWTON, polish, (mean, mean, mean, still))
+    return z, jnp.abs(change).max(), slope + still, (high - low)[:3].max() / 2

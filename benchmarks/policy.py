@@ -13,6 +13,7 @@ import itertools
 import json
 import statistics
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -46,18 +47,26 @@ def told(contents: PolicyFile, plant: Path) -> PolicyFile:
     return in_team(contents, "policy", plant, plant_setup(plant).plant.followers[0])
 
 
-def microseconds(policy: Policy, shape: tuple[int, ...]) -> dict[str, float]:
-    """Median, 95th percentile and smallest of the repetitions' means [us per call] for observations of `shape`."""
-    seen = np.random.default_rng(1).normal(scale=0.3, size=(CALLS, *shape))
-    means = []
+def microseconds(policies: Sequence[tuple[Policy, tuple[int, ...]]]) -> list[dict[str, float]]:
+    """Of every policy, for observations of that shape: median, 95th percentile and smallest of means [us per call].
+
+    A mean is of one repetition. They take turns, so that a machine that others keep busy is as slow for all of them.
+    """
+    random = np.random.default_rng(1)
+    seen = [random.normal(scale=0.3, size=(CALLS, *shape)) for _, shape in policies]
+    means: list[list[float]] = [[] for _ in policies]
     for _ in range(REPETITIONS + 3):
-        policy.reset()
-        start = time.perf_counter()
-        for row in seen:
-            policy(row)
-        means.append((time.perf_counter() - start) / CALLS * 1e6)
-    means = sorted(means[3:])  # the first ones warm caches up
-    return {"median": statistics.median(means), "p95": means[int(0.95 * len(means))], "least": means[0]}
+        for (policy, _), rows, found in zip(policies, seen, means, strict=True):
+            policy.reset()
+            start = time.perf_counter()
+            for row in rows:
+                policy(row)
+            found.append((time.perf_counter() - start) / CALLS * 1e6)
+    ordered = [sorted(found[3:]) for found in means]  # the first ones warm caches up
+    return [
+        {"median": statistics.median(found), "p95": found[int(0.95 * len(found))], "least": found[0]}
+        for found in ordered
+    ]
 
 
 def main() -> None:
@@ -67,16 +76,17 @@ def main() -> None:
     parser.add_argument("--plant", type=Path, default=Path("pair"), metavar="NAME", help="or FILE.toml (default pair)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as JSON")
     options = parser.parse_args()
-    measured = {path.stem: told(load_file(path), options.plant) for path in options.policies}
+    measured = {"/".join(path.parts[-2:]): told(load_file(path), options.plant) for path in options.policies}
     measured["random"] = widened(next(iter(measured.values())), 256)
+    cases = list(itertools.product(measured.items(), SHAPES.items()))
+    times = microseconds([(Policy(contents, name), shape) for (name, contents), (_, shape) in cases])
     rows = []
-    for (name, contents), (label, shape) in itertools.product(measured.items(), SHAPES.items()):
+    for ((name, contents), (label, _)), found in zip(cases, times, strict=True):
         layers = " x ".join(str(bias.size) for bias in contents.biases[:-1])
-        times = microseconds(Policy(contents, name), shape)
-        rows.append({"policy": name, "layers": layers, "observation": label, **times})
-    print(f"{'policy':>12}{'layers':>12}{'observation':>14}{'median us':>12}{'p95 us':>10}{'least us':>10}")
+        rows.append({"policy": name, "layers": layers, "observation": label, **found})
+    print(f"{'policy':>24}{'layers':>12}{'observation':>14}{'median us':>12}{'p95 us':>10}{'least us':>10}")
     for row in rows:
-        print(f"{row['policy']:>12}{row['layers']:>12}{row['observation']:>14}", end="")
+        print(f"{row['policy']:>24}{row['layers']:>12}{row['observation']:>14}", end="")
         print(f"{row['median']:12.1f}{row['p95']:10.1f}{row['least']:10.1f}")
     if options.json:
         options.json.write_text(json.dumps({"numpy": np.__version__, "rows": rows}, indent=2) + "\n")

@@ -10,7 +10,7 @@ compiled program, ten of them in three minutes on two cores. Of each:
 - cells: how many of the 70 and the 40 of cells.py it meets (known mass, disturbed, unknown, disturbed), and of those
   beyond trim that somebody holds, where its peak is near the smallest (undisturbed, disturbed)
 - commands: rms change from step to step with noise and delay, median and largest of the 70 cells [rad]
-- hovers: those of stability.py that are stable with 60 ms of delay, mass known and unknown
+- hovers: those of stability.py that are stable with 60 ms of delay, mass known and unknown; how far the worst swings
 - flights: random ones as of stability.py, mass known and unknown: failed, median, 99 % quantile, largest peak [m]
 """
 
@@ -166,7 +166,7 @@ def of_cells(config: Config, policies: list[Policy]) -> list[dict[str, Any]]:
 
 
 def of_hovers(config: Config, policies: list[Policy]) -> list[dict[str, Any]]:
-    """Of every policy: stable hovers with 60 ms of delay and all of them, mass known and unknown."""
+    """Of every policy: stable hovers with 60 ms of delay, all of them, largest swing [m]; mass known and unknown."""
     rows: list[dict[str, Any]] = [{"hovers": []} for _ in policies]
     every = Stacked(policies)
     for unknown in (False, True):
@@ -175,7 +175,8 @@ def of_hovers(config: Config, policies: list[Policy]) -> list[dict[str, Any]]:
         for row, hovers in zip(
             rows, linearised(config, lambda n: Single(every, n), networks, cases, DELAY), strict=True
         ):
-            row["hovers"].append([sum(hover.stable for hover in hovers), len(cases)])
+            swing = max(hover.swing for hover in hovers)
+            row["hovers"].append([sum(hover.stable for hover in hovers), len(cases), swing])
     return rows
 
 

@@ -25,6 +25,7 @@ from mjxball.commands.train import main
 from mjxball.config import Config
 from mjxball.control.network import gru_cell
 from mjxball.env import TransportEnv
+from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
 from mjxball.policy.mean import mean_policy
 from mjxball.policy.policy import NetworkLaw
@@ -227,6 +228,27 @@ def test_a_damaged_file_is_refused(
     np.savez(path, **{name: array for name, array in held.items() if array is not None})
     with pytest.raises(PolicyFileError, match=words):
         load_file(path)
+
+
+def test_a_state_that_is_none_is_refused_and_the_flight_goes_on(recurrent: Recurrent) -> None:
+    """Not finite, of another size, or beyond what a GRU can reach; alone and in a batch."""
+    walk = 0.1 * np.random.default_rng(8).normal(size=(30, 18))
+    for shape in ((), (2,)):
+        flown, alone = Policy(recurrent.contents, "one"), Policy(recurrent.contents, "one")
+        for number, row in enumerate(walk):
+            seen = np.broadcast_to(row, (*shape, 18))
+            if number == 20:
+                size = flown.memory.shape[-1]
+                for value, words in ((np.nan, "not finite"), (-np.inf, "not finite"), (1.1, "beyond 1: it is another")):
+                    spoilt = flown.memory.copy()
+                    spoilt[..., -2] = value
+                    with pytest.raises(InputError, match=words):
+                        flown.memory = spoilt
+                with pytest.raises(InputError, match=f"remembers {size} numbers"):
+                    flown.memory = flown.memory[..., 1:]
+            np.testing.assert_array_equal(flown(seen), alone(seen))
+        flown.memory = flown.memory  # its own is taken
+        np.testing.assert_allclose(flown(seen), alone(seen), atol=1e-6)
 
 
 def test_a_mean_is_of_the_gru_as_well(recurrent: Recurrent) -> None:

@@ -1,4 +1,4 @@
-"""One observation at a time, a policy of format 4 answers and remembers what the law of arrays does."""
+"""One observation at a time, a policy answers and remembers what the law of arrays does."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Recurrent
 from rig_laws import OLDEST, with_law
 
 from mjxball.cli import plant_setup
@@ -28,6 +29,7 @@ from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
 UNIVERSAL = load_file(shipped_policy("universal"))
+SEEN = np.random.default_rng(7).normal(scale=0.3, size=(2, 18))
 TEAMS = {"pair": None, "team3": 1, "team4": 3, "plate4": 2, "team6": 4}  # plant: which of its followers
 
 
@@ -250,3 +252,40 @@ def test_a_memory_that_is_not_sound_is_left_to_the_law_of_arrays(value: float, p
                     policy(seen)
                 np.testing.assert_array_equal(policy.memory, kept)
                 break
+
+
+@pytest.mark.parametrize("heads", [(), (6,), (6, 5)])
+@pytest.mark.parametrize(
+    "fields", [{}, {"context": ["share"]}, {"history": 2, "filters": [0.1]}, {"action_mode": "direct"}]
+)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_of_a_recurrent_network(
+    heads: tuple[int, ...], fields: dict[str, Any], dtype: type, recurrent: Recurrent
+) -> None:
+    """Also told its team, with another history, without a law; one layer is left to the law of arrays."""
+    random, card = np.random.default_rng(6), {**recurrent.contents.card, **fields, "command_limits": [0.3, 0.6]}
+    card["team"] = {"drone": 1, "mount_angle": 0.0, "context": [2.0, 3.0, -4.0, 5.0]}
+    law, draw = law_of(card), lambda *shape: (random.normal(size=shape) / np.sqrt(shape[0])).astype(np.float32)
+    size = 18 + law.shown - law.units
+    widths = [size + law.units, *heads, 6]
+    shapes = [[below, above] for below, above in itertools.pairwise(widths)]
+    shapes[-1][0] += law.units
+    contents = dataclasses.replace(
+        recurrent.contents,
+        weights=tuple(draw(*shape) for shape in shapes),
+        biases=tuple(draw(width) for width in widths[1:]),
+        observation_mean=draw(size),
+        observation_scale=np.abs(draw(size)),
+        gru=(draw(size, 3 * law.units), draw(law.units, 3 * law.units), draw(3 * law.units)),
+        card=card,
+    )
+    policy = Policy(contents, "recurrent", dtype)
+    reference, tolerance = Reference(policy), 1e-5 if dtype == np.float32 else 1e-12
+    agree(policy, reference, walk(200), tolerance, tolerance)
+    assert policy._ahead == bool(heads)
+    policy.memory = reference.memory = np.stack([policy.memory] * 2).astype(dtype)
+    np.testing.assert_allclose(
+        policy(SEEN), reference(SEEN.astype(dtype))[1], tolerance, tolerance
+    )  # several, by the law of arrays
+    policy.memory, reference.memory = policy.memory[1], reference.memory[1]
+    agree(policy, reference, walk(20, 1), tolerance, tolerance)

@@ -116,10 +116,6 @@ class AnyRigLaw(NetworkLaw):
         found._context = team_geometry(plant, rig.numbers.mounts, rig.size)
         return found
 
-    def shown(self, observation: Any, memory: Any) -> Any:
-        """What the network sees of its `memory` (..., s)."""
-        return self._law.network_input(observation, memory)[..., observation.shape[-1] :]
-
 
 class AnyRigBase(MultiModelOffsetFree):
     """The law that a policy for any rig adds its action to, alone, told every rig's geometry."""

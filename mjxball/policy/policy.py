@@ -13,15 +13,17 @@ from mjxball.config import LEAST_LIFTING, Attitude, Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.followers import OneThread, checked_observation
-from mjxball.control.multi_model_lqg import MultiModelLqg, team_geometry
+from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg, team_geometry
 from mjxball.control.network import Network
 from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.policy.file import PolicyFile, law_of, load_file
-from mjxball.policy.single import SingleFollower, remembers_one
+from mjxball.policy.single import SingleFollower, single_follower
+from mjxball.policy.single_network import SinglePdFollower
 
 Array = Any
+ROUNDED = 1e-5  # that a GRU's state may be beyond 1
 
 
 def not_told(name: str) -> InputError:
@@ -88,7 +90,8 @@ class Policy:
         self._context: Array | None = np.array(card["team"]["context"], dtype) if told else None
         self._memory: Array | None = None
         self._thread = OneThread()
-        self._single: SingleFollower | None = None
+        self._single: SingleFollower | SinglePdFollower | None = None
+        self._answers_alone = True  # as far as is known
         self._ahead = False  # whether `_single` has the memory, newer than `_memory`
 
     @classmethod
@@ -124,7 +127,7 @@ class Policy:
 
     @memory.setter
     def memory(self, memory: Array) -> None:
-        """Raises InputError, and keeps the old one, unless `memory` is of m finite numbers."""
+        """Raises InputError, and keeps the old one, unless `memory` is of m finite numbers, of a GRU up to 1."""
         self._memory, self._ahead = None if memory is None else self._checked(memory), False
         self._thread.forget()
 
@@ -150,8 +153,8 @@ class Policy:
         remembers = self._law.size > 0
         if remembers:
             self._thread.check(self.name)
-        if observation.ndim == 1 and isinstance(self._law.lqg, MultiModelLqg):
-            alone = self._answer_alone(observation, self._law.lqg)
+        if observation.ndim == 1 and remembers and self._answers_alone:
+            alone = self._answer_alone(observation)
             if alone is not None:
                 return alone
         law, memory = self.law, self.memory if remembers else None
@@ -163,14 +166,17 @@ class Policy:
             self._memory, self._ahead = memory, False
         return action, command
 
-    def _answer_alone(self, observation: Array, lqg: MultiModelLqg) -> tuple[Array, Array] | None:
+    def _answer_alone(self, observation: Array) -> tuple[Array, Array] | None:
         """`_answer` to one observation (18,), by a `SingleFollower`; None if that cannot answer it."""
         if self._single is None:
-            network = (self._weights, self._biases, self._mean, self._scale)
-            self._single = SingleFollower(self._law, lqg, network)
+            self._single = single_follower(self._law, self._network)
+            self._answers_alone = self._single is not None
+        if self._single is None:
+            return None
         if not self._ahead:
             memory = self.law.start(observation) if self._memory is None else self._memory
-            if not remembers_one(memory):
+            # Of several followers, or one whose share of the command is 0, by which it divides.
+            if memory.ndim > 1 or (isinstance(self._law.lqg, MultiModelLqg) and memory[-CONTEXT] <= 0):
                 return None
             self._single.memory = memory
         found = self._single.answer(observation)
@@ -180,7 +186,7 @@ class Policy:
         return np.array(found[0], self._dtype), np.array(found[1], self._dtype)
 
     def _checked(self, memory: Array) -> Array:
-        """A copy of `memory`, or InputError unless it is of m finite numbers."""
+        """A copy of `memory`, or InputError unless it is one that this policy may have."""
         given, size = np.asarray(memory), self._law.size
         if given.dtype.kind not in "fiu" or given.shape[-1:] != (size,):
             raise InputError(f"policy {self.name} remembers {size} numbers, not {given.dtype} of shape {given.shape}")
@@ -188,6 +194,9 @@ class Policy:
             own = np.array(given, self._dtype)
         if not np.isfinite(own).all():
             raise InputError(f"a memory of policy {self.name} must be finite, and this one is not finite")
+        first = self._law.history.size
+        if (np.abs(own[..., first : first + self._law.units]) > 1 + ROUNDED).any():
+            raise InputError(f"a memory of policy {self.name} has a GRU's state beyond 1: it is another policy's")
         return own
 
 
@@ -208,6 +217,15 @@ class NetworkLaw:
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
         return self._law.start(observation, _known(self.name, self._law, self._context))
+
+    @property
+    def units(self) -> int:
+        """H of the network's GRU, whose state ends what is `shown`; 0 without one."""
+        return self._law.units
+
+    def shown(self, observation: Array, memory: Array) -> Array:
+        """What the network sees of its `memory` (..., s)."""
+        return self._law.network_input(observation, memory)[..., layout.OBSERVATION_SIZE :]
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""

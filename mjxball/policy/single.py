@@ -1,14 +1,11 @@
 """A policy of format 4 that answers one observation at a time, on NumPy: what `FollowerLaw` computes, in few steps.
 
-An operation of NumPy on the few numbers of one follower takes about as long whatever it computes. What is linear is
-therefore one matrix, made once by putting unit vectors through it, and the rest are Python's floats. All of it is in
-double precision.
+As in `single_network`, what is linear is one matrix, and the rest are Python's floats.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,19 +21,28 @@ from mjxball.control.multi_model_lqg import (
     MultiModelLqg,
     is_pair,
 )
-from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
+from mjxball.control.network import Network
 from mjxball.control.swing import LEAST_ENERGY, SHARPNESS, STATES
+from mjxball.policy.single_network import SingleNetwork, SinglePdFollower, clipped, led_command
 
 Array = Any
-TURNED = (0, 1), (2, 3), (5, 8), (6, 9), (7, 10), (15, 16), (20, 21)  # features about roll and pitch that are vectors
+
+
+def single_follower(law: FollowerLaw, network: Network) -> SingleFollower | SinglePdFollower | None:
+    """One follower of `law` that remembers something, None if only the law of arrays answers it."""
+    if len(network.weights) < 2:
+        return None
+    if law.lqg is None:
+        return SinglePdFollower(law, network)
+    return SingleFollower(law, law.lqg, network) if isinstance(law.lqg, MultiModelLqg) else None
 
 
 class SingleFollower:
     """Network, law and memory of one follower; names are those of `MultiModelLqg`."""
 
-    def __init__(self, law: FollowerLaw, lqg: MultiModelLqg, network: tuple[Any, ...]):
-        """Prepare `law`, with `lqg` in it, and `network`: the first four fields of `control.network.Network`."""
-        self._filters, self._network = _Filters(lqg), _Network(law, lqg.shown, *network)
+    def __init__(self, law: FollowerLaw, lqg: MultiModelLqg, network: Network):
+        """Prepare `law`, with `lqg` in it, and its `network`."""
+        self._filters, self._network = _Filters(lqg), SingleNetwork(law, network)
         self._swings, self._held_room = _Swings(lqg) if lqg.swings else None, float(lqg.held_room)
         self._height, self._height_gain = lqg.height.tolist(), lqg.height_gain.tolist()
         self._rise, self._limits, self._keep = lqg.rise.tolist(), lqg.limits.tolist(), float(lqg.keep[1])
@@ -111,14 +117,12 @@ class SingleFollower:
         roll_grown, pitch_grown = grown or (0.0, 0.0)
         action = self._network.act([*features, *grown], observation)
         # What the leader does.
-        (gravity, kp_x, kp_y, kp_z, kd_x, kd_y, kd_z), (tilt_limit, vertical_limit) = self._leader, self._clip
-        led_roll = _clipped(-(kp_y * y + kd_y * vy) / gravity, tilt_limit)
-        led_pitch = _clipped((kp_x * x + kd_x * vx) / gravity, tilt_limit)
-        led_vertical = _clipped(kp_z * z + kd_z * vz, vertical_limit)
+        tilt_limit, vertical_limit = self._clip
+        led_roll, led_pitch, led_vertical = led_command(self._leader, self._clip, x, y, z, vx, vy, vz)
         # What the law alone would command.
         error_limit, rise_limit, load_limit = self._limits
-        rise = _clipped(self._rise[0] * z + self._rise[1] * vz, rise_limit) - lift_error
-        vertical = _clipped(share * rise - (share - 1.0) * led_vertical, vertical_limit)
+        rise = clipped(self._rise[0] * z + self._rise[1] * vz, rise_limit) - lift_error
+        vertical = clipped(share * rise - (share - 1.0) * led_vertical, vertical_limit)
         lifted = vertical - led_vertical
         roll_far, pitch_far = -r_error * y - r_velocity * vy, p_error * x + p_velocity * vx
         far = _within(roll_far, pitch_far, error_limit)
@@ -138,9 +142,9 @@ class SingleFollower:
         tilt_reach, vertical_reach = self._reach
         counted = [a * (k + (1.0 - k) * abs(a)) for a, k in zip(action, self._small, strict=True)]
         command = [
-            _clipped(cos * roll_own - sin * pitch_own + tilt_reach * counted[0], tilt_limit),
-            _clipped(sin * roll_own + cos * pitch_own + tilt_reach * counted[1], tilt_limit),
-            _clipped(vertical + vertical_reach * counted[2], vertical_limit),
+            clipped(cos * roll_own - sin * pitch_own + tilt_reach * counted[0], tilt_limit),
+            clipped(sin * roll_own + cos * pitch_own + tilt_reach * counted[1], tilt_limit),
+            clipped(vertical + vertical_reach * counted[2], vertical_limit),
         ]
         if not math.isfinite(sum(command)):
             return None
@@ -336,70 +340,6 @@ def _of_both(rows: Array) -> Array:
     """`rows` (R, S + 1) of one axis for both: (2 R, 2 S + 2), the last columns, of the load, at the end."""
     every = np.kron(np.eye(2), rows[:, :-1])
     return np.concatenate([every, np.kron(np.eye(2), rows[:, -1:])], axis=1)
-
-
-class _Network:
-    """The network with the history that it sees. Every input ends or begins with a 1, for the biases."""
-
-    def __init__(
-        self,
-        law: FollowerLaw,
-        features: int,
-        weights: Sequence[Array],
-        biases: Sequence[Array],
-        mean: Array,
-        scale: Array,
-    ):
-        history, size = law.history, OBSERVATION_SIZE + law.history.size
-        unit = np.eye(size + ACTION_SIZE)
-        observation, past, action = np.split(unit, [OBSERVATION_SIZE, size], axis=1)
-        self._next_history = history.next(past, observation, action)
-        shown = history.network_input(observation[:size], past[:size])
-        # Features, 1, observation, history -> the normalised input -> the first layer.
-        count = shown.shape[1]
-        normal = np.zeros((features + 1 + size, count + features))
-        normal[:features, count:], normal[features], normal[features + 1 :, :count] = np.eye(features), -mean, shown
-        first = normal * scale @ weights[0].astype(np.float64)
-        first[features] += biases[0]
-        self._first, self._of_features = first, first[:features].copy()
-        rest = [np.vstack(layer).astype(np.float64) for layer in zip(weights[1:], biases[1:], strict=True)]
-        *layers, self._last = first, *rest
-        outputs = [np.ones(layer.shape[1] + 1) for layer in layers]
-        self._layers = [(layer, output, output[:-1]) for layer, output in zip(layers, outputs, strict=True)]
-        seen = np.ones(features + 1 + size + ACTION_SIZE)
-        self._features, self._input, self._past = seen[:features], seen[:-ACTION_SIZE], seen[features + 1 :]
-        self._observation, self.history, self._action = np.split(self._past, [OBSERVATION_SIZE, size])
-        self._zero = np.zeros(())
-
-    def tell(self, cos: float, sin: float) -> None:
-        """Take features about axes that are turned in the mount frame, of which the network has learnt."""
-        for one, other in TURNED if len(self._features) > max(TURNED[-1]) else TURNED[:-1]:
-            x, y = self._of_features[one], self._of_features[other]
-            self._first[one], self._first[other] = cos * x + sin * y, cos * y - sin * x
-
-    def act(self, features: list[float], observation: Array) -> list[float]:
-        """Action in [-1, 1] (3)."""
-        self._features[:], self._observation[:] = features, observation
-        given = self._input
-        for weight, output, inner in self._layers:
-            np.dot(given, weight, out=inner)
-            np.maximum(inner, self._zero, out=inner)
-            given = output
-        return [math.tanh(value) for value in np.dot(given, self._last).tolist()]
-
-    def remember(self, action: list[float]) -> None:
-        """Move the history on by the newest observation and its `action`."""
-        self._action[:] = action
-        self.history[:] = np.dot(self._past, self._next_history)
-
-
-def remembers_one(memory: Array) -> bool:
-    """Whether `memory` is one that a `SingleFollower` can take over: of one follower, with a sound share."""
-    return memory.ndim == 1 and memory[-CONTEXT] > 0
-
-
-def _clipped(value: float, limit: float) -> float:
-    return min(max(value, -limit), limit)
 
 
 def _turned(seen: list[float], cos: float, sin: float) -> tuple[float, ...]:
