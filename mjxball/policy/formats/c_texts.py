@@ -164,23 +164,31 @@ LAYER = """
 #else
 #define MJXBALL_APART(a, b, c, d) (void)0
 #endif
+/* Four rows, whose weights stand side by side: what is loaded of the input serves them all. */
+#define MJXBALL_ADD(weight, from, a, b, c, d) \\
+    do { \\
+        mjxball_real p = (weight)[0] * (from), q = (weight)[1] * (from); \\
+        mjxball_real r = (weight)[2] * (from), s = (weight)[3] * (from); \\
+        MJXBALL_APART(p, q, r, s); \\
+        a += p; \\
+        b += q; \\
+        c += r; \\
+        d += s; \\
+    } while (0)
 
-/* to = weight from + bias, where a bias of 0 is none: four rows at once, whose weights stand side by side, so that what
- * is loaded of `from` serves them all. Rows are filled up to a multiple of four. */
+/* to = weight from + bias, where a bias of 0 is none. Rows are filled up to a multiple of four. Sums over even and odd
+ * inputs round less than one long sum. */
 static inline void mjxball_layer(
     const float *weight, const float *bias, int inputs, int outputs, const mjxball_real *from, mjxball_real *to) {
-    for (int row = 0; row < outputs; row += 4) {
-        mjxball_real a = 0, b = 0, c = 0, d = 0;
-        for (int k = 0; k < inputs; k++, weight += 4) {
-            mjxball_real p = weight[0] * from[k], q = weight[1] * from[k];
-            mjxball_real r = weight[2] * from[k], s = weight[3] * from[k];
-            MJXBALL_APART(p, q, r, s);
-            a += p;
-            b += q;
-            c += r;
-            d += s;
+    for (int row = 0; row < outputs; row += 4, weight += 4 * (inputs & 1)) {
+        mjxball_real a = 0, b = 0, c = 0, d = 0, e = 0, f = 0, g = 0, h = 0;
+        int k = 0;
+        for (; k < (inputs & ~1); k += 2, weight += 8) {
+            MJXBALL_ADD(weight, from[k], a, b, c, d);
+            MJXBALL_ADD(weight + 4, from[k + 1], e, f, g, h);
         }
-        const mjxball_real sums[4] = {a, b, c, d};
+        if (inputs & 1) MJXBALL_ADD(weight, from[k], a, b, c, d);
+        const mjxball_real sums[4] = {a + e, b + f, c + g, d + h};
         for (int i = 0; i < 4 && row + i < outputs; i++) to[row + i] = sums[i] + (bias ? bias[row + i] : 0);
     }
 }
