@@ -3,7 +3,7 @@
 HEADER = """\
 /* Follower {name}, exported by mjxball {version}: {origin}.
  *
- *   mjxball_follower follower;
+ *   mjxball_follower follower = {{0}};
  *   mjxball_reset(&follower);                                              before every flight
  *   int status = mjxball_follow(&follower, observation, action, command);  every {period} s
  *
@@ -363,8 +363,8 @@ static inline int32_t mjxball_products(const int8_t *weight, const int16_t *step
 }
 #endif
 
-/* to = step weight from + bias of whole numbers, where a bias of 0 is none: rows of `stride` weights, of which `inputs` are not 0, four rows at
- * once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four. */
+/* to = step weight from + bias of whole numbers, where a bias of 0 is none: rows of `stride` weights, of which `inputs`
+ * are not 0, four rows at once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four. */
 static inline void mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
     int stride, const mjxball_real *from, mjxball_real *to) {
     int16_t steps[MJXBALL_MOST_INPUTS + 7];
@@ -393,8 +393,8 @@ static inline void mjxball_layer(const int8_t *weight, const float *step, const 
 }
 """
 EXPONENTIAL = """
-/* exp(-x) for 0 <= x < 40, within 1e-15, is share (even - odd) / (even + odd): as many halvings as ln 2 goes into x, and
- * a Pade fraction of the rest. */
+/* exp(-x) for 0 <= x < 40, within 1e-15, is share (even - odd) / (even + odd): as many halvings as ln 2 goes into x,
+ * and a Pade fraction of the rest. */
 typedef struct {
     mjxball_real share, even, odd;
 } mjxball_fraction;
