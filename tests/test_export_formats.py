@@ -28,7 +28,7 @@ from mjxball.policy.file import law_of, save_file, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 from mjxball.policy.law_fields import LATER_SHAPES, SWING_SHAPES
-from mjxball.policy.quantize import rows_of
+from mjxball.policy.quantize import balanced, rows_of
 from onboard import placed
 from onboard import recurrent as gru_of
 
@@ -246,7 +246,7 @@ def test_c_with_weights_of_8_bits_computes_with_whole_numbers(name: str, tmp_pat
     """Also beside the weights in float32, so that the whole numbers are those of the policy."""
     recurrent, _, last = name.rpartition(" ")
     contents = placed(gru_of(last), name) if recurrent else load_file(shipped_policy(name))
-    policy = Policy(contents, "follower")
+    policy = Policy(balanced(contents), "follower")
     network = policy._network
     gru = None if network.gru is None else (*map(Whole, network.gru[:2]), network.gru[2])
     policy._network = network._replace(weights=[Whole(weight) for weight in network.weights], gru=gru)

@@ -26,11 +26,11 @@ from mjxball.fly.telemetry import Rig
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats.c_header import weight_bytes
-from mjxball.policy.quantize import quantized
+from mjxball.policy.quantize import balanced, quantized
 
 
 def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):
-    policy = policy_of("balance")
+    policy = balanced(policy_of("balance"))
     assert call(export, [shipped_policy("balance"), tmp_path / "rounded.npz", "--int8"]) == 0
     saved = load_file(tmp_path / "rounded.npz").weights
     for exact, rounded, written in zip(policy.weights, quantized(policy).weights, saved, strict=True):

@@ -28,7 +28,7 @@ from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
 from mjxball.policy.formats.c_multi_model import MULTI_MODEL_LQG
 from mjxball.policy.policy import known_context
-from mjxball.policy.quantize import Rows, rows_of
+from mjxball.policy.quantize import Rows, balanced, rows_of
 
 FLOAT = 4  # bytes
 WIDEST_INT8 = 512  # products of 8 and 16 bits whose sum fits into 32
@@ -422,6 +422,7 @@ def _layers_int8(policy: PolicyFile) -> tuple[list[Rows], list[np.ndarray]]:
 
 def weight_bytes(policy: PolicyFile) -> bytes:
     """The struct `mjxball_weights` of `policy` as a little-endian machine holds it."""
+    policy = balanced(policy)
     rows, biases = _layers_int8(policy)
     parts = [policy.observation_mean, policy.observation_scale]
     for own, bias in zip(rows, biases, strict=True):
@@ -445,6 +446,7 @@ def _padded(weight: np.ndarray) -> np.ndarray:
 
 def _compiled(policy: PolicyFile) -> str:
     """The constant `mjxball_compiled`."""
+    policy = balanced(policy)
     rows, biases = _layers_int8(policy)
     parts: list[list[str]] = [[_number(value) for value in part] for part in _scaling(policy)]
     for own, bias in zip(rows, biases, strict=True):
