@@ -160,6 +160,7 @@ LIST = -1  # one and one for each register
 WEIGHTS = (
     (r"v?(ldm|stm)|push|pop|vpush|vpop", LIST),
     (r"vdiv|vsqrt", 14),
+    (r"vn?ml[as]|vfn?m[as]", 3),
     (r"(s|u)div", 12),
     (r"v?ldrd|strd", 3),
     (r"v?(ldr|str)", 2),

@@ -1,14 +1,16 @@
 """Followers on board: the same C on this computer and on a Cortex-M4F, its size, stack and time; weights of 8 bits.
 
 `python benchmarks/onboard.py [--policies FILE ...] [--observations 10000] [--json FILE]` needs gcc, gcc-arm-none-eabi
-and qemu-system-arm. One step from the same memory, outputs compared bit for bit between both machines and with NumPy in
-float32. Time: instructions of a call under QEMU times the weights of `cortex.py`, at 168 MHz. Flash and stack are those
-of the whole core of a follower's app, law, network and supervisor, where the policy is one of a pair.
+and qemu-system-arm; without FILE it takes the shipped policies and recurrent ones of random weights. One step from the
+same memory, outputs compared bit for bit between both machines and with NumPy in float32. Time: instructions of a call
+under QEMU times the weights of `cortex.py`, at 168 MHz. Flash and stack are those of the whole core of a follower's
+app, law, network and supervisor, where the policy is one of a pair.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import math
 import sys
@@ -25,11 +27,12 @@ from mjxball.export import in_team
 from mjxball.fly.app.generate import CORE, options, rig_header, sources
 from mjxball.fly.card import config_of
 from mjxball.policy import Policy, PolicyFile
-from mjxball.policy.file import law_of, load_file, shipped_policies
+from mjxball.policy.file import law_of, load_file, shipped_policies, shipped_policy
 from mjxball.policy.formats.c_header import APP, c_header, footprint
 
 FLIGHT = 500  # steps of a flight
 PAIR = Path("pair")  # the plant of a policy that has to be told its team
+RECURRENT = {"flight": (48, 32), "universal": (64, 48)}  # units and head of followers for a pair and for any rig
 MAIN = r"""
 #include "policy.h"
 int file_open(const char *name, int write);
@@ -114,23 +117,50 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> dict[str, Any]:
     return {**row, "flash": cortex.sizes(place, flags, "core.c"), "stack": stack}
 
 
+def recurrent(name: str, units: int | None = None) -> PolicyFile:
+    """The shipped policy `name`, one of RECURRENT, with a GRU of random weights in place of its network and law."""
+    policy, random = load_file(shipped_policy(name)), np.random.default_rng(2)
+    own, head = RECURRENT[name]
+    units = own if units is None else units
+    left_out = {"lqg", "filters", "flown"}
+    card = {field: value for field, value in policy.card.items() if field not in left_out}
+    card |= {"format_version": 5, "recurrent_units": units, "previous_action": True}
+    size = 18 + law_of(card).shown - units
+
+    def layer(inputs: int, outputs: int) -> np.ndarray:
+        return random.normal(scale=inputs**-0.5, size=(inputs, outputs)).astype(np.float32)
+
+    return dataclasses.replace(
+        policy,
+        card=card,
+        observation_mean=np.zeros(size, np.float32),
+        observation_scale=np.append(policy.observation_scale[:18], np.ones(size - 18)).astype(np.float32),
+        weights=(layer(size + units, head), layer(head + units, 6)),
+        biases=(layer(1, head)[0], layer(1, 6)[0]),
+        gru=(layer(size, 3 * units), layer(units, 3 * units), layer(1, 3 * units)[0]),
+    )
+
+
 def policy_of(path: Path) -> PolicyFile:
-    """The policy in `path`, as the follower of a pair if it has to be told, or of its own team if it flies no pair."""
-    policy = load_file(path)
+    """The policy in `path`, see `placed`."""
+    return placed(load_file(path), path.stem)
+
+
+def placed(policy: PolicyFile, name: str) -> PolicyFile:
+    """`policy` as the follower of a pair if it has to be told, or of its own team if it flies no pair."""
     law = law_of(policy.card)
     if not law.needs_context:
         return policy
     if isinstance(law.lqg, TeamLqg) and law.lqg.lifting:
-        return in_team(policy, path.stem, Path(f"team{len(policy.card['plant']['drones'])}"), 2)
-    return in_team(policy, path.stem, PAIR)
+        return in_team(policy, name, Path(f"team{len(policy.card['plant']['drones'])}"), 2)
+    return in_team(policy, name, PAIR)
 
 
-def measure(path: Path, int8: bool, steps: int) -> dict[str, Any]:
+def measure(policy: PolicyFile, name: str, int8: bool, steps: int) -> dict[str, Any]:
     """One row of the table."""
-    policy = policy_of(path)
     with tempfile.TemporaryDirectory() as place:
         compared = compare(policy, Path(place), int8, steps)
-        row = {"policy": path.stem, "weights": "int8" if int8 else "float32", **compared}
+        row = {"policy": name, "weights": "int8" if int8 else "float32", **compared}
         return {**row, **cost(policy, Path(place), int8)}
 
 
@@ -141,16 +171,18 @@ def main() -> int:
     parser.add_argument("--observations", type=int, default=10_000)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    options.policies = options.policies or shipped_policies()
     if cortex.missing():
         print(f"not installed: {cortex.missing()}", file=sys.stderr)
         return 2
     names = f"{'error':>8} {'rms':>8} {'flash B':>8} {'stack B':>8} {'instr.':>8} {'ms':>6}"
     print(f"{'policy':18} {'weights':8} identical {names}")
+    policies = {path.stem: policy_of(path) for path in options.policies or shipped_policies()}
+    if not options.policies:
+        policies |= {f"recurrent {name}": placed(recurrent(name), name) for name in RECURRENT}
     rows = []
-    for path in options.policies:
+    for name, policy in policies.items():
         for int8 in (False, True):
-            row = measure(path, int8, options.observations)
+            row = measure(policy, name, int8, options.observations)
             rows.append(row)
             flash, stack = row.get("flash", "-"), row.get("stack", "-")
             print(

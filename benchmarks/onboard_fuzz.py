@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import onboard
 from mjxball.export import in_team
 from mjxball.fly.app.generate import CORE, EXACT, ROLES, files_of
 from mjxball.fly.app.protocol import CAUSES, Phase
@@ -26,13 +27,17 @@ from mjxball.policy.file import load_file, shipped_policy
 DRIVER = Path(__file__).with_suffix(".c")
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
 SANITIZERS = ("-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
-POLICIES = (("flight", False), ("flight", True), ("universal", False), ("stand", True))  # name, weights of 8 bits
+POLICIES = (  # name, weights of 8 bits
+    *(("flight", False), ("flight", True), ("universal", False), ("stand", True)),
+    *(("recurrent flight", True), ("recurrent universal", False)),
+)
 
 
 def sources_of(name: str, int8: bool) -> dict[str, str]:
     """The app's C without the firmware's interface, by file name."""
-    policy = load_file(shipped_policy(name))
-    files = files_of(in_team(policy, name, Path("crazyflie")) if name == "universal" else policy, name, int8)
+    recurrent, _, last = name.rpartition(" ")
+    policy = onboard.recurrent(last) if recurrent else load_file(shipped_policy(name))
+    files = files_of(in_team(policy, name, Path("crazyflie")) if last == "universal" else policy, name, int8)
     return {one: files[f"src/{one}"] for one in (*CORE, "policy.h", "rig.h")}
 
 
@@ -65,7 +70,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    print(f"{'role':9}{'policy':11}{'weights':9}{'ticks':>9}{'flights':>9}{'flying':>9}{'uploads':>9}  report")
+    print(f"{'role':9}{'policy':20}{'weights':9}{'ticks':>9}{'flights':>9}{'flying':>9}{'uploads':>9}  report")
     rows: list[dict[str, Any]] = []
     for number, role in enumerate(ROLES):
         for place, (name, int8) in enumerate(POLICIES):
@@ -74,7 +79,7 @@ def main() -> int:
             rows.append({**row, "report": "", **found})
             flying = sum(found["phases"][phase] for phase in ("fly", "land", "descend")) if "phases" in found else 0
             print(
-                f"{role:9}{name:11}{row['weights']:9}{found.get('ticks', 0):9}{found.get('flights', 0):9}"
+                f"{role:9}{name:20}{row['weights']:9}{found.get('ticks', 0):9}{found.get('flights', 0):9}"
                 f"{flying:9}{found.get('accepted', 0):9}  {found.get('report', 'none')}",
                 flush=True,
             )

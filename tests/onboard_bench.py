@@ -11,25 +11,33 @@ from typing import Any
 import numpy as np
 import pytest
 
+import onboard
 from mjxball.export import in_team
 from mjxball.fly.app import protocol
 from mjxball.fly.app.host import App, Library, State, compile_pair
 from mjxball.fly.app.protocol import CAUSES, Phase
 from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.policy import PolicyFile, load_file
-from mjxball.policy.file import shipped_policy
+from mjxball.policy.file import law_of, shipped_policy
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc is installed")
 AT_REST = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros(3))
 
 
 def policy_of(name: str) -> PolicyFile:
-    """The shipped policy; that of teams with commands which a pair of Crazyflies can follow."""
+    """The shipped policy, or "recurrent NAME"; that of teams with commands which a pair of Crazyflies can follow."""
+    if name.startswith("recurrent "):
+        return in_pair(onboard.recurrent(name.split()[1]))
     policy = load_file(shipped_policy(name))
     if name != "team":
         return policy
     gentle = dataclasses.replace(policy, card={**policy.card, "command_limits": [0.26, 0.4]})
-    return in_team(gentle, name, Path("crazyflie"))
+    return in_pair(gentle)
+
+
+def in_pair(policy: PolicyFile) -> PolicyFile:
+    """Told that it flies a pair of Crazyflies, if it has to be told."""
+    return in_team(policy, "follower", Path("crazyflie")) if law_of(policy.card).needs_context else policy
 
 
 @functools.cache

@@ -16,6 +16,7 @@ from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats import c_header
+from onboard import RECURRENT, recurrent
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Werror", "-O1")
 TWO = """
@@ -25,8 +26,8 @@ TWO = """
 #include "first.h"
 
 int main(void) {
-    mjxball_first_follower first;
-    mjxball_other_2_follower other;
+    mjxball_first_follower first = {0};
+    mjxball_other_2_follower other = {0};
     float seen[18], action[3], command[2][3];
     mjxball_first_reset(&first);
     mjxball_other_2_reset(&other);
@@ -44,7 +45,7 @@ ONE = """
 #include "first.h"
 
 int main(void) {
-    mjxball_first_follower first;
+    mjxball_first_follower first = {0};
     float seen[18], out[7];
     mjxball_first_reset(&first);
     while (fread(seen, sizeof seen, 1, stdin) == 1) {
@@ -108,12 +109,16 @@ def spoilt(value: float, slot: int) -> np.ndarray:
 
 @pytest.mark.slow
 @needs_gcc
-@pytest.mark.parametrize("name", ["balance", "flight", "paper", "robust", "team", "universal"])
+@pytest.mark.parametrize(
+    "name",
+    [*("balance", "flight", "paper", "robust", "team", "universal"), *(f"recurrent {name}" for name in RECURRENT)],
+)
 @pytest.mark.parametrize("int8", [False, True])
 def test_an_observation_that_cannot_be_leaves_no_trace(name: str, int8: bool, tmp_path: Path):
     """Status 1, level, and every later answer is that of a flight which has not seen it."""
-    policy: PolicyFile = load_file(shipped_policy(name))
-    policy = in_team(policy, name, Path("pair")) if name in ("team", "universal") else policy
+    last = name.rsplit(maxsplit=1)[-1]
+    policy: PolicyFile = recurrent(last) if last != name else load_file(shipped_policy(name))
+    policy = in_team(policy, name, Path("pair")) if last in ("team", "universal") else policy
     (tmp_path / "first.h").write_text(c_header.c_header(policy, "first", int8))
     seen = observations()
     odd = [spoilt(value, slot) for value in (np.nan, np.inf, -np.inf, 1e38, 1e7) for slot in (0, 3, 9, 14, 17)]

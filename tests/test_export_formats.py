@@ -16,6 +16,7 @@ import onnxruntime
 import pytest
 from command_line import assert_one_line, call, listing, load_arrays, run, write_arrays
 from conftest import Trained
+from onboard_bench import needs_gcc
 from rig_laws import OLDEST, with_law
 
 from mjxball.cli import plant_setup
@@ -27,11 +28,15 @@ from mjxball.policy.file import law_of, save_file, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
 from mjxball.policy.law_fields import LATER_SHAPES, SWING_SHAPES
+from mjxball.policy.quantize import balanced, rows_of
+from onboard import placed
+from onboard import recurrent as gru_of
 
 STEPS = 60
 # Of one step's action in [-1, 1] by C, against NumPy in the same dtype: what docs/policy-file.md promises of float32.
 # The steepest policies, whose inputs are scaled by up to 370, were seen at 7e-6.
 TOLERANCE = 1e-5
+INT8_TOLERANCE = 5e-4  # steps of 16 bits that rounding takes to the next one; weights of 8 bits differ by 0.02
 ONNX_TOLERANCE = 1e-5  # likewise; its matrix products add up in an order of their own
 HARNESS = """
 #include <stdio.h>
@@ -39,7 +44,7 @@ HARNESS = """
 
 /* Each record: start (int), memory, observation -> action, command, memory, in MJXBALL_REAL. */
 int main(void) {
-    mjxball_follower_follower follower;
+    mjxball_follower_follower follower = {0};
     mjxball_follower_real seen[18], action[3], command[3];
     int start;
     fprintf(stderr, "%d", (int)sizeof follower);
@@ -84,7 +89,7 @@ def limited(remembering: Trained) -> PolicyFile:
 
 @pytest.fixture(
     params=[
-        *("trained", "direct", "remembering", "limited", "estimating", "recurrent"),
+        *("trained", "direct", "remembering", "limited", "estimating", "recurrent", "told"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
         *("team pair", "team team3", "universal pair", "universal team3", "lifting team6"),
         *("newer pair", "newer team3", "still pair", "older pair", "older team3"),
@@ -113,6 +118,12 @@ def lifting() -> PolicyFile:
     return dataclasses.replace(team, card={**team.card, "lqg": {**team.card["lqg"], "lifting": 0.9}})
 
 
+@pytest.fixture(scope="module")
+def told() -> PolicyFile:
+    """A recurrent follower of any rig, told which it flies."""
+    return placed(gru_of("universal"), "told")
+
+
 @dataclasses.dataclass(frozen=True)
 class Flight:
     """What NumPy inference in one dtype does, step by step; two flights, the second starts half way."""
@@ -125,9 +136,9 @@ class Flight:
     next_memory: np.ndarray  # (T, m)
 
 
-def flown(contents: PolicyFile, dtype: Any) -> Flight:
-    """NumPy inference on observations that change as smoothly as a flight's."""
-    policy, random = Policy(contents, "follower", dtype), np.random.default_rng(3)
+def flown(contents: PolicyFile, dtype: Any, policy: Policy | None = None) -> Flight:
+    """NumPy inference, by `policy` or `contents`, on observations that change as smoothly as a flight's."""
+    policy, random = policy or Policy(contents, "follower", dtype), np.random.default_rng(3)
     walk = np.cumsum(random.normal(scale=0.03, size=(STEPS, 18)), axis=0) + random.normal(scale=0.3, size=18)
     size = law_of(contents.card).size
     rows: dict[str, list[Any]] = {field.name: [] for field in dataclasses.fields(Flight)}
@@ -192,11 +203,11 @@ def test_onnx_flies_by_itself(limited: PolicyFile):
         np.testing.assert_allclose(action[0], flight.action[number], rtol=0, atol=5e-6)  # 30 steps of rounding
 
 
-def compiled(contents: PolicyFile, place: Path, real: str) -> Path:
+def compiled(contents: PolicyFile, place: Path, real: str, int8: bool = False) -> Path:
     """The harness around the header of `contents`, compiled as strictly as gcc can."""
     if shutil.which("gcc") is None:
         pytest.skip("no gcc is installed")
-    (place / "follower.h").write_text(c_header(contents, "follower"))
+    (place / "follower.h").write_text(c_header(contents, "follower", int8))
     (place / "main.c").write_text(HARNESS)
     strict = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Werror", "-O2"]
     command = ["gcc", *strict, f"-DMJXBALL_REAL={real}", "main.c", "-o", "harness", "-lm"]
@@ -205,23 +216,59 @@ def compiled(contents: PolicyFile, place: Path, real: str) -> Path:
     return place / "harness"
 
 
+def answered(harness: Path, flight: Flight, dtype: Any) -> tuple[np.ndarray, int]:
+    """(action, command, memory of the next step) (T, 6 + m) of `harness` for each step, and what its state takes."""
+    records = b"".join(
+        np.int32(start).tobytes() + memory.astype(dtype).tobytes() + seen.astype(dtype).tobytes()
+        for start, memory, seen in zip(flight.start, flight.memory, flight.observation, strict=True)
+    )
+    done = subprocess.run([harness], input=records, capture_output=True, check=True)
+    return np.frombuffer(done.stdout, dtype).reshape(STEPS, -1), int(done.stderr)
+
+
+class Whole:
+    """A matrix of weights of 8 bits, whose products with a vector of 16 bits are whole numbers."""
+
+    __array_ufunc__ = None  # a product with it is `__rmatmul__`
+
+    def __init__(self, weight: np.ndarray):
+        self.rows = rows_of(weight)
+
+    def __rmatmul__(self, seen: np.ndarray) -> np.ndarray:
+        largest, most = np.abs(seen).max(), np.float32(32767)
+        whole = (seen * (most / largest) + np.float32(32768.5)).astype(np.int64) - 32768
+        return (self.rows.weight @ whole).astype(np.float32) * (largest / most * self.rows.step)
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["balance", "flight", "recurrent flight", "recurrent universal"])
+def test_c_with_weights_of_8_bits_computes_with_whole_numbers(name: str, tmp_path: Path):
+    """Also beside the weights in float32, so that the whole numbers are those of the policy."""
+    recurrent, _, last = name.rpartition(" ")
+    contents = placed(gru_of(last), name) if recurrent else load_file(shipped_policy(name))
+    policy = Policy(balanced(contents), "follower")
+    network = policy._network
+    gru = None if network.gru is None else (*map(Whole, network.gru[:2]), network.gru[2])
+    policy._network = network._replace(weights=[Whole(weight) for weight in network.weights], gru=gru)
+    flight, exact = flown(contents, np.float32, policy), flown(contents, np.float32)
+    answer, _ = answered(compiled(contents, tmp_path, "float", int8=True), flight, np.float32)
+    np.testing.assert_allclose(answer[:, :3], flight.action, rtol=0, atol=INT8_TOLERANCE)
+    assert_remembered(answer[:, 6:], flight, contents, INT8_TOLERANCE)
+    assert 1e-3 < np.sqrt(np.mean((flight.action - exact.action) ** 2)) < 0.1
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("real", ["float", "double"])
 def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_path: Path):
     dtype = np.float32 if real == "float" else np.float64
     flight = flown(contents, dtype)
-    records = b"".join(
-        np.int32(start).tobytes() + memory.astype(dtype).tobytes() + seen.astype(dtype).tobytes()
-        for start, memory, seen in zip(flight.start, flight.memory, flight.observation, strict=True)
-    )
-    done = subprocess.run([compiled(contents, tmp_path, real)], input=records, capture_output=True, check=True)
-    answer = np.frombuffer(done.stdout, dtype).reshape(STEPS, -1)
+    answer, state = answered(compiled(contents, tmp_path, real), flight, dtype)
     np.testing.assert_allclose(answer[:, :3], flight.action, rtol=0, atol=TOLERANCE)
     scale = float(contents.action_scale.max())
     np.testing.assert_allclose(answer[:, 3:6], flight.command, rtol=0, atol=1e-6 + scale * TOLERANCE)
     assert_remembered(answer[:, 6:], flight, contents, TOLERANCE)
     if real == "float":
-        assert int(done.stderr) == footprint(contents).state
+        assert state == footprint(contents).state
 
 
 def test_the_header_states_what_it_costs(contents: PolicyFile):

@@ -16,6 +16,7 @@ from mjxball.fly.app.host import App
 from mjxball.fly.app.protocol import CAUSES, Phase
 from mjxball.fly.card import config_of, variants
 from mjxball.fly.telemetry import Rig
+from mjxball.policy.file import law_of
 
 WILD = (math.nan, math.inf, -3e38)
 AFTER = {"mount": "the mount is not set, or no length below 1 m", "goal": "the goal is beyond the fence or not finite"}
@@ -26,17 +27,17 @@ LIMIT, LEAST, MOST = 15.001, 10001, 60000  # [deg], [thrust units] of what is se
 
 
 @functools.cache
-def taken_off() -> Bench:
+def taken_off(name: str = "flight") -> Bench:
     """A pair in the first period of its laws."""
-    bench = Bench(cores_of(), Rig.of_card(policy_of("flight").card))
+    bench = Bench(cores_of(name), Rig.of_card(policy_of(name).card))
     bench.take_off()
     assert bench.phases == [Phase.FLY] * 2
     return bench
 
 
-def flying() -> Bench:
+def flying(name: str = "flight") -> Bench:
     """Another one in the same state."""
-    bench, before = Bench(cores_of(), taken_off().rig), taken_off()
+    bench, before = Bench(cores_of(name), taken_off(name).rig), taken_off(name)
     bench.now = before.now
     for app, old in zip(bench.apps, before.apps, strict=True):
         app._core.raw = old._core.raw
@@ -202,6 +203,26 @@ def test_what_an_app_computes_is_checked_before_it_leaves():
             assert 0.7 * calm[0].thrust < sent[0].thrust < calm[0].thrust
             assert_within_limits(bench.tick(Phase.FLY))
             assert bench.phases == [Phase.DESCEND] * 2
+
+
+@needs_gcc
+@rows("name", ["recurrent flight", "recurrent universal"])
+def test_a_state_of_the_network_that_is_not_finite_lands_the_pair(name: str):
+    """The law of `copy` flies on from the same period; what cannot be is forgotten."""
+    size = law_of(policy_of(name).card).size
+    for value in (math.nan, math.inf, -math.inf):
+        bench = flying(name)
+        app = bench.apps[1]
+        memory = app._c.memory(app._core)
+        assert np.isfinite(memory[:size]).all()
+        memory[3 + 7] = value  # behind the last action
+        assert_within_limits(bench.tick(Phase.FLY))
+        assert app.phase is Phase.LAND
+        assert app.logged()["copying"] == 1
+        assert bench.cause(1) == "the command is not finite"
+        for _ in range(10):
+            assert_within_limits(bench.tick(Phase.FLY, HIGH))
+        assert bench.phases == [Phase.LAND] * 2
 
 
 @needs_gcc

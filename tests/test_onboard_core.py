@@ -21,7 +21,7 @@ from mjxball.sim.laws import Laws
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["flight", "stand", "team"])
+@pytest.mark.parametrize("name", ["flight", "stand", "team", "recurrent flight", "recurrent universal"])
 def test_the_apps_command_what_the_laptop_would(name: str):
     """Leader and follower over 5 s of motion: float32 on board, float64 laws on the laptop."""
     policy = policy_of(name)
@@ -68,6 +68,25 @@ def test_the_laptop_turns_into_mount_frames_as_teams_do():
         pair = ObjectState(place, velocity, rotations.quaternion_from_euler(euler), rates)
         wanted = laws.in_body_axes(np.asarray(alone(laws.observe(pair, goal)), float))
         np.testing.assert_allclose(controller.step(pair, goal).follower, wanted, rtol=0, atol=1e-6)
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["recurrent flight", "recurrent universal"])
+def test_a_flight_begins_with_an_empty_state(name: str):
+    """A second one without a reboot, after motion that the first one remembers, is the first one again."""
+    bench = Bench(cores_of(name), Rig.of_card(policy_of(name).card))
+    flights: list[list[Any]] = []
+    for _ in range(2):
+        bench.take_off()
+        flights.append([(one.roll, one.pitch, one.thrust) for _ in range(30) for one in bench.tick(Phase.FLY)])
+        for _ in range(40):
+            bench.tick(Phase.FLY, AT_REST._replace(velocity=np.array([0.3, -0.2, 0.1])))
+        while bench.phases != [Phase.IDLE] * 2:
+            bench.tick(Phase.STOP if bench.apps[0].phase is not Phase.STOP else Phase.IDLE)
+        for app in bench.apps:
+            app.laptop(protocol.order(Phase.IDLE).data, bench.now)
+    assert flights[1] == flights[0]
+    assert len(set(flights[0])) > 30
 
 
 REFUSED: tuple[tuple[str, Any], ...] = (

@@ -20,7 +20,7 @@ from mjxball.export import main as export
 from mjxball.fly.app import generate, protocol
 from mjxball.fly.app.protocol import Phase
 from mjxball.fly.telemetry import ObjectState, Rig
-from mjxball.policy.file import shipped_policy
+from mjxball.policy.file import load_file, save_file, shipped_policy
 
 needs_arm = pytest.mark.skipif(bool(cortex.missing()), reason=f"not installed: {cortex.missing()}")
 
@@ -39,10 +39,13 @@ FIRMWARE = (  # its Kbuild's, release 2026.08: gcc's dialect has functions of it
 
 @pytest.mark.slow
 @needs_gcc
-@pytest.mark.parametrize("name", ["flight", "flight --int8", "stand", "universal"])
+@pytest.mark.parametrize(
+    "name", ["flight", "flight --int8", "stand", "universal", "recurrent flight --int8", "recurrent universal"]
+)
 def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsys: pytest.CaptureFixture):
-    policy, *more = name.split()
-    assert call(export, [shipped_policy(policy), tmp_path / "app", "--crazyflie", *more]) == 0
+    policy, *more = name.removesuffix(" --int8"), *(["--int8"] if name.endswith("--int8") else [])
+    save_file(tmp_path / "policy.npz", policy_of(policy))
+    assert call(export, [tmp_path / "policy.npz", tmp_path / "app", "--crazyflie", *more]) == 0
     glue = (tmp_path / "app/src/glue.c").read_text()
     (tmp_path / "include").mkdir()
     for header in set(re.findall(r'#include "(\w+\.h)"', glue)) - {"core.h"}:
@@ -69,8 +72,10 @@ def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsy
 @needs_arm
 @pytest.mark.parametrize("int8", [False, True])
 def test_a_cortex_m4_computes_the_same_bits(int8: bool, tmp_path: Path):
-    for name in ("balance", "flight", "team", "universal"):
-        found = benchmark.compare(benchmark.policy_of(shipped_policy(name)), tmp_path, int8, 500)
+    policies = {name: load_file(shipped_policy(name)) for name in ("balance", "flight", "team", "universal")}
+    policies |= {f"recurrent {name}": benchmark.recurrent(name) for name in benchmark.RECURRENT}
+    for name, policy in policies.items():
+        found = benchmark.compare(benchmark.placed(policy, name), tmp_path, int8, 500)
         assert found["identical"], name
         if not int8:
             # Odds of twelve filters multiply what float32 rounds; rms 5e-7.
@@ -112,7 +117,7 @@ int main(void) {
 
 @pytest.mark.slow
 @needs_arm
-@pytest.mark.parametrize("name", ["flight", "team"])
+@pytest.mark.parametrize("name", ["flight", "team", "recurrent flight"])
 def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
     """Both apps over take-off, motion of the pair, landing and a fence that is left, whose inputs were recorded."""
     policy = policy_of(name)

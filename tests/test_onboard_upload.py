@@ -12,23 +12,25 @@ import pytest
 from command_line import assert_one_line, call
 from onboard_bench import Bench, needs_gcc, policy_of
 
+import onboard as benchmark
 from mjxball.errors import InputError
 from mjxball.export import main as export
 from mjxball.fly.app import generate, protocol
-from mjxball.fly.app.host import compile_pair
+from mjxball.fly.app.host import App, compile_pair
 from mjxball.fly.app.protocol import CAUSES, Phase
 from mjxball.fly.connection import LinkError
 from mjxball.fly.main import main as fly
-from mjxball.fly.onboard import Apps
+from mjxball.fly.onboard import Apps, send_weights
+from mjxball.fly.packets import Packet
 from mjxball.fly.telemetry import Rig
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats.c_header import weight_bytes
-from mjxball.policy.quantize import quantized
+from mjxball.policy.quantize import balanced, quantized
 
 
 def test_int8_weights_are_near(tmp_path: Path, capsys: pytest.CaptureFixture):
-    policy = policy_of("balance")
+    policy = balanced(policy_of("balance"))
     assert call(export, [shipped_policy("balance"), tmp_path / "rounded.npz", "--int8"]) == 0
     saved = load_file(tmp_path / "rounded.npz").weights
     for exact, rounded, written in zip(policy.weights, quantized(policy).weights, saved, strict=True):
@@ -56,10 +58,11 @@ def test_export_refuses_what_cannot_fly_on_board(tmp_path: Path, capsys: pytest.
 
 
 @needs_gcc
-def test_weights_are_uploaded_on_the_ground_only():
-    policy = policy_of("flight")
+@pytest.mark.parametrize("name", ["flight", "recurrent flight"])
+def test_weights_are_uploaded_on_the_ground_only(name: str):
+    policy = policy_of(name)
     other = dataclasses.replace(policy, biases=tuple(bias + np.float32(0.01) for bias in policy.biases))
-    bench = Bench(compile_pair(policy, "flight", int8=True), Rig.of_card(policy.card))
+    bench = Bench(compile_pair(policy, name, int8=True), Rig.of_card(policy.card))
     follower, key, data = bench.apps[1], generate.key_of(policy), weight_bytes(other)
     assert key == generate.key_of(other)
     assert follower.ident == zlib.crc32(weight_bytes(policy)) == generate.ident_of(policy, True)
@@ -68,7 +71,7 @@ def test_weights_are_uploaded_on_the_ground_only():
         replies = [protocol.reply_of(follower.laptop(packet.data, bench.now)) for packet in packets]
         return next((reply.status for reply in replies if reply is not None and reply.status), 0)
 
-    bad = CAUSES.index("weights refused: wrong rate, plant, format, size or CRC")
+    bad = CAUSES.index("weights refused: wrong rate, plant, layers, size or CRC")
     packets = list(protocol.upload(data, key))
     assert upload(protocol.upload(data, key + 1)) == bad  # another rate or plant
     assert upload(protocol.upload(data[:-8], key)) == bad
@@ -85,12 +88,36 @@ def test_weights_are_uploaded_on_the_ground_only():
     assert follower.ident == generate.ident_of(other, True)
     bench.take_off()
     flown = [bench.tick(Phase.FLY)[1] for _ in range(3)]
-    new = Bench(compile_pair(other, "flight", int8=True), bench.rig)
+    new = Bench(compile_pair(other, name, int8=True), bench.rig)
     new.take_off()
     assert [one.thrust for one in flown] == [new.tick(Phase.FLY)[1].thrust for _ in range(3)]
     assert upload(protocol.upload(data, key)) == CAUSES.index(
         "refused: weights, mount and curve change on the ground only"
     )
+
+
+class AppLink:
+    """A drone that runs `app`."""
+
+    name = "follower"
+
+    def __init__(self, app: App):
+        self.app = app
+
+    def ask_app(self, packet: Packet) -> protocol.Reply | None:
+        return protocol.reply_of(self.app.laptop(packet.data, 0))
+
+
+@needs_gcc
+def test_a_recurrent_policy_of_another_size_is_refused():
+    """Of more units, of fewer, and of none; the one that is on board stays."""
+    policy = policy_of("recurrent flight")
+    follower = App(compile_pair(policy, "small", int8=True)[1], 1)
+    refusal = r"^the follower: weights refused: wrong rate, plant, layers, size or CRC$"
+    for other in (benchmark.recurrent("flight", 47), benchmark.recurrent("flight", 64), policy_of("flight")):
+        with pytest.raises(InputError, match=refusal):
+            send_weights(AppLink(follower), weight_bytes(other), generate.key_of(other), print)  # type: ignore[arg-type]
+        assert follower.ident == generate.ident_of(policy, True)
 
 
 class FakeLink:

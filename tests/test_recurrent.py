@@ -251,6 +251,32 @@ def test_a_state_that_is_none_is_refused_and_the_flight_goes_on(recurrent: Recur
         np.testing.assert_allclose(flown(seen), alone(seen), atol=1e-6)
 
 
+def test_a_later_format_is_named_whatever_its_arrays(recurrent: Recurrent, tmp_path: Path) -> None:
+    path = tmp_path / "policy.npz"
+    save_file(path, recurrent.contents)
+    with np.load(path) as data:
+        held: dict[str, Any] = {name: data[name] for name in data.files if not name.startswith("gru")}
+    held["card"] = np.array(json.dumps({**json.loads(str(held["card"])), "format_version": 6}))
+    np.savez(path, lstm=np.zeros(3), **held)
+    with pytest.raises(PolicyFileError, match=r"has policy format 6; this version reads formats 1, 2, 3, 4, 5$"):
+        load_file(path)
+
+
+def test_a_state_that_cannot_be_is_refused(recurrent: Recurrent) -> None:
+    """Of another policy, or not finite: one sentence, and the state stays as it was."""
+    policy = Policy(recurrent.contents, "one")
+    policy(np.zeros(18))
+    kept = policy.memory.copy()
+    for memory, words in ((np.zeros(kept.size - 1), "remembers 10 numbers, not"), (kept * np.nan, "must be finite")):
+        with pytest.raises(InputError, match=words):
+            policy.memory = memory
+        np.testing.assert_array_equal(policy.memory, kept)
+    for wrong in (np.nan, np.inf):
+        with pytest.raises(InputError):
+            policy(np.full(18, wrong))
+        np.testing.assert_array_equal(policy.memory, kept)
+
+
 def test_a_mean_is_of_the_gru_as_well(recurrent: Recurrent) -> None:
     one = recurrent.contents
     assert one.gru is not None

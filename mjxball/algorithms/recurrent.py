@@ -68,7 +68,9 @@ class RecurrentPolicy(NamedTuple):
 
     def step(self, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:
         """(parameters of the action's distribution (..., 2 a), next state (..., H)) at `observation` (..., n)."""
-        network = RecurrentNetwork(policy["params"], statistics.mean, statistics.std, np.asarray(self.mask, np.float32))
+        network = RecurrentNetwork(
+            policy["params"], statistics.mean, statistics.std, jnp.asarray(self.mask, jnp.float32)
+        )
         return network.outputs(observation)
 
     def apply(self, statistics: Any, policy: Any, observation: Array) -> Array:

@@ -125,12 +125,13 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
         if needed not in arrays:
             raise PolicyFileError(f"{name} is not a policy file: it has no {needed}")
     card = _read_card(name, arrays.pop("card"))
+    _check_version(card, name)  # before the arrays, which later formats may have others of
     layers = 0
     while f"weight_{layers}" in arrays:
         layers += 1
     expected = {"observation_mean", "observation_scale", "action_scale"}
     expected |= {f"{kind}_{i}" for kind in ("weight", "bias") for i in range(layers)}
-    recurrent = card.get("format_version") == 5
+    recurrent = card["format_version"] == 5
     expected |= set(GRU_ARRAYS) if recurrent else set()
     odd = sorted(set(arrays) ^ expected)
     if odd or not layers:
@@ -214,11 +215,15 @@ def _check_array(name: str, label: str, array: np.ndarray, shape: tuple[int, ...
         raise PolicyFileError(f"{name}: {label} is empty or holds a value beyond {MAX_NUMBER:g}")
 
 
-def _check_card(card: dict[str, Any], name: str) -> None:
+def _check_version(card: dict[str, Any], name: str) -> None:
     version = card.get("format_version")
     if version not in FORMAT_VERSIONS or isinstance(version, bool):
         known = ", ".join(map(str, FORMAT_VERSIONS))
         raise PolicyFileError(f"{name} has policy format {version!r}; this version reads formats {known}")
+
+
+def _check_card(card: dict[str, Any], name: str) -> None:
+    _check_version(card, name)
     for field, kind in CARD_FIELDS.items():
         value = card.get(field)
         if isinstance(value, bool) and kind is not bool:

@@ -27,8 +27,27 @@ def rows_of(weight: np.ndarray) -> Rows:
     return Rows(whole.astype(np.int8), step.astype(np.float32))
 
 
+def balanced(policy: PolicyFile) -> PolicyFile:
+    """The same function of the observation, in which the first weights are about as large for each input as for others.
+
+    Inputs, which have 16 bits on board, are scaled by powers of two instead; weights of those that are not used are 0.
+    """
+    size, used = len(policy.observation_mean), policy.observation_scale > 0
+    first = policy.weights[0] if policy.gru is None else policy.gru[0]
+    rms = np.sqrt(np.mean(np.square(first[-size:], dtype=float), axis=1))
+    factor = np.exp2(np.rint(np.log2(np.where(used & (rms > 0), rms, 1.0)))).astype(np.float32)
+
+    def over(weight: np.ndarray) -> np.ndarray:
+        return np.concatenate([weight[:-size], weight[-size:] * (used / factor)[:, None]]).astype(np.float32)
+
+    weights, scale = (over(policy.weights[0]), *policy.weights[1:]), policy.observation_scale * factor
+    gru = policy.gru and (over(policy.gru[0]), *policy.gru[1:])
+    return dataclasses.replace(policy, weights=weights, observation_scale=scale, gru=gru)
+
+
 def quantized(policy: PolicyFile) -> PolicyFile:
     """`policy` with the weights that its 8 bit export has, as floats: what it flies like, but for its activations."""
+    policy = balanced(policy)
 
     def rounded(weight: np.ndarray) -> np.ndarray:
         rows = rows_of(weight)

@@ -24,6 +24,11 @@ ACCESS = """\
 uint32_t mjxball_size(void) { return sizeof(mjxball_app); }
 const float *mjxball_command(const mjxball_app *app) { return app->command; }
 const float *mjxball_integral(const mjxball_app *app) { return app->integral; }
+#if MJXBALL_MEMORY_SIZE > 0
+const float *mjxball_memory(const mjxball_app *app) { return app->follower.memory; }
+#else
+const float *mjxball_memory(const mjxball_app *app) { return app ? 0 : 0; }
+#endif
 """
 
 
@@ -75,6 +80,7 @@ class Library:
             ("mjxball_upload_size", ctypes.c_uint32),
             ("mjxball_command", ctypes.POINTER(ctypes.c_float)),
             ("mjxball_integral", ctypes.POINTER(ctypes.c_float)),
+            ("mjxball_memory", ctypes.POINTER(ctypes.c_float)),
         ):
             getattr(self._library, name).restype = result
 

@@ -64,7 +64,7 @@ CAUSES = (
     "the law comes late",
     "the phase lasted too long",
     "on the ground",
-    "weights refused: wrong rate, plant, format, size or CRC",
+    "weights refused: wrong rate, plant, layers, size or CRC",
     "refused: weights, mount and curve change on the ground only",
     "the battery is low",
     "the limit of the battery is not between 0 and 10 V",

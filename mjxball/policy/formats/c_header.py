@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control import multi_model_lqg, swing, team_lqg
+from mjxball.control import swing
 from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, FollowerLaw
 from mjxball.control.multi_model_lqg import LEAST_ROOM, MultiModelLqg, is_pair
 from mjxball.control.observation import (
@@ -28,7 +28,7 @@ from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
 from mjxball.policy.formats.c_multi_model import MULTI_MODEL_LQG
 from mjxball.policy.policy import known_context
-from mjxball.policy.quantize import Rows, rows_of
+from mjxball.policy.quantize import Rows, balanced, rows_of
 
 FLOAT = 4  # bytes
 WIDEST_INT8 = 512  # products of 8 and 16 bits whose sum fits into 32
@@ -107,18 +107,23 @@ def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     """Bytes that the header of `policy` needs, see `c_header`."""
     weights, biases = layers_of(policy)
     size, units = len(policy.observation_mean), law_of(policy.card).units
-    widest = max(len(bias) for bias in biases[2 if units else 0 :])
-    lqg, told = law_of(policy.card).lqg, policy.card.get("team")
-    constants = 2 * ACTION_SIZE + sum(np.size(value) for value in _lqg_numbers(lqg, told and told["context"]).values())
-    constants += {TeamLqg: team_lqg.CONTEXT, MultiModelLqg: multi_model_lqg.CONTEXT}.get(type(lqg), 0)
+    outputs = [weight.shape[1] for weight in weights]
+    widest = max(outputs[2 if units else 0 :])
+    lqg, told = law_of(policy.card).lqg, policy.card.get("team", {}).get("context")
+    constants = 2 * ACTION_SIZE + sum(np.size(value) for value in _lqg_numbers(lqg, told).values()) + len(told or ())
     own = OBSERVATION_SIZE + 2 * lqg.models + 4 if isinstance(lqg, MultiModelLqg) else 0  # `seen`, `known`
     own += 11 * units + size if units else 0  # `given`, `kept`, `next`, `joined`, and behind both of `hidden`
     state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest + own)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
-        return Footprint(flash, state + FLOAT, stack + 2 * (max(size, widest) + 7))
-    constants += sum(array.size for array in (*weights, *biases)) + 2 * size
+        return Footprint(flash, state + FLOAT, stack + 2 * (_most_inputs(weights) + 7))
+    constants += sum(rows_up(weight.shape[1]) * weight.shape[0] for weight in weights)
+    constants += sum(bias.size for bias in biases) + 2 * size
     return Footprint(FLOAT * constants, state, stack)
+
+
+def _most_inputs(weights: Sequence[np.ndarray]) -> int:
+    return max(weight.shape[0] for weight in weights)
 
 
 def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | None = None) -> str:
@@ -133,13 +138,11 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     context = known_context(policy.card, name)
     law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)
     history = law.history
-    shapes = [weight.shape for weight in layers_of(policy)[0]]
-    sizes = [len(policy.observation_mean), *(outputs for _, outputs in shapes)]
-    widest = max(sizes[3:]) + law.units if law.units else max(sizes[1:])
-    if int8 and max(sizes[:-1]) > WIDEST_INT8:
-        raise InputError(
-            f"{name} has a layer of {max(sizes[:-1])} inputs; with weights of 8 bits {WIDEST_INT8} at most"
-        )
+    weights, _ = layers_of(policy)
+    outputs = [weight.shape[1] for weight in weights[2 if law.units else 0 :]]
+    size, most = len(policy.observation_mean), _most_inputs(weights)
+    if int8 and most > WIDEST_INT8:
+        raise InputError(f"{name} has a layer of {most} inputs; with weights of 8 bits {WIDEST_INT8} at most")
     arrays = _float_arrays(policy) if not int8 else []
     tilt, vertical = card["command_limits"]
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
@@ -162,19 +165,19 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         period=f"{card['control_period']:g}",
         gravity=_number(card["gravity"]),
         observation=_table(),
-        layers=" x ".join(map(str, sizes)),
+        layers=" x ".join(map(str, [size, *([f"GRU {law.units}"] if law.units else []), *outputs])),
         flash=cost.flash,
         state=cost.state,
         stack=cost.stack,
-        size=sizes[0],
-        widest=widest,
-        broadest=max(*sizes, *(inputs for inputs, _ in shapes)),
+        size=size,
+        widest=max(outputs) + law.units,
+        most_inputs=most,
         largest=_number(LARGEST),
         int8="#define MJXBALL_INT8 1\n" if int8 else "",
         weights=", weights of 8 bits" if int8 else "",
         includes="#include <stdint.h>\n\n" if int8 else "",
         weights_field="    const mjxball_weights *weights;  /* 0: those compiled in */\n" if int8 else "",
-        weights_type=_weights_type(sizes[0], shapes) if int8 else "",
+        weights_type=_weights_type(policy) if int8 else "",
         compiled=_compiled(policy) if int8 else "",
         leader="\n".join(["    int i;", *_leader(card, "to")]),
         memory_size=law.size,
@@ -187,7 +190,7 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         arrays="\n".join(arrays),
         history=_history(law, card),
         history_update=_history_update(law),
-        network=_network(law, sizes[0], shapes, int8),
+        network=_network(law, policy, int8),
         command=_command(law, card),
     )
     return _named(text, prefix or prefix_of(name))
@@ -216,21 +219,29 @@ def _team(team: dict[str, Any]) -> str:
 def layers_of(policy: PolicyFile) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Weights and biases without the last layer's second half, which exploration alone uses.
 
-    Before them those of a GRU: for what is seen, and for its state, which has no bias of its own.
+    Before them those of a GRU: for what is seen, and for its state, whose bias is empty.
     """
     weights = [*policy.weights[:-1], policy.weights[-1][:, :ACTION_SIZE]]
     biases = [*policy.biases[:-1], policy.biases[-1][:ACTION_SIZE]]
     if policy.gru is None:
         return weights, biases
     kernel, recurrent, bias = policy.gru
-    return [kernel, recurrent, *weights], [bias, np.zeros_like(bias), *biases]
+    return [kernel, recurrent, *weights], [bias, bias[:0], *biases]
 
 
 def _float_arrays(policy: PolicyFile) -> list[str]:
     arrays = [_array("mean", policy.observation_mean), _array("scale", policy.observation_scale)]
     for number, (weight, bias) in enumerate(zip(*layers_of(policy), strict=True)):
-        arrays += [_array(f"weight_{number}", weight.T), _array(f"bias_{number}", bias)]
+        arrays += [_array(f"weight_{number}", _side_by_side(weight))]
+        arrays += [_array(f"bias_{number}", bias)] if bias.size else []
     return arrays
+
+
+def _side_by_side(weight: np.ndarray) -> np.ndarray:
+    """`weight` (inputs, outputs) as (blocks, inputs, 4), outputs filled up with zeros: four of them in a block."""
+    inputs, outputs = weight.shape
+    padded = np.pad(weight, ((0, 0), (0, rows_up(outputs) - outputs)))
+    return padded.reshape(inputs, -1, 4).swapaxes(0, 1)
 
 
 def _number(value: float | np.floating) -> str:
@@ -342,19 +353,20 @@ def _history_update(law: FollowerLaw) -> str:
     return "\n".join(lines)
 
 
-def _network(law: FollowerLaw, size: int, shapes: Sequence[tuple[int, int]], int8: bool) -> str:
-    """Lines that scale `input` (`size`,) and call the layers, which have `shapes` (inputs, outputs)."""
-    mean, scale = ("w->mean", "w->scale") if int8 else ("mjxball_mean", "mjxball_scale")
+def _network(law: FollowerLaw, policy: PolicyFile, int8: bool) -> str:
+    """Lines that scale `input` and call the layers."""
+    size, own = len(policy.observation_mean), "w->" if int8 else "mjxball_"
+    weights, biases = layers_of(policy)
+    shapes = [weight.shape for weight in weights]
     lines = (
         ["    const mjxball_weights *w = follower->weights ? follower->weights : &mjxball_compiled;"] if int8 else []
     )
-    lines += [f"    for (i = 0; i < {size}; i++) input[i] = (input[i] - {mean}[i]) * {scale}[i];"]
-    calls = [
-        f"mjxball_layer(w->weight_{n}, w->step_{n}, w->bias_{n}, {inputs}, {outputs}, {stride(inputs)}"
-        if int8
-        else f"mjxball_layer(mjxball_weight_{n}, mjxball_bias_{n}, {inputs}, {outputs}"
-        for n, (inputs, outputs) in enumerate(shapes)
-    ]
+    lines += [f"    for (i = 0; i < {size}; i++) input[i] = (input[i] - {own}mean[i]) * {own}scale[i];"]
+    calls = []
+    for n, ((inputs, outputs), bias) in enumerate(zip(shapes, biases, strict=True)):
+        steps, row = (f"w->step_{n}, ", f", {stride(inputs)}") if int8 else ("", "")
+        added = f"{own}bias_{n}" if bias.size else "0"
+        calls += [f"mjxball_layer({own}weight_{n}, {steps}{added}, {inputs}, {outputs}{row}"]
     if not law.units:
         return "\n".join([*lines, *_layers(shapes, calls, "input")])
     units, state = law.units, f"memory + {law.history.size}"
@@ -388,15 +400,17 @@ def stride(inputs: int) -> int:
 
 
 def rows_up(outputs: int) -> int:
-    """Rows of weights of 8 bits, a multiple of 4."""
+    """Rows of weights, a multiple of 4."""
     return -(-outputs // 4) * 4
 
 
-def _weights_type(size: int, shapes: Sequence[tuple[int, int]]) -> str:
+def _weights_type(policy: PolicyFile) -> str:
     """The struct whose bytes are `weight_bytes`."""
-    floats = [f"mean[{size}]", f"scale[{size}]"]
-    floats += [f"{kind}_{n}[{outputs}]" for n, (_, outputs) in enumerate(shapes) for kind in ("step", "bias")]
-    whole = [f"weight_{n}[{rows_up(outputs) * stride(inputs)}]" for n, (inputs, outputs) in enumerate(shapes)]
+    floats, whole = [f"{kind}[{len(policy.observation_mean)}]" for kind in ("mean", "scale")], []
+    for n, (weight, bias) in enumerate(zip(*layers_of(policy), strict=True)):
+        inputs, outputs = weight.shape
+        floats += [f"step_{n}[{outputs}]", *([f"bias_{n}[{outputs}]"] if bias.size else [])]
+        whole += [f"weight_{n}[{rows_up(outputs) * stride(inputs)}]"]
     fields = [*(f"float {one}" for one in floats), *(f"int8_t {one}" for one in whole)]
     return "typedef struct {\n" + "".join(f"    {one};\n" for one in fields) + "} mjxball_weights;\n\n"
 
@@ -408,6 +422,7 @@ def _layers_int8(policy: PolicyFile) -> tuple[list[Rows], list[np.ndarray]]:
 
 def weight_bytes(policy: PolicyFile) -> bytes:
     """The struct `mjxball_weights` of `policy` as a little-endian machine holds it."""
+    policy = balanced(policy)
     rows, biases = _layers_int8(policy)
     parts = [policy.observation_mean, policy.observation_scale]
     for own, bias in zip(rows, biases, strict=True):
@@ -431,10 +446,11 @@ def _padded(weight: np.ndarray) -> np.ndarray:
 
 def _compiled(policy: PolicyFile) -> str:
     """The constant `mjxball_compiled`."""
+    policy = balanced(policy)
     rows, biases = _layers_int8(policy)
     parts: list[list[str]] = [[_number(value) for value in part] for part in _scaling(policy)]
     for own, bias in zip(rows, biases, strict=True):
-        parts += [[_number(value) for value in part] for part in (own.step, bias)]
+        parts += [[_number(value) for value in part] for part in (own.step, bias) if part.size]
     parts += [[str(value) for value in _padded(own.weight).ravel()] for own in rows]
     return "static const mjxball_weights mjxball_compiled = {\n" + ",\n".join(map(_braced, parts)) + "};\n"
 
@@ -468,7 +484,7 @@ def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
     if isinstance(law.lqg, MultiModelLqg) and law.lqg.by_size is not None:
         size = "(action[i] < 0 ? -action[i] : action[i])"
         added += f" * (mjxball_lqg_small[i] + (1 - mjxball_lqg_small[i]) * {size})"
-    if law.needs_context:
+    if isinstance(law.lqg, TeamLqg | MultiModelLqg):
         lifts = _lifts(law.lqg)
         lines = [f"    mjxball_real own[{6 if lifts else 3}];"]
         lines += [f"    mjxball_lqg_command(memory + {law.history.size}, {_seen(law)}{_known(law)}, led, own);"]

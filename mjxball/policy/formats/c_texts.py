@@ -3,7 +3,7 @@
 HEADER = """\
 /* Follower {name}, exported by mjxball {version}: {origin}.
  *
- *   mjxball_follower follower;
+ *   mjxball_follower follower = {{0}};
  *   mjxball_reset(&follower);                                              before every flight
  *   int status = mjxball_follow(&follower, observation, action, command);  every {period} s
  *
@@ -32,7 +32,7 @@ typedef MJXBALL_REAL mjxball_real;
 #define MJXBALL_OBSERVATION_SIZE 18
 #define MJXBALL_ACTION_SIZE 3
 #define MJXBALL_MEMORY_SIZE {memory_size}
-#define MJXBALL_WIDEST {broadest}
+#define MJXBALL_MOST_INPUTS {most_inputs}
 #define MJXBALL_LARGEST {largest}
 {int8}#define MJXBALL_CONTROL_PERIOD {period}
 #define MJXBALL_GRAVITY {gravity}
@@ -158,37 +158,39 @@ static inline void mjxball_lqg_next(
 """
 
 LAYER = """
-/* to = weight from + bias, two rows at once: what is loaded serves both. Four sums side by side keep a pipelined FPU
- * busy and round less than one long sum. */
-static inline void mjxball_rows(
-    const float *w, const float *v, int inputs, const mjxball_real *from, mjxball_real *one, mjxball_real *other) {
-    mjxball_real a = 0, b = 0, c = 0, d = 0, e = 0, f = 0, g = 0, h = 0;
-    int k = 0;
-    for (; k < (inputs & ~3); k += 4) {
-        a += w[k] * from[k];
-        e += v[k] * from[k];
-        b += w[k + 1] * from[k + 1];
-        f += v[k + 1] * from[k + 1];
-        c += w[k + 2] * from[k + 2];
-        g += v[k + 2] * from[k + 2];
-        d += w[k + 3] * from[k + 3];
-        h += v[k + 3] * from[k + 3];
-    }
-    for (; k < inputs; k++) {
-        a += w[k] * from[k];
-        e += v[k] * from[k];
-    }
-    *other = (e + f) + (g + h);
-    *one = (a + b) + (c + d);
-}
+/* Products and sums as instructions of their own, where one for both takes longer (Cortex-M4). */
+#ifdef __ARM_FEATURE_DSP
+#define MJXBALL_APART(a, b, c, d) __asm__("" : "+w"(a), "+w"(b), "+w"(c), "+w"(d))
+#else
+#define MJXBALL_APART(a, b, c, d) (void)0
+#endif
+/* Four rows, whose weights stand side by side: what is loaded of the input serves them all. */
+#define MJXBALL_ADD(weight, from, a, b, c, d) \\
+    do { \\
+        mjxball_real p = (weight)[0] * (from), q = (weight)[1] * (from); \\
+        mjxball_real r = (weight)[2] * (from), s = (weight)[3] * (from); \\
+        MJXBALL_APART(p, q, r, s); \\
+        a += p; \\
+        b += q; \\
+        c += r; \\
+        d += s; \\
+    } while (0)
 
+/* to = weight from + bias, where a bias of 0 is none. Rows are filled up to a multiple of four. Sums over even and odd
+ * inputs round less than one long sum. */
 static inline void mjxball_layer(
     const float *weight, const float *bias, int inputs, int outputs, const mjxball_real *from, mjxball_real *to) {
-    for (int row = 0; row < outputs; row += 2, weight += 2 * inputs) {
-        const int two = row + 1 < outputs;
-        mjxball_rows(weight, weight + two * inputs, inputs, from, to + row, to + row + two);
+    for (int row = 0; row < outputs; row += 4, weight += 4 * (inputs & 1)) {
+        mjxball_real a = 0, b = 0, c = 0, d = 0, e = 0, f = 0, g = 0, h = 0;
+        int k = 0;
+        for (; k < (inputs & ~1); k += 2, weight += 8) {
+            MJXBALL_ADD(weight, from[k], a, b, c, d);
+            MJXBALL_ADD(weight + 4, from[k + 1], e, f, g, h);
+        }
+        if (inputs & 1) MJXBALL_ADD(weight, from[k], a, b, c, d);
+        const mjxball_real sums[4] = {a + e, b + f, c + g, d + h};
+        for (int i = 0; i < 4 && row + i < outputs; i++) to[row + i] = sums[i] + (bias ? bias[row + i] : 0);
     }
-    for (int row = 0; row < outputs; row++) to[row] += bias[row];
 }
 """
 ROOT = """
@@ -361,11 +363,11 @@ static inline int32_t mjxball_products(const int8_t *weight, const int16_t *step
 }
 #endif
 
-/* to = step weight from + bias of whole numbers: rows of `stride` weights, of which `inputs` are not 0, four rows at
- * once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four. */
+/* to = step weight from + bias of whole numbers, where a bias of 0 is none: rows of `stride` weights, of which `inputs`
+ * are not 0, four rows at once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four. */
 static inline void mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
     int stride, const mjxball_real *from, mjxball_real *to) {
-    int16_t steps[MJXBALL_WIDEST + 7];
+    int16_t steps[MJXBALL_MOST_INPUTS + 7];
     mjxball_real size = mjxball_steps(from, inputs, stride, steps);
     if (size != size) {
         for (int row = 0; row < outputs; row++) to[row] = size;
@@ -386,27 +388,43 @@ static inline void mjxball_layer(const int8_t *weight, const float *step, const 
         }
         const int32_t sums[4] = {a, b, c, d};
         for (int i = 0; i < 4 && row + i < outputs; i++)
-            to[row + i] = (mjxball_real)sums[i] * (size * step[row + i]) + bias[row + i];
+            to[row + i] = (mjxball_real)sums[i] * (size * step[row + i]) + (bias ? bias[row + i] : 0);
     }
 }
 """
 EXPONENTIAL = """
-/* exp(-x) for 0 <= x: halved as often as ln 2 goes into x, and a Taylor sum of the rest. */
+/* exp(-x) for 0 <= x < 40, within 1e-15, is share (even - odd) / (even + odd): as many halvings as ln 2 goes into x,
+ * and a Pade fraction of the rest. */
+typedef struct {
+    mjxball_real share, even, odd;
+} mjxball_fraction;
+
+static inline mjxball_fraction mjxball_fraction_of(mjxball_real x) {
+    const int halvings = (int)(x * (mjxball_real)1.4426950408889634 + (mjxball_real)0.5);
+    const mjxball_real rest = x - (mjxball_real)halvings * (mjxball_real)0.69314718055994531, square = rest * rest;
+    const union {
+        unsigned bits;
+        float value;
+    } share = {(127u - (unsigned)halvings) << 23};
+    const mjxball_fraction one = {share.value, 30240 + square * (3360 + 30 * square),
+        rest * (15120 + square * (420 + square))};
+    return one;
+}
+
 static inline mjxball_real mjxball_decay(mjxball_real x) {
-    mjxball_real rest = x, value = 1;
-    int halves = 0;
     if (!(x < 40)) return 0;
-    for (; rest > (mjxball_real)0.35; halves++)
-        rest = x - (mjxball_real)(halves + 1) * (mjxball_real)0.69314718055994531;
-    for (int k = 12; k > 0; k--) value = 1 - rest * value / (mjxball_real)k;
-    for (; halves > 0; halves--) value *= (mjxball_real)0.5;
-    return value;
+    const mjxball_fraction one = mjxball_fraction_of(x);
+    return one.share * ((one.even - one.odd) / (one.even + one.odd));
 }
 
 /* NaN stays NaN. */
 static inline mjxball_real mjxball_tanh(mjxball_real x) {
-    mjxball_real decay = mjxball_decay(x < 0 ? -2 * x : 2 * x), size = (1 - decay) / (1 + decay);
-    return x < 0 ? -size : x >= 0 ? size : x;
+    const mjxball_real size = x < 0 ? -x : x;
+    if (!(size < 20)) return x < 0 ? -1 : x > 0 ? 1 : x;
+    const mjxball_fraction one = mjxball_fraction_of(2 * size);
+    const mjxball_real less = 1 - one.share, more = 1 + one.share;
+    const mjxball_real value = (less * one.even + more * one.odd) / (more * one.even + less * one.odd);
+    return x < 0 ? -value : value;
 }
 """
 GRU = """
