@@ -263,9 +263,12 @@ class Flight:
             events += known or self.spin.update(self.supervisor.since + times.spin / 2, self._now, self.note)
         if elapsed >= self._limit(state):
             stuck = state is State.RAMP and not self._is_off()
-            text = self._take_off.stuck(self.maps) if stuck else f"{state.value} lasted {elapsed:.1f} s"
+            text = self._stuck() if stuck else f"{state.value} lasted {elapsed:.1f} s"
             events.append(Fault(Event.TIMEOUT, text))
         return events
+
+    def _stuck(self) -> str:
+        return self._take_off.stuck(self.maps)
 
     def _limit(self, state: State) -> float:
         """How long a state may last [s]."""

@@ -21,6 +21,7 @@ from mjxball.fly.link import Link
 from mjxball.fly.monitor import UplinkWatch, tilt_angle
 from mjxball.fly.packets import ZERO, Setpoint
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, TRANSITIONS, Event, Fault, State
+from mjxball.fly.takeoff import STUCK
 from mjxball.fly.telemetry import DroneLink, Rig, object_state
 
 STATE_AGE = 0.5  # [s]: from here on the laptop lands, as the apps do when they have not heard it for as long
@@ -139,7 +140,11 @@ class OnboardFlight(Flight):
         return None, []
 
     def _is_off(self) -> bool:
-        return True  # the apps take over by the clock
+        """True once an app says that its law flies."""
+        return self.settings.dry_run or any(app is not None and app.phase >= Phase.FLY for app in self._apps())
+
+    def _stuck(self) -> str:
+        return f"{STUCK}: is it heavier, or does a propeller give less?"
 
     def _wanted(self, mapped: list[Mapped] | None) -> list[Setpoint]:
         return [ZERO, ZERO]

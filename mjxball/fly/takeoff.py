@@ -27,6 +27,7 @@ CLIMB_INTEGRAL = 1.5  # likewise per m: a pair that stands gets 15 % of hover mo
 # Shares of hover that the drones lift apart, per rad, rad/s and rad s of the stick. At 50 ms of motor lag and 40 ms of
 # delay the stick settles within half a second; twice these gains let it swing.
 LEVEL_GAIN, LEVEL_DAMPING, LEVEL_INTEGRAL = 2.5, 0.35, 15.0
+STUCK = "the pair is not seen to leave the ground"
 APART = 0.15  # share of hover that the drones lift apart at most
 
 
@@ -83,5 +84,4 @@ class TakeOff:
             elif share >= MOST - 0.01:
                 bound = ", the most that is tried"
             found.append(f"the {name} was sent {thrust:.0f} units ({share:.2f} of what should hover{bound})")
-        why = "is it heavier, or does a propeller give less?"
-        return f"the pair is not seen to leave the ground: {' and '.join(found)}; {why}"
+        return f"{STUCK}: {' and '.join(found)}; is it heavier, or does a propeller give less?"

@@ -21,7 +21,21 @@
 #define BATTERY_TIME 5000u
 #define NEAR_GROUND 0.04f     /* [m] */
 #define STILL 0.12f           /* [m/s] */
+#define REST 150u             /* [ms] in which what stands does not sink by more than RESTING */
+#define RESTING 0.005f        /* [m] */
 #define BRAKE_TILT 0.13962634f /* [rad] 8 degrees */
+/* The take-off, as in fly/takeoff.py. */
+#define BEGIN 0.85f           /* of the ramp, from which on thrust follows the climb */
+#define LIFT_TIME 4000u       /* [ms] beyond the ramp */
+#define LIFTED 0.05f          /* [m] */
+#define MOST_LIFT 1.25f       /* share of hover */
+#define CLIMB 0.1f            /* [m/s] */
+#define CLIMB_GAIN 0.4f
+#define CLIMB_INTEGRAL 1.5f
+#define LEVEL_GAIN 2.5f
+#define LEVEL_DAMPING 0.35f
+#define LEVEL_INTEGRAL 15.0f
+#define APART 0.15f
 
 const char *mjxball_text(int cause) {
     return cause >= 0 && cause < MJXBALL_CAUSES ? mjxball_texts[cause] : "unknown";
@@ -129,6 +143,25 @@ static void ask(wish *one, uint8_t phase, uint8_t cause) {
     }
 }
 
+static float height_of(const mjxball_app *app) {
+    return app->position[2] - app->origin[2];
+}
+
+/* From where on the legs carry nothing, so that the law may take over. */
+static float lifted_height(const mjxball_app *app) {
+    return clip(app->set.goal[2] / 2, 0.001f, LIFTED);
+}
+
+static void watch_rest(mjxball_app *app, bool good) {
+    float height = height_of(app);
+    if (!good || !(height >= app->low - RESTING)) {
+        app->low = height;
+        app->low_since = app->now;
+    } else if (height > app->low) {
+        app->low = height;
+    }
+}
+
 static void judge_air(const mjxball_app *app, const seen *one, const mjxball_state *state, bool good, wish *to) {
     const bool guided = app->phase == MJXBALL_FLY || app->phase == MJXBALL_LAND;
     const uint32_t elapsed = app->now - app->since;
@@ -143,14 +176,15 @@ static void judge_air(const mjxball_app *app, const seen *one, const mjxball_sta
     if (good && !in_fence(place)) ask(to, MJXBALL_DESCEND, MJXBALL_FENCE);
     if (guided && app->now - app->saturated_since >= SATURATED_TIME) ask(to, MJXBALL_DESCEND, MJXBALL_SATURATED);
     if (app->phase == MJXBALL_LAND && (float)elapsed > 1000 * landing) ask(to, MJXBALL_DESCEND, MJXBALL_TIMEOUT);
+    if (app->phase == MJXBALL_RAMP && elapsed > RAMP_TIME + LIFT_TIME) ask(to, MJXBALL_DESCEND, MJXBALL_TIMEOUT);
     if (app->phase == MJXBALL_DESCEND && elapsed > DESCEND_TIME) ask(to, MJXBALL_STOP, MJXBALL_TIMEOUT);
     if (good && one->level < MOST_TILT) ask(to, MJXBALL_STOP, MJXBALL_TILT);
     if (!state->can_fly) ask(to, MJXBALL_STOP, MJXBALL_CANNOT_FLY);
     if (peer_is_heard(app) && app->peer.phase == MJXBALL_IDLE) ask(to, MJXBALL_STOP, MJXBALL_PEER);
     if ((app->phase == MJXBALL_LAND || app->phase == MJXBALL_DESCEND) && elapsed >= SETTLED) {
         float height = app->position[2] - app->origin[2], climb = app->velocity[2];
-        bool blind = !good || !app->trusted;
-        if (!blind && height < NEAR_GROUND && climb < STILL && climb > -STILL) ask(to, MJXBALL_STOP, MJXBALL_DOWN);
+        bool blind = !good || !app->trusted, rests = app->now - app->low_since >= REST;
+        if (!blind && height < NEAR_GROUND && climb < STILL && climb > -STILL && rests) ask(to, MJXBALL_STOP, MJXBALL_DOWN);
         if (blind && app->phase == MJXBALL_DESCEND && app->height <= 0) ask(to, MJXBALL_STOP, MJXBALL_DOWN);
     }
 }
@@ -176,7 +210,8 @@ static void supervise(mjxball_app *app, uint8_t fault, const seen *one, const mj
         if (!peer_is_heard(app)) ask(&to, MJXBALL_STOP, MJXBALL_NO_PEER);
         if (!good || !state->can_fly) ask(&to, MJXBALL_STOP, good ? MJXBALL_CANNOT_FLY : MJXBALL_BAD_STATE);
     } else {
-        if (app->phase == MJXBALL_RAMP && elapsed >= RAMP_TIME) ask(&to, MJXBALL_FLY, MJXBALL_ASKED);
+        if (app->phase == MJXBALL_RAMP && elapsed >= RAMP_TIME && good && height_of(app) >= lifted_height(app))
+            ask(&to, MJXBALL_FLY, MJXBALL_ASKED);
         judge_air(app, one, state, good, &to);
     }
     /* The law lands what it has flown. */
@@ -185,16 +220,56 @@ static void supervise(mjxball_app *app, uint8_t fault, const seen *one, const mj
     if (to.phase != app->phase) enter(app, to.phase, to.cause, map);
 }
 
+/* Roll and pitch [rad] against the `velocity` sideways. */
+static void brake(const float *velocity, float *tilt) {
+    float braking[3], command[3] = {0, 0, 0};
+    for (int i = 0; i < 3; i++) braking[i] = -velocity[i] / 0.7f;
+    if (!mjxball_rig.stand) command_of(braking, command);
+    for (int i = 0; i < 2; i++) tilt[i] = clip(command[i], -BRAKE_TILT, BRAKE_TILT);
+}
+
+/* Thrust rises until the pair is off the ground; the stick is held level, by what each drone sees for itself. */
+static void take_off(mjxball_app *app, const seen *one, const mjxball_map *map, mjxball_setpoint *out) {
+    const float period = (float)mjxball_rig.period / 1000, hover = hover_of(map), side = MJXBALL_FOLLOWER ? 1 : -1;
+    const float ramped = clip((float)(app->now - app->since) / (float)RAMP_TIME, 0, 1);
+    float along[3] = {0, 0, 0}, turning[3], moving[3], tilt[2], length = 0, sine, angle, missing, off, apart;
+    for (int i = 0; i < 2; i++) {
+        along[i] = mjxball_rig.mount[0][i] - mjxball_rig.mount[1][i];
+        length += along[i] * along[i];
+    }
+    for (int i = 0; i < 2; i++) along[i] /= root(length);
+    rotate(one, along, moving);
+    sine = clip(moving[2], -0.99f, 0.99f);
+    angle = arctan(sine / root(1 - sine * sine));
+    if (ramped < BEGIN) {
+        float thrust = FLOOR + ramped * (hover - FLOOR);
+        app->share = thrust / hover - CLIMB_GAIN * CLIMB;
+        app->apart = 0;
+        app->resting = angle; /* the floor need not be level */
+        send_level(out, 0, 0, thrust);
+        return;
+    }
+    cross(one->rates, along, turning);
+    rotate(one, turning, moving);
+    brake(app->velocity, tilt);
+    missing = CLIMB - app->velocity[2];
+    app->share = clip(app->share + CLIMB_INTEGRAL * period * missing, 0, MOST_LIFT);
+    off = angle - app->resting * (1 - clip(height_of(app) / lifted_height(app), 0, 1));
+    app->apart = clip(app->apart + LEVEL_INTEGRAL * period * off, -APART, APART);
+    apart = clip(app->apart + LEVEL_GAIN * off + LEVEL_DAMPING * moving[2], -APART, APART);
+    send_level(out, tilt[0], tilt[1],
+        hover * (clip(app->share + CLIMB_GAIN * missing, 0, MOST_LIFT) + side * apart));
+}
+
 /* Brake sideways and sink, by what is measured here and by the other drone; else by a model of the fall. */
 static void descend(mjxball_app *app, bool good, mjxball_setpoint *out) {
     const float period = (float)mjxball_rig.period / 1000;
     const float own = good && app->trusted, other = peer_is_heard(app) && app->peer.trusted;
-    float velocity[3], braking[3], command[3] = {0, 0, 0}, share;
+    float velocity[3], tilt[2] = {0, 0}, share;
     if (own + other > 0) {
         for (int i = 0; i < 3; i++)
             velocity[i] = (own * app->velocity[i] + other * app->peer.velocity[i]) / (own + other);
-        for (int i = 0; i < 3; i++) braking[i] = -velocity[i] / 0.7f;
-        if (!mjxball_rig.stand) command_of(braking, command);
+        brake(velocity, tilt);
         app->climb = velocity[2];
         share = 1 + clip(-0.4f * (app->climb + SINK_SPEED), -0.3f, 0.1f);
     } else {
@@ -203,8 +278,7 @@ static void descend(mjxball_app *app, bool good, mjxball_setpoint *out) {
         share = 1 + wanted / (float)MJXBALL_GRAVITY;
     }
     app->height += app->climb * period;
-    send_level(out, clip(command[0], -BRAKE_TILT, BRAKE_TILT), clip(command[1], -BRAKE_TILT, BRAKE_TILT),
-        app->trim * share);
+    send_level(out, tilt[0], tilt[1], app->trim * share);
 }
 
 /* Nothing that was computed can be believed: level, sinking as a model of the fall does. */
@@ -279,6 +353,7 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
         }
     }
     if (app->phase > MJXBALL_SPIN && !estimate_is_good(state)) app->trusted = 0;
+    watch_rest(app, good);
     supervise(app, fault, &one, state, good, map);
     switch (app->phase) {
     case MJXBALL_IDLE:
@@ -286,11 +361,9 @@ void mjxball_tick(mjxball_app *app, const mjxball_parameters *set, const mjxball
     case MJXBALL_SPIN:
         send_level(out, 0, 0, SPIN_THRUST);
         break;
-    case MJXBALL_RAMP: {
-        float share = clip((float)(now - app->since) / (float)RAMP_TIME, 0, 1);
-        send_level(out, 0, 0, FLOOR + share * (hover_of(map) - FLOOR));
+    case MJXBALL_RAMP:
+        take_off(app, &one, map, out);
         break;
-    }
     case MJXBALL_FLY:
     case MJXBALL_LAND:
         fly(app, &one, map, out);

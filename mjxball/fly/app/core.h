@@ -134,6 +134,9 @@ typedef struct {
     float integral[7];
     float trim;       /* thrust that hovers [thrust units] */
     float climb, height; /* of a descent that is flown blind */
+    float share, apart, resting; /* of the take-off: lift of both, their difference [shares of hover], the stick's angle [rad] */
+    uint32_t low_since; /* it has not sunk since then by more than RESTING from `low` [m] */
+    float low;
     float action[3], command[3];
     mjxball_beat peer;
     mjxball_follower follower;
