@@ -37,7 +37,7 @@ STEPS = 60
 # The steepest policies, whose inputs are scaled by up to 370, were seen at 7e-6.
 TOLERANCE = 1e-5
 INT8_TOLERANCE = 5e-4  # steps of 16 bits that rounding takes to the next one; weights of 8 bits differ by 0.02
-ONNX_TOLERANCE = 1e-5  # likewise; its matrix products add up in an order of their own
+ONNX_TOLERANCE = 2e-5  # float32 beside NumPy, which answers one follower in float64
 HARNESS = """
 #include <stdio.h>
 #include "follower.h"
@@ -249,6 +249,7 @@ def test_c_with_weights_of_8_bits_computes_with_whole_numbers(name: str, tmp_pat
     policy = Policy(balanced(contents), "follower")
     network = policy._network
     gru = None if network.gru is None else (*map(Whole, network.gru[:2]), network.gru[2])
+    policy._answers_alone = False
     policy._network = network._replace(weights=[Whole(weight) for weight in network.weights], gru=gru)
     flight, exact = flown(contents, np.float32, policy), flown(contents, np.float32)
     answer, _ = answered(compiled(contents, tmp_path, "float", int8=True), flight, np.float32)

@@ -150,6 +150,33 @@ def test_a_frame_is_contradicted_as_soon_as_the_pair_moves() -> None:
         assert after <= (0.25 * probe.PERIOD if how == "gyroscope" else WINDOW) + CONTRADICTING + 0.1, (name, after)
 
 
+def test_what_a_hand_has_not_shown_yet_is_asked_for() -> None:
+    """Turned by 20 degrees about each axis, then moved by 0.2 m along each, to and fro in 1.6 s; 2 s of rest before."""
+    watch, step, period, asked = ImuWatch(), 0.01, 1.6, []
+    for number in range(round((2.0 + 6 * period) / step) + 1):
+        time = step * number
+        part, since = divmod(max(time - 2.0, 0.0), period)
+        phase = 2 * math.pi / period
+        size, speed = 0.5 - 0.5 * math.cos(phase * since), 0.5 * phase * math.sin(phase * since)
+        axis = np.eye(6)[min(int(part), 5)] * (time > 2.0)
+        turned, moved = math.radians(20) * axis[:3], 0.2 * axis[3:]
+        quaternion = np.array(
+            [math.cos(0.5 * size * math.radians(20)), *(math.sin(0.5 * size * math.radians(20)) * axis[:3])]
+        )
+        quaternion[0] = math.sqrt(1 - (quaternion[1:] ** 2).sum())
+        pushed = 0.5 * phase**2 * math.cos(phase * since) * moved + [0.0, 0.0, 9.81]
+        force = rotations.matrix_from_quaternion(quaternion).T @ pushed
+        watch.turn(Sample(DroneState(size * moved, speed * moved, quaternion, speed * turned, 0, 3.9), time, time))
+        assert watch.update(time, force, size * moved, quaternion) == "", time
+        if not asked or asked[-1] != watch.not_shown():
+            asked.append(watch.not_shown())
+    turn, move = "turn it 10 degrees about its", "move it 0.1 m along"
+    assert asked == [
+        f"{turn} x, y, z and {move} x, y, z", f"{turn} y, z and {move} x, y, z", f"{turn} z and {move} x, y, z",
+        f"{move} x, y, z", f"{move} y, z", f"{move} z", "",
+    ]  # fmt: skip
+
+
 def test_the_probe_leaves_neither_speed_nor_offset_and_turns_about_the_stick() -> None:
     times = np.arange(0.0, probe.TIME + 0.1, 1e-3)
     for span, axis in ((np.array([0.0, 0.3, 0.0]), 1), (np.array([-0.3, 0.0, 0.0]), 0)):

@@ -37,6 +37,7 @@ class View(NamedTuple):
     wanted: tuple[Setpoint, Setpoint]
     late: float  # [s]
     missed: int
+    carry: str = ""  # what is to be done by hand
 
 
 def lines(view: View, bounds: Limits, colour: bool = True, columns: int = 120) -> list[str]:
@@ -52,6 +53,7 @@ def lines(view: View, bounds: Limits, colour: bool = True, columns: int = 120) -
         (f" {state.value.upper()}{why} ", code),
         (timing, RED if view.missed else ""),
     ]
+    first += [(f"by hand: {view.carry}", YELLOW)] if view.carry else []
     shown = _wrapped(first, columns, colour)
     for name, drone, age, sent in zip(NAMES, view.states, view.ages, view.wanted, strict=True):
         roll, pitch, yaw = np.degrees(rotations.euler_from_matrix(rotations.matrix_from_quaternion(drone.quaternion)))

@@ -229,6 +229,11 @@ class Flight:
         return goal
 
     @property
+    def carry(self) -> str:
+        """In a dry run on motion capture: what is to be done by hand, so that the drones' IMUs can judge the axes."""
+        return self._monitor.not_shown() if self._mocap is not None and self.settings.dry_run else ""
+
+    @property
     def _probes(self) -> bool:
         """True at the begin of a flight on motion capture, whose axes no flight has shown to be right."""
         return self._mocap is not None and self.supervisor.state is State.FLY and self.elapsed < probe.TIME
@@ -365,4 +370,4 @@ class Flight:
         laws = self._commands._asdict() if self._commands is not None and state in GUIDED else {}
         self.note("tick", self._now, state=state.value, goal=goal, sent=sent, ages=self._ages, late=late, **laws)
         shown = self._states, self._ages, (sent[0], sent[1]), late, missed
-        self.view = View(self._now - self._start, self.supervisor, *shown)
+        self.view = View(self._now - self._start, self.supervisor, *shown, self.carry)

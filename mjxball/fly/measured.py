@@ -65,6 +65,7 @@ TURN = 0.035  # [rad] by which the measured turn may differ from the gyroscope's
 LATE = 0.04  # [s] that the measured attitude may be late against the gyroscope
 WAY, BIAS, DOUBT = 0.012, 0.1, 4.0  # likewise of the way, see `ImuWatch._felt`: [m], [m/s2], standard deviations
 CONTRADICTING = 0.1  # [s] for which it must differ
+TURNED, MOVED = math.radians(10), 0.1  # about and along an axis within the window, [m], which show that it is right
 
 
 class _Moment(NamedTuple):
@@ -89,6 +90,7 @@ class ImuWatch:
         self._turned = np.array([1.0, 0.0, 0.0, 0.0])
         self._state: Sample | None = None
         self._wrong_since = math.inf
+        self._turned_by, self._moved_by = np.zeros(3), np.zeros(3)  # at most within a window, [rad] and [m]
 
     def turn(self, sample: Sample) -> None:
         """A state came: its rates [rad/s] turn the gyroscope's attitude on."""
@@ -122,7 +124,19 @@ class ImuWatch:
             return ""
         why = self._turn_fault(known[0], known[-1]) or self._way_fault(known)
         self._wrong_since = min(self._wrong_since, time) if why else math.inf
+        if not why:
+            turn = 2 * relative(known[0].quaternion, known[-1].quaternion)[1:]
+            self._turned_by = np.maximum(self._turned_by, np.abs(turn))
+            self._moved_by = np.maximum(self._moved_by, np.abs(known[-1].position - known[0].position))
         return why if time - self._wrong_since >= CONTRADICTING else ""
+
+    def not_shown(self) -> str:
+        """What was not seen to agree with the IMU yet, as an order to who carries the drone; empty if all was."""
+        turns = [name for name, angle in zip("xyz", self._turned_by, strict=True) if angle < TURNED]
+        moves = [name for name, way in zip("xyz", self._moved_by, strict=True) if way < MOVED]
+        told = [f"turn it {math.degrees(TURNED):.0f} degrees about its {', '.join(turns)}"] if turns else []
+        told += [f"move it {MOVED:g} m along {', '.join(moves)}"] if moves else []
+        return " and ".join(told)
 
     @staticmethod
     def _turn_fault(first: _Moment, last: _Moment) -> str:

@@ -123,6 +123,11 @@ class Monitor:
                 faults.append(Fault(Event.BATTERY, f"{name} at {state.battery:.2f} V"))
         return faults
 
+    def not_shown(self) -> str:
+        """What of the measured axes of the pair, carried by hand, was not seen to agree with the IMUs yet."""
+        told = [(name, watch.imu.not_shown()) for name, watch in zip(NAMES, self._drones, strict=True)]
+        return next((f"{order} within a second (the {name} has not shown it)" for name, order in told if order), "")
+
     def _measured(self, phase: State, links: Sequence[DroneLink]) -> list[Fault]:
         """Streams that stand still, or that the IMU contradicts; watched on the ground as well, said in flight."""
         found = []

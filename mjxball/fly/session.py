@@ -93,7 +93,7 @@ def fly(
                 timing = run(flight)
                 if retrainer is not None:
                     _say_of(retrainer, flight)
-                return _ended(flight, timing, journal)
+                return _ended(flight, timing, journal, setup.mocap is not None)
         except KeyboardInterrupt:  # before take-off; afterwards Ctrl-C is the flight's own
             journal.note("refused", text="interrupted")
             _say("interrupted before take-off")
@@ -168,7 +168,7 @@ def _say_of(retrainer: Retrainer, flight: Flight) -> None:
         _say(f"retraining: the first policy came back: {flight.controller.handover.returned}")
 
 
-def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
+def _ended(flight: Flight, timing: Timing, journal: Journal, captured: bool) -> int:
     supervisor = flight.supervisor
     cause = supervisor.cause
     stayed = not (flight.settings.dry_run or flight.interrupts or flight.lifted)
@@ -184,6 +184,10 @@ def _ended(flight: Flight, timing: Timing, journal: Journal) -> int:
     if flight.settings.dry_run and flight.highest:
         text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
         _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
+    if flight.settings.dry_run and captured:
+        _say(
+            f"axes: not shown yet: {flight.carry}" if flight.carry else "axes: every turn and way agrees with the IMUs"
+        )
     late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
     _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
     if supervisor.cause is None and not (flown or flight.settings.dry_run):
