@@ -1,6 +1,7 @@
 """Every cell of CG speed x amplitude x object mass: does a policy beat the best classical follower there?
 
-`python benchmarks/cells.py POLICY.npz ... [--robust POLICY.npz ...] [--seeds N] [--json FILE]`
+`python benchmarks/cells.py FOLLOWER ... [--robust FOLLOWER ...] [--seeds N] [--json FILE]`; a follower is a policy
+file or the name of a classical one.
 
 A cell is flown from the origin to (1, 1, 1) m for 45 s from several CG phases, with the mass known to the hover thrust
 or believed to be 0.2 kg (then adaptive adapts its mass), undisturbed and with noise at level 1 and 40 ms of delay. All
@@ -168,6 +169,11 @@ def evaluate(
     return summaries, missed
 
 
+def follower_of(name: str, config: Config) -> Follower:
+    """Of a policy file, or a classical one."""
+    return load_policy(Path(name), config) if name.endswith(".npz") else make_baseline(name, config)
+
+
 def shortfall(where: str, name: str, row: dict[str, Any]) -> str:
     """What a cell misses, in words."""
     names = [key for key in WANTED if key not in row["wins"]]
@@ -178,8 +184,10 @@ def shortfall(where: str, name: str, row: dict[str, Any]) -> str:
 def main() -> None:
     """Fly, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policies", type=Path, nargs="*")
-    parser.add_argument("--robust", type=Path, nargs="+", help="policies for unknown masses (default: the same)")
+    parser.add_argument("policies", nargs="*", metavar="FOLLOWER")
+    parser.add_argument(
+        "--robust", nargs="+", metavar="FOLLOWER", help="policies for unknown masses (default: the same)"
+    )
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--reference", choices=("lqg", "lqg-slow"), default="lqg", help="LQG of settling and rmse")
     parser.add_argument("--json", type=Path, metavar="FILE")
@@ -188,8 +196,8 @@ def main() -> None:
     cells = feasible(config)
     lost = ", ".join(f"{a:g} m with {m:g} kg" for a, m in sorted({c[1:] for c in EVERY} - {c[1:] for c in cells}))
     print(f"{len(cells)} of {len(EVERY)} cells are feasible, not at any speed: {lost}")
-    policies = [load_policy(path, config) for path in options.policies]
-    robust = [load_policy(path, config) for path in options.robust] if options.robust else policies
+    policies = [follower_of(name, config) for name in options.policies]
+    robust = [follower_of(name, config) for name in options.robust] if options.robust else policies
     summaries, missed = evaluate(config, policies, robust, options.reference, cells, options.seeds)
     distribution(summaries)
     if len(policies) + len(robust) <= 4:
