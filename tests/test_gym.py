@@ -113,6 +113,47 @@ def test_seeds():
     assert not np.array_equal(FollowerEnv().reset()[0], FollowerEnv().reset()[0])
 
 
+def test_worlds_are_the_same_where_jax_counts_in_64_bits(short: Config):
+    """JAX draws other numbers then, and what was seen was no member of the space."""
+    actions = np.full((2, 3), 0.3, np.float32)
+    for make in (lambda: FollowerEnv(config=short), lambda: FollowerVectorEnv(2, config=short, physics="newton-euler")):
+        found = []
+        for wide in (False, True):
+            with jax.enable_x64(wide):
+                env = make()
+                first, _ = env.reset(seed=1)
+                assert env.observation_space.contains(first)
+                given = actions[0] if isinstance(env, FollowerEnv) else actions
+                found.append((first, *env.step(given)[:2]))
+        for one, other in zip(*found, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+FORKED = """
+import multiprocessing
+def child():
+    import gymnasium, mjxball.gym
+    gymnasium.make("mjxball/Transport-v0").reset(seed=1)
+if __name__ == "__main__":
+    import jax
+    jax.jit(lambda x: x @ x)(jax.numpy.ones((300, 300))).block_until_ready()
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    process.join(60)
+    print("alive" if process.is_alive() else process.exitcode)
+    process.kill()
+"""
+
+
+@pytest.mark.slow
+def test_a_process_forked_after_any_use_of_jax_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    (tmp_path / "forked.py").write_text(FORKED)
+    done = run(["forked.py"], tmp_path)
+    assert "this process was forked from one in which JAX runs" in done.stderr
+    assert done.stdout.split() == ["1"]
+
+
 def test_the_time_limit_truncates_and_leaving_terminates(short: Config):
     env = FollowerEnv(config=short)
     env.reset(seed=3)

@@ -66,6 +66,10 @@ def test_the_second_is_refused_with_the_name_of_the_first(tmp_path: Path, holder
     assert_one_line(done.stderr)
     assert f"process {holder.pid}" in done.stderr
     assert listing(run) == before
+    (run / "config.json").write_text("{}")  # as soon as it has written something
+    done = command([script("train.py"), *tiny(out=run)], tmp_path)
+    assert done.returncode == 2
+    assert f"process {holder.pid}" in done.stderr
 
 
 def test_a_lock_ends_with_its_process_however_that_ends(tmp_path: Path, holder: subprocess.Popen[str]) -> None:

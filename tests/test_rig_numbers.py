@@ -86,6 +86,26 @@ def test_every_command_flies_the_object_of_the_plant(tmp_path: Path, capsys: pyt
     assert [cell["mass"] for cell in json.loads(out.read_text())["cells"]] == [0.25]
 
 
+def test_what_a_file_says_of_its_scenario_is_flown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "cells.json"
+    path = written(tmp_path, "[scenario]\nobject_mass = [0.35, 0.4]\ncg_speed = [2.0, 3.0]\n")
+    asked = ["--plant", str(path), "--followers", "copy", "--physics", "newton-euler", "--seconds", "0.1"]
+    assert evaluate.main([*asked, "--json", str(out)]) == 0
+    (cell,) = json.loads(out.read_text())["cells"]
+    assert (cell["mass"], cell["omega"]) == (0.35, 2.0)
+    assert "2.35 kg with an object of 0.35 kg" in capsys.readouterr().out
+    out.unlink()
+    assert evaluate.main([*asked, "--mass", "0.1", "0.5", "--json", str(out)]) == 0
+    assert "an object of 0.5 kg" in capsys.readouterr().out  # the heaviest that is flown
+
+
+def test_what_nobody_can_lift_is_not_flown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate.main(["--followers", "copy", "--mass", "35", "--seconds", "0.1"]) == 2
+    error = capsys.readouterr().err
+    assert "35 g would be 0.035 kg" in error
+    assert error.count("\n") == 1
+
+
 def test_the_paper_flies_as_before() -> None:
     assert (REFERENCE.mass, REFERENCE.amplitude, REFERENCE.goal) == (0.2, 0.05, (1.0, 1.0, 1.0))
     for name in ("paper", "transport", "balance"):
@@ -151,6 +171,12 @@ def test_flags_and_plant_file_are_refused_or_taken_together(tmp_path: Path, caps
         ({"plant.rotor_force_max": 550.0}, "550 gf would be 5.4 N"),
         ({"plant.rotor_force_max": 0.0055}, "0.0055 kN would be 5.5 N"),
         ({"plant.rotor_force_max": 0.0055}, "thrust over weight is 0.002"),
+        (
+            {"plant.yaw_per_thrust": 16.0},
+            "plant.yaw_per_thrust 16 m is more than 10 times the arm of 0.12 m; 16 mm would be 0.016 m",
+        ),
+        ({"plant.carrier_mass": 0.2, "plant.carrier_inertia": (6.7, 6.7, 6.7)}, "6.7 g m2 would be 0.0067 kg m2"),
+        ({"plant.gravity": 981.0}, "981 cm/s2 would be 9.81 m/s2"),
         ({"scenario.object_mass": (0.1, 3.0)}, "thrust over weight is 0.9"),  # the heaviest drawn cannot be lifted
         ({"plant.drones.0.inertia": (2300.0, 2300.0, 4000.0)}, "kg mm2 would be 0.004 kg m2"),
         ({"plant.drones.0.inertia": (2.3, 2.3, 4.0)}, "4 g m2 would be 0.004 kg m2"),

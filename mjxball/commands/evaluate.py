@@ -229,8 +229,8 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
         results = fly_scenarios(group.setup, [*baselines, *policies], group.scenarios, options.physics)
         if number:
             print(f"\n{group.setup.preset}: its own plant and scenarios")  # noqa: T201
-        if group.setup.plant != config.Plant():
-            print(rig_line(group.setup))  # noqa: T201
+        if options.plant or group.setup.plant != config.Plant():
+            print(rig_line(group.setup, max(scenario.mass for scenario in group.scenarios)))  # noqa: T201
         print(table(results))  # noqa: T201
         if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
             every += results

@@ -30,7 +30,7 @@ from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.quiet import import_jax
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
-from mjxball.train.lock import LOCK
+from mjxball.train.lock import LOCK, check_free
 from mjxball.train.run_directory import (
     CHECKPOINTS,
     EXTENSIONS,
@@ -151,7 +151,11 @@ def _finish(settings: config.Config, origin: dict[str, Any], out: Path, code: in
 
 
 def _output_directory(out: Path) -> Path:
-    return cli.output_directory(out, but=(LOCK,))
+    try:
+        return cli.output_directory(out, but=(LOCK,))
+    except InputError:
+        check_free(out)  # whoever holds it is the better reason
+        raise
 
 
 def _run(

@@ -5,9 +5,10 @@ Importing it needs the standard library only.
 
 from mjxball.config._leaf import Range
 from mjxball.config._learning import Gradient, Ppo, Sac
+from mjxball.config._load import follow_plant
 from mjxball.config._plant import LEAST_LIFTING, Drone, Plant
 from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
-from mjxball.config._plausible import thrust_over_weight, total_mass
+from mjxball.config._plausible import check_lift, thrust_over_weight, total_mass
 from mjxball.config._presets import PRESETS, preset
 from mjxball.config._renamed import CONSTANT, RENAMED, current_name, old_names, with_current_names
 from mjxball.config._rigs import Rigs
@@ -66,8 +67,10 @@ __all__ = [
     "apply_overrides",
     "ball_limit",
     "cg_limit",
+    "check_lift",
     "config_hash",
     "current_name",
+    "follow_plant",
     "from_dict",
     "from_record",
     "leaves",

@@ -12,9 +12,12 @@ from mjxball.errors import InputError
 
 MOST_THRUST = 100.0  # times the weight; racing drones have 15
 WRONG_UNIT = 0.5  # below it a plant is not only too weak
+MOST_GRAVITY = 30.0  # [m/s2], a little more than Jupiter's
+YAW_OF_ARM = 10.0  # yaw torque per thrust over the arm; shipped plants have 0.13 to 0.17
 LONGEST_LAG = 1.0  # [s] of any rotor
 ARM_OF_SPACING = 1.0  # arm over the distance to the nearest drone; shipped plants have 0.15 to 0.43
 GYRATION = (0.02, 5.0)  # radius of gyration over the arm; shipped plants have 0.4 to 0.9
+CARRIER_OF_REACH = 3.0  # the carrier's radius of gyration over its own reach; shipped plants have 0.5
 SIZE_OF_REACH = 20.0  # longest edge of the object over the farthest mount; shipped plants have 1 to 2
 FASTEST = 0.5  # natural frequency times physics step, beyond which the sampled loop has too little phase
 
@@ -34,14 +37,18 @@ def total_mass(plant: Plant, object_mass: float | None = None) -> float:
 def check_units(config: Config) -> None:
     """Raise InputError for proportions that no rig has; the sentence says which unit was probably meant.
 
-    Checked are thrust over weight, arm over spacing, radius of gyration over arm, object over mounts, rotor lag, and
-    the attitude loop's natural frequency against rotor lag, physics step and leader.
+    Checked are gravity, thrust over weight, arm over spacing, radii of gyration, yaw torque over arm, object over
+    mounts, rotor lag, and the attitude loop's natural frequency against rotor lag, physics step and leader.
     """
     plant = config.plant
+    if plant.gravity > MOST_GRAVITY:
+        hint = f"; {plant.gravity:g} cm/s2 would be {plant.gravity / 100:g} m/s2"
+        raise InputError(f"plant.gravity {plant.gravity:g} m/s2 is more than {MOST_GRAVITY:g} m/s2{hint}")
     _check_sizes(plant)
     _check_lags(plant)
     _check_weight(config)
     _check_inertia(plant)
+    _check_carrier(plant)
     if config.autopilot.kind == "ideal":
         _check_loop(config)
 
@@ -60,6 +67,14 @@ def _check_sizes(plant: Plant) -> None:
             raise InputError(
                 f"{_place(plant, number, 'arm')} {arm:g} m is longer than the {nearest:.3g} m to the next drone{hint}"
             )
+    yaws = zip(plant.of_drones("arm"), plant.of_drones("yaw_per_thrust"), strict=True)
+    for number, (arm, yaw) in enumerate(yaws):
+        if yaw > YAW_OF_ARM * arm:
+            hint = _meant(yaw, "mm", "m", yaw / 1000 <= YAW_OF_ARM * arm)
+            raise InputError(
+                f"{_place(plant, number, 'yaw_per_thrust')} {yaw:g} m is more than {YAW_OF_ARM:g} times the arm of "
+                f"{arm:g} m{hint}"
+            )
     reach, longest = max(math.hypot(*mount) for mount in mounts), max(plant.object_size)
     if longest > SIZE_OF_REACH * reach:
         hint = _meant(longest, "mm", "m", longest / 1000 <= SIZE_OF_REACH * reach)
@@ -77,19 +92,24 @@ def _check_lags(plant: Plant) -> None:
 
 
 def _check_weight(config: Config) -> None:
-    """A plant lifts its own object and the heaviest that is drawn; on a pivot nothing is lifted."""
+    """A plant lifts its own object and the heaviest that is drawn."""
+    for mass in (config.plant.object_mass, config.scenario.object_mass[1]):
+        check_lift(config, mass)
+
+
+def check_lift(config: Config, mass: float) -> None:
+    """Raise InputError unless the plant lifts an object of `mass` [kg]; on a pivot nothing is lifted."""
     plant, force = config.plant, 4 * sum(config.plant.of_drones("rotor_force_max"))
     if plant.stand == "pivot":
         return
     least = 1.0 if config.autopilot.kind == "ideal" else WRONG_UNIT  # a Crazyflie's margin is checked elsewhere
-    for mass in (plant.object_mass, config.scenario.object_mass[1]):
-        ratio = thrust_over_weight(plant, mass)
-        if least < ratio <= MOST_THRUST:
-            continue
-        weights = f"the rotors give {force:.4g} N, and {total_mass(plant, mass):.4g} kg weigh"
-        weighs = f"{weights} {plant.gravity * total_mass(plant, mass):.4g} N: thrust over weight is {ratio:.2g}"
-        hint = _weaker(plant, mass) if ratio > 1 else next(_stronger(plant, mass), "") if ratio < WRONG_UNIT else ""
-        raise InputError(f"{weighs}, where it must be between 1 and {MOST_THRUST:g}{hint}")
+    ratio = thrust_over_weight(plant, mass)
+    if least < ratio <= MOST_THRUST:
+        return
+    weights = f"the rotors give {force:.4g} N, and {total_mass(plant, mass):.4g} kg weigh"
+    weighs = f"{weights} {plant.gravity * total_mass(plant, mass):.4g} N: thrust over weight is {ratio:.2g}"
+    hint = _weaker(plant, mass) if ratio > 1 else next(_stronger(plant, mass), "") if ratio < WRONG_UNIT else ""
+    raise InputError(f"{weighs}, where it must be between 1 and {MOST_THRUST:g}{hint}")
 
 
 def _stronger(plant: Plant, mass: float) -> Iterator[str]:
@@ -135,6 +155,23 @@ def _check_inertia(plant: Plant) -> None:
         raise InputError(
             f"plant.drones.{number}.inertia {max(drone.inertia):g} kg m2 with {drone.mass:g} kg makes a radius of "
             f"gyration of {radius:.3g} m beside an arm of {arm:g} m{hint}; check mass, inertia and arm"
+        )
+
+
+def _check_carrier(plant: Plant) -> None:
+    """The carrier's mass is not farther out than the farthest mount or edge, with some to spare."""
+    if not plant.carrier_mass:
+        return
+    largest, reach = max(plant.carrier_inertia), max(*plant.object_size, *(math.hypot(*d.mount) for d in plant.drones))
+    radius = math.sqrt(largest / plant.carrier_mass)
+    if radius > CARRIER_OF_REACH * reach:
+        hint = ""
+        for unit, factor in (("g cm2", 1e-7), ("g m2", 1e-3)):
+            if 0.1 <= math.sqrt(largest * factor / plant.carrier_mass) / reach <= 1.5:
+                hint = f"; {largest:g} {unit} would be {largest * factor:.3g} kg m2"
+        raise InputError(
+            f"plant.carrier_inertia {largest:g} kg m2 with {plant.carrier_mass:g} kg makes a radius of gyration of "
+            f"{radius:.3g} m beside a reach of {reach:.3g} m{hint}"
         )
 
 

@@ -142,7 +142,7 @@ class Follower:
         (), "time constants of exponential averages of observations and actions that the network sees [s]", above=1e-3
     )
     recurrent_units: int = setting(
-        0, "units of a GRU whose state the network carries from step to step, with --algorithm gradient; 0: none", low=0
+        0, "units of a GRU whose state the network carries from step to step; 0: none", low=0, high=512
     )
     privileged_critic: bool = setting(False, "in training, critics also see the CG, the true mass and the disturbances")
 

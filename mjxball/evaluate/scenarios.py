@@ -38,12 +38,14 @@ def cross(
 def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
     """The standard scenarios as far as the plant allows them, the reference one last; raise InputError if unsound.
 
-    Load and goal are the plant's (`of_plant`). A waveform or a rolling ball makes one scenario. In the plane the CG
-    goes round in a circle.
+    Load and goal are the plant's (`of_plant`); the reference's CG is as fast as training may draw. A waveform or a
+    rolling ball makes one scenario. In the plane the CG goes round in a circle.
     """
     plant, path = settings.plant, CIRCLE if len(settings.plant.directions) == 2 else REFERENCE.path
     start = min(settings.scenario.ball_start, ball_limit(plant))
-    reference = of_plant(settings, Scenario(path=path, ball_start=start))
+    slowest, fastest = settings.scenario.cg_speed
+    omega = min(max(REFERENCE.omega, slowest), fastest)
+    reference = of_plant(settings, Scenario(omega=omega, path=path, ball_start=start))
     others = [
         dataclasses.replace(reference, omega=s.omega, amplitude=min(s.amplitude, reference.amplitude))
         for s in STANDARD
@@ -52,15 +54,16 @@ def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
     return tuple(check_scenario(settings, scenario) for scenario in (*others, reference))
 
 
-def rig_line(settings: Config) -> str:
-    """What a user should see of a rig before its results: mass, thrust over weight, trim."""
+def rig_line(settings: Config, mass: float | None = None) -> str:
+    """What a user should see of a rig before its results, with an object of `mass` [kg], None: the reference's."""
     plant, margin = settings.plant, settings.scenario.trim_margin
-    offset = largest_amplitude(settings, plant.object_mass, margin)
+    mass = of_plant(settings, Scenario()).mass if mass is None else mass
+    offset = largest_amplitude(settings, mass, margin)
     trimmed = f"CG trimmed up to {offset:.3g} m" if offset >= 0 else "CG not trimmed even at O"
     return (
-        f"rig: {plant.count} drones, {total_mass(plant):.4g} kg with an object of {plant.object_mass:g} kg, "
-        f"thrust over weight {thrust_over_weight(plant):.3g}, {trimmed} with {margin:.0%} of what rotors and commands "
-        "reach left"
+        f"rig: {plant.count} drones, {total_mass(plant, mass):.4g} kg with an object of {mass:g} kg, "
+        f"thrust over weight {thrust_over_weight(plant, mass):.3g}, {trimmed} with {margin:.0%} of what rotors "
+        "and commands reach left"
     )
 
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import os
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium
+import jax
 import numpy as np
+from jax._src import xla_bridge  # whether a device has been made: nothing public says it
 
 from mjxball import config as configs
 from mjxball.config import Config
@@ -15,15 +20,30 @@ from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 
 Array = Any
+THREADS = Path("/proc/self/task")
 _home: dict[str, int] = {}  # number of the process in which JAX runs for the environments
 
 
-def check_process() -> None:
-    """Raise InputError in a process that was forked from one in which an environment has been: JAX would hang there.
+def in_float32(method: Callable[..., Any]) -> Callable[..., Any]:
+    """`method` with arrays of 32 bits, also where JAX_ENABLE_X64 is set: a seed draws the same worlds then."""
 
-    Its threads are not in the copy.
+    @functools.wraps(method)
+    def call(*arguments: Any, **named: Any) -> Any:
+        if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
+            return method(*arguments, **named)
+        with jax.enable_x64(False):
+            return method(*arguments, **named)
+
+    return call
+
+
+def check_process() -> None:
+    """Raise InputError in a process that was forked from one in which JAX has run: it would hang there.
+
+    Its threads are not in the copy: where JAX has a device and the process a single thread, it is a copy.
     """
-    if _home.setdefault("process", os.getpid()) != os.getpid():
+    copied = xla_bridge.backends_are_initialized() and THREADS.is_dir() and len(list(THREADS.iterdir())) == 1
+    if copied or _home.setdefault("process", os.getpid()) != os.getpid():
         raise InputError(
             "this process was forked from one in which JAX runs, where it would wait for ever; start it with spawn, "
             "such as gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"

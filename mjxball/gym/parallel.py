@@ -97,6 +97,7 @@ class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndar
         """(3,) in [-1, 1], the same for all."""
         return self.action_spaces[agent]
 
+    @common.in_float32
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
@@ -112,6 +113,7 @@ class FollowersParallelEnv(common.Picklable, pettingzoo.ParallelEnv[str, np.ndar
             self._scene = None
         return self._seen(), {agent: {} for agent in self.agents}
 
+    @common.in_float32
     def step(
         self, actions: dict[str, np.ndarray]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:

@@ -96,6 +96,7 @@ class FollowerEnv(common.Picklable, gymnasium.Env[np.ndarray, np.ndarray]):
     def _arguments(self) -> dict[str, Any]:
         return {"config": self.config, "physics": self._physics, "render_mode": self.render_mode}
 
+    @common.in_float32
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """A fresh world drawn from `config.scenario`; `options` are not used."""
         common.check_process()
@@ -110,6 +111,7 @@ class FollowerEnv(common.Picklable, gymnasium.Env[np.ndarray, np.ndarray]):
             self._scene.move_goal(*self._view())
         return self._seen(), {}
 
+    @common.in_float32
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold `action` (3,), clipped to [-1, 1], for one control period; InputError unless it is finite."""
         if self._state is None or self._plant is None:

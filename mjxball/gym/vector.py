@@ -40,6 +40,7 @@ def compiled_program(config: Config, physics: str) -> Program:
         chain, key = jax.random.split(chain)
         return chain, pair.reset(key)
 
+    @common.in_float32
     def step(state: Any, action: Array) -> Any:
         return pair.step(state.replace(done=jnp.zeros_like(state.done)), action)
 
@@ -101,6 +102,7 @@ class FollowerVectorEnv(common.Picklable, gymnasium.vector.VectorEnv):
         mode = self.metadata["autoreset_mode"]
         return {"num_envs": self.num_envs, "config": self.config, "physics": self._physics, "autoreset_mode": mode}
 
+    @common.in_float32
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict]:
@@ -112,6 +114,7 @@ class FollowerVectorEnv(common.Picklable, gymnasium.vector.VectorEnv):
         self._chains, self._state = self._program.start(self._chains)
         return self._seen(), {}
 
+    @common.in_float32
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Hold `actions` (N, 3), clipped to [-1, 1], for one control period; InputError unless they are finite."""
         if self._state is None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from mjxball.config import Config, Plant, preset, validate
+from mjxball.config import Config, Plant, follow_plant, preset, replace, validate
 from mjxball.control import rotations
 from mjxball.control.followers import Baseline, Follower, PrivilegedInfo
 from mjxball.control.observation import mount_angles
@@ -126,7 +126,8 @@ def simulate(
 
     `physics` is mjx, newton-euler or mujoco. Raises InputError for an unsound scenario or a policy of another rate.
     """
-    config = plant if isinstance(plant, Config) else dataclasses.replace(preset("paper"), plant=plant)
+    paper = preset("paper")
+    config = plant if isinstance(plant, Config) else follow_plant(replace(paper, "plant", plant), paper.plant, ())
     check_rate(config, follower)
     return simulate_batch(config, [(follower, [scenario or Scenario()])], physics).world(0)
 

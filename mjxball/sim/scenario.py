@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.config import Config, ball_limit, cg_limit
+from mjxball.config import Config, ball_limit, cg_limit, check_lift
 from mjxball.errors import InputError
 from mjxball.sim.disturbances import Disturbance, Vector3, check_disturbance
 
@@ -61,13 +61,13 @@ class Scenario:
 def of_plant(config: Config, scenario: Scenario) -> Scenario:
     """`scenario` with the load and the goal of `config`'s plant where it gives none.
 
-    The mass is the plant's, the CG goes as far as the object and training's draws allow, 5 cm at most, and the goal is
-    1 m away on every axis that a stand leaves free, drawn in to what training may draw.
+    The mass is the plant's, drawn in to what training may draw. The CG goes as far as the object and training's draws
+    allow, 5 cm at most. The goal is 1 m away on every axis that a stand leaves free, drawn in likewise.
     """
     ranges, plant = config.scenario, config.plant
     distance = min(GOAL, ranges.goal_range)
     own: dict[str, Any] = {
-        "mass": plant.object_mass,
+        "mass": min(max(plant.object_mass, ranges.object_mass[0]), ranges.object_mass[1]),
         "amplitude": min(AMPLITUDE, cg_limit(plant), ranges.cg_amplitude[1]),
         "goal": tuple(distance * free for free in MOVES[plant.stand]),
     }
@@ -83,6 +83,7 @@ def check_scenario(config: Config, scenario: Scenario) -> Scenario:
         raise InputError("every number of a scenario must be finite")
     if scenario.mass <= 0:
         raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
+    check_lift(config, scenario.mass)
     if scenario.believed_mass is not None and scenario.believed_mass < 0:
         raise InputError(f"believed mass must not be negative, but is {scenario.believed_mass:g} kg")
     if scenario.omega < 0 or scenario.amplitude < 0:

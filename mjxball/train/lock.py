@@ -58,6 +58,18 @@ def held(run: Path) -> Iterator[None]:
                 place.rmdir()
 
 
+def check_free(run: Path) -> None:
+    """Raise InputError, which names the holder, if another process holds `run`. Makes nothing."""
+    if run / LOCK in _held:
+        return
+    with contextlib.suppress(OSError):
+        handle = os.open(run / LOCK, os.O_RDWR | os.O_CLOEXEC)
+        try:
+            _lock(handle, run / LOCK)
+        finally:
+            os.close(handle)  # and with it the lock
+
+
 def drop() -> None:
     """Remove this process's lock files; for who ends the process at once."""
     for path in list(_held):

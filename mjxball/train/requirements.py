@@ -52,26 +52,34 @@ def _weights(inputs: int, layers: Sequence[int], outputs: int) -> int:
     return sum(a * b + b for a, b in itertools.pairwise((inputs, *layers, outputs)))
 
 
+def _policy(config: Config, layers: Sequence[int]) -> int:
+    """Weights of a policy, whose GRU's state the first and the last layer see as well."""
+    units, outputs = config.follower.recurrent_units, 2 * ACTION_SIZE
+    gru = 3 * units * (OBSERVATION_SIZE + units + 1)
+    return gru + _weights(OBSERVATION_SIZE + units, layers, outputs) + units * outputs
+
+
 # Each: environment steps, rounds of steps that follow each other, numbers of the state, of other arrays, operations.
 _Sizes = tuple[int, int, float, float, float]
 
 
 def _sac(config: Config) -> _Sizes:
     sac = config.sac
-    policy = _weights(OBSERVATION_SIZE, sac.policy_layers, 2 * ACTION_SIZE)
+    policy = _policy(config, sac.policy_layers)
     critics = sac.num_critics * _weights(OBSERVATION_SIZE + ACTION_SIZE, sac.critic_layers, 1)
-    state = 4 * policy + 4 * critics + (sac.replay_size + sac.num_envs) * ROW + sac.num_envs * STATE
+    row = ROW + 2 * config.follower.recurrent_units
+    state = 4 * policy + 4 * critics + (sac.replay_size + sac.num_envs) * row + sac.num_envs * STATE
     rounds = max(sac.total_steps // sac.num_envs, 1)
     updates = max(sac.total_steps - sac.warmup_steps, 0) // sac.num_envs * sac.updates_per_step
     operations = 6.0 * updates * sac.batch_size * (policy + critics)
-    return sac.total_steps, rounds + updates, state, sac.updates_per_step * sac.batch_size * ROW, operations
+    return sac.total_steps, rounds + updates, state, sac.updates_per_step * sac.batch_size * row, operations
 
 
 def _ppo(config: Config) -> _Sizes:
     ppo = config.ppo
-    policy = _weights(OBSERVATION_SIZE, ppo.policy_layers, 2 * ACTION_SIZE)
+    policy = _policy(config, ppo.policy_layers)
     value = _weights(OBSERVATION_SIZE, ppo.value_layers, 1)
-    data = ppo.num_envs * ppo.unroll_length * ppo.unrolls * ROW
+    data = ppo.num_envs * ppo.unroll_length * ppo.unrolls * (ROW + 2 * config.follower.recurrent_units)
     operations = 6.0 * ppo.total_steps * ppo.epochs * (policy + value)
     rounds = max(ppo.total_steps // ppo.num_envs, 1)
     return ppo.total_steps, rounds, 3 * (policy + value) + ppo.num_envs * STATE, data, operations
@@ -79,8 +87,8 @@ def _ppo(config: Config) -> _Sizes:
 
 def _gradient(config: Config) -> _Sizes:
     gradient = config.gradient
-    policy = _weights(OBSERVATION_SIZE, gradient.policy_layers, 2 * ACTION_SIZE)
-    kept = sum(gradient.policy_layers) + STATE  # of every step, for the way back
+    policy = _policy(config, gradient.policy_layers)
+    kept = sum(gradient.policy_layers) + 4 * config.follower.recurrent_units + STATE  # of every step, for the way back
     rounds = gradient.gradient_steps * gradient.horizon
     steps = rounds * gradient.num_envs
     data = gradient.num_envs * gradient.horizon * kept
