@@ -88,6 +88,8 @@ def _asked(options: argparse.Namespace, setup: config.Config, reference: Scenari
         mass_changes=tuple(map(_mass_change, options.mass_change or [])),
         **common,
     )
+    for mass in options.mass or []:
+        config.check_lift(setup, mass)
     return tuple(check_scenario(setup, scenario) for scenario in made)
 
 

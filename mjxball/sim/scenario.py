@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.config import Config, ball_limit, cg_limit, check_lift
+from mjxball.config import Config, ball_limit, cg_limit
 from mjxball.errors import InputError
 from mjxball.sim.disturbances import Disturbance, Vector3, check_disturbance
 
@@ -83,7 +83,6 @@ def check_scenario(config: Config, scenario: Scenario) -> Scenario:
         raise InputError("every number of a scenario must be finite")
     if scenario.mass <= 0:
         raise InputError(f"mass must be positive, not {scenario.mass:g} kg")
-    check_lift(config, scenario.mass)
     if scenario.believed_mass is not None and scenario.believed_mass < 0:
         raise InputError(f"believed mass must not be negative, but is {scenario.believed_mass:g} kg")
     if scenario.omega < 0 or scenario.amplitude < 0:

@@ -192,6 +192,8 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
         follower = load_policy(file, setup, seconds=seconds)
         follower.name = path.name if path.is_dir() else follower.name
     scenario = dataclasses.replace(standard_scenarios(setup)[-1], **tuples)
+    if "mass" in changes:
+        configs.check_lift(setup, changes["mass"])
     flown = simulate(setup, follower, scenario, physics)
     reach = "±" if len(setup.plant.directions) == 1 else "on a circle of "
     motion = f"CG {reach}{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s"
