@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -66,6 +67,8 @@ def kept_up_with(flight: Ended) -> None:
     events = {event.split(":")[0] for record in read(flight.log) for event in record.get("events", [])}
     ages = [float(age) for age in re.findall(r"state age: (\d+) ms", flight.out)]
     late = [float(late) for late in re.findall(r"p99 ([\d.]+) ms", flight.out)]
+    if flight.code == -signal.SIGKILL:
+        too_busy("the watchdog took over from a runner that stood still")
     if events & {"DEADLINES", "STALE", "REFUSED"} or max(ages, default=0) > OLD or max(late, default=0) > LATE:
         too_busy(f"{sorted(events)}, states {ages} ms old, ticks {late} ms late")
 
