@@ -179,6 +179,20 @@ def test_a_pair_without_lift_that_climbs_has_lift() -> None:
 
 
 @pytest.mark.slow
+def test_a_slow_landing_is_not_over_before_the_pair_rests() -> None:
+    """Below 4 cm it sank no faster than what counts as standing, and fell from there at 0.7 m/s."""
+    policy = Policy.load(shipped_policy("stand"))
+    world = VirtualTwin(policy, FlightSettings(4.0, (0.0, 0.0, 0.08), stand=True), log=MemoryLog(False), settle=1.0)
+    for number in range(2):
+        if number:
+            world.track.clear()
+            world.next_flight(pause=1.5)
+        world.run(40.0)
+        assert world.flight.supervisor.cause is None
+        assert world.touchdown_speed() < 0.25
+
+
+@pytest.mark.slow
 def test_flights_in_a_row_with_reboots_between_them() -> None:
     """Six here, 30 with ten reboots in benchmarks/fly_firmware.py."""
     world = hovering(1.0)
