@@ -21,7 +21,7 @@ from mjxball.algorithms.base import (
     Transition,
 )
 from mjxball.algorithms.networks import normaliser
-from mjxball.algorithms.recurrent import RecurrentPolicy
+from mjxball.algorithms.recurrent import RecurrentPolicy, answer
 from mjxball.config import Config, Ppo
 from mjxball.errors import InputError
 from mjxball.quiet import import_brax_ppo, import_brax_training
@@ -89,11 +89,8 @@ class ProximalPolicyOptimization:
         distribution = self.networks.parametric_action_distribution
 
         def step(envs: Any, key: Array) -> tuple[Any, Any]:
-            network, arguments = self.networks.policy_network, (state.normaliser, state.parameters.policy)
-            if self._units:
-                parameters, memory = network.step(*arguments, envs.states.obs)
-            else:
-                parameters, memory = network.apply(*arguments, envs.states.obs), envs.states.obs[..., :0]
+            network, policy = self.networks.policy_network, state.parameters.policy
+            parameters, memory = answer(network, state.normaliser, policy, envs.states.obs)
             raw = distribution.sample_no_postprocessing(parameters, self._shards.own(key))
             action = jnp.where(phase.evaluate, distribution.mode(parameters), distribution.postprocess(raw))
             envs, seen = self._environments.step(envs, jnp.concatenate([action, memory], axis=-1), None, fresh)

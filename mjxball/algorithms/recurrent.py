@@ -93,3 +93,10 @@ class RecurrentPolicy(NamedTuple):
             return state, found
 
         return jax.lax.scan(one, held[0], (observations, held))[1]
+
+
+def answer(network: Any, statistics: Any, policy: Any, observation: Array) -> tuple[Array, Array]:
+    """(parameters of the action's distribution, next state) of any policy network; without a GRU a state (..., 0)."""
+    if isinstance(network, RecurrentPolicy):
+        return network.step(statistics, policy, observation)
+    return network.apply(statistics, policy, observation), observation[..., :0]

@@ -15,6 +15,7 @@ from jax import Array
 from mjxball.algorithms import replay
 from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
 from mjxball.algorithms.networks import Networks, make_networks
+from mjxball.algorithms.recurrent import answer
 from mjxball.algorithms.replay import Replay, Transitions
 from mjxball.config import Config, Sac
 from mjxball.errors import InputError
@@ -258,8 +259,8 @@ class SoftActorCritic:
     def collect(self, state: SacState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[SacState, Any]:
         """One step of all environments into the replay and the normaliser."""
         learner, (*act_keys, reset_key) = state.learner, keys
-        action, answer = self._act(learner, envs.states.obs, act_keys, phase)
-        envs, transition = self._environments.step(envs, answer, reset_key)
+        action, memory = self._act(learner, envs.states.obs, act_keys, phase)
+        envs, transition = self._environments.step(envs, jnp.concatenate([action, memory], axis=-1), reset_key)
         transitions = Transitions(
             transition.observation,
             action,
@@ -277,22 +278,17 @@ class SoftActorCritic:
 
     def _act(
         self, learner: Learner, observation: Float[Array, "envs n"], keys: Sequence[Array], phase: Phase
-    ) -> tuple[Float[Array, "envs actions"], Float[Array, "envs answer"]]:
-        """(actions, and behind them the next states of a recurrent policy)."""
+    ) -> tuple[Float[Array, "envs actions"], Float[Array, "envs units"]]:
+        """(actions, next states of a recurrent policy)."""
         sample_key, random_key = map(self._shards.own, keys)
         policy = jax.tree.map(lambda mean, new: jnp.where(phase.evaluate, mean, new), learner.average, learner.policy)
-        network = self.networks.policy_network
-        if self._units:
-            parameters, memory = network.step(learner.normaliser, policy, observation)
-        else:
-            parameters, memory = network.apply(learner.normaliser, policy, observation), observation[..., :0]
+        parameters, memory = answer(self.networks.policy_network, learner.normaliser, policy, observation)
         distribution = self.networks.parametric_action_distribution
         shape = (self._environments.count, self._sizes[1])
         sampled = distribution.sample(parameters, jax.random.normal(sample_key, shape))
         uniform = jax.random.uniform(random_key, shape, minval=-1.0, maxval=1.0)
         chosen = jnp.where(phase.random, uniform, sampled)
-        action = jnp.where(phase.evaluate, distribution.mode(parameters), chosen)
-        return action, jnp.concatenate([action, memory], axis=-1)
+        return jnp.where(phase.evaluate, distribution.mode(parameters), chosen), memory
 
     def update(
         self, state: SacState, keys: Sequence[Array], progress: Float[Array, ""], phase: Phase

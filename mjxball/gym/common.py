@@ -42,8 +42,11 @@ def check_process() -> None:
 
     Its threads are not in the copy: where JAX has a device and the process a single thread, it is a copy.
     """
+    process = os.getpid()
+    if _home.get("process") == process:
+        return
     copied = xla_bridge.backends_are_initialized() and THREADS.is_dir() and len(list(THREADS.iterdir())) == 1
-    if copied or _home.setdefault("process", os.getpid()) != os.getpid():
+    if copied or _home.setdefault("process", process) != process:
         raise InputError(
             "this process was forked from one in which JAX runs, where it would wait for ever; start it with spawn, "
             "such as gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
