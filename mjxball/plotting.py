@@ -20,6 +20,15 @@ def pyplot() -> Any:
     return plt
 
 
+def logarithmic(axes: Any, scale: str = "log", **given: Any) -> None:
+    """Make y of `axes` logarithmic. Its ticks are plain numbers: Matplotlib's own are formulas, see `pyplot`."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    axes.set_yscale(scale, **given)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
 def save(figure: Any, path: Path) -> None:
     """Write the picture `path`, whole or not at all; its ending is the format."""
     stream = io.BytesIO()

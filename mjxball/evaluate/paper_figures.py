@@ -18,7 +18,7 @@ from mjxball.evaluate.results import Result, fly_scenarios
 from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.evaluate.stand_figure import draw_stand
 from mjxball.evaluate.suites import BY_NAME
-from mjxball.plotting import pyplot
+from mjxball.plotting import logarithmic, pyplot
 from mjxball.policy import Policy
 
 NAMES = ("reward", "adaptive", "speeds", "masses", "stand")
@@ -104,7 +104,7 @@ def draw_reward(policies: Sequence[Policy]) -> Figure:
         axis.plot(curve.evaluated_steps, curve.evaluated, label="evaluated, deterministic", **style)
         if mimics:
             axis.axhline(0.0, color="black", linestyle=":", linewidth=1, label="optimum: copy the leader")
-        axis.set_yscale("symlog", linthresh=LINEAR)
+        logarithmic(axis, "symlog", linthresh=LINEAR)
         axis.set_ylim(top=min(axis.get_ylim()[1], LINEAR / 2))
         axis.xaxis.set_major_formatter(EngFormatter())
         axis.set(title=policy.name, ylabel="return of an episode")

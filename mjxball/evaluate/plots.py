@@ -16,7 +16,7 @@ import numpy as np
 from mjxball.evaluate.benchmark import Score, Summary
 from mjxball.evaluate.results import RESULTS, Result, scenario_stem, scenario_title, to_json
 from mjxball.files import write_whole
-from mjxball.plotting import pyplot, save
+from mjxball.plotting import logarithmic, pyplot, save
 from mjxball.sim.rollout import Trajectory
 
 POINTS = 240  # of a curve over time
@@ -81,7 +81,7 @@ def variant_curves(scores: Sequence[Score], axis: str) -> str:
             panel.plot(range(len(variants)), rows[:, 0], marker="o", markersize=3, color=shade[name], label=name)
             panel.fill_between(range(len(variants)), rows[:, 1], rows[:, 2], color=shade[name], alpha=0.15, linewidth=0)
         if metric == "peak" and any(np.isfinite(line.get_ydata()).any() for line in panel.lines):
-            panel.set_yscale("log")
+            logarithmic(panel)
             panel.set_ylim(bottom=max(panel.get_ylim()[0], LEAST_PEAK))
         panel.set_ylabel(label)
         panel.set_xticks(range(len(variants)), variants, fontsize=8, rotation=15 if max(map(len, variants)) > 9 else 0)
@@ -217,7 +217,7 @@ def _draw_panel(axis: Any, results: Sequence[Result], kind: str, index: int | No
             dashed: dict[str, Any] = {"linewidth": 0.8, "linestyle": "--", "alpha": 0.7, "label": name}
             axis.plot(time, factor * flight.leader_command[:, index], color=colour, **dashed)
     if kind == "error":
-        axis.set_yscale("log")
+        logarithmic(axis)
     low, high = axis.get_ylim()
     if high - low < LEAST_SPAN:  # rounding errors must not look like motion
         axis.set_ylim((low + high - LEAST_SPAN) / 2, (low + high + LEAST_SPAN) / 2)

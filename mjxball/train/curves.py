@@ -69,7 +69,7 @@ def best_member(rows: list[dict[str, float]]) -> int:
 
 def draw_members(run: Path, path: Path) -> None:
     """Picture of all members over training: steady-state error and return, each one, their median and quartiles."""
-    from mjxball.plotting import pyplot, save
+    from mjxball.plotting import logarithmic, pyplot, save
 
     rows = read_members(run)
     steps = sorted({row["steps"] for row in rows})
@@ -86,7 +86,7 @@ def draw_members(run: Path, path: Path) -> None:
         axis.set_ylabel(label)
         axis.grid(alpha=0.25)
     if any(row["eval_steady_error"] > 0 for row in rows):
-        axes[0].set_yscale("log")
+        logarithmic(axes[0])
     axes[1].legend()
     axes[1].set_xlabel("environment steps of each member")
     figure.suptitle(f"{table.shape[1]} followers")
@@ -142,7 +142,7 @@ def _rows(run: Path) -> list[dict[str, str]]:
 
 def draw_training(run: Path, config: Config, path: Path) -> None:
     """Draw `metrics.csv` of the directory `run` to `path`, whose directory is made."""
-    from mjxball.plotting import pyplot, save
+    from mjxball.plotting import logarithmic, pyplot, save
 
     rows = _rows(run)
 
@@ -166,7 +166,7 @@ def draw_training(run: Path, config: Config, path: Path) -> None:
         axis.grid(alpha=0.25)
     for axis in axes[1:]:
         if (column(below[0][1])[1] > 0).any():
-            axis.set_yscale("log")
+            logarithmic(axis)
     if config.reward.kind == "paper":
         axes[0].axhline(0.0, color="black", linestyle=":", linewidth=1, label="optimum: copy the leader")
     axes[0].legend(fontsize="small")
