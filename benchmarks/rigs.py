@@ -209,6 +209,12 @@ def row_of(flown: dict[str, Flown], name: str, rigs: RigTable, period: float) ->
         **{f"settling_{q}": _quantile(settling, q) for q in (50, 90)},
         **{f"peak_{q}": _quantile(peak, q) for q in (50, 90)},
     }
+    effort = flown[name].effort
+    if effort is not None:
+        row |= {"at_limit": float(effort.at_limit.mean())}
+        for part in ("tilt_spread", "lift_spread", "power"):
+            of_rig = np.median(getattr(effort, part), axis=1)
+            row |= {f"{part}_{q}": _quantile(of_rig, q) for q in (50, 90)}
     if not set(KNOWING) <= flown.keys():
         return row
     knowing = [flown[one] for one in KNOWING]

@@ -114,6 +114,34 @@ def test_a_gradient_decays_by_its_factor_at_every_step_and_the_loss_stays(
     np.testing.assert_allclose(found, wanted, rtol=2e-3)
 
 
+def impulse_cost(gain: np.ndarray, impulse: np.ndarray, steps: int) -> float:
+    """Mean of log(1 + |answer|^2 / 1e-6) of u = -gain x to `impulse` (worlds, 1) of the first action, in float64."""
+    x, total = np.zeros((len(impulse), 2)), 0.0
+    for number in range(steps):
+        u = -x @ gain.T + (impulse if number == 0 else 0.0)
+        x = x @ A.T + u @ B.T
+        total += np.log1p(((x**2).sum(axis=1) + (u**2).sum(axis=1)) / 1e-6).mean() / steps
+    return total
+
+
+@pytest.mark.parametrize("swept", [False, True])
+def test_an_impulse_response_costs_its_logarithm(swept: bool, transport: Config) -> None:
+    """Loss and gradient against central differences of an independent simulation."""
+    gain, steps, weight = np.array([[2.0, 1.5]]), 25, 0.3
+    own = {"impulse_response": weight}
+    _, without, slope = gradient_of(transport, gain, horizon=steps)
+    _, loss, found = gradient_of(transport, gain, horizon=steps, **({"swept": own} if swept else own))
+    key = jax.random.fold_in(jax.random.PRNGKey(2), 1)
+    impulse = np.asarray(jax.random.normal(key, (32, 1)), float)
+    assert loss - without == pytest.approx(weight * impulse_cost(gain, impulse, steps), rel=1e-4)
+    steps_of = 1e-5 * np.eye(2)[:, None]
+    wanted = [
+        (impulse_cost(gain + step, impulse, steps) - impulse_cost(gain - step, impulse, steps)) / 2e-5
+        for step in steps_of
+    ]
+    np.testing.assert_allclose((found - slope)[0], weight * np.array(wanted), rtol=2e-3)
+
+
 class Standing(LinearQuadratic):
     """It stays at observations of mean 3 and deviation 0.5, whatever the action."""
 

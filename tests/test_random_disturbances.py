@@ -49,6 +49,22 @@ def test_nothing_disturbed_carries_nothing(transport: Config) -> None:
     np.testing.assert_array_equal(disturbances.sensors.step(sensors, 2 * SEEN, sample)[1], 2 * SEEN)
 
 
+@pytest.mark.parametrize("probability", [0.0, 0.4, 1.0])
+def test_a_calm_flight_has_a_delay_alone(probability: float, transport: Config) -> None:
+    levels = {"noise": (0.5, 1.0), "gust": (0.1, 0.2), "estimator_drift": (0.5, 1.0), "delay": (0.02, 0.1)}
+    config = with_settings(transport, scenario=levels)
+    calm = with_settings(config, scenario={"calm_probability": probability})
+    keys = jax.random.split(jax.random.key(0), 1000)
+    usual, found = (jax.vmap(lambda key: RandomDisturbances(c).start(key)[0])(keys) for c in (config, calm))  # noqa: B023
+    still = np.asarray(found.noise) == 0
+    for name in ("gust", "force", "drift", "drift_level"):
+        quiet = np.asarray(getattr(found, name)).reshape(len(keys), -1) == 0
+        np.testing.assert_array_equal(quiet, np.broadcast_to(still[:, None], quiet.shape))
+        np.testing.assert_array_equal(getattr(found, name)[~still], getattr(usual, name)[~still])
+    np.testing.assert_array_equal(found.delay, usual.delay)
+    assert abs(still.mean() - probability) <= 5 * math.sqrt(probability * (1 - probability) / len(keys))
+
+
 def test_noise_has_the_judges_deviations_and_is_white(transport: Config) -> None:
     config = with_settings(transport, scenario={"noise": (2.0, 2.0)})
     _, seen = rolled(config, jnp.broadcast_to(SEEN, (STEPS, 18)))

@@ -203,6 +203,31 @@ class TestUniversal:
         assert np.median(found.error[..., 300:].max(axis=-1)) < 0.1
 
     @pytest.mark.slow
+    def test_effort_is_what_followers_command_apart_and_what_rotors_give(self) -> None:
+        rigs, period = held_out(UNIVERSAL, 3).rows(slice(0, 8)), UNIVERSAL.timing.control_period
+
+        class Apart:
+            """Both followers tilt and lift against each other, by as much as 'lift' says."""
+
+            def __init__(self, lift: float):
+                self.commands = jnp.array([[0.02, 0.0, lift], [-0.02, 0.0, -lift]])
+
+            def start(self, observation: Any) -> Any:
+                return ()
+
+            def step(self, memory: Any, observation: Any, known: Any) -> Any:
+                return memory, jnp.broadcast_to(self.commands, (*observation.shape[:-2], 2, 3))
+
+        calm, hard = (fly(UNIVERSAL, rigs, Apart(lift), 2, 25 * period).effort for lift in (0.3, 8.0))
+        np.testing.assert_allclose(calm.tilt_spread, 0.02 / np.sqrt(2), rtol=1e-3)
+        np.testing.assert_allclose(calm.lift_spread, 0.3, rtol=1e-3)
+        assert (hard.at_limit >= calm.at_limit).all()
+        assert hard.at_limit.mean() > calm.at_limit.mean()
+        assert ((calm.power > 0.6) & (calm.power < 1.4)).all()
+        # Jensen: what is shared unevenly takes more power.
+        assert np.median(hard.power) > np.median(calm.power)
+
+    @pytest.mark.slow
     def test_a_step_in_flight_is_felt_from_then_on(self) -> None:
         rigs = held_out(UNIVERSAL, 2).rows(slice(0, 12))
         law = AnyRigLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 
 Array = Any
+SMALL_RESPONSE = 1e-3  # to an impulse of 1, in deviations of observations and in actions: below that it is over
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
 
 
@@ -42,6 +44,7 @@ class FirstOrderGradient:
     in turn, so that every window has flights towards the goal and flights at it. `gradient.gradient_decay` multiplies
     the gradient that passes from one control step to the one before, and `gradient.state_gradient_clip` limits it in
     each environment. A recurrent network's own state passes it whole: that is what it is to learn to remember by.
+    `gradient.impulse_response` asks for a closed loop that is well damped about every flight, however small its errors.
     """
 
     metrics = ("loss", "gradient_norm")
@@ -52,8 +55,9 @@ class FirstOrderGradient:
 
     def __init__(self, config: Config, environments: Environments):
         own = config.gradient
-        # Number by number a window's gradient takes a quarter of the time, and two thirds to compile.
-        self._config, self._environments = own, environments.rewritten(scalar_form)
+        # Number by number a window's gradient takes a quarter of the time, and two thirds to compile; but it has none
+        # forwards.
+        self._config, self._environments, self._plain = own, environments.rewritten(scalar_form), environments
         self._shards = environments.shards
         self._adam = optax.scale_by_adam(*own.adam_betas)
         self.steps_per_collect = own.horizon
@@ -61,9 +65,11 @@ class FirstOrderGradient:
         self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations, 0.0)
         self._slots = environments.recurrent_slots
         self._units = self._slots.stop - self._slots.start
-        actions = environments.action_size - self._units
-        self._sizes = (environments.observation_size, *own.policy_layers, 2 * actions)
+        self._actions = environments.action_size - self._units
+        self._sizes = (environments.observation_size, *own.policy_layers, 2 * self._actions)
         self._mask: Any = np.asarray(environments.policy_mask, np.float32)
+        weight: Any = own.impulse_response  # no number where a sweep traces it
+        self._responds = not (isinstance(weight, (int, float)) and weight == 0)
 
     def init(self, key: Array) -> GradientState:
         """A policy that adds hardly anything."""
@@ -113,7 +119,10 @@ class FirstOrderGradient:
         # Also by the first states, where they allow it: JAX then sees at once what the loop carries a gradient of.
         arguments = (0, 2) if own.smooth else (0,)
         differentiated = jax.value_and_grad(self._window, arguments, has_aux=True, allow_int=True)
-        (loss, (envs, mean, square)), (slope, *_) = differentiated(state.layers, state, envs)
+        shape = (len(envs.states.obs), self._actions)
+        own_key = self._shards.own(jax.random.fold_in(keys[0], 1))
+        impulse = jax.random.normal(own_key, shape) if self._responds else ()
+        (loss, (envs, mean, square)), (slope, *_) = differentiated(state.layers, state, envs, impulse)
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
         first = (phase.random & phase.recording).astype(jnp.float32) * (1 - state.seen)
         known = GradientState(
@@ -129,20 +138,56 @@ class FirstOrderGradient:
         known = jax.tree.map(lambda new, old: jnp.where(phase.recording, new, old), known, state)
         return known, envs
 
-    def _window(self, layers: Any, state: GradientState, envs: Any) -> Any:
+    def _window(self, layers: Any, state: GradientState, envs: Any, impulse: Any) -> Any:
         policy = self.policy(state._replace(layers=layers))
+        respond = jax.checkpoint(functools.partial(self._respond, policy))
 
-        def step(carry: tuple[Any, Array], _: None) -> tuple[Any, tuple[Array, Array]]:
-            envs, flies = carry
+        def step(carry: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
+            envs, flies, response, impulse = carry
             envs = envs._replace(states=self._damped(envs.states))
-            seen = envs.states.obs
+            seen, lasting = envs.states.obs, 0.0
+            if self._responds:
+                response, lasting = respond(envs, response, impulse)
             envs, after = self._environments.step(envs, policy(seen), None)
-            reward = after.reward * flies if self._config.until_termination else after.reward
-            return (_forget(envs), flies * (1.0 - after.terminated)), (reward, jax.lax.stop_gradient(seen))
+            reward = after.reward - lasting
+            reward = reward * flies if self._config.until_termination else reward
+            impulse = jax.tree.map(jnp.zeros_like, impulse)  # over after one step
+            return (_forget(envs), flies * (1.0 - after.terminated), response, impulse), (
+                reward,
+                jax.lax.stop_gradient(seen),
+            )
 
-        start = envs, jnp.ones_like(envs.states.reward)
-        (envs, _), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
+        response = jax.tree.map(jnp.zeros_like, _floats(envs.states)) if self._responds else ()
+        start: Any = envs, jnp.ones_like(envs.states.reward), response, impulse
+        (envs, *_), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
+
+    def _respond(
+        self, policy: PolicyNetwork, envs: Any, response: list[Array], impulse: Array
+    ) -> tuple[list[Array], Array]:
+        """(what `response` of `_floats(envs.states)` is one step on, the cost of it (envs,)).
+
+        The closed loop is linearised about the flight, which has no gradient here: the policy's slopes alone have one.
+        What counts are the observations, each over its deviation, and the actions, so that what followers do against
+        each other counts as well, which none of them sees.
+        """
+        still = jax.lax.stop_gradient(envs)
+        size = impulse.shape[-1]
+
+        def one(floats: list[Array], impulse: Array) -> tuple[list[Array], Array]:
+            states = _with_floats(still.states, floats)
+            answer = policy(states.obs)
+            answer = jnp.concatenate([answer[..., :size] + impulse, answer[..., size:]], axis=-1)
+            after, _ = self._plain.step(still._replace(states=states), answer, None)
+            return _floats(_forget(after).states), answer[..., :size]
+
+        response = _floats(self._damped(_with_floats(still.states, response)))
+        point = _floats(still.states), jnp.zeros_like(impulse)
+        _, (response, action) = jax.jvp(one, point, (response, impulse))
+        seen = _with_floats(still.states, response).obs * self._mask / jax.lax.stop_gradient(policy.deviation)
+        seen = seen[..., : self._slots.start if self._units else None]
+        square = (seen**2).sum(axis=-1) + (action**2).sum(axis=-1)
+        return response, self._config.impulse_response * jnp.log1p(square / SMALL_RESPONSE**2)
 
     def _damped(self, states: Any) -> Any:
         """`states`; the gradient that passes them backwards is made smaller, that of a network's own state is not."""
@@ -206,6 +251,20 @@ def _forget(envs: Any) -> Any:
     still, states = jax.lax.stop_gradient, envs.states
     past = {name: still(getattr(states, name)) for name in ("reward", "done", "metrics", "info")}
     return envs._replace(states=states.replace(**past), statistics=still(envs.statistics))
+
+
+def _floats(tree: Any) -> list[Array]:
+    """The leaves of `tree` that have derivatives."""
+    return [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+
+
+def _with_floats(tree: Any, floats: Sequence[Array]) -> Any:
+    """`tree` with these in place of them."""
+    leaves, structure = jax.tree.flatten(tree)
+    given = iter(floats)
+    return jax.tree.unflatten(
+        structure, [next(given) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf for leaf in leaves]
+    )
 
 
 def _decayed(tree: Any, factor: float) -> Any:

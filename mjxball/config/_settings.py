@@ -181,6 +181,9 @@ class ScenarioRanges:
     estimator_drift: Range = drawn(
         (0.0, 0.0), "slow measurement error, in standard deviations of a drone's estimator", low=0
     )
+    calm_probability: float = setting(
+        0.0, "probability of a flight without noise, drift and gusts, whatever its delay", low=0, high=1
+    )
     quantize: bool = setting(False, "states arrive with the resolution of a Crazyflie's log packets")
     leader_uses_measurements: bool = setting(
         False, "the leader flies on the follower's measurements, else on the true state"

@@ -16,7 +16,7 @@ from mjxball.config import Config, Plant
 from mjxball.control.followers import Law, PrivilegedInfo
 from mjxball.control.multi_model_lqg import team_geometry
 from mjxball.env import PipelineState, State, TransportEnv
-from mjxball.evaluate.metrics import SETTLED, STEADY_AFTER
+from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, SETTLED, STEADY_AFTER
 from mjxball.physics.motion import object_mass
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import RigTable, rig_config
@@ -28,11 +28,21 @@ SECONDS = 30.0  # of a flight
 Change = Callable[[PipelineState], PipelineState]
 
 
+class Effort(NamedTuple):
+    """What flights of R rigs, K each, cost; all (R, K)."""
+
+    at_limit: Any  # share of the steps in which any rotor is within 1 % of 0 or of its largest force
+    tilt_spread: Any  # rms of the followers' roll and pitch less their mean; 0 of a pair [rad]
+    lift_spread: Any  # of their vertical command [m/s2]
+    power: Any  # mean of sum F^1.5 over all rotors, over that of rotors which share the weight evenly
+
+
 class Flown(NamedTuple):
     """Flights of R rigs, K each."""
 
     error: Float[np.ndarray, "R K T"]  # |e_o| at every control step, the start first [m]
     failed: Bool[np.ndarray, "R K"]  # it left scenario.termination_distance, or diverged
+    effort: Effort | None = None
 
     def settling(self, period: float) -> Float[np.ndarray, "R K"]:
         """Last time at which the error exceeds 2 % of the first one [s]; inf: it never settles."""
@@ -72,15 +82,15 @@ def fly(
     steps = round(seconds / env.dt)
     at = -1 if change is None else round(change[0] / env.dt)
 
-    def flight(key: Any, rig: RigTable, law: Law) -> tuple[Any, Any]:
+    def flight(key: Any, rig: RigTable, law: Law) -> Any:
         state = env.reset(key, 1.0, None, rig)
         if change is not None:  # nothing of its own before
             later = state.pipeline_state.load
             later = later._replace(mass_change_time=later.mass_change_time + jnp.inf)
             state = state.replace(pipeline_state=state.pipeline_state._replace(load=later))
 
-        def step(carry: tuple[State, Any, Any], number: Any) -> Any:
-            state, memory, far = carry
+        def step(carry: tuple[State, Any, Any, Any], number: Any) -> Any:
+            state, memory, far, effort = carry
             if change is not None:
                 world = change[1](state.pipeline_state)
                 world = jax.tree.map(lambda new, old: jnp.where(number == at, new, old), world, state.pipeline_state)
@@ -89,22 +99,44 @@ def fly(
             error = jnp.linalg.norm(world.goal - world.loop.plant.position)
             far = far | (error > config.scenario.termination_distance) | world.loop.diverged
             memory, command = law.step(memory, state.obs[..., :18], _known(world, size))
-            return (env.step_with_command(state, command), memory, far), error
+            state = env.step_with_command(state, command)
+            effort = jax.tree.map(jnp.add, effort, _effort(state.pipeline_state, command, rig, own.plant.gravity))
+            return (state, memory, far, effort), error
 
         if isinstance(law, AnyRigLaw | AnyRigBase):
             law = law.on(rig, own.plant)
-        start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool))
-        (_, _, far), error = jax.lax.scan(step, start, jnp.arange(steps + 1))
-        return error, far
+        nothing = Effort(*(jnp.zeros(()) for _ in Effort._fields))
+        start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool), nothing)
+        (_, _, far, effort), error = jax.lax.scan(step, start, jnp.arange(steps + 1))
+        mean = jax.tree.map(lambda total: total / (steps + 1), effort)
+        return error, far, mean._replace(tilt_spread=jnp.sqrt(mean.tilt_spread), lift_spread=jnp.sqrt(mean.lift_spread))
 
-    def rig_flights(rig: RigTable, numbers: Any, keys: Any) -> tuple[Any, Any]:
+    def rig_flights(rig: RigTable, numbers: Any, keys: Any) -> Any:
         return jax.vmap(lambda key: flight(key, rig, rebuild(numbers)))(keys)
 
     keys = jax.random.split(jax.random.key(seed), (rigs.total, flights))
     single = jax.tree.map(lambda part: jnp.asarray(part, jnp.float32), (rigs, numbers))
     with jax.default_matmul_precision("highest"):
-        error, failed = jax.jit(jax.vmap(rig_flights))(*single, keys)
-    return Flown(np.asarray(error), np.asarray(failed))
+        error, failed, effort = jax.tree.map(np.asarray, jax.jit(jax.vmap(rig_flights))(*single, keys))
+    return Flown(error, failed, effort)
+
+
+def _effort(world: PipelineState, command: Any, rig: RigTable, gravity: float) -> Effort:
+    """Of one step, squares in place of roots; `command` (3,) or (followers, 3)."""
+    size = len(rig.numbers.mounts)
+    force = world.loop.plant.rotor_force
+    fade = 1.0 - rig.thrust_fade * world.loop.plant.time
+    most = (rig.numbers.rotor_force_max * rig.thrust * fade)[:, None]
+    weight = gravity * (rig.numbers.drone_mass.sum() + rig.numbers.carrier_mass + rig.object_mass)
+    even = 4 * size * (weight / (4 * size)) ** 1.5
+    apart = jnp.atleast_2d(command)
+    apart = (apart - apart.mean(axis=0)) ** 2
+    return Effort(
+        at_limit=jnp.any((force < AT_LIMIT_WITHIN * most) | (force > (1 - AT_LIMIT_WITHIN) * most)).astype(jnp.float32),
+        tilt_spread=apart[:, :2].mean(),
+        lift_spread=apart[:, 2].mean(),
+        power=(jnp.maximum(force, 0.0) ** 1.5).sum() / even,
+    )
 
 
 class AnyRigLaw(NetworkLaw):

@@ -263,7 +263,7 @@ class RandomDisturbances:
     def __init__(self, config: Config):
         scenario, self._period = config.scenario, config.timing.control_period
         self._ranges = (scenario.noise, scenario.delay, scenario.gust)
-        self._drift = scenario.estimator_drift
+        self._drift, self._calm = scenario.estimator_drift, scenario.calm_probability
         self._relay = (scenario.relay_probability, scenario.relay_rate, scenario.relay_loss)
         self._relays = scenario.relay_probability > 0
         self.present = any(high > 0 for _, high in (*self._ranges, self._drift)) or scenario.quantize or self._relays
@@ -280,12 +280,14 @@ class RandomDisturbances:
         draw_key, key = random.split(key)
         share = random.uniform(draw_key, (3,))
         noise, delay, gust = (low + (high - low) * u for (low, high), u in zip(self._ranges, share, strict=True))
+        calm = random.uniform(random.fold_in(draw_key, 1)) < self._calm
+        noise, gust = jnp.where(calm, 0.0, noise), jnp.where(calm, 0.0, gust)
         key, noise_key, force_key = random.split(key, 3)
         drift: Any = ()
         level: Any = ()
         if self._drift[1] > 0:
             low, high = self._drift
-            level = low + (high - low) * random.uniform(random.fold_in(noise_key, 2))
+            level = jnp.where(calm, 0.0, low + (high - low) * random.uniform(random.fold_in(noise_key, 2)))
             drift = level * random.normal(random.fold_in(noise_key, 3), self._shape)
         steps = jnp.round(delay / self._period).astype(jnp.int32)
         relay: Any = ()
