@@ -20,7 +20,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from mjxball.config import Config
-from mjxball.control import observation as layout
 from mjxball.control import rotations
 from mjxball.control.followers import Law
 from mjxball.physics import newton_euler
@@ -130,7 +129,7 @@ def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], 
     def first(load: Load) -> tuple[PlantState, Any, Array]:
         plant = start_state(config, still, still, still, load.believed_mass, zero)
         observation = loop.observe(plant, goal)
-        return plant, law.start(observation), jnp.broadcast_to(observation, (delay, layout.OBSERVATION_SIZE))
+        return plant, law.start(observation), jnp.broadcast_to(observation, (delay, *observation.shape))
 
     def start(load: Load) -> Array:
         return flat(*first(load))[0]
@@ -174,7 +173,8 @@ def _linearise(start: Array, step: Callable[[Array], Array]) -> tuple[Array, Arr
     def polish(_: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
         point = found[0]
         slope, change = slopes(point)
-        tried = point - shares[:, None] * jnp.linalg.solve(slope, change)
+        # A memory that the loop does not use has no slope, and no change either.
+        tried = point - shares[:, None] * jnp.linalg.solve(slope - NEUTRAL**2 * still, change)
         left = jax.vmap(lambda z: jnp.linalg.norm(step(z) - z))(tried)
         return tried[jnp.nanargmin(left)], point, change, slope
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import json
 import subprocess
 import sys
@@ -14,17 +15,23 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import REPOSITORY, assert_one_line, call, environment
+from fly_virtual import VirtualTwin, log_header
 from wire import pack_state
 
+import onboard as benchmark
 from mjxball import config as configs
 from mjxball.commands import evaluate
 from mjxball.control.crazyflie import gains_to_json, pair_gains
+from mjxball.control.rotations import turned_about_z
 from mjxball.errors import InputError
 from mjxball.fly import packets, recording
+from mjxball.fly.card import mount_angle
 from mjxball.fly.flight_log import STREAMS, Journal, Tail, read
+from mjxball.fly.limits import FlightSettings
 from mjxball.fly.log_schema import KINDS, SCHEMA
 from mjxball.fly.packets import DroneState
-from mjxball.fly.recording import SILENCE, load
+from mjxball.fly.recording import SILENCE, load, read_recording
+from mjxball.policy import Policy
 from mjxball.rig import identify
 from mjxball.view.command import main as view
 
@@ -105,6 +112,31 @@ def test_the_package_writes_what_the_schema_says() -> None:
         missing = {name for name, field in known.items() if field.required} - fields
         assert more or not missing, f"{place}: {kind!r} lacks {missing}"
     assert KINDS.keys() == {kind for _, kind, _, _ in calls}
+
+
+def test_the_state_of_a_gru_is_recorded(tmp_path: Path) -> None:
+    """Tick by tick what the policy remembers after the observation beside it, to the log's decimals."""
+    contents = benchmark.recurrent("flight")
+    # It moves nothing, and what it remembers follows the flight.
+    contents = dataclasses.replace(contents, weights=(*contents.weights[:-1], 0 * contents.weights[-1]))
+    contents = dataclasses.replace(contents, biases=(*contents.biases[:-1], 0 * contents.biases[-1]))
+    path = tmp_path / "flight.jsonl"
+    with Journal(path, **log_header(contents)) as log:
+        assert VirtualTwin(FlightSettings(seconds=3.0), contents=contents, log=log).run() == "done"
+        log.note("end", code=0)
+    recording, policy = read_recording(path), Policy(contents, "again")
+    angle = mount_angle(contents.card)
+    guided = np.isfinite(recording.observation).all(axis=1)
+    assert guided.sum() > 100
+    assert np.isnan(recording.hidden[~guided]).all()
+    remembered = []
+    for seen in recording.observation[guided]:
+        policy(turned_about_z(seen, -angle))
+        assert policy.hidden is not None
+        remembered.append(policy.hidden)
+    assert recording.hidden.shape[1] == contents.card["recurrent_units"] == len(remembered[0])
+    np.testing.assert_allclose(recording.hidden[guided], remembered, atol=2e-4)
+    assert np.std(remembered, axis=0).max() > 0.01
 
 
 def test_a_log_is_read_whatever_its_length(tmp_path: Path) -> None:

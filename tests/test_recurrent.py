@@ -135,6 +135,43 @@ def algorithm_of(name: str, transport: Config) -> tuple[Any, Environments]:
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent) -> None:
+    """The loss beside flights, one with a small impulse of the first action: observations, actions, GRU and all."""
+    worlds, steps, weight, small = 3, 6, 0.3, 2e-3
+    own = {"num_envs": worlds, "horizon": steps, "windows_per_episode": 99}
+    env, network = TransportEnv(recurrent.config, "newton-euler"), recurrent.network
+    key = jax.random.PRNGKey(2)
+    with jax.default_matmul_precision("highest"):
+        environments = Environments(env, worlds)
+        envs = environments.begin(environments.reset(jax.random.key(0)), 1.0)
+        losses = []
+        for response in (0.0, weight):
+            config = with_settings(recurrent.config, gradient={**own, "impulse_response": response})
+            algorithm = FirstOrderGradient(config, environments)
+            square = np.square(network.deviation) + np.square(network.mean)
+            state = algorithm.init(jax.random.key(1))._replace(
+                **{"layers": network.layers, "mean": network.mean, "square": square, "seen": np.float32(1)},
+                windows=jnp.ones((), jnp.int32),
+            )
+            losses.append(float(jax.jit(algorithm.collect)(state, envs, [key], TRAIN)[0].loss))
+        impulse = jax.random.normal(jax.random.fold_in(key, 1), (worlds, env.action_size - 7))
+        step = jax.jit(jax.vmap(env.step))
+        flown = []
+        for size in (small, -small):
+            states, rows = envs.states, []
+            for number in range(steps):
+                answer = network(states.obs)
+                answer = answer.at[:, : impulse.shape[1]].add(size * impulse * (number == 0))
+                states = step(states, answer)
+                seen = states.obs[:, : network.inputs] * (network.mask / network.deviation)[: network.inputs]
+                rows.append(np.concatenate([seen, answer[:, : impulse.shape[1]]], axis=1))
+            flown.append(np.array(rows, float))
+    found = (flown[0] - flown[1]) / (2 * small)
+    wanted = weight * np.log1p((found**2).sum(axis=-1) / 1e-6).mean()
+    assert losses[1] - losses[0] == pytest.approx(wanted, rel=0.01)
+
+
 @pytest.mark.parametrize("name", LEARNING)
 def test_what_was_seen_once_is_remembered(name: str, transport: Config) -> None:
     """Who answers 0 after the first step pays 0.8 ** 2 / 3 in nine of ten steps, 0.19 a step."""

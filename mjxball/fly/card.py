@@ -159,6 +159,7 @@ class Commands(NamedTuple):
     leader: np.ndarray  # (3,) roll, pitch [rad], vertical acceleration [m/s2]
     follower: np.ndarray  # (3,) likewise
     observation: np.ndarray  # (18,) what the follower saw
+    hidden: np.ndarray | None = None  # (H,) state of its GRU after that; None: it has none
 
 
 class Controller:
@@ -188,4 +189,4 @@ class Controller:
         answer = self.handover(rotations.turned_about_z(seen, -self._angle))
         followed = self._loop.follower_command(rotations.turned_about_z(answer, self._angle), self._integral)
         self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=followed)
-        return Commands(led, followed, seen)
+        return Commands(led, followed, seen, self.policy.hidden)

@@ -25,6 +25,7 @@ from mjxball.fly.takeoff import TakeOff
 from mjxball.fly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
 from mjxball.fly.watchdog import Watchdog
 
+HIDDEN_DECIMALS = 4  # of a GRU's state in the log, 50 times a second
 LIFTED = 0.05  # [m], or half of the goal's height if that is less, from which on a pair counts as having flown
 
 
@@ -368,6 +369,9 @@ class Flight:
     def _record(self, sent: list[Setpoint], late: float, missed: int) -> None:
         goal, state = self.goal(self._now), self.supervisor.state
         laws = self._commands._asdict() if self._commands is not None and state in GUIDED else {}
+        hidden = laws.pop("hidden", None)
+        if hidden is not None:
+            laws["hidden"] = np.round(hidden, HIDDEN_DECIMALS)
         self.note("tick", self._now, state=state.value, goal=goal, sent=sent, ages=self._ages, late=late, **laws)
         shown = self._states, self._ages, (sent[0], sent[1]), late, missed
         self.view = View(self._now - self._start, self.supervisor, *shown, self.carry)

@@ -176,6 +176,7 @@ KINDS: dict[str, Kind] = {
         leader=may(array(3), COMMAND),
         follower=may(array(3), COMMAND),
         observation=may(array(None), "of the policy"),
+        hidden=may(array(None), "state of the policy's GRU after it"),
     ),
     "transition": record(
         "the supervisor changes its state", before=need(TEXT), after=need(TEXT), events=need(TEXTS, "of that tick")

@@ -208,6 +208,7 @@ class Recording:
     leader: np.ndarray  # (T, 3) command: roll, pitch [rad], vertical acceleration [m/s2]; NaN: no law in command
     follower: np.ndarray  # (T, 3) likewise
     observation: np.ndarray  # (T, 18) NaN where no law was in command
+    hidden: np.ndarray  # (T, H) state of the follower's GRU, likewise; H = 0: it has none
     rotor_force: np.ndarray  # (T, 2, 4) [N]; of a log: what the thrust that was sent gives, without lag and cascade
     cg_offset: np.ndarray  # (T,) [m]; NaN where it was not measured
     remarks: tuple[str, ...] = ()  # what a reader of the log should know, a line each
@@ -240,9 +241,13 @@ def _recording(log: FlightLog, ticks: Sequence[Mapping[str, Any]], seen: Sequenc
     position, velocity, quaternion, rates = (np.array(part) for part in zip(*seen, strict=True))
     curves = log.setup.force_curves(log.config)
     force = np.array([[c.force(s[3]) / 4 for c, s in zip(curves, tick["sent"], strict=True)] for tick in ticks])
-    lengths = {len(tick["observation"]) for tick in ticks if "observation" in tick} or {OBSERVATION}
-    if len(lengths) > 1:
-        raise InputError(f"flight log {log.path} holds observations of several lengths")
+
+    def length(name: str, usual: int) -> int:
+        lengths = {len(tick[name]) for tick in ticks if name in tick} or {usual}
+        if len(lengths) > 1:
+            raise InputError(f"flight log {log.path} holds a tick's {name} in several lengths")
+        return lengths.pop()
+
     return Recording(
         policy=log.policy,
         config=log.config,
@@ -257,7 +262,8 @@ def _recording(log: FlightLog, ticks: Sequence[Mapping[str, Any]], seen: Sequenc
         rates=rates,
         leader=column("leader", 3),
         follower=column("follower", 3),
-        observation=column("observation", lengths.pop()),
+        observation=column("observation", length("observation", OBSERVATION)),
+        hidden=column("hidden", length("hidden", 0)),
         rotor_force=np.repeat(force[..., None], 4, axis=-1),
         cg_offset=np.full(len(ticks), np.nan),
         remarks=log.remarks,

@@ -131,6 +131,13 @@ class Policy:
         self._memory, self._ahead = None if memory is None else self._checked(memory), False
         self._thread.forget()
 
+    @property
+    def hidden(self) -> Array | None:
+        """State of the network's GRU (..., H) in `memory`, each number from -1 to 1; None: no GRU, or nothing yet."""
+        units, first = self._law.units, self._law.history.size
+        memory = self.memory if units else None
+        return None if memory is None else memory[..., first : first + units]
+
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which share neither the buffers of `_single` nor the thread."""
         return {**self.__dict__, "_memory": self.memory, "_single": None, "_ahead": False, "_thread": OneThread()}
