@@ -7,7 +7,7 @@
 Teams: N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A
 case counts where `mjxball.plant.trim` finds 15 % margin in every direction and the followers' tilt commands reach it.
 The bar: peak in the plane at most that of `adaptive` + 3 mm, settling at most that of `lqg` + 10 %. 5 drones are in no
-training. With --random: random loads, starts and goals that can be trimmed.
+training. With --random: random loads, starts and goals that can be trimmed. All with their effort (`effort_of`).
 
 Plate: random starts, the ball within 60 % of the rim with up to 0.1 m/s, both uniform in radius, 60 s, noise level 1.
 Beside them the share of these starts from which friction alone stops the ball before the rim of a level plate. No
@@ -113,12 +113,30 @@ def _row(found: Sequence[Metrics], references: dict[str, list[Metrics]]) -> dict
         "settling_10_median": float(np.median(of("settling_time_10"))),
         "rmse_median": float(np.median(of("rmse"))),
         "small_peak": float(small.mean()),
+        **effort_of(found),
     }
     for label, name in (("", "settling_time"), ("_10", "settling_time_10")):
         told = of(name, references["lqg"])
         soon = np.where(np.isfinite(told), of(name) <= LATER * told, True)
         row |= {f"soon{label}": float(soon.mean()), f"both{label}": float((small & soon).mean())}
     return {name: None if value == math.inf else value for name, value in row.items()}
+
+
+def effort_of(found: Sequence[Metrics]) -> dict[str, float]:
+    """Of the flights that did not fail: share of the time with a rotor at its limit, power over hover's, spread [rad].
+
+    The spread is the median of rms differences between the followers' tilts and their mean; 0 of a pair.
+    """
+    flown = [run for run in found if not run.failed]
+
+    def of(name: str) -> np.ndarray:
+        return np.array([getattr(run, name) or 0.0 for run in flown] or [math.inf])
+
+    return {
+        "rotors_at_limit": float(of("rotors_at_limit").mean()),
+        "rotor_power": float(np.median(of("rotor_power"))),
+        "command_spread": float(np.median(of("command_spread"))),
+    }
 
 
 def random_flights(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
@@ -156,7 +174,7 @@ def random_flights(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str
             for label, share in (("median", 0.5), ("99", 0.99), ("largest", 1.0)):
                 peak = float(np.quantile(peaks, share, method="higher"))
                 row[f"plane_peak_{label}"] = peak if math.isfinite(peak) else None
-            rows.append({**row, "failed": sum(run.failed for run in found)})
+            rows.append({**row, "failed": sum(run.failed for run in found), **effort_of(found)})
             print(json.dumps(rows[-1]))
             sys.stdout.flush()
     return rows
