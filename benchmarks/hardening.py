@@ -56,7 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     causes = Counter(cause.split(":")[0] for row in bad for cause in row["wrong"])
     print(f"{len(rows) - len(bad)} of {len(rows)} of {len(cases)} lines; {dict(causes)}")
     if options.json:
-        options.json.write_text(json.dumps({"lines": rows}, indent=1) + "\n")
+        lines = ",\n".join(json.dumps(row) for row in rows)
+        options.json.write_text(f'{{"lines": [\n{lines}\n]}}\n')
     return 1 if bad else 0
 
 

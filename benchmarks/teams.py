@@ -122,21 +122,17 @@ def _row(found: Sequence[Metrics], references: dict[str, list[Metrics]]) -> dict
     return {name: None if value == math.inf else value for name, value in row.items()}
 
 
-def effort_of(found: Sequence[Metrics]) -> dict[str, float]:
+def effort_of(found: Sequence[Metrics]) -> dict[str, float | None]:
     """Of the flights that did not fail: share of the time with a rotor at its limit, power over hover's, spread [rad].
 
-    The spread is the median of rms differences between the followers' tilts and their mean; 0 of a pair.
+    The spread is the median of rms differences between the followers' tilts and their mean; None of a pair. All are
+    None where every flight failed.
     """
-    flown = [run for run in found if not run.failed]
-
-    def of(name: str) -> np.ndarray:
-        return np.array([getattr(run, name) or 0.0 for run in flown] or [math.inf])
-
-    return {
-        "rotors_at_limit": float(of("rotors_at_limit").mean()),
-        "rotor_power": float(np.median(of("rotor_power"))),
-        "command_spread": float(np.median(of("command_spread"))),
-    }
+    effort: dict[str, float | None] = {}
+    for name, middle in (("rotors_at_limit", np.mean), ("rotor_power", np.median), ("command_spread", np.median)):
+        values = [getattr(run, name) for run in found if not run.failed and getattr(run, name) is not None]
+        effort[name] = float(middle(values)) if values else None
+    return effort
 
 
 def random_flights(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
