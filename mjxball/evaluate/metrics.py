@@ -106,7 +106,7 @@ def begin(position: Array, target: Array, rotor_force: Array, leader: int = 0) -
         furthest=none,
         tilt=zero,
         hover=hover,
-        hover_power=_power(rotor_force),
+        hover_power=power_of(rotor_force),
         tilts=xp.zeros_like(hover[..., :2]),
         target=target,
     )
@@ -137,8 +137,8 @@ def update(
     tilts, difference = followed[..., :2], followed - led
     most = xp.asarray(rotor_force_max, dtype=rotors.dtype)
     most = xp.broadcast_to(most, tick.rotor_force.shape[:-1])[..., None]
-    saturated = _of_followers(_within(SATURATED_WITHIN, tick.rotor_force, most), leader)
-    limited = xp.max(_within(AT_LIMIT_WITHIN, tick.rotor_force, most), axis=(-2, -1))
+    saturated = _of_followers(near_limit(SATURATED_WITHIN, tick.rotor_force, most), leader)
+    limited = xp.max(near_limit(AT_LIMIT_WITHIN, tick.rotor_force, most), axis=(-2, -1))
     early = tick.time <= RMSE_UNTIL + TINY
     mimicry = xp.mean(paper_reward(led, followed), axis=-1)
     change = xp.mean((tilts - running.tilts) ** 2, axis=(-2, -1))
@@ -154,7 +154,7 @@ def update(
         change=running.change + xp.where(running.steps > 0, change, 0.0),
         saturated=running.saturated + xp.mean(saturated, axis=(-2, -1)),
         limited=running.limited + limited,
-        power=running.power + _power(tick.rotor_force),
+        power=running.power + power_of(tick.rotor_force),
         spread=running.spread + xp.mean(apart**2, axis=(-2, -1)),
         failed=running.failed | tick.diverged | ~(distance <= termination_distance),
         initial=initial,
@@ -242,15 +242,15 @@ def _of_followers(rotor_force: Array, leader: int) -> Array:
     return xp.concat([rotor_force[:, :leader], rotor_force[:, leader + 1 :]], axis=1)
 
 
-def _within(share: float, force: Array, most: Array) -> Array:
+def near_limit(share: float, force: Array, most: Array) -> Array:
     """1 where a rotor's force is within `share` of `most` of 0 or `most`, else 0; NaN of a force that nobody knows."""
     xp = force.__array_namespace__()
     found = (force <= share * most) | (force >= (1 - share) * most)
     return xp.where(xp.isnan(force), xp.nan, xp.astype(found, force.dtype))
 
 
-def _power(rotor_force: Array) -> Array:
-    """(n,) of (n, N, 4): what air takes from rotors that hover, but for a factor of their size [N^1.5]."""
+def power_of(rotor_force: Array) -> Array:
+    """(...,) of (..., N, 4): what air takes from rotors that hover, but for a factor of their size [N^1.5]."""
     xp = rotor_force.__array_namespace__()
     return xp.sum(xp.maximum(rotor_force, xp.zeros_like(rotor_force)) ** 1.5, axis=(-2, -1))
 

@@ -16,7 +16,7 @@ from mjxball.config import Config, Plant
 from mjxball.control.followers import Law, PrivilegedInfo
 from mjxball.control.multi_model_lqg import team_geometry
 from mjxball.env import PipelineState, State, TransportEnv
-from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, SETTLED, STEADY_AFTER
+from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, SETTLED, STEADY_AFTER, near_limit, power_of
 from mjxball.physics.motion import object_mass
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import RigTable, rig_config
@@ -128,14 +128,14 @@ def _effort(world: PipelineState, command: Any, rig: RigTable, gravity: float) -
     fade = 1.0 - rig.thrust_fade * world.loop.plant.time
     most = (rig.numbers.rotor_force_max * rig.thrust * fade)[:, None]
     weight = gravity * (rig.numbers.drone_mass.sum() + rig.numbers.carrier_mass + rig.object_mass)
-    even = 4 * size * (weight / (4 * size)) ** 1.5
+    even = power_of(jnp.broadcast_to(weight / (4 * size), force.shape))
     apart = jnp.atleast_2d(command)
     apart = (apart - apart.mean(axis=0)) ** 2
     return Effort(
-        at_limit=jnp.any((force < AT_LIMIT_WITHIN * most) | (force > (1 - AT_LIMIT_WITHIN) * most)).astype(jnp.float32),
+        at_limit=near_limit(AT_LIMIT_WITHIN, force, most).max(),
         tilt_spread=apart[:, :2].mean(),
         lift_spread=apart[:, 2].mean(),
-        power=(jnp.maximum(force, 0.0) ** 1.5).sum() / even,
+        power=power_of(force) / even,
     )
 
 
