@@ -142,6 +142,34 @@ def test_an_impulse_response_costs_its_logarithm(swept: bool, transport: Config)
     np.testing.assert_allclose((found - slope)[0], weight * np.array(wanted), rtol=2e-3)
 
 
+def test_an_impulse_response_begins_to_count_late_in_one_branch_for_all_members(transport: Config) -> None:
+    """Two members side by side; the program has both windows and computes one."""
+    gain, steps = np.array([[2.0, 1.5]]), 25
+    losses = [gradient_of(transport, gain, horizon=steps, impulse_response=weight)[1] for weight in (0.0, 0.3)]
+    own = dataclasses.replace(
+        transport.gradient,
+        **{"num_envs": 32, "windows_per_episode": 99, "policy_layers": (), "horizon": steps},
+        **{"gradient_steps": 100, "impulse_response": 0.3, "impulse_response_from": 0.4},
+    )
+    environments = Environments(LinearQuadratic(), 32, Shards())
+    algorithm = FirstOrderGradient(dataclasses.replace(transport, gradient=own), environments)
+    kernel = jnp.concatenate([-jnp.asarray(gain.T, jnp.float32), jnp.zeros((2, 1))], axis=1)
+    states = environments.reset(jax.random.PRNGKey(0))
+
+    def loss(windows: Any) -> Any:
+        state = algorithm.init(jax.random.PRNGKey(1))._replace(
+            layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=windows
+        )
+        after, _ = algorithm.collect(state, environments.begin(states, 1.0), [jax.random.PRNGKey(2)], TRAIN)
+        return after.loss
+
+    both = jax.vmap(loss)
+    for windows, wanted in ((39, losses[0]), (40, losses[1])):
+        np.testing.assert_allclose(both(jnp.array([windows, windows])), wanted, rtol=1e-5)
+    primitives = [str(equation.primitive) for equation in jax.make_jaxpr(both)(jnp.array([1, 1])).eqns]
+    assert "cond" in primitives
+
+
 class Standing(LinearQuadratic):
     """It stays at observations of mean 3 and deviation 0.5, whatever the action."""
 

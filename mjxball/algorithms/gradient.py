@@ -23,6 +23,20 @@ SMALL_RESPONSE = 1e-3  # to an impulse of 1, in deviations of observations and i
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
 
 
+@jax.custom_batching.custom_vmap
+def _of_all(value: Array) -> Array:
+    """`value`, which is the same in every member of a population, as one number for all of them.
+
+    What hangs on it is then one branch, where members of their own would compute both.
+    """
+    return value
+
+
+@_of_all.def_vmap
+def _of_all_members(count: int, batched: Any, value: Array) -> tuple[Array, bool]:
+    return (value[0] if batched[0] else value), False
+
+
 class GradientState(NamedTuple):
     """What the algorithm knows."""
 
@@ -70,6 +84,7 @@ class FirstOrderGradient:
         self._mask: Any = np.asarray(environments.policy_mask, np.float32)
         weight: Any = own.impulse_response  # no number where a sweep traces it
         self._responds = not (isinstance(weight, (int, float)) and weight == 0)
+        self._responds_from = round(own.impulse_response_from * own.gradient_steps)  # windows
 
     def init(self, key: Array) -> GradientState:
         """A policy that adds hardly anything."""
@@ -119,10 +134,16 @@ class FirstOrderGradient:
         # Also by the first states, where they allow it: JAX then sees at once what the loop carries a gradient of.
         arguments = (0, 2) if own.smooth else (0,)
         differentiated = jax.value_and_grad(self._window, arguments, has_aux=True, allow_int=True)
-        shape = (len(envs.states.obs), self._actions)
-        own_key = self._shards.own(jax.random.fold_in(keys[0], 1))
-        impulse = jax.random.normal(own_key, shape) if self._responds else ()
-        (loss, (envs, mean, square)), (slope, *_) = differentiated(state.layers, state, envs, impulse)
+        flown = functools.partial(differentiated, state.layers, state, envs)
+        if self._responds:
+            own_key = self._shards.own(jax.random.fold_in(keys[0], 1))
+            impulse = jax.random.normal(own_key, (len(envs.states.obs), self._actions))
+            late = _of_all(state.windows) >= self._responds_from
+            whole, plain = functools.partial(flown, impulse), functools.partial(flown, ())
+            found = jax.lax.cond(late, whole, plain) if self._responds_from else whole()
+            (loss, (envs, mean, square)), (slope, *_) = found
+        else:
+            (loss, (envs, mean, square)), (slope, *_) = flown(())
         slope, loss, mean, square = self._shards.mean((slope, loss, mean, square))
         first = (phase.random & phase.recording).astype(jnp.float32) * (1 - state.seen)
         known = GradientState(
@@ -146,7 +167,7 @@ class FirstOrderGradient:
             envs, flies, response, impulse = carry
             envs = envs._replace(states=self._damped(envs.states))
             seen, lasting = envs.states.obs, 0.0
-            if self._responds:
+            if response:
                 response, lasting = respond(envs, response, impulse)
             envs, after = self._environments.step(envs, policy(seen), None)
             reward = after.reward - lasting
@@ -157,7 +178,8 @@ class FirstOrderGradient:
                 jax.lax.stop_gradient(seen),
             )
 
-        response = jax.tree.map(jnp.zeros_like, _floats(envs.states)) if self._responds else ()
+        answers = isinstance(impulse, jax.Array)
+        response = jax.tree.map(jnp.zeros_like, _floats(envs.states)) if answers else []
         start: Any = envs, jnp.ones_like(envs.states.reward), response, impulse
         (envs, *_), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
