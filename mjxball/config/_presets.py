@@ -164,6 +164,18 @@ def _balance() -> Config:
         reward=replace(
             large.reward, error=0.25, error_scale=0.004, velocity=12.0, smoothness=0.2, command_change=110.0
         ),
+        # Large batches: with 1024 transitions, and four times as many updates, commands chatter.
+        sac=replace(
+            large.sac,
+            total_steps=6_144_000,
+            batch_size=8192,
+            updates_per_step=4,
+            replay_size=1_024_000,
+            learning_rate=2e-3,
+            policy_layers=(32,),
+            critic_layers=(256, 256),
+            critic_layer_norm=True,
+        ),
         gradient=replace(
             RECURRENT_GRADIENT,
             gradient_steps=1500,
@@ -287,9 +299,9 @@ def _universal() -> Config:
             rotor_lag_scale=(1.0, 1.0),
             mass_known=False,
         ),
-        rigs=Rigs(number=512, mass_step=0.3),
+        rigs=Rigs(number=4096, mass_step=0.3),
         bounds=Bounds(x_peak=0.02, settling_time=4.0, rmse=0.4),
-        reward=_team().reward,
+        reward=replace(_team().reward, rates=0.5),
         sac=replace(large.sac, num_envs=528, replay_size=528_000),
         ppo=Ppo(num_envs=528),
         gradient=replace(TEAM_GRADIENT, num_envs=1100, gradient_steps=1700),  # for a GPU
