@@ -269,6 +269,42 @@ def test_what_nobody_measured_is_not_shown(flight: Flight, browser: Any, tmp_pat
     tab.close()
 
 
+@pytest.mark.parametrize(("name", "plant", "units"), [("balance", None, (48,)), ("universal", "team3", (2, 64))])
+def test_what_a_recurrent_network_remembers_is_shown_if_asked(
+    name: str, plant: str | None, units: tuple[int, ...], browser: Any, tmp_path: Path
+):
+    """Its own replay beside the state that the viewer holds, which is drawn a row of colour each."""
+    source, rig = str(shipped_policy(name)), None if plant is None else Path(plant)
+    shown = flight_from(source, {"seconds": 2.0}, "newton-euler", rig, hidden=True)
+    assert shown["hidden"].shape == (101, *units)
+    assert 0.1 < np.abs(shown["hidden"]).max() <= 1
+    path = tmp_path / "kept.npz"
+    save_flight(path, shown)
+    np.testing.assert_allclose(flight_from(str(path), {}, "", hidden=True)["hidden"], shown["hidden"], atol=1e-6)
+    assert "hidden" not in flight_from(str(path), {}, "").arrays
+    page = tmp_path / "page.html"
+    page.write_text(flight_page(shown), encoding="utf-8")
+    tab = opened(browser, page, 1280)
+    assert "What the follower’s network remembers" in tab.text_content("#plots")
+    # The uppermost pixels at the end are the last unit: red above 0, blue below.
+    red, blue = tab.evaluate(
+        "(() => { const plot = [...document.querySelectorAll('.plot canvas')].at(-1), ratio = devicePixelRatio;"
+        "const dot = plot.getContext('2d').getImageData(plot.width - 12 * ratio, 7 * ratio, 1, 1).data;"
+        "return [dot[0], dot[2]]; })()"
+    )
+    last = shown["hidden"][-1].ravel()[-1]
+    assert np.sign(red - blue) == np.sign(last) or abs(last) < 0.02
+    tab.close()
+
+
+def test_who_has_no_recurrent_network_shows_none(flight: Flight, tmp_path: Path):
+    path = tmp_path / "flight.npz"
+    save_flight(path, flight)
+    for source in (str(TRANSPORT), "copy", str(path)):
+        with pytest.raises(InputError, match="holds no state of a recurrent network"):
+            flight_from(source, {"seconds": 1.0}, "newton-euler", hidden=True)
+
+
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture):
     page, record = tmp_path / "page.html", tmp_path / "flight.npz"
     given = ["copy", "--seconds", 1, "--omega", 2, "--out", page, "--save", record]

@@ -27,6 +27,9 @@ def parser() -> Parser:
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
     result.add_argument("--save", type=Path, metavar="FILE.npz", help="write the flight itself too")
+    result.add_argument(
+        "--hidden", action="store_true", help="show what the follower's recurrent network remembers as well"
+    )
     live = result.add_argument_group("while it is flown")
     live.add_argument(
         "--live", action="store_true", help="follow a flight log that is being written, on a page of this machine alone"
@@ -61,7 +64,7 @@ def _view(options: argparse.Namespace) -> int:
         if path:
             output_file(path, suffix)
     given = {name: getattr(options, name) for name in CHANGES if getattr(options, name) is not None}
-    flight = flight_from(options.source, given, options.physics, options.plant)
+    flight = flight_from(options.source, given, options.physics, options.plant, options.hidden)
     if options.save:
         save_flight(options.save, flight)
         print(f"the flight is {options.save}")  # noqa: T201
@@ -76,6 +79,8 @@ def _view(options: argparse.Namespace) -> int:
 def _follow(options: argparse.Namespace) -> int:
     from mjxball.view.live import follow
 
+    if options.hidden:
+        raise InputError("--hidden is of a flight that has ended: leave it out of --live")
     if options.out or options.save:
         raise InputError("--live writes no file; play the log with --out or --save once the flight has ended")
     path, port = Path(options.source), options.port or 0

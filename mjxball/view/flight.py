@@ -56,7 +56,10 @@ def shapes(plant: Plant) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True)
 class Flight:
-    """One flight of T rows: arrays (T, ...) in SI units, named and laid out as in `rollout.Trajectory`."""
+    """One flight of T rows: arrays (T, ...) in SI units, named and laid out as in `rollout.Trajectory`.
+
+    `hidden` (T, [followers,] H), the state of the followers' GRU after each row, is there if it was asked for.
+    """
 
     title: str
     plant: Plant
@@ -66,9 +69,10 @@ class Flight:
         return self.arrays[name]
 
 
-def flight_of(trajectory: Trajectory, plant: Plant, title: str) -> Flight:
+def flight_of(trajectory: Trajectory, plant: Plant, title: str, hidden: np.ndarray | None = None) -> Flight:
     """A single recorded `trajectory` as a flight."""
-    return Flight(title, plant, {name: np.asarray(getattr(trajectory, name), float) for name in shapes(plant)})
+    arrays = {name: np.asarray(getattr(trajectory, name), float) for name in shapes(plant)}
+    return Flight(title, plant, arrays if hidden is None else {**arrays, "hidden": hidden})
 
 
 def save_flight(path: str | os.PathLike[str], flight: Flight) -> None:
@@ -100,6 +104,9 @@ def check_flight(flight: Flight, name: str) -> Flight:
     if len(rows) != 1 or rows[0] < 2:
         raise InputError(f"{name}: a flight needs a time of at least two rows")
     wanted = shapes(flight.plant)
+    if "hidden" in flight.arrays:
+        own = np.shape(flight["hidden"])
+        wanted["hidden"] = (*wanted["follower_command"][:-1], own[-1] if own and own[-1] else 1)
     for field, shape in wanted.items():
         array = flight.arrays.get(field)
         if array is None or array.dtype.kind != "f" or array.shape != rows + shape:
@@ -124,20 +131,30 @@ def is_flight(path: Path) -> bool:
         return False
 
 
-def flight_from(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None = None) -> Flight:
-    """The flight that `source` names.
+def flight_from(
+    source: str, changes: Mapping[str, Any], physics: str, plant: Path | None = None, hidden: bool = False
+) -> Flight:
+    """The flight that `source` names; with `hidden`, what its follower's GRU remembers as well.
 
     A flight file or a flight log is read. A policy file, a run directory (its `policy.npz`) or the name of a classical
     follower is flown through its reference scenario with `changes` to the fields of `Scenario`, on the paper's plant;
     a policy made for Crazyflies on its own; or on `plant`, a plant file or a shipped one's name. Raises InputError if
-    it is none of these.
+    it is none of these, or has no GRU where its state is asked for.
     """
     path = Path(source)
     if path.suffix == ".npz" and path.is_file() and is_flight(path):
-        return load_flight(path)
-    if path.is_file() and path.suffix != ".npz":
-        return read_log(path)
-    return _flown(source, changes, physics, plant)
+        found = load_flight(path)
+    elif path.is_file() and path.suffix != ".npz":
+        found = read_log(path)
+    else:
+        found = _flown(source, changes, physics, plant, hidden)
+    if hidden and "hidden" not in found.arrays:
+        raise InputError(f"{source} holds no state of a recurrent network that could be shown")
+    return found if hidden else dataclasses.replace(found, arrays=_without_hidden(found.arrays))
+
+
+def _without_hidden(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: array for name, array in arrays.items() if name != "hidden"}
 
 
 def read_log(path: Path) -> Flight:
@@ -168,12 +185,13 @@ def read_log(path: Path) -> Flight:
         "object_mass": np.full(rows, recording.config.plant.object_mass),
         "contact_force": np.zeros((rows, 2, 3)),
         "target": recording.goal,
+        **({"hidden": np.nan_to_num(recording.hidden)} if recording.hidden.shape[1] else {}),
     }
     title = f"{recording.policy}, flown (ball and contact forces were not measured)"
     return check_flight(Flight(title, recording.config.plant, arrays), str(path))
 
 
-def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None) -> Flight:
+def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None, hidden: bool) -> Flight:
     from mjxball.baselines import LAWS, make_baseline
     from mjxball.evaluate.policies import load_policy, native_config
     from mjxball.evaluate.scenarios import standard_scenarios
@@ -199,7 +217,19 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
     motion = f"CG {reach}{100 * scenario.amplitude:g} cm at {scenario.omega:g} rad/s"
     if setup.motion.kind == "rolling":
         motion = f"ball from {100 * scenario.ball_start:g} cm"
-    return flight_of(flown, setup.plant, f"{follower.name}: {motion}, {scenario.mass:g} kg")
+    remembered = _remembered(follower, flown.observation) if hidden else None
+    return flight_of(flown, setup.plant, f"{follower.name}: {motion}, {scenario.mass:g} kg", remembered)
+
+
+def _remembered(follower: Any, observations: np.ndarray) -> np.ndarray | None:
+    """The state (T, [followers,] H) of the GRU of `follower` after each of `observations`; None if it has none."""
+    rows = []
+    if hasattr(follower, "hidden"):
+        follower.reset()
+        for seen in observations:
+            follower(seen)
+            rows.append(follower.hidden)
+    return np.array(rows, float) if rows and rows[0] is not None else None
 
 
 def _policy_file(path: Path) -> Path:

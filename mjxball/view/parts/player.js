@@ -109,7 +109,7 @@ class Player {
   makePlots() {
     const parent = document.getElementById('plots');
     return this.recipes().map(({ title, unit, series }) =>
-      new Plot(parent, title, unit, this.flight.time, series, (time) => this.seek(time)));
+      new (series[0].rows ? Strips : Plot)(parent, title, unit, this.flight.time, series, (time) => this.seek(time)));
   }
 
   // What is plotted of the arrays that the flight has.
@@ -137,6 +137,8 @@ class Player {
     plot('leader_command', 'Commanded vertical acceleration', 'm/s²', () => command(2, 1));
     plot('thrust', 'Thrust', 'N', () => of('thrust'));
     plot('contact_force', 'Contact force on the object', 'N', () => drones.map(([name, colour], k) => line(name, colour, push(k))));
+    plot('hidden', 'What the follower’s network remembers', 'units, −1 blue to 1 red', () => [{
+      name: '', colour: 'transparent', values: flight.arrays.hidden, rows: flight.arrays.hidden.length / flight.rows }]);
     plot('battery', 'Battery', 'V', () => of('battery'));
     plot('late', 'Lateness of the loop', 'ms', () => [line('late', COLOURS.weight, flight.column('late', 0, 1000))]);
     return found;

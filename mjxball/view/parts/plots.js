@@ -95,7 +95,7 @@ class Plot {
     c.beginPath(); c.rect(LEFT, 0, width - LEFT - RIGHT, height); c.clip();
     c.lineWidth = 1.5;
     c.lineJoin = 'round';
-    for (const { values, colour, dash } of this.series) {
+    for (const { values, colour, dash } of this.series.filter(({ rows }) => !rows)) {
       c.strokeStyle = colour;
       c.setLineDash(dash || []);
       c.beginPath();
@@ -124,6 +124,28 @@ class Plot {
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     c.strokeStyle = '#1d2329';
     c.beginPath(); c.moveTo(this.x(this.time[row]), TOP); c.lineTo(this.x(this.time[row]), height - BOTTOM); c.stroke();
-    this.series.forEach(({ values }, k) => { this.readouts[k].textContent = short(values[row]); });
+    this.series.forEach(({ values, rows }, k) => { this.readouts[k].textContent = rows ? '' : short(values[row]); });
+  }
+}
+
+// Many values from -1 to 1 over time, one row of colour each: red is positive, blue negative.
+class Strips extends Plot {
+  range() { [this.low, this.high] = [0, this.series[0].rows]; }
+
+  still(width, height, ratio) {
+    const [{ rows, values }] = this.series, { time, from, to } = this;
+    const picture = super.still(width, height, ratio), c = picture.getContext('2d');
+    const tall = (height - TOP - BOTTOM) / rows, wide = Math.ceil(width - LEFT - RIGHT);
+    let row = 0;
+    for (let x = 0; x < wide; x++) {
+      const now = from + (to - from) * x / wide;
+      while (row < time.length - 1 && time[row + 1] <= now) row++;
+      for (let unit = 0; unit < rows; unit++) {
+        const value = values[row * rows + unit], shade = Math.round(235 * (1 - Math.min(1, Math.abs(value))));
+        c.fillStyle = value > 0 ? `rgb(235 ${shade} ${shade})` : `rgb(${shade} ${shade} 235)`;
+        c.fillRect(LEFT + x, TOP + (rows - 1 - unit) * tall, 1.5, tall + 0.5);
+      }
+    }
+    return picture;
   }
 }
