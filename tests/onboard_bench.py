@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import shutil
 from pathlib import Path
@@ -25,19 +24,13 @@ AT_REST = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zer
 
 
 def policy_of(name: str) -> PolicyFile:
-    """The shipped policy, or "recurrent NAME"; that of teams with commands which a pair of Crazyflies can follow."""
-    if name.startswith("recurrent "):
-        return in_pair(onboard.recurrent(name.split()[1]))
-    policy = load_file(shipped_policy(name))
-    if name != "team":
-        return policy
-    gentle = dataclasses.replace(policy, card={**policy.card, "command_limits": [0.26, 0.4]})
-    return in_pair(gentle)
+    """The shipped policy for a pair of Crazyflies, or "recurrent flight"."""
+    return onboard.recurrent() if name == "recurrent flight" else in_pair(load_file(shipped_policy(name)))
 
 
 def in_pair(policy: PolicyFile) -> PolicyFile:
     """Told that it flies a pair of Crazyflies, if it has to be told."""
-    return in_team(policy, "follower", Path("crazyflie")) if law_of(policy.card).needs_context else policy
+    return in_team(policy, "follower", Path("crazyflie")) if law_of(policy.card).geometry else policy
 
 
 @functools.cache

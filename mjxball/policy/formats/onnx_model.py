@@ -16,7 +16,7 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from mjxball.control import observation as layout
 from mjxball.policy.file import PolicyFile, law_of
-from mjxball.policy.policy import NetworkLaw, Policy, known_context
+from mjxball.policy.policy import NetworkLaw, Policy, known_geometry
 
 Array = Any
 OPSET, IR_VERSION = 17, 8  # of 2022: read by every runtime of the last years
@@ -222,13 +222,13 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
 
     Inputs: `observation` (N, 18); with a memory of m numbers also `memory` (N, m) and `start` (N, 1) bool, true at
     the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
-    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m). A policy of format 3
-    or 4 is that of the one follower that `team` in its card names, and sees and commands in its mount frame.
+    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m). A policy that is
+    told its team is that of the one follower that `team` in its card names, and sees and commands in its mount frame.
     """
     graph, around = Graph(), law_of(contents.card)
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
-    memory = around.start(observation, known_context(contents.card, name))
+    memory = around.start(observation, known_geometry(contents.card, name))
     if around.size:
         inputs += [_value("memory", TensorProto.FLOAT, around.size), _value("start", TensorProto.BOOL, 1)]
         start, given = TracedArray(graph, "start", 1), TracedArray(graph, "memory", around.size)
