@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import shutil
 from pathlib import Path
@@ -24,8 +25,13 @@ AT_REST = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zer
 
 
 def policy_of(name: str) -> PolicyFile:
-    """The shipped policy for a pair of Crazyflies, or "recurrent flight"."""
-    return onboard.recurrent() if name == "recurrent flight" else in_pair(load_file(shipped_policy(name)))
+    """The shipped policy, or "recurrent flight"; for any rig with commands that a pair of Crazyflies can follow."""
+    if name == "recurrent flight":
+        return onboard.recurrent()
+    policy = load_file(shipped_policy(name))
+    if name != "universal":
+        return policy
+    return in_pair(dataclasses.replace(policy, card={**policy.card, "command_limits": [0.26, 0.4]}))
 
 
 def in_pair(policy: PolicyFile) -> PolicyFile:

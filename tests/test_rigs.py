@@ -124,7 +124,7 @@ def test_a_padded_rig_flies_as_it_does_alone() -> None:
     flown = []
     for config, table in ((UNIVERSAL, rigs), (alone, unpadded(rigs, 3))):
         still = dataclasses.replace(config.scenario, noise=(0.0, 0.0), delay=(0.0, 0.0), estimator_drift=(0.0, 0.0))
-        simple = dataclasses.replace(config.follower, base="pd")
+        simple = dataclasses.replace(config.follower, recurrent_units=0)
         env = TransportEnv(dataclasses.replace(config, scenario=still, follower=simple), "newton-euler")
         own = jax.tree.map(lambda part: jnp.asarray(part[1], jnp.float32), table)
         state, step = jax.jit(env.reset)(jax.random.key(3), 1.0, None, own), jax.jit(env.step)
@@ -250,7 +250,7 @@ class TestUniversal:
             assert felt[half].mean() > 0.3
 
     def test_a_rig_outside_is_flown_with_a_warning(self, capsys: pytest.CaptureFixture[str]) -> None:
-        load_policy(POLICY, with_plant(UNIVERSAL, "team4"))
+        load_policy(POLICY, with_plant(preset("transport"), "team4"))
         assert "trained from" not in capsys.readouterr().err  # more drones than its card is good for, but of its ranges
         paper = preset("paper")
         load_policy(POLICY, paper)
