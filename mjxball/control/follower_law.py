@@ -78,13 +78,16 @@ class FollowerLaw(NamedTuple):
         seen = self.history.network_input(observation, memory[..., : self.history.size])
         if not self.units:
             return seen
-        xp, behind = observation.__array_namespace__(), self.history.size + self.units
-        hidden, told = memory[..., self.history.size : behind], memory[..., behind:]
+        xp, told = observation.__array_namespace__(), memory[..., self.history.size + self.units :]
         small = [
             xp.tanh(observation[..., part] * (1 / scale))
             for part, scale in ((ERROR, NEAR_ERROR), (ERROR_RATE, NEAR_ERROR_RATE))
         ]
-        return xp.concat([seen, *small, told, hidden], axis=-1)
+        return xp.concat([seen, *small, told, self.hidden(memory)], axis=-1)
+
+    def hidden(self, memory: Array) -> Array:
+        """State (..., H) of the network's GRU in `memory` (..., m)."""
+        return memory[..., self.history.size : self.history.size + self.units]
 
     def command(self, scaled: Array, observation: Array) -> Array:
         """Command (..., 3) of a network action `scaled` in [-1, 1] (..., 3) at `observation` (..., 18).

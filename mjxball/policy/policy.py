@@ -108,9 +108,8 @@ class Policy:
     @property
     def hidden(self) -> Array | None:
         """State of the network's GRU (..., H) in `memory`, each number from -1 to 1; None: no GRU, or nothing yet."""
-        units, first = self._law.units, self._law.history.size
-        memory = self.memory if units else None
-        return None if memory is None else memory[..., first : first + units]
+        memory = self.memory if self._law.units else None
+        return None if memory is None else self._law.hidden(memory)
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which share neither the buffers of `_single` nor the thread."""
@@ -118,7 +117,7 @@ class Policy:
 
     def scaled(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
-        return self._answer(observation)[0]
+        return np.asarray(self._answer(observation)[0], self._dtype)
 
     def __call__(self, observation: Array) -> Array:
         """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18).
@@ -126,7 +125,7 @@ class Policy:
         Raises InputError for what is no observation (`checked_observation`) or has no finite answer, and remembers
         nothing of it; RuntimeError if the flight that it remembers is another thread's.
         """
-        return self._answer(observation)[1]
+        return np.asarray(self._answer(observation)[1], self._dtype)
 
     def _answer(self, observation: Array) -> tuple[Array, Array]:
         """(action in [-1, 1], command) for `observation`, remembered if need be."""
@@ -160,7 +159,7 @@ class Policy:
         if found is None:
             return None
         self._ahead = True
-        return np.array(found[0], self._dtype), np.array(found[1], self._dtype)
+        return found
 
     def _checked(self, memory: Array) -> Array:
         """A copy of `memory`, or InputError unless it is one that this policy may have."""
@@ -171,8 +170,7 @@ class Policy:
             own = np.array(given, self._dtype)
         if not np.isfinite(own).all():
             raise InputError(f"a memory of policy {self.name} must be finite, and this one is not finite")
-        first = self._law.history.size
-        if (np.abs(own[..., first : first + self._law.units]) > 1 + ROUNDED).any():
+        if (np.abs(self._law.hidden(own)) > 1 + ROUNDED).any():
             raise InputError(f"a memory of policy {self.name} has a GRU's state beyond 1: it is another policy's")
         return own
 
@@ -195,14 +193,9 @@ class NetworkLaw:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
         return self._law.start(observation, _known(self.name, self._law, self._geometry))
 
-    @property
-    def units(self) -> int:
-        """H of the network's GRU, whose state ends what is `shown`; 0 without one."""
-        return self._law.units
-
-    def shown(self, observation: Array, memory: Array) -> Array:
-        """What the network sees of its `memory` (..., s)."""
-        return self._law.network_input(observation, memory)[..., layout.OBSERVATION_SIZE :]
+    def hidden(self, memory: Array) -> Array:
+        """State (..., H) of the network's GRU in `memory` (..., m)."""
+        return self._law.hidden(memory)
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""

@@ -11,9 +11,11 @@ import math
 
 import numpy as np
 
-from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, FollowerLaw
+from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, SATURATED, FollowerLaw
 from mjxball.control.network import Network
 from mjxball.control.observation import ACTION_SIZE, ERROR, ERROR_RATE, OBSERVATION_SIZE
+
+PER_ERROR = 1 / NEAR_ERROR, 1 / NEAR_ERROR_RATE
 
 
 class SingleFollower:
@@ -28,7 +30,6 @@ class SingleFollower:
         history, size, units = law.history, OBSERVATION_SIZE + law.history.size, law.units
         self._recurrent, self._residual = units > 0, law.residual
         self._reach, self._limits, self._gains = law.action_scale, law.limits, (law.gravity, *law.kp, *law.kd)
-        self._told: list[float] = []
         features = law.input_size - size  # what a recurrent network sees besides
         unit = np.eye(size + ACTION_SIZE)
         observation, past, action = np.split(unit, [OBSERVATION_SIZE, size], axis=1)
@@ -44,24 +45,26 @@ class SingleFollower:
         first = normal @ weights[0][units:]
         first[one] += network.biases[0]
         self._first = np.concatenate([*_halved(normal, one, network), first], axis=1)
-        self._of_state, self._seen = weights[0][:units].copy(), np.zeros(self._first.shape[1])
+        self._of_state, self._seen = 0.5 * weights[0][:units], np.zeros(self._first.shape[1])
         self._gates, self._kept, self._candidate, self._below = np.split(self._seen, np.cumsum([2, 1, 1]) * units)
         self._reset, self._update = np.split(self._gates, 2)
         self._change, self._of_next = np.zeros(units), np.zeros(first.shape[1])
-        # Units of a layer, a 1, and in the last the GRU's next state -> the layer above.
+        # Units of a layer, a 1, and in the last twice the GRU's next state -> the layer above.
         outputs = [np.ones(weight.shape[1] + 1) for weight in weights[:-1]]
         outputs[-1] = np.ones(len(outputs[-1]) + units)
         widths = [weight.shape[1] for weight in weights[:-1]]
         above = [np.insert(*row, axis=0) for row in zip(weights[1:], widths, network.biases[1:], strict=True)]
+        above[-1][widths[-1] + 1 :] *= 0.5
         self._inner = outputs[0][: widths[0]]
         parts = zip(outputs[:-1], above[:-1], outputs[1:], widths[1:], strict=True)
         self._layers = [(given, weight, output[:width]) for given, weight, output, width in parts]
-        self._top, self._last, self._next = outputs[-1], above[-1], outputs[-1][widths[-1] + 1 :]
+        self._top, self._last, self._twice = outputs[-1], above[-1], outputs[-1][widths[-1] + 1 :]
         seen = np.zeros(one + 1 + size + ACTION_SIZE)
         seen[one] = 1.0
-        self._state, self._features, self._input = seen[:units], seen[units:one], seen[:-ACTION_SIZE]
-        self._past = seen[one + 1 :]
+        self._state, self._near, self._told, _ = np.split(seen, [units, units + (SATURATED if units else 0), one])
+        self._input, self._past = seen[:-ACTION_SIZE], seen[one + 1 :]
         self._observation, self._history, self._action = np.split(self._past, [OBSERVATION_SIZE, size])
+        self._errors, self._per_error = self._observation[ERROR.start : ERROR_RATE.stop], np.repeat(PER_ERROR, 3)
         self._zero, self._half = np.zeros(()), np.full((), 0.5)
 
     @property
@@ -71,26 +74,23 @@ class SingleFollower:
 
     @memory.setter
     def memory(self, memory: np.ndarray) -> None:
-        history, state = self._history, self._state
-        history[:], state[:], told = np.split(memory, np.cumsum([history.size, state.size]))
-        self._told = told.tolist()
+        history, state, told = self._history, self._state, self._told
+        history[:], state[:], told[:] = np.split(memory, np.cumsum([history.size, state.size]))
 
     def answer(self, observation: np.ndarray) -> tuple[list[float], list[float]] | None:
         """(action in [-1, 1] (3), command (3)) for `observation` (18,), which is remembered.
 
         None, and nothing is remembered, if the command is not finite.
         """
-        seen = observation.tolist()
-        error, rate = seen[ERROR], seen[ERROR_RATE]
         self._observation[:] = observation
         if self._recurrent:
-            small = [value / NEAR_ERROR for value in error] + [value / NEAR_ERROR_RATE for value in rate]
-            self._features[:] = [*map(math.tanh, small), *self._told]
+            np.multiply(self._errors, self._per_error, out=self._near)
+            np.tanh(self._near, out=self._near)
         action = self._act()
         (tilt, vertical), (tilt_limit, vertical_limit) = self._reach, self._limits
         roll, pitch, rise = tilt * action[0], tilt * action[1], vertical * action[2]
         if self._residual:  # added to `observation.copy_command`
-            (x, y, z), (vx, vy, vz) = error, rate
+            x, y, z, vx, vy, vz = self._errors.tolist()
             gravity, kp_x, kp_y, kp_z, kd_x, kd_y, kd_z = self._gains
             roll += _clipped(-(kp_y * y + kd_y * vy) / gravity, tilt_limit)
             pitch += _clipped((kp_x * x + kd_x * vx) / gravity, tilt_limit)
@@ -100,7 +100,7 @@ class SingleFollower:
             return None
         self._action[:] = action
         self._history[:] = np.dot(self._past, self._next_history)
-        self._state[:] = self._next
+        np.multiply(self._twice, self._half, out=self._state)
         return action, command
 
     def _act(self) -> list[float]:
@@ -115,18 +115,17 @@ class SingleFollower:
         return [math.tanh(value) for value in np.dot(self._top, self._last).tolist()]
 
     def _advance(self) -> None:
-        """The next state, and what the first layer sees of it: `control.network.gru_cell`."""
-        state, candidate, change, following = self._state, self._candidate, self._change, self._next
+        """Twice the next state, and what the first layer sees of it: `control.network.gru_cell`."""
+        state, candidate, change, twice = self._state, self._candidate, self._change, self._twice
         np.tanh(self._gates, out=self._gates)
         np.multiply(self._reset, self._kept, out=self._kept)
         np.add(candidate, self._kept, out=candidate)
         np.tanh(candidate, out=candidate)
         np.subtract(state, candidate, out=change)
         np.multiply(change, self._update, out=change)
-        np.add(state, candidate, out=following)
-        np.add(following, change, out=following)
-        np.multiply(following, self._half, out=following)
-        np.dot(following, self._of_state, out=self._of_next)
+        np.add(state, candidate, out=twice)
+        np.add(twice, change, out=twice)
+        np.dot(twice, self._of_state, out=self._of_next)
         np.add(self._below, self._of_next, out=self._below)
 
 
