@@ -137,15 +137,20 @@ def test_a_padded_rig_flies_as_it_does_alone() -> None:
 
 @pytest.mark.slow
 def test_training_differentiates_what_followers_remember() -> None:
-    """The slope of what is commanded later in the first action, of which the filters know: against a difference."""
+    """The slope of what is commanded later in the first action, by a state that sums up rates: against a difference."""
     config = UNIVERSAL
     for setting, value in (("rigs.number", 2), ("scenario.team_sizes", (2,)), ("scenario.delay", (0.0, 0.0))):
         config = replace(config, setting, value)
     env = TransportEnv(config, "newton-euler")
-    start, first = env.reset(jax.random.key(1)), jnp.zeros((20, 3, 3)).at[0].set(jnp.array([0.3, -0.5, 0.2]))
+    start, first = env.reset(jax.random.key(1)), jnp.zeros((20, 5, 3)).at[0].set(jnp.array([0.3, -0.5, 0.2]))
 
     def cost(push: Any) -> Any:
-        states = lambda state, action: (env.step(state, action), state.pipeline_state.command)  # noqa: E731
+        def states(state: Any, action: Any) -> Any:
+            hidden = state.obs[..., env.recurrent_slots]
+            later = hidden.at[..., :3].set(0.9 * hidden[..., :3] + 0.3 * state.obs[..., 9:12])
+            answer = jnp.concatenate([action + hidden[..., :3], later], axis=-1)
+            return env.step(state, answer), state.pipeline_state.command
+
         _, commands = jax.lax.scan(states, start, push * first)
         return (commands[2:, 0] * jnp.array([1.0, 1.0, 0.1])).sum()
 
