@@ -147,7 +147,7 @@ def test_training_differentiates_what_followers_remember() -> None:
     def cost(push: Any) -> Any:
         def states(state: Any, action: Any) -> Any:
             hidden = state.obs[..., env.recurrent_slots]
-            later = hidden.at[..., :3].set(0.9 * hidden[..., :3] + 0.3 * state.obs[..., 9:12])
+            later = hidden.at[..., :3].set(0.9 * hidden[..., :3] + 0.2 * state.obs[..., 9:12])
             answer = jnp.concatenate([action + hidden[..., :3], later], axis=-1)
             return env.step(state, answer), state.pipeline_state.command
 
