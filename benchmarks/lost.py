@@ -1,6 +1,6 @@
 """Teams that lose a follower in flight: how many flights the rotors that are left can trim, and who holds these.
 
-    python benchmarks/lost.py policies/team.npz policies/lost.npz --json benchmarks/results/lost.json
+    python benchmarks/lost.py policies/lost.npz policies/universal.npz --json benchmarks/results/lost.json
 
 Random flights of `team6`: mass, elliptic CG path, goal, which follower's rotors stop and when. A flight counts where
 `mjxball.plant.trim` finds 15 % margin at every point of the path with that drone lost, the leader on its hover law. It
@@ -38,8 +38,6 @@ FLIGHTS, SECONDS = 200, 40.0
 MASSES, AMPLITUDES, SPEEDS, TIMES = (0.05, 0.4), (0.0, 0.3), (0.1, 3.1), (5.0, 15.0)  # [kg] for each drone, [m], ...
 POINTS = 24  # of a path
 CLASSICAL = ("copy", "adaptive", "adaptive-mass", "lqg", "lqg-offset-free", "lqg-known-failures")
-# Share of the load's torque that `lqg-offset-free` lifts apart here.
-LIFTED = preset("lost").follower.differential_thrust_share
 VERTICAL_LIMIT, USUAL_LIMIT = 12.0, 6.0  # of commands [m/s2]
 HELD, LAST = 0.05, 10.0  # [m] in the last seconds
 COMES_DOWN = 5.0  # [s] after the loss in which team4's descent is measured
@@ -118,9 +116,7 @@ def margin(config: Config, scenario: Scenario) -> float:
 
 def flying(config: Config, names: Sequence[str], policies: Sequence[Path]) -> list[tuple[Config, Follower]]:
     """Classical followers and policies, each with the configuration that it flies with."""
-    apart = replace(replace(config, "follower.base", "lqg"), "follower.differential_thrust_share", LIFTED)
-    setups = [apart if name == "lqg-offset-free" else config for name in names]
-    made = [(setup, make_baseline(name, setup)) for name, setup in zip(names, setups, strict=True)]
+    made: list[tuple[Config, Follower]] = [(config, make_baseline(name, config)) for name in names]
     for path in policies:
         try:
             made.append((config, load_policy(path, config)))

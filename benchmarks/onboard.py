@@ -1,10 +1,10 @@
 """Followers on board: the same C on this computer and on a Cortex-M4F, its size, stack and time; weights of 8 bits.
 
 `python benchmarks/onboard.py [--policies FILE ...] [--observations 10000] [--json FILE]` needs gcc, gcc-arm-none-eabi
-and qemu-system-arm; without FILE it takes the shipped policies and recurrent ones of random weights. One step from the
-same memory, outputs compared bit for bit between both machines and with NumPy in float32. Time: instructions of a call
-under QEMU times the weights of `cortex.py`, at 168 MHz. Flash and stack are those of the whole core of a follower's
-app, law, network and supervisor, where the policy is one of a pair.
+and qemu-system-arm; without FILE it takes the shipped policies and a recurrent one of random weights for two
+Crazyflies. One step from the same memory, outputs compared bit for bit between both machines and with NumPy in float32.
+Time: instructions of a call under QEMU times the weights of `cortex.py`, at 168 MHz. Flash and stack are those of the
+whole core of a follower's app, law, network and supervisor, where the policy is one of a pair.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 import cortex
-from mjxball.control.team_lqg import TeamLqg
 from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.fly.app.generate import CORE, options, rig_header, sources
@@ -32,7 +31,7 @@ from mjxball.policy.formats.c_header import APP, c_header, footprint
 
 FLIGHT = 500  # steps of a flight
 PAIR = Path("pair")  # the plant of a policy that has to be told its team
-RECURRENT = {"flight": (48, 32), "universal": (64, 48)}  # units and head of followers for a pair and for any rig
+UNITS, HEAD = 48, 32  # of a recurrent follower for a pair of Crazyflies
 MAIN = r"""
 #include "policy.h"
 int file_open(const char *name, int write);
@@ -79,7 +78,7 @@ def flown(policy: PolicyFile, steps: int) -> tuple[np.ndarray, np.ndarray]:
         for noise in random.normal(scale=math.sqrt(1 - kept**2), size=(FLIGHT, 18)):
             place = kept * place + noise
             seen = (policy.observation_mean[:18] + spread * place).astype(np.float32)
-            memory = follower.memory if follower.memory is not None else follower._law.start(seen, follower._context)
+            memory = follower.memory if follower.memory is not None else follower.law.start(seen)
             records.append(np.concatenate([memory, seen]).astype(np.float32))
             actions.append(follower.scaled(seen))
     return np.array(records[:steps]), np.array(actions[:steps])
@@ -117,15 +116,12 @@ def cost(policy: PolicyFile, place: Path, int8: bool) -> dict[str, Any]:
     return {**row, "flash": cortex.sizes(place, flags, "core.c"), "stack": stack}
 
 
-def recurrent(name: str, units: int | None = None) -> PolicyFile:
-    """The shipped policy `name`, one of RECURRENT, with a GRU of random weights in place of its network and law."""
-    policy, random = load_file(shipped_policy(name)), np.random.default_rng(2)
-    own, head = RECURRENT[name]
-    units = own if units is None else units
-    left_out = {"lqg", "filters", "flown"}
-    card = {field: value for field, value in policy.card.items() if field not in left_out}
+def recurrent(units: int = UNITS) -> PolicyFile:
+    """The shipped policy `flight` with a GRU of random weights in place of its network."""
+    policy, random = load_file(shipped_policy("flight")), np.random.default_rng(2)
+    card = {field: value for field, value in policy.card.items() if field not in ("filters", "flown")}
     card |= {"format_version": 5, "recurrent_units": units, "previous_action": True}
-    size = 18 + law_of(card).shown - units
+    size = law_of(card).input_size
 
     def layer(inputs: int, outputs: int) -> np.ndarray:
         return random.normal(scale=inputs**-0.5, size=(inputs, outputs)).astype(np.float32)
@@ -135,25 +131,15 @@ def recurrent(name: str, units: int | None = None) -> PolicyFile:
         card=card,
         observation_mean=np.zeros(size, np.float32),
         observation_scale=np.append(policy.observation_scale[:18], np.ones(size - 18)).astype(np.float32),
-        weights=(layer(size + units, head), layer(head + units, 6)),
-        biases=(layer(1, head)[0], layer(1, 6)[0]),
+        weights=(layer(size + units, HEAD), layer(HEAD + units, 6)),
+        biases=(layer(1, HEAD)[0], layer(1, 6)[0]),
         gru=(layer(size, 3 * units), layer(units, 3 * units), layer(1, 3 * units)[0]),
     )
 
 
-def policy_of(path: Path) -> PolicyFile:
-    """The policy in `path`, see `placed`."""
-    return placed(load_file(path), path.stem)
-
-
 def placed(policy: PolicyFile, name: str) -> PolicyFile:
-    """`policy` as the follower of a pair if it has to be told, or of its own team if it flies no pair."""
-    law = law_of(policy.card)
-    if not law.needs_context:
-        return policy
-    if isinstance(law.lqg, TeamLqg) and law.lqg.lifting:
-        return in_team(policy, name, Path(f"team{len(policy.card['plant']['drones'])}"), 2)
-    return in_team(policy, name, PAIR)
+    """`policy` as the follower of a pair, if it has to be told."""
+    return in_team(policy, name, PAIR) if law_of(policy.card).geometry else policy
 
 
 def measure(policy: PolicyFile, name: str, int8: bool, steps: int) -> dict[str, Any]:
@@ -176,9 +162,9 @@ def main() -> int:
         return 2
     names = f"{'error':>8} {'rms':>8} {'flash B':>8} {'stack B':>8} {'instr.':>8} {'ms':>6}"
     print(f"{'policy':18} {'weights':8} identical {names}")
-    policies = {path.stem: policy_of(path) for path in options.policies or shipped_policies()}
+    policies = {path.stem: placed(load_file(path), path.stem) for path in options.policies or shipped_policies()}
     if not options.policies:
-        policies |= {f"recurrent {name}": placed(recurrent(name), name) for name in RECURRENT}
+        policies["recurrent flight"] = recurrent()
     rows = []
     for name, policy in policies.items():
         for int8 in (False, True):

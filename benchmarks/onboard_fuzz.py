@@ -28,16 +28,14 @@ DRIVER = Path(__file__).with_suffix(".c")
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
 SANITIZERS = ("-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all")
 POLICIES = (  # name, weights of 8 bits
-    *(("flight", False), ("flight", True), ("universal", False), ("stand", True)),
-    *(("recurrent flight", True), ("recurrent universal", False)),
+    *(("flight", False), ("flight", True), ("universal", False), ("stand", True), ("recurrent flight", True)),
 )
 
 
 def sources_of(name: str, int8: bool) -> dict[str, str]:
     """The app's C without the firmware's interface, by file name."""
-    recurrent, _, last = name.rpartition(" ")
-    policy = onboard.recurrent(last) if recurrent else load_file(shipped_policy(name))
-    files = files_of(in_team(policy, name, Path("crazyflie")) if last == "universal" else policy, name, int8)
+    policy = onboard.recurrent() if name == "recurrent flight" else load_file(shipped_policy(name))
+    files = files_of(in_team(policy, name, Path("crazyflie")) if name == "universal" else policy, name, int8)
     return {one: files[f"src/{one}"] for one in (*CORE, "policy.h", "rig.h")}
 
 

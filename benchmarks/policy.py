@@ -1,14 +1,13 @@
-"""Microseconds per command of a NumPy follower: shipped policies, and the first one with a random 2 x 256 network.
+"""Microseconds per command of a NumPy follower: a policy for a pair, one for any rig, and one without a GRU.
 
 `python benchmarks/policy.py [POLICY.npz ...] [--plant NAME or FILE.toml] [--json FILE]`. One observation at a time, as
-in flight (18), and as a batch of one (1 x 18), which the laws of arrays answer in every format. A policy that has to be
+in flight (18), and as a batch of one (1 x 18), which the law of arrays answers. A policy that has to be
 told its team is told of the first follower of `--plant`, by default the pair.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
 import json
 import statistics
@@ -19,30 +18,20 @@ from pathlib import Path
 import numpy as np
 
 from mjxball.cli import plant_setup
-from mjxball.control.observation import ACTION_SIZE, OBSERVATION_SIZE
+from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.export import in_team
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.file import law_of, shipped_policy
 
-SHIPPED = [shipped_policy(name) for name in ("balance", "universal")]
+SHIPPED = [shipped_policy(name) for name in ("balance", "universal", "flight")]
 SHAPES = {"18": (OBSERVATION_SIZE,), "1 x 18": (1, OBSERVATION_SIZE)}
 CALLS = 200  # in one repetition
 REPETITIONS = 100
 
 
-def widened(contents: PolicyFile, width: int) -> PolicyFile:
-    """The same file with two random hidden layers of `width` units."""
-    draw = np.random.default_rng(0)
-    sizes = (contents.observation_mean.size, width, width, 2 * ACTION_SIZE)
-    shapes = list(itertools.pairwise(sizes))
-    weights = tuple((draw.normal(size=shape) / np.sqrt(shape[0])).astype(np.float32) for shape in shapes)
-    biases = tuple(np.zeros(shape[1], np.float32) for shape in shapes)
-    return dataclasses.replace(contents, weights=weights, biases=biases)
-
-
 def told(contents: PolicyFile, plant: Path) -> PolicyFile:
     """`contents` as the first follower on `plant` flies it, if it has to be told its team."""
-    if not law_of(contents.card).needs_context:
+    if not law_of(contents.card).geometry:
         return contents
     return in_team(contents, "policy", plant, plant_setup(plant).plant.followers[0])
 
@@ -77,7 +66,6 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows as JSON")
     options = parser.parse_args()
     measured = {"/".join(path.parts[-2:]): told(load_file(path), options.plant) for path in options.policies}
-    measured["random"] = widened(next(iter(measured.values())), 256)
     cases = list(itertools.product(measured.items(), SHAPES.items()))
     times = microseconds([(Policy(contents, name), shape) for (name, contents), (_, shape) in cases])
     rows = []

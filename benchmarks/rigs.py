@@ -42,7 +42,7 @@ from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Copy, Law
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import flies_any_rig, load_policy
-from mjxball.evaluate.rigs import AnyRigBase, AnyRigLaw, Flown, cg_jumps, fly, mass_changes, rig_laws
+from mjxball.evaluate.rigs import AnyRigLaw, Flown, cg_jumps, fly, mass_changes, rig_laws
 from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw
 from mjxball.sim.rigs import (
@@ -117,7 +117,6 @@ def followers(paths: Sequence[Path]) -> list[Made]:
     return [
         ("lqg-known-rig", lambda config, rigs: rig_laws(config, rigs, KnownRigLqg)),
         ("lqg-slow-known-rig", lambda config, rigs: rig_laws(config, rigs, SlowKnownRigLqg)),
-        ("lqg-multi-model", lambda config, rigs: AnyRigBase(config)),
         ("copy", lambda config, rigs: Copy(config)),
         ("adaptive-mass", lambda config, rigs: rig_laws(config, rigs, _adaptive)),
         *((path.stem, functools.partial(network, path)) for path in paths),
@@ -333,7 +332,7 @@ def _draw(curves: dict[Any, list[np.ndarray]], period: float, path: Path) -> Non
     figure.savefig(path, dpi=120)
 
 
-WORST = ("lqg-multi-model", "copy", "adaptive-mass")  # not of the steps, nor outside of training
+WORST = ("copy", "adaptive-mass")  # not of the steps, nor outside of training
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ class OwnWeights(AnyRigLaw):
 
     def __init__(self, policy: Policy):
         plain = AnyRigLaw(policy)
-        self.name, self._parts, self._context = plain.name, plain._parts, None
+        self.name, self._network, self._geometry = plain.name, plain._network, None
         self._shared = lambda: plain._law
 
     @property
@@ -115,9 +115,7 @@ def train(config: Config, rigs: RigTable, policy: PolicyFile, options: Any) -> l
                 print(f"{size} drones: {count + 1} gradients, loss {np.median(state.loss):.3f}", file=sys.stderr)
     algorithm, known = parts(first)[1], jax.tree.map(np.asarray, state)
     one = lambda row: jax.tree.map(lambda leaf: leaf[row], known)  # noqa: E731
-    law = {name: numbers for name, numbers in policy.card["lqg"].items() if name != "by_size"}  # as in training
-    plain = dataclasses.replace(policy, card={**policy.card, "lqg": law})
-    return [with_network(plain, algorithm.policy(one(row))) for row in range(rigs.total)]
+    return [with_network(policy, algorithm.policy(one(row))) for row in range(rigs.total)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

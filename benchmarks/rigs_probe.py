@@ -143,16 +143,16 @@ def _of_flights(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flown(env: TransportEnv, law: NetworkLaw, state: Any, truth: Callable[[PipelineState], Any]) -> tuple[Any, Any]:
-    """(what the first follower's network sees of its memory (T, s), `truth` (T, t)) at `TIMES`."""
+    """(what the first follower's GRU remembers (T, s), `truth` (T, t)) at `TIMES`."""
     ends = np.array([round(time / env.dt) for time in TIMES])
 
     def step(carry: Any, _: None) -> Any:
         state, memory = carry
         observation = state.obs[..., :OBSERVATION_SIZE]
-        seen = law.shown(observation, memory)
+        seen = law.hidden(memory)
         memory, command = law.step(memory, observation, None)
         state = env.step_with_command(state, command)
-        return (state, memory), (seen.reshape(-1, seen.shape[-1])[0, -law.units :], truth(state.pipeline_state))
+        return (state, memory), (seen.reshape(-1, seen.shape[-1])[0], truth(state.pipeline_state))
 
     start = state, law.start(state.obs[..., :OBSERVATION_SIZE])
     return jax.tree.map(lambda part: part[ends - 1], jax.lax.scan(step, start, None, length=int(ends[-1]))[1])

@@ -1,7 +1,7 @@
 """Followers of teams: the load on paths in the plane on rings of 2 to 6 drones, and a free ball on a plate.
 
-    python benchmarks/teams.py policies/team.npz --followers copy adaptive lqg --json benchmarks/results/teams.json
-    python benchmarks/teams.py policies/team.npz --random --json benchmarks/results/teams_random.json
+    python benchmarks/teams.py policies/universal.npz --followers copy adaptive lqg --json benchmarks/results/teams.json
+    python benchmarks/teams.py policies/universal.npz --random --json benchmarks/results/teams_random.json
     python benchmarks/teams.py --plate --followers copy adaptive lqg --json benchmarks/results/plate.json
 
 Teams: N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A

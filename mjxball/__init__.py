@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 # XLA writes two lines of 2 kB to stderr for each CPU program that it loads from its cache. What goes wrong is raised.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = ["Policy", "Scenario", "Trajectory", "__version__", "simulate"]
 
 if TYPE_CHECKING:

@@ -142,6 +142,8 @@ def add_config_flags(parser: argparse.ArgumentParser) -> None:
         group.add_argument(f"--{path}", metavar="VALUE", dest=f"config:{path}", default=None, help=about)
         for old in configs.old_names(path):
             group.add_argument(f"--{old}", dest=f"config:{path}", default=None, help=argparse.SUPPRESS)
+    for path in configs.CONSTANT:
+        group.add_argument(f"--{path}", dest=f"config:{path}", default=None, help=argparse.SUPPRESS)
 
 
 def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> configs.Config:

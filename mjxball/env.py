@@ -16,8 +16,7 @@ from mjxball import rewards
 from mjxball.config import Config, ball_limit
 from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
-from mjxball.control.multi_model_lqg import team_geometry
-from mjxball.control.team_lqg import team_context
+from mjxball.control.geometry import GEOMETRY_SIZE, team_geometry
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Array, Load, PlantState
@@ -66,7 +65,6 @@ class PipelineState(NamedTuple):
     command: Float[Array, "... 3"]  # the followers' last, roll, pitch [rad], vertical acceleration [m/s2]
     steps: Int[Array, ""]  # control steps since the reset
     rig: Any = ()  # its own `plant.PlantParameters`; () if all worlds have the plant's
-    known: Any = ()  # what the follower makes of the observation, see `FollowerLaw.known`; () if nothing
 
     @property
     def plant(self) -> PlantState:
@@ -101,7 +99,7 @@ class TransportEnv:
         self._law = law = follower_law(config)
         # Calls of their own, which `algorithms.scalar_form` leaves as they are if their arrays are large. A law has no
         # hash, as `jax.jit` wants; `partial` has.
-        parts = self._seen, self._answer, law.next if law.size else lambda *_: ()
+        parts = self._input, self._answer, law.next if law.size else lambda *_: ()
         self._law_seen, self._answered, self._remembered = (jax.jit(functools.partial(part)) for part in parts)
         self._cg = make_cg_offset(config)
         commanded = layout.commanded(config.follower.load_axis_only, config.plant.cg_axis)
@@ -120,7 +118,7 @@ class TransportEnv:
     @property
     def policy_input_size(self) -> int:
         """How many numbers of the observation the follower sees and remembers; only critics are told the rest."""
-        return layout.OBSERVATION_SIZE + self._law.shown
+        return self._law.input_size + self._law.units
 
     @property
     def input_mask(self) -> list[float]:
@@ -175,8 +173,7 @@ class TransportEnv:
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
         reward = jnp.zeros(self._followers)
-        world, seen = self.seeing(world, observation)
-        return State(world, seen, reward, zero, metrics, {"truncation": zero})
+        return State(world, self.seen(world, observation), reward, zero, metrics, {"truncation": zero})
 
     def step(self, state: State, action: Float[Array, "... actions"], physics: ControlStep | None = None) -> State:
         """Apply the network's `action` for one control period, with `physics` in place of the engine.
@@ -191,14 +188,14 @@ class TransportEnv:
             raise InputError(f"an action of one world must have shape {shape}, not {jnp.shape(action)}")
         finite = jnp.all(jnp.isfinite(action))
         action = jnp.where(finite, jnp.clip(action, -1.0, 1.0), jnp.zeros_like(action)) * self._commanded
-        command, memory = self._answered(action, self._observed(state), world.history, world.known)
+        command, memory = self._answered(action, self._observed(state), world.history)
         return self._step(state, command, memory, action, ~finite | world.loop.diverged, 1.0, physics)
 
     def step_with_command(self, state: State, follower_command: Float[Array, "... 3"]) -> State:
         """`step` of a follower that is no network: `follower_command` is flown as it is."""
         world = state.pipeline_state
         action = jnp.zeros((*follower_command.shape[:-1], self.action_size))
-        memory = self._remembered(world.history, self._observed(state), action, follower_command, world.known)
+        memory = self._remembered(world.history, self._observed(state), action)
         return self._step(state, follower_command, memory, action, world.loop.diverged, 0.0)
 
     def commands(self, state: State, action: Float[Array, "... 3"]) -> tuple[Float[Array, "drones 3"], Load]:
@@ -250,10 +247,9 @@ class TransportEnv:
         truncated = jnp.logical_and(moved.steps >= self.config.timing.episode_steps, ~terminated) & (not wrapped)
         steady = (loop.plant.time > STEADY_IN_TRAINING_AFTER).astype(jnp.float32)
         difference = commands.follower - commands.leader
-        moved, seen = self.seeing(moved, after)
         return state.replace(
             pipeline_state=moved,
-            obs=seen,
+            obs=self.seen(moved, after),
             reward=rewards.reward(self.config.reward, self._transition(world, moved, commands, terminated)),
             done=jnp.logical_or(terminated, truncated).astype(jnp.float32),
             metrics={
@@ -296,7 +292,7 @@ class TransportEnv:
             load=load,
             goal=goal,
             disturbances=disturbances,
-            history=self._law.start(observation, self._context(rig)) if self._law.size else (),
+            history=self._law.start(observation, self._geometry(rig)) if self._law.size else (),
             action=jnp.zeros((*self._followers, 3)),
             command=jnp.zeros((*self._followers, 3)),
             steps=jnp.zeros((), jnp.int32),
@@ -304,50 +300,37 @@ class TransportEnv:
         )
         return world, observation
 
-    def _context(self, rig: Rig | None) -> Any:
-        """What the followers of a world know of their team; None if their law needs nothing."""
-        if not self._law.needs_context:
+    def _geometry(self, rig: Rig | None) -> Any:
+        """Where the drones of a world are mounted, as its followers are told it; None if they are not."""
+        if not self._law.geometry:
             return None
         plant = self.config.plant
         if rig is not None and rig.drawn is not None:
             return team_geometry(plant, rig.drawn.numbers.mounts, rig.drawn.size)
         numbers = plant_parameters(plant, self.config.attitude) if rig is None else rig.numbers
-        if self._law.geometry:
-            mounts, masses = jnp.asarray(numbers.mounts, jnp.float32), jnp.asarray(numbers.drone_mass)
-            return team_geometry(plant, mounts, (masses > 0).sum().astype(jnp.float32))
-        mass = jnp.float32(plant.object_mass) * (1.0 if rig is None else rig.share)
-        return team_context(jax.tree.map(jnp.float32, numbers), plant, mass)
+        mounts, masses = jnp.asarray(numbers.mounts, jnp.float32), jnp.asarray(numbers.drone_mass)
+        return team_geometry(plant, mounts, (masses > 0).sum().astype(jnp.float32))
 
-    def seeing(
-        self, world: PipelineState, observation: Float[Array, "... 18"]
-    ) -> tuple[PipelineState, Float[Array, "... input"]]:
-        """(`world` once its followers have seen `observation`, the networks' input).
-
-        The input: what followers see and remember, and behind it what only critics are given.
-        """
-        shown = observation
-        if self._law.size:
-            shown, known = self._law_seen(observation, world.history)
-            world = world._replace(known=known)
+    def seen(self, world: PipelineState, observation: Float[Array, "... 18"]) -> Float[Array, "... input"]:
+        """The networks' input: what followers see and remember, and behind it what only critics are given."""
+        shown = self._law_seen(observation, world.history) if self._law.size else observation
         if self.config.follower.privileged_critic:
             shown = jnp.concatenate([shown, self._privileged(world)], axis=-1)
-        return world, shown
+        return shown
 
-    def _seen(self, observation: Float[Array, "... 18"], memory: Float[Array, "... m"]) -> tuple[Array, Any]:
-        """(input of the network, `FollowerLaw.known`)."""
-        law, told = self._law, self._law.told
-        if told:  # nothing is learnt from what never changes: its derivatives need not be carried through an episode
-            memory = jnp.concatenate([memory[..., :-told], jax.lax.stop_gradient(memory[..., -told:])], axis=-1)
-        known = law.known(observation, memory)
-        return law.network_input(observation, memory, known), () if known is None else known
+    def _input(self, observation: Float[Array, "... 18"], memory: Float[Array, "... m"]) -> Array:
+        """Input of the network."""
+        if self._law.geometry:  # nothing is learnt from what never changes: no derivatives need be carried through it
+            changes, told = memory[..., :-GEOMETRY_SIZE], memory[..., -GEOMETRY_SIZE:]
+            memory = jnp.concatenate([changes, jax.lax.stop_gradient(told)], axis=-1)
+        return self._law.network_input(observation, memory)
 
     def _answer(
-        self, action: Float[Array, "... actions"], observation: Float[Array, "... 18"], memory: Any, known: Any
+        self, action: Float[Array, "... actions"], observation: Float[Array, "... 18"], memory: Any
     ) -> tuple[Float[Array, "... 3"], Any]:
         """(command, memory of the next step) of the network's `action`."""
         law = self._law
-        command = law.command(action, observation, memory, known)
-        return command, law.next(memory, observation, action, command, known) if law.size else ()
+        return law.command(action, observation), law.next(memory, observation, action) if law.size else ()
 
     def _first_privileged(self, rng: Array) -> Float[Array, "... privileged"]:
         return self._privileged(self._fresh_world(rng, 1.0)[0])

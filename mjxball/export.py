@@ -17,7 +17,6 @@ from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.policy import team
 from mjxball.policy.file import PolicyFile, load_file, save_file
-from mjxball.policy.mean import mean_policy
 
 
 def policy_of_run(run: Path) -> PolicyFile:
@@ -36,12 +35,8 @@ def policy_of_run(run: Path) -> PolicyFile:
     return policy
 
 
-def contents_of(source: Path, mean: bool = False) -> PolicyFile:
-    """The policy in `source`, a policy file or a run directory; with `mean` that of the run's population."""
-    if mean:
-        from mjxball.train.run_directory import members_of
-
-        return mean_policy([load_file(member) for member in members_of(source)])
+def contents_of(source: Path) -> PolicyFile:
+    """The policy in `source`, a policy file or a run directory."""
     return load_file(source) if source.suffix == ".npz" else policy_of_run(source)
 
 
@@ -80,17 +75,16 @@ def export(
     int8: bool = False,
     plant: Path | None = None,
     drone: int | None = None,
-    mean: bool = False,
 ) -> None:
     """Export `source` to the new file `out`, in the format that its ending names; raise InputError if that fails.
 
     `crazyflie`: to the new directory `out`, as apps for both drones. `int8`: weights of 8 bits in an app or a header,
     floats rounded to them in a policy file. `plant`, `drone`: see `in_team`; a policy file need not be told them.
-    Apps of a policy for any rig are for the plant `crazyflie` by default. `mean`: see `mjxball.policy.mean`.
+    Apps of a policy for any rig are for the plant `crazyflie` by default.
     """
 
     def policy() -> PolicyFile:
-        found = contents_of(source, mean)
+        found = contents_of(source)
         return found if untold else in_team(found, source.stem, plant, drone)
 
     untold = out.suffix == ".npz" and not crazyflie and plant is None and drone is None
@@ -98,7 +92,7 @@ def export(
         from mjxball.fly.app.generate import check_place, write_app
 
         check_place(out)
-        if plant is None and team.is_for_any(contents_of(source, mean).card):
+        if plant is None and team.is_for_any(contents_of(source).card):
             plant = team.CRAZYFLIES
         drones = 2 if plant is None else plant_setup(plant).plant.count
         if drones != 2:
@@ -124,20 +118,10 @@ def main(arguments: list[str] | None = None) -> int:
     about = f"team in which a policy flies that has to be told: {', '.join(configs.PLANTS)}, or a rig in TOML or JSON"
     parser.add_argument("--plant", metavar="NAME|FILE", type=Path, help=about)
     parser.add_argument("--drone", metavar="N", type=int, help="its number in --plant where several drones follow")
-    about = "mean of the weights of a run's members, which must have begun as one policy: train.py --start-from"
-    parser.add_argument("--mean", action="store_true", help=about)
     options = parser.parse_args(arguments)
 
     def command() -> int:
-        export(
-            options.source,
-            options.out,
-            options.crazyflie,
-            options.int8,
-            options.plant,
-            options.drone,
-            options.mean,
-        )
+        export(options.source, options.out, options.crazyflie, options.int8, options.plant, options.drone)
         print(options.out)  # noqa: T201
         return 0
 

@@ -248,12 +248,6 @@ def remembering(transport: Config) -> Trained:
     return make_trained(with_settings(transport, follower=follower))
 
 
-@pytest.fixture(scope="session")
-def estimating(transport: Config) -> Trained:
-    """A follower whose network's action is added to an offset-free LQG."""
-    return make_trained(with_settings(transport, follower={"base": "lqg", "observation_averages": (0.1,)}))
-
-
 class Recurrent(NamedTuple):
     """A follower with a GRU, lived-in, and what is needed to run it."""
 

@@ -25,19 +25,18 @@ AT_REST = ObjectState(np.zeros(3), np.zeros(3), np.array([1.0, 0, 0, 0]), np.zer
 
 
 def policy_of(name: str) -> PolicyFile:
-    """The shipped policy, or "recurrent NAME"; that of teams with commands which a pair of Crazyflies can follow."""
-    if name.startswith("recurrent "):
-        return in_pair(onboard.recurrent(name.split()[1]))
+    """The shipped policy, or "recurrent flight"; for any rig with commands that a pair of Crazyflies can follow."""
+    if name == "recurrent flight":
+        return onboard.recurrent()
     policy = load_file(shipped_policy(name))
-    if name != "team":
+    if name != "universal":
         return policy
-    gentle = dataclasses.replace(policy, card={**policy.card, "command_limits": [0.26, 0.4]})
-    return in_pair(gentle)
+    return in_pair(dataclasses.replace(policy, card={**policy.card, "command_limits": [0.26, 0.4]}))
 
 
 def in_pair(policy: PolicyFile) -> PolicyFile:
     """Told that it flies a pair of Crazyflies, if it has to be told."""
-    return in_team(policy, "follower", Path("crazyflie")) if law_of(policy.card).needs_context else policy
+    return in_team(policy, "follower", Path("crazyflie")) if law_of(policy.card).geometry else policy
 
 
 @functools.cache

@@ -335,7 +335,7 @@ def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:
         (["paper", "--algorithm", "gradient", "--start-from", shipped_policy("universal")], "follower."),
         (
             ["universal", "--algorithm", "gradient", *NARROW, "--start-from", shipped_policy("universal")],
-            "--gradient.policy_layers 40,32",
+            "--gradient.policy_layers 48",
         ),
         (["--algorithm", "gradient", "--resume", "run", "--start-from", TRANSPORT], "drop"),
     ],

@@ -64,7 +64,7 @@ def test_no_arguments_judge_every_shipped_policy_and_baseline(standard: list[dic
     here, others = group_by_plant(shipped_policies())
     names = {*BASELINES, *(path.stem for path in here)}
     assert {"balance", "paper"} <= names
-    assert {"flight", "stand", "team", "universal"} <= {config.preset for config, _ in others}
+    assert {"flight", "stand", "universal"} <= {config.preset for config, _ in others}
     scenarios = {(0.31, 0.0), *((omega, 0.05) for omega in SPEEDS)}
     assert {(cell["follower"], cell["omega"], cell["amplitude"]) for cell in standard} == {
         (name, *scenario) for name in names for scenario in scenarios

@@ -278,6 +278,13 @@ def test_bad_export_is_refused(here: Path, arguments: list[str], capsys: pytest.
     assert_refused(export.main, arguments, here, capsys)
 
 
+def test_a_setting_that_is_a_constant_now_may_say_so(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["--follower.base", "pd", "--follower.differential_thrust_share", "0"]
+    assert cli.apply_config_flags(configs.preset("balance"), parser().parse_args(asked)) == configs.preset("balance")
+    said = assert_refused(main, ["balance", "--follower.base", "lqg"], here, capsys)
+    assert "follower.base is no setting any more: it is 'pd', and cannot be 'lqg'" in said
+
+
 def test_a_list_may_begin_with_a_negative_number() -> None:
     """As every flag with a value, after a space or after `=`."""
     asked = (["--scenario.mass_change", "-0.05,0.1"], ["--scenario.mass_change=-0.05,0.1"])

@@ -330,6 +330,14 @@ class TestOldNames:
         with pytest.raises(InputError, match="no setting any more"):
             configs.from_dict(recorded)
 
+    def test_a_network_stands_on_the_pd_law_alone(self):
+        recorded = configs.to_dict(Config())
+        recorded["follower"] |= {"base": "pd", "differential_thrust_share": 0.0}
+        assert configs.from_record(recorded) == configs.override(Config(), "follower.base", "pd") == Config()
+        recorded["follower"]["base"] = "lqg"
+        with pytest.raises(InputError, match=r"follower\.base is no setting any more"):
+            configs.from_record(recorded)
+
     @rows("path", sorted(Path(__file__).parents[1].glob("policies/**/*.npz")))
     def test_the_card_of_every_shipped_policy(self, path):
         card = load_file(path).card

@@ -188,7 +188,8 @@ def parses(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_commands_parse(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for words in shown(page.read_text()):
-        if "..." in words:
+        gone = page.parent.name == "archive" and words[0] not in MAINS and not (REPOSITORY / words[0]).exists()
+        if "..." in words or gone:  # an archive tells of scripts as they were
             continue
         if words[0] in MAINS:
             parses(words, monkeypatch)

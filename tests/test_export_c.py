@@ -16,7 +16,6 @@ from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.file import shipped_policy
 from mjxball.policy.formats import c_header
-from onboard import RECURRENT, recurrent
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Werror", "-O1")
 TWO = """
@@ -111,14 +110,13 @@ def spoilt(value: float, slot: int) -> np.ndarray:
 @needs_gcc
 @pytest.mark.parametrize(
     "name",
-    [*("balance", "flight", "paper", "robust", "team", "universal"), *(f"recurrent {name}" for name in RECURRENT)],
+    ["balance", "flight", "paper", "robust", "universal"],
 )
 @pytest.mark.parametrize("int8", [False, True])
 def test_an_observation_that_cannot_be_leaves_no_trace(name: str, int8: bool, tmp_path: Path):
     """Status 1, level, and every later answer is that of a flight which has not seen it."""
-    last = name.rsplit(maxsplit=1)[-1]
-    policy: PolicyFile = recurrent(last) if last != name else load_file(shipped_policy(name))
-    policy = in_team(policy, name, Path("pair")) if last in ("team", "universal") else policy
+    policy = load_file(shipped_policy(name))
+    policy = in_team(policy, name, Path("pair")) if name == "universal" else policy
     (tmp_path / "first.h").write_text(c_header.c_header(policy, "first", int8))
     seen = observations()
     odd = [spoilt(value, slot) for value in (np.nan, np.inf, -np.inf, 1e38, 1e7) for slot in (0, 3, 9, 14, 17)]

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +15,15 @@ import pytest
 from command_line import assert_one_line, call, listing, load_arrays, run, write_arrays
 from conftest import Trained
 from onboard_bench import needs_gcc
-from rig_laws import OLDEST, with_law
 
 from mjxball.cli import plant_setup
-from mjxball.control import swing
-from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.file import law_of, save_file, shipped_policy
+from mjxball.policy.file import law_of, shipped_policy
 from mjxball.policy.formats.c_header import c_header, footprint
 from mjxball.policy.formats.onnx_model import onnx_model
-from mjxball.policy.law_fields import LATER_SHAPES, SWING_SHAPES
 from mjxball.policy.quantize import balanced, rows_of
-from onboard import placed
-from onboard import recurrent as gru_of
+from onboard import recurrent as recurrent_flight
 
 STEPS = 60
 # Of one step's action in [-1, 1] by C, against NumPy in the same dtype: what docs/policy-file.md promises of float32.
@@ -69,10 +62,6 @@ int main(void) {
 """
 
 
-ROUNDED = 5e-5  # of what is large in a memory: angular accelerations, scores of models
-SCORES = 1e-3  # of models' scores in double: the numbers of the law, of which large ones cancel, are float in C
-
-
 @pytest.fixture(scope="module")
 def direct(trained: Trained) -> PolicyFile:
     """A follower that commands directly, with other gains and limits."""
@@ -89,39 +78,19 @@ def limited(remembering: Trained) -> PolicyFile:
 
 @pytest.fixture(
     params=[
-        *("trained", "direct", "remembering", "limited", "estimating", "recurrent", "told"),
+        *("trained", "direct", "remembering", "limited", "recurrent"),
         *("balance", "transport", "robust", "flight", "stand", "paper"),
-        *("team pair", "team team3", "universal pair", "universal team3", "lifting team6"),
-        *("newer pair", "newer team3", "still pair", "older pair", "older team3"),
+        *("universal pair", "universal team3"),
     ]
 )
 def contents(request: pytest.FixtureRequest) -> PolicyFile:
     name, _, plant = request.param.partition(" ")
     if plant:
-        older = {name: functools.partial(with_law, without) for name, without in OLDER.items()}
-        laws: dict[str, Callable[[], PolicyFile]] = {"lifting": lifting, **older}
-        policy = laws[name]() if name in laws else load_file(shipped_policy(name))
-        return in_team(policy, name, Path(plant), None if plant == "pair" else 2)
+        return in_team(load_file(shipped_policy(name)), name, Path(plant), None if plant == "pair" else 2)
     if name in ("balance", "transport", "robust", "flight", "stand", "paper"):
         return load_file(shipped_policy(name))
     made = request.getfixturevalue(request.param)
     return made if isinstance(made, PolicyFile) else made.contents
-
-
-# `universal` with the law as it is made now, and with what older files hold of it.
-OLDER = {"newer": (), "still": SWING_SHAPES, "older": OLDEST}
-
-
-def lifting() -> PolicyFile:
-    """`team` with a law that holds most of the load by lifting apart."""
-    team = load_file(shipped_policy("team"))
-    return dataclasses.replace(team, card={**team.card, "lqg": {**team.card["lqg"], "lifting": 0.9}})
-
-
-@pytest.fixture(scope="module")
-def told() -> PolicyFile:
-    """A recurrent follower of any rig, told which it flies."""
-    return placed(gru_of("universal"), "told")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,21 +127,9 @@ def flown(contents: PolicyFile, dtype: Any, policy: Policy | None = None) -> Fli
     return Flight(**{name: np.array(values) for name, values in rows.items()})
 
 
-def assert_remembered(found: np.ndarray, flight: Flight, contents: PolicyFile, tolerance: float) -> None:
-    """Memories agree; scores of models, the differences of large numbers, as well as these are rounded.
-
-    So are the rotors' parts, of which commands and angles times the stiffness nearly cancel.
-    """
-    wanted, law = flight.next_memory, law_of(contents.card)
-    least = np.full(wanted.shape[1], 1e-6 + tolerance)
-    if isinstance(law.lqg, MultiModelLqg):
-        states = slice(law.history.size, law.history.size + 15 * law.lqg.models)
-        least[states] += 2e-7 * np.max(law.lqg.stiffness)
-        last = -CONTEXT - 2 - 2 * law.lqg.swings * swing.STATES
-        scores = slice(last - 2 * law.lqg.models, last)
-        least[scores] += max(np.spacing(np.abs(wanted[:, scores]).max().astype(found.dtype)), SCORES)
-    excess = np.abs(found - wanted) - ROUNDED * np.abs(wanted) - least
-    assert (excess <= 0).all(), np.argwhere(~(excess <= 0))
+def assert_remembered(found: np.ndarray, flight: Flight, tolerance: float) -> None:
+    """Memories agree: observations, actions, states of a GRU, what is told of a team."""
+    np.testing.assert_allclose(found, flight.next_memory, rtol=1e-5, atol=1e-6 + tolerance)
 
 
 def test_onnx_computes_what_numpy_computes(contents: PolicyFile):
@@ -188,7 +145,7 @@ def test_onnx_computes_what_numpy_computes(contents: PolicyFile):
     scale = float(contents.action_scale.max())
     np.testing.assert_allclose(answer["command"], flight.command, rtol=0, atol=1e-6 + scale * ONNX_TOLERANCE)
     if flight.memory.shape[1]:
-        assert_remembered(answer["next_memory"], flight, contents, ONNX_TOLERANCE)
+        assert_remembered(answer["next_memory"], flight, ONNX_TOLERANCE)
     assert np.abs(flight.action).max() > 0.05
 
 
@@ -241,20 +198,20 @@ class Whole:
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["balance", "flight", "recurrent flight", "recurrent universal"])
+@pytest.mark.parametrize("name", ["balance", "flight", "universal", "recurrent flight"])
 def test_c_with_weights_of_8_bits_computes_with_whole_numbers(name: str, tmp_path: Path):
     """Also beside the weights in float32, so that the whole numbers are those of the policy."""
-    recurrent, _, last = name.rpartition(" ")
-    contents = placed(gru_of(last), name) if recurrent else load_file(shipped_policy(name))
+    contents = recurrent_flight() if name == "recurrent flight" else load_file(shipped_policy(name))
+    contents = in_team(contents, name, Path("pair")) if name == "universal" else contents
     policy = Policy(balanced(contents), "follower")
     network = policy._network
     gru = None if network.gru is None else (*map(Whole, network.gru[:2]), network.gru[2])
-    policy._answers_alone = False
+    policy._answer_alone = lambda observation: None
     policy._network = network._replace(weights=[Whole(weight) for weight in network.weights], gru=gru)
     flight, exact = flown(contents, np.float32, policy), flown(contents, np.float32)
     answer, _ = answered(compiled(contents, tmp_path, "float", int8=True), flight, np.float32)
     np.testing.assert_allclose(answer[:, :3], flight.action, rtol=0, atol=INT8_TOLERANCE)
-    assert_remembered(answer[:, 6:], flight, contents, INT8_TOLERANCE)
+    assert_remembered(answer[:, 6:], flight, INT8_TOLERANCE)
     assert 1e-3 < np.sqrt(np.mean((flight.action - exact.action) ** 2)) < 0.1
 
 
@@ -267,7 +224,7 @@ def test_c_computes_what_numpy_computes(contents: PolicyFile, real: str, tmp_pat
     np.testing.assert_allclose(answer[:, :3], flight.action, rtol=0, atol=TOLERANCE)
     scale = float(contents.action_scale.max())
     np.testing.assert_allclose(answer[:, 3:6], flight.command, rtol=0, atol=1e-6 + scale * TOLERANCE)
-    assert_remembered(answer[:, 6:], flight, contents, TOLERANCE)
+    assert_remembered(answer[:, 6:], flight, TOLERANCE)
     if real == "float":
         assert state == footprint(contents).state
 
@@ -280,71 +237,12 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert f"Flash: {cost.flash} bytes" in text
     assert f"RAM: {cost.state} bytes" in text
     size, widest = map(int, re.search(r"mjxball_follower_real input\[(\d+)\], hidden\[2\]\[(\d+)\];", text).groups())
-    lqg, units = law_of(contents.card).lqg, law_of(contents.card).units
-    own = 18 + 2 * lqg.models + 4 if isinstance(lqg, MultiModelLqg) else 0
-    assert ("mjxball_follower_real seen[18];" in text) == ("mjxball_follower_known known;" in text) == bool(own)
     gates = re.search(r"given\[(\d+)\], kept\[(\d+)\], next\[(\d+)\], joined\[(\d+)\];", text)
-    assert (gates is None) == (units == 0)
-    own += sum(map(int, gates.groups())) if gates else 0
+    assert (gates is None) == (law_of(contents.card).units == 0)
+    own = sum(map(int, gates.groups())) if gates else 0
     assert 4 * (size + 2 * widest + own) == cost.stack
     assert f"{cost.stack} bytes of arrays on the stack" in text
     assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
-
-
-def test_only_a_pair_pays_for_filters_of_its_own_about_roll():
-    more, less = with_law(), with_law(LATER_SHAPES)
-    of_three = [in_team(made, "three", Path("team3"), 1) for made in (more, less)]
-    assert footprint(of_three[0]) == footprint(of_three[1])
-    own, other = (c_header(made, "follower").splitlines() for made in of_three)
-    found = [pair for pair in zip(own, other, strict=True) if pair[0] != pair[1] and "_H_" not in pair[0]]
-    assert [line.rpartition(" ")[0] for pair in found for line in pair] == [
-        *["#define MJXBALL_FOLLOWER_RIG_COS"] * 2,
-        *["#define MJXBALL_FOLLOWER_RIG_SIN"] * 2,
-    ]
-    pairs = [in_team(made, "pair", Path("pair"), None) for made in (more, less)]
-    texts, costs = [c_header(made, "follower") for made in pairs], [footprint(made) for made in pairs]
-    assert costs[0].flash - costs[1].flash == 4 * (5 * 2 + 3 + 1) * law_of(more.card).lqg.models
-    assert ["pair_roll" in text for text in texts] == [True, False]
-    assert not any("nanf" in text for text in texts)  # what a law lacks
-    assert "#define MJXBALL_FOLLOWER_ROLL_ROOM 1.0e+00f\n" in texts[1]
-    for text in (*texts, c_header(of_three[1], "follower")):
-        assert "#define MJXBALL_FOLLOWER_RIG_COS 1.0e+00f\n#define MJXBALL_FOLLOWER_RIG_SIN" in text
-        assert re.search(r"#define MJXBALL_FOLLOWER_RIG_SIN -?0\.0e\+00f\n", text)
-
-
-@pytest.mark.parametrize(("share", "weight", "room"), [(2.0, 1.0, "1.3e+01f"), (1.75, 0.5, "7.0e+00f")])
-def test_a_pairs_header_has_its_numbers_about_roll(share: float, weight: float, room: str):
-    """Also where a card names a share between those of a pair and of three."""
-    pair = in_team(with_law(), "pair", Path("pair"), None)
-    pair.card["team"]["context"][0] = share
-    text, lqg = c_header(pair, "follower"), pair.card["lqg"]
-    for own, every in (("roll_gain", "axis_gain"), ("roll_certainty", "certainty"), ("roll_prior", "prior")):
-        numbers = (
-            re.search(rf"mjxball_follower_lqg_pair_{own}\[\d+\] = {{([^}}]*)}}", text)[1].replace("f", "").split(",")
-        )
-        wanted = weight * np.ravel(lqg[f"pair_{own}"]) + (1.0 - weight) * np.ravel(lqg[every])
-        np.testing.assert_allclose([float(number) for number in numbers], wanted, rtol=1e-6)
-        assert f"#define MJXBALL_FOLLOWER_{own.upper()} mjxball_follower_lqg_pair_{own}\n" in text
-    assert f"#define MJXBALL_FOLLOWER_ROLL_ROOM {room}\n" in text
-
-
-def test_a_header_has_the_factors_of_its_teams_size():
-    """Of the first sizes in the table, and of one beyond it."""
-    rows = [[1.5, 2.0, 0.5, 0.25], [1.25, 3.0, 0.75, 0.125]]
-    made = with_law()
-    sized = dataclasses.replace(made, card={**made.card, "lqg": {**made.card["lqg"], "by_size": rows}})
-    for plant, drone, row in (("pair", None, rows[0]), ("team3", 1, rows[1]), ("team4", 2, rows[1])):
-        text = c_header(in_team(sized, "follower", Path(plant), drone), "follower")
-        found = {
-            name: [
-                float(number.rstrip("f"))
-                for number in re.search(rf"mjxball_follower_lqg_{name}\[\d+\] = {{([^}}]*)}}", text)[1].split(",")
-            ]
-            for name in ("tilts", "small")
-        }
-        wanted = np.array(made.card["lqg"]["tilt"]) * [row[0], row[1], 1.0, 1.0]
-        np.testing.assert_allclose(found["tilts"], wanted.ravel(), rtol=1e-6)
-        np.testing.assert_allclose(found["small"], [row[2], row[2], row[3]], rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -379,25 +277,21 @@ def test_command_line_exports_a_policy_file(name: str, saved: Path, tmp_path: Pa
         ("broken.npz", "follower.onnx", "broken.npz: card field history is missing"),
         ("no-run", "follower.onnx", "no-run"),
         ("follower.npz", "a.h --plant team4", "is told nothing of its team"),
-        ("team.npz", "a.h", "has to be told its team: --plant NAME"),
-        ("team.npz", "a.onnx --plant team4", "--drone must be a follower of --plant: 1, 2, 3"),
-        ("team.npz", "a.onnx --plant team4 --drone 0", "--drone must be a follower of --plant: 1, 2, 3"),
-        ("team.npz", "a.onnx --drone 1", "has to be told its team: --plant NAME"),
-        ("team.npz", "a.onnx --plant stand", "free flight with attitude loops of 10 rad/s"),
-        ("team.npz", "apps --crazyflie", "has to be told its team: --plant NAME"),
-        ("team.npz", "apps --crazyflie --plant team4", "an app is for pairs of Crazyflies, and team4 has 4 drones"),
-        ("team.npz", "apps --crazyflie --plant pair", "is for another plant than a pair of Crazyflies"),
-        ("team.npz", "apps --crazyflie --plant crazyflie", "may lift 4 m/s2 more than the leader"),
-        ("lifting.npz", "a.h --plant team3 --drone 1", "needs a team of at least 4 drones, not 3"),
-        ("lifting.npz", "apps --crazyflie --plant crazyflie", "needs a team of at least 4 drones, not 2"),
-        ("team.npz", "a.npz --plant nothing", "plant file nothing does not exist"),
+        ("universal.npz", "a.h", "has to be told its team: --plant NAME"),
+        ("universal.npz", "a.onnx --plant team4", "--drone must be a follower of --plant: 1, 2, 3"),
+        ("universal.npz", "a.onnx --plant team4 --drone 0", "--drone must be a follower of --plant: 1, 2, 3"),
+        ("universal.npz", "a.onnx --drone 1", "has to be told its team: --plant NAME"),
+        ("universal.npz", "apps --crazyflie --plant team4", "for pairs of Crazyflies, and team4 has 4 drones"),
+        ("universal.npz", "apps --crazyflie --plant pair", "is for another plant than a pair of Crazyflies"),
+        ("older.npz", "a.h --plant team4 --drone 1", "has policy format 3, a network on top of an LQG"),
+        ("universal.npz", "a.npz --plant nothing", "plant file nothing does not exist"),
     ],
 )
 def test_refusals(source: str, out: str, message: str, saved: Path, monkeypatch, capsys):
-    shutil.copy(shipped_policy("team"), saved.parent / "team.npz")
-    save_file(saved.parent / "lifting.npz", lifting())
+    shutil.copy(shipped_policy("universal"), saved.parent)
     (saved.parent / "taken.h").write_text("mine")
     arrays, card = load_arrays(saved)
+    write_arrays(saved.parent / "older.npz", arrays, {**card, "format_version": 3})
     del card["history"]
     write_arrays(saved.parent / "broken.npz", arrays, card)
     before = listing(saved.parent)
@@ -411,9 +305,9 @@ def test_refusals(source: str, out: str, message: str, saved: Path, monkeypatch,
 
 def test_a_policy_that_was_told_its_team_flies_as_one_that_joined(tmp_path: Path):
     out = tmp_path / "third.npz"
-    assert call(main, [shipped_policy("team"), out, "--plant", "team4", "--drone", "3"]) == 0
-    config, joined, told = plant_setup(Path("team4")), Policy.load(shipped_policy("team")), Policy.load(out)
-    joined.join(config.plant, config.attitude)
+    assert call(main, [shipped_policy("universal"), out, "--plant", "team4", "--drone", "3"]) == 0
+    config, joined, told = plant_setup(Path("team4")), Policy.load(shipped_policy("universal")), Policy.load(out)
+    joined.join(config.plant)
     for seen in np.random.default_rng(0).normal(scale=0.2, size=(5, 18)):
         np.testing.assert_allclose(told(seen), joined(np.stack([seen] * 3))[2], rtol=0, atol=1e-5)
     assert call(main, [out, tmp_path / "third.onnx"]) == 0  # it need not be told again

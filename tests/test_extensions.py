@@ -121,14 +121,14 @@ def test_a_reward_of_the_users_own_replaces_ours() -> None:
 
 def test_followers_of_a_team_share_a_reward_or_have_their_own() -> None:
     config = with_plant(preset("lost"), "team6")
-    action = np.zeros((5, 3), np.float32)
     for reward in (lambda _, action, after: -after.metrics["error"], lambda _, action, after: action[..., 0] - 1.0):
         env = make_env(Extensions(reward=reward), config, "newton-euler")
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+        action = np.zeros((5, env.action_size), np.float32)
         assert jax.eval_shape(env.step, state, action).reward.shape == (5,)
     assert make_env(Extensions(env=toys.Gentle), config, "newton-euler").observation_size == env.observation_size
     with pytest.raises(InputError, match=r"one number or one for each follower, shape \(5,\), not shape \(5, 3\)"):
-        make_env(Extensions(reward=lambda _, a, after: a), config, "newton-euler")
+        make_env(Extensions(reward=lambda _, a, after: a[..., :3]), config, "newton-euler")
 
 
 def test_a_run_on_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,7 +116,7 @@ def test_the_package_writes_what_the_schema_says() -> None:
 
 def test_the_state_of_a_gru_is_recorded(tmp_path: Path) -> None:
     """Tick by tick what the policy remembers after the observation beside it, to the log's decimals."""
-    contents = benchmark.recurrent("flight")
+    contents = benchmark.recurrent()
     # It moves nothing, and what it remembers follows the flight.
     contents = dataclasses.replace(contents, weights=(*contents.weights[:-1], 0 * contents.weights[-1]))
     contents = dataclasses.replace(contents, biases=(*contents.biases[:-1], 0 * contents.biases[-1]))

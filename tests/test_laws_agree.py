@@ -15,6 +15,7 @@ from mjxball.config import Autopilot, preset
 from mjxball.control import attitude, crazyflie, leader, mixer, observation, rotations
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.followers import PrivilegedInfo
+from mjxball.control.geometry import ring_geometry
 from mjxball.control.observation import ObservationHistory
 from mjxball.plant import AttitudeGains
 from mjxball.sim.follower import follower_law
@@ -37,8 +38,9 @@ KP, KD, KI = (0.5, 0.4, 0.3), (1.0, 0.9, 0.8), (0.1, 0.0, 0.2)
 GAINS = AttitudeGains((0.24, 3.22, 0.543), (0.0433, 0.579, 0.244))
 MOUNT = np.array([-0.17, 0.0, 0.0])
 LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
-LQG = follower_law(preset("balance"))
-LQG_MEMORY = 0.1 * normal(LQG.size)
+RECURRENT = follower_law(preset("team"))
+TOLD, STATE = random.uniform(1, 3, (WORLDS, 4)), random.uniform(-1, 1, (WORLDS, RECURRENT.units))
+KEPT = 0.1 * normal(RECURRENT.size)
 HISTORY = ObservationHistory(length=3, previous_action=True, filters=(0.1, 0.5))
 SEEN, MEMORY, ACTION = normal(18), normal(HISTORY.size), random.uniform(-1, 1, (WORLDS, 3))
 MASSES = random.uniform(0.1, 0.3, WORLDS)
@@ -120,12 +122,13 @@ LAWS: dict[str, tuple[Callable[..., Any], tuple[np.ndarray, ...]]] = {
     "observation.copy_command": (lambda s: observation.copy_command(s, KP, KD, G, *LIMITS), (3 * SEEN,)),
     "observation.scale_action": (lambda a: observation.scale_action(a, *REACH), (ACTION,)),
     "follower_law.command": (
-        lambda a, s: FollowerLaw(HISTORY, REACH, LIMITS, KP, KD, G).command(a, s, ()),
+        lambda a, s: FollowerLaw(HISTORY, REACH, LIMITS, KP, KD, G).command(a, s),
         (ACTION, 3 * SEEN),
     ),
-    "follower_law.command lqg": (LQG.command, (ACTION, SEEN, LQG_MEMORY)),
-    "follower_law.next lqg": (LQG.next, (LQG_MEMORY, SEEN, ACTION, ACTION)),
-    "follower_law.network_input lqg": (LQG.network_input, (SEEN, LQG_MEMORY)),
+    "follower_law.start": (RECURRENT.start, (SEEN, TOLD)),
+    "follower_law.next": (RECURRENT.next, (KEPT, SEEN, np.concatenate([ACTION, STATE], axis=-1))),
+    "follower_law.network_input": (RECURRENT.network_input, (SEEN, KEPT)),
+    "geometry.ring_geometry": (ring_geometry, (np.arange(WORLDS) % 5 + 2.0, normal(2))),
     **{f"baseline {name}": (flown(name), (FLIGHT, *PRIVILEGED)) for name in FOLLOWERS},
     **{
         f"baseline {name} {plant}": (flown(name, plant), (FLIGHT, *PRIVILEGED))

@@ -87,7 +87,7 @@ def test_residual_adds_to_the_pd_law_and_direct_does_not():
     seen, scaled = seen_with([1.0, 0, 0], [0, 0, 0]), np.array([0.5, -1.0, 0.25])
     reach = (0.2, 2.0)
     direct, residual = (
-        FollowerLaw(HISTORY, reach, residual=adds, **LAW).command(scaled, seen, ()) for adds in (False, True)
+        FollowerLaw(HISTORY, reach, residual=adds, **LAW).command(scaled, seen) for adds in (False, True)
     )
     np.testing.assert_allclose(direct, [0.1, -0.2, 0.5], rtol=1e-15)
     np.testing.assert_allclose(residual, [0.1, -0.2 + 0.05, 0.5], rtol=1e-14)
@@ -96,9 +96,9 @@ def test_residual_adds_to_the_pd_law_and_direct_does_not():
 def test_command_never_leaves_the_shared_limits():
     seen = seen_with([100.0, -100.0, 100.0], [0, 0, 0])
     for scaled in (np.ones(3), -np.ones(3)):
-        command = FollowerLaw(HISTORY, (0.2, 2.0), **LAW).command(scaled, seen, ())
+        command = FollowerLaw(HISTORY, (0.2, 2.0), **LAW).command(scaled, seen)
         assert (np.abs(command) <= [0.6, 0.6, 6.0]).all()
-    wide = FollowerLaw(HISTORY, (1.0, 20.0), residual=False, **LAW).command(np.ones(3), seen, ())
+    wide = FollowerLaw(HISTORY, (1.0, 20.0), residual=False, **LAW).command(np.ones(3), seen)
     np.testing.assert_array_equal(wide, [0.6, 0.6, 6.0])
 
 

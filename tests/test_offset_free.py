@@ -1,28 +1,17 @@
-"""Offset-free LQG: its estimates against what the load does, and the network that stands on it."""
+"""Offset-free LQG of a pair: its estimates against what the load does."""
 
 from __future__ import annotations
 
-import dataclasses
-import json
-
 import numpy as np
 import pytest
-from command_line import assert_refused, write_arrays
-from conftest import Trained
 
-from mjxball.baselines import make_baseline
+from mjxball.baselines import make_baseline, make_law
 from mjxball.baselines.assembly_model import ideal_model
-from mjxball.baselines.offset_free import offset_free_lqg
-from mjxball.commands.train import main
+from mjxball.baselines.offset_free import design
 from mjxball.config import preset
 from mjxball.errors import InputError
-from mjxball.policy import Policy, PolicyFile, load_file
-from mjxball.policy.container import PolicyFileError
-from mjxball.sim.follower import follower_law
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
-
-CONFIG = preset("balance")
 
 
 def estimates(mass: float, believed: float, offset: float) -> np.ndarray:
@@ -38,7 +27,7 @@ def estimates(mass: float, believed: float, offset: float) -> np.ndarray:
     )
     flown = simulate(preset("paper"), follower, scenario, "newton-euler")
     assert np.abs(flown.error[-1]).max() < 2e-4
-    return follower.law._law.estimate(follower._state, flown.observation[-1])[0]
+    return follower.law.estimate(follower._state, flown.observation[-1])[0]
 
 
 @pytest.mark.parametrize(("mass", "offset"), [(0.2, 0.05), (0.4, -0.1)])
@@ -57,7 +46,7 @@ def test_it_finds_what_a_mass_that_nobody_knows_pulls():
 
 def test_the_filter_predicts_a_pair_that_turns_and_climbs():
     """One period of a constant drive from rest, by the equations of motion integrated in small steps."""
-    pair, law = ideal_model(preset("paper"), "test"), offset_free_lqg(preset("paper"))
+    pair, law = ideal_model(preset("paper"), "test"), design(preset("paper"))
     state, steps = np.array([0.02, -0.1, 0.03, 0.2, 0.01, 0.3, 0.1, -0.2]), 20000
     drive, h = np.array([0.05, 0.4]), preset("paper").timing.control_period / 20000
     moved = state.copy()
@@ -69,58 +58,6 @@ def test_the_filter_predicts_a_pair_that_turns_and_climbs():
     np.testing.assert_allclose(law.transition @ np.append(state, drive), moved, atol=2e-6)
 
 
-def test_a_network_of_zeros_flies_the_law(estimating: Trained):
-    """To float64's rounding, memory included."""
-    silent = [np.zeros_like(weight) for weight in estimating.contents.weights]
-    biases = [np.zeros_like(bias) for bias in estimating.contents.biases]
-    contents = dataclasses.replace(estimating.contents, weights=tuple(silent), biases=tuple(biases))
-    scenario = Scenario(amplitude=0.1, omega=1.0, seconds=6)
-    plain = make_baseline("lqg-offset-free", preset("paper"))
-    flown, expected = (
-        simulate(preset("paper"), follower, scenario, "newton-euler")
-        for follower in (Policy(contents, "silent", np.float64), plain)
-    )
-    np.testing.assert_allclose(flown.position, expected.position, rtol=0, atol=1e-9)
-
-
-def test_other_plants_are_refused(tmp_path, capsys: pytest.CaptureFixture):
-    flight = preset("flight")
+def test_other_plants_are_refused():
     with pytest.raises(InputError, match="free pair along x"):
-        follower_law(dataclasses.replace(flight, follower=dataclasses.replace(flight.follower, base="lqg")))
-    said = assert_refused(main, ["flight", "--follower.base", "lqg", "--out", tmp_path / "run"], tmp_path, capsys)
-    assert "lqg" in said
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"format_version": 1}, "lqg"),
-        ({"format_version": 3}, "format 3"),
-        ({"lqg": None}, "lqg"),
-        ({"lqg.gain": [[0.0]]}, "gain"),
-        ({"lqg.height": [0.0, float("nan")]}, "height"),
-        ({"lqg.stiffness": 0.0}, "stiffness"),
-        ({"lqg.odd": 1.0}, "lqg"),
-        ({"action_mode": "direct"}, "lqg"),
-    ],
-)
-def test_unsound_numbers_are_named(estimating: Trained, tmp_path, change: dict, named: str):
-    path = tmp_path / "follower.npz"
-    card = json.loads(json.dumps(estimating.contents.card))
-    for field, value in change.items():
-        place, _, inner = field.partition(".")
-        if inner:
-            card[place][inner] = value
-        else:
-            card[place] = value
-    write_arrays(path, arrays_of(estimating.contents), card)
-    with pytest.raises(PolicyFileError, match=named):
-        load_file(path)
-
-
-def arrays_of(contents: PolicyFile) -> dict:
-    """As they stand in the file."""
-    arrays = {name: getattr(contents, name) for name in ("observation_mean", "observation_scale", "action_scale")}
-    for number, (weight, bias) in enumerate(zip(contents.weights, contents.biases, strict=True)):
-        arrays |= {f"weight_{number}": weight, f"bias_{number}": bias}
-    return arrays
+        make_law("lqg-offset-free", preset("flight"))

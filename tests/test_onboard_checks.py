@@ -207,7 +207,7 @@ def test_what_an_app_computes_is_checked_before_it_leaves():
 
 
 @needs_gcc
-@rows("name", ["recurrent flight", "recurrent universal"])
+@rows("name", ["recurrent flight", "universal"])
 def test_a_state_of_the_network_that_is_not_finite_lands_the_pair(name: str):
     """The law of `copy` flies on from the same period; what cannot be is forgotten."""
     size = law_of(policy_of(name).card).size

@@ -21,7 +21,7 @@ from mjxball.sim.laws import Laws
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["flight", "stand", "team", "recurrent flight", "recurrent universal"])
+@pytest.mark.parametrize("name", ["flight", "stand", "recurrent flight", "universal"])
 def test_the_apps_command_what_the_laptop_would(name: str):
     """Leader and follower over 5 s of motion: float32 on board, float64 laws on the laptop."""
     policy = policy_of(name)
@@ -58,11 +58,11 @@ def test_the_apps_command_what_the_laptop_would(name: str):
 
 def test_the_laptop_turns_into_mount_frames_as_teams_do():
     """A pair along y, whose follower's frame is turned by a right angle, beside the same rig as a team."""
-    policy = policy_of("team")
-    controller, random = Controller(Policy(policy, "team")), np.random.default_rng(1)
+    policy = policy_of("universal")
+    controller, random = Controller(Policy(policy, "universal")), np.random.default_rng(1)
     config = controller.config
     laws = Laws(dataclasses.replace(config, plant=dataclasses.replace(config.plant, cg_axis="xy")))
-    alone, goal = Policy(policy, "team"), np.array([0.0, 0.0, 0.4])
+    alone, goal = Policy(policy, "universal"), np.array([0.0, 0.0, 0.4])
     for _ in range(5):
         place, velocity, rates, euler = random.normal(scale=0.02, size=(4, 3))
         pair = ObjectState(place, velocity, rotations.quaternion_from_euler(euler), rates)
@@ -71,7 +71,7 @@ def test_the_laptop_turns_into_mount_frames_as_teams_do():
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["recurrent flight", "recurrent universal"])
+@pytest.mark.parametrize("name", ["recurrent flight", "universal"])
 def test_a_flight_begins_with_an_empty_state(name: str):
     """A second one without a reboot, after motion that the first one remembers, is the first one again."""
     bench = Bench(cores_of(name), Rig.of_card(policy_of(name).card))

@@ -114,7 +114,7 @@ def test_a_recurrent_policy_of_another_size_is_refused():
     policy = policy_of("recurrent flight")
     follower = App(compile_pair(policy, "small", int8=True)[1], 1)
     refusal = r"^the follower: weights refused: wrong rate, plant, layers, size or CRC$"
-    for other in (benchmark.recurrent("flight", 47), benchmark.recurrent("flight", 64), policy_of("flight")):
+    for other in (benchmark.recurrent(47), benchmark.recurrent(64), policy_of("flight")):
         with pytest.raises(InputError, match=refusal):
             send_weights(AppLink(follower), weight_bytes(other), generate.key_of(other), print)  # type: ignore[arg-type]
         assert follower.ident == generate.ident_of(policy, True)

@@ -20,14 +20,14 @@ from mjxball.export import in_team
 from mjxball.policy import Policy, load_file, shipped_policy
 
 # One of every format, without and with a history, alone and in a batch of two; and classical followers.
-POLICIES = ("paper", "flight", "balance", "team", "universal")
+POLICIES = ("paper", "flight", "balance", "universal")
 SEEN = 0.1 * np.random.default_rng(3).standard_normal((40, 18))
 
 
 def policy(name: str, dtype: type = np.float32) -> Policy:
     """The shipped policy `name`, told that it flies in a pair or in a team of three."""
     contents = load_file(shipped_policy(name))
-    if name in ("team", "universal"):
+    if name == "universal":
         contents = in_team(contents, name, Path("team3"), 1)
     return Policy(contents, name, dtype)
 

@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from command_line import assert_refused
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mjxball.commands import evaluate
 from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFileError
 
@@ -214,7 +216,18 @@ class TestDamagedArrays:
 
 
 class TestDamagedCard:
-    @pytest.mark.parametrize("version", [0, 2, "1", None, True, [1], 1.5, HUGE], ids=lambda v: repr(v)[:5])
+    @pytest.mark.parametrize(
+        ("version", "kind"), [(2, "an LQG of a pair"), (3, "an LQG of one of a team"), (4, "LQGs for attitude loops")]
+    )
+    def test_a_format_on_an_lqg_names_the_last_version_that_flies_it(self, saved, version, kind, capsys):
+        """Whatever its arrays are, and on the command line."""
+        rewrite_card(saved, lambda card: card.update(format_version=version))
+        rewrite(saved, lambda arrays: arrays.update(weight_0=arrays["weight_0"][:3]))
+        refused(saved, f"has policy format {version}, a network on top of {kind}")
+        refused(saved, ": mjxball 0.1.0 is the last version that flies it")
+        assert "0.1.0" in assert_refused(evaluate.main, [saved], saved.parent, capsys)
+
+    @pytest.mark.parametrize("version", [0, 6, "1", None, True, [1], 1.5, HUGE], ids=lambda v: repr(v)[:5])
     def test_unknown_format_version(self, saved, version):
         rewrite_card(saved, lambda card: card.update(format_version=version))
         refused(saved, "format")

@@ -13,10 +13,9 @@ import pytest
 from tables import rows
 
 from mjxball.baselines.lqg import SlowKnownRigLqg
+from mjxball.baselines.team_lqg import known
 from mjxball.config import preset, replace, validate, with_plant
 from mjxball.control.followers import PrivilegedInfo
-from mjxball.control.multi_model_lqg import team_geometry
-from mjxball.control.team_lqg import team_context
 from mjxball.env import PipelineState, TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
@@ -26,6 +25,7 @@ from mjxball.physics.step import make_control_step
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
+from mjxball.policy.policy import geometry_of
 from mjxball.sim.outside import outside
 from mjxball.sim.rigs import (
     TRAINING,
@@ -124,7 +124,7 @@ def test_a_padded_rig_flies_as_it_does_alone() -> None:
     flown = []
     for config, table in ((UNIVERSAL, rigs), (alone, unpadded(rigs, 3))):
         still = dataclasses.replace(config.scenario, noise=(0.0, 0.0), delay=(0.0, 0.0), estimator_drift=(0.0, 0.0))
-        simple = dataclasses.replace(config.follower, base="pd")
+        simple = dataclasses.replace(config.follower, recurrent_units=0)
         env = TransportEnv(dataclasses.replace(config, scenario=still, follower=simple), "newton-euler")
         own = jax.tree.map(lambda part: jnp.asarray(part[1], jnp.float32), table)
         state, step = jax.jit(env.reset)(jax.random.key(3), 1.0, None, own), jax.jit(env.step)
@@ -137,15 +137,20 @@ def test_a_padded_rig_flies_as_it_does_alone() -> None:
 
 @pytest.mark.slow
 def test_training_differentiates_what_followers_remember() -> None:
-    """The slope of what is commanded later in the first action, of which the filters know: against a difference."""
+    """The slope of what is commanded later in the first action, by a state that sums up rates: against a difference."""
     config = UNIVERSAL
     for setting, value in (("rigs.number", 2), ("scenario.team_sizes", (2,)), ("scenario.delay", (0.0, 0.0))):
         config = replace(config, setting, value)
     env = TransportEnv(config, "newton-euler")
-    start, first = env.reset(jax.random.key(1)), jnp.zeros((20, 3, 3)).at[0].set(jnp.array([0.3, -0.5, 0.2]))
+    start, first = env.reset(jax.random.key(1)), jnp.zeros((20, 5, 3)).at[0].set(jnp.array([0.3, -0.5, 0.2]))
 
     def cost(push: Any) -> Any:
-        states = lambda state, action: (env.step(state, action), state.pipeline_state.command)  # noqa: E731
+        def states(state: Any, action: Any) -> Any:
+            hidden = state.obs[..., env.recurrent_slots]
+            later = hidden.at[..., :3].set(0.9 * hidden[..., :3] + 0.2 * state.obs[..., 9:12])
+            answer = jnp.concatenate([action + hidden[..., :3], later], axis=-1)
+            return env.step(state, answer), state.pipeline_state.command
+
         _, commands = jax.lax.scan(states, start, push * first)
         return (commands[2:, 0] * jnp.array([1.0, 1.0, 0.1])).sum()
 
@@ -173,20 +178,20 @@ def test_thrust_falls_as_the_battery_empties() -> None:
 
 class TestUniversal:
     def test_what_it_makes_of_mounts_is_that_of_a_middling_rig(self) -> None:
-        """Against what a law that is told the whole rig is told: medians of the rigs, their spread and direction."""
+        """Against what followers that know the whole rig know: medians of the rigs, their spread and direction."""
         for size in (2, 3, 4, 6):
             levers, rooms, turned = [], [], []
             rigs = held_out(UNIVERSAL, size, 40)
             for row in range(40):
                 config = rig_config(UNIVERSAL, rigs, row)
-                plant, numbers = config.plant, plant_parameters(config.plant, config.attitude)
-                told = np.reshape(team_context(numbers, plant, np.float64(plant.object_mass)), (size - 1, 5))
-                guessed = np.reshape(team_geometry(plant, rigs.numbers.mounts[row], np.float64(size)), (size - 1, 4))
-                np.testing.assert_allclose(guessed[:, 0], told[:, 0])
+                share, *whole = known(config)
+                lever, room = (np.atleast_2d(part) for part in whole)
+                guessed = np.atleast_2d(geometry_of(config.plant))
+                np.testing.assert_allclose(guessed[:, 0], share)
                 stiffness = np.square(config.attitude.natural_frequency[:2])
-                levers.append(np.hypot(*(told[:, 1:3] * stiffness).T) / np.hypot(*guessed[:, 1:3].T))
-                rooms.append(told[:, 4] * stiffness[1] / guessed[:, 3])
-                turned.append(np.arctan2(told[:, 1], told[:, 2]) - np.arctan2(guessed[:, 1], guessed[:, 2]))
+                levers.append(np.hypot(*(lever * stiffness).T) / np.hypot(*guessed[:, 1:3].T))
+                rooms.append(room[:, 1] * stiffness[1] / guessed[:, 3])
+                turned.append(np.arctan2(*lever.T) - np.arctan2(guessed[:, 1], guessed[:, 2]))
             assert np.median(levers) == pytest.approx(1.0, abs=0.15)
             assert np.median(rooms) == pytest.approx(1.0, abs=0.25)
             assert np.quantile(np.abs(np.log(levers)), 0.9) < 0.5
@@ -250,7 +255,7 @@ class TestUniversal:
             assert felt[half].mean() > 0.3
 
     def test_a_rig_outside_is_flown_with_a_warning(self, capsys: pytest.CaptureFixture[str]) -> None:
-        load_policy(POLICY, with_plant(UNIVERSAL, "team4"))
+        load_policy(POLICY, with_plant(preset("transport"), "team4"))
         assert "trained from" not in capsys.readouterr().err  # more drones than its card is good for, but of its ranges
         paper = preset("paper")
         load_policy(POLICY, paper)

@@ -37,8 +37,10 @@ QUIET = {
     "scenario.rotor_lag_scale": (1.0, 1.0),
     "follower.privileged_critic": False,
     "follower.observation_averages": (),
-    "follower.base": "pd",
+    "follower.recurrent_units": 0,
+    "follower.previous_action": False,
     "reward.command_change": 0.0,
+    "reward.spread": 0.0,
     "scenario.thrust_scale": (1.0, 1.0),
     **{f"scenario.{name}": (1.0, 1.0) for name in Factors._fields},
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from plants import paper_with, random_motion, team
@@ -12,8 +13,10 @@ from tables import rows
 from test_engines import TOLERANCE, jitted, relative_difference
 
 from engines import random_states
+from mjxball import config as configs
 from mjxball.config import Attitude, Plant, preset
 from mjxball.control import rotations
+from mjxball.env import TransportEnv
 from mjxball.physics import mjx, mujoco, newton_euler
 from mjxball.physics.engine import Load, contact_wrenches, total_wrench
 from mjxball.physics.step import make_control_step, start_state
@@ -179,3 +182,42 @@ def test_carriers_own_equations_hold_with_the_contact_wrenches() -> None:
     # 1e-9 of the largest force and torque
     assert np.abs(newton).max() <= 1e-9 * np.abs(force).max()
     assert np.abs(euler).max() <= 1e-9 * np.abs(torque).max()
+
+
+FACTORS = ("drone_mass", "drone_inertia", "mount", "arm", "yaw_per_thrust", "rotor_force", "carrier", "attitude_gain")
+
+
+@pytest.fixture(scope="module")
+def moved():
+    """State after a few steps of strong commands, for a range of one number of the rig at 1.3 and none."""
+    strong = jnp.asarray(np.random.default_rng(2).uniform(-1, 1, (2, 3)), jnp.float32) * jnp.array([0.6, 0.6, 40.0])
+
+    steps: list = []  # of the first one's program, to which a rig is data
+
+    def fly(name: str = "") -> np.ndarray:
+        changes = {
+            "follower.privileged_critic": False,
+            "command.vertical_limit": 40.0,
+            "scenario.start_tilt": 0.3,
+            **{f"scenario.{one}_scale": (1.0, 1.0) for one in (*FACTORS, "rotor_lag", "thrust", "inertia")},
+            "scenario.team_sizes": (3,),
+        }
+        if name:
+            changes[f"scenario.{name}_scale"] = (1.3, 1.3)
+        base = configs.apply_overrides(preset("team"), changes)
+        env = TransportEnv(base, "newton-euler")
+        state = env.reset(jax.random.key(3), 1.0, 0)
+        if not steps:
+            steps.append(jax.jit(env.step_with_command))
+        for _ in range(3):
+            state = steps[0](state, jnp.concatenate([strong, jnp.zeros((3, 3))]))
+        plant = state.pipeline_state.plant
+        return np.concatenate([np.ravel(leaf) for leaf in (plant.velocity, plant.rates)])
+
+    return fly
+
+
+def test_every_range_of_a_rig_acts(moved) -> None:
+    base = moved()
+    for name in (*FACTORS, "rotor_lag", "thrust", "inertia"):
+        assert np.abs(moved(name) - base).max() > 1e-5, name

@@ -101,16 +101,7 @@ def kalman(model: AssemblyModel, axis: int, torque_walk: float) -> Filter:
 def steady_filter(
     a: np.ndarray, b: np.ndarray, period: float, walks: Mapping[int, float], noise: Mapping[int, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(A, B, K) of `innovation_filter`."""
-    return innovation_filter(a, b, period, walks, noise)[:3]
-
-
-def innovation_filter(
-    a: np.ndarray, b: np.ndarray, period: float, walks: Mapping[int, float], noise: Mapping[int, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(A (n, n), B (n, m), K (n, k), covariance (k, k) of what is measured less what is predicted).
-
-    Of the steady-state Kalman filter of x' = a x + b u, sampled every `period` [s].
+    """(A (n, n), B (n, m), K (n, k)) of the steady-state Kalman filter of x' = a x + b u, sampled every `period` [s].
 
     `walks`: intensity of the white noise that drives a state, by its number. `noise`: deviation of the measurement of
     a state, by its number; K has a column for each.
@@ -120,19 +111,9 @@ def innovation_filter(
     for state, intensity in walks.items():
         process_noise[state, state] = intensity * period
     measured, measurement_noise = np.eye(len(a))[list(noise)], np.diag([value**2 for value in noise.values()])
-    return transition, drive, *kalman_gain(transition, measured, process_noise, measurement_noise)
-
-
-def kalman_gain(
-    transition: np.ndarray, measured: np.ndarray, process_noise: np.ndarray, measurement_noise: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(K (n, k), covariance (k, k) of what is measured less what is predicted) of a steady-state Kalman filter.
-
-    Of x <- A x, `transition` (n, n), of which `measured` (k, n) x is seen; covariances of both noises in a step.
-    """
     predicted = solve_discrete_are(transition.T, measured.T, process_noise, measurement_noise)
-    innovation = measured @ predicted @ measured.T + measurement_noise
-    return predicted @ measured.T @ np.linalg.inv(innovation), innovation
+    gain = predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + measurement_noise)
+    return transition, drive, gain
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

@@ -305,7 +305,7 @@ def _load(
     policies = []
     for path in paths:
         setup, policy = setup_of(path), Policy.load(path)
-        policy.join(setup.plant, setup.attitude)  # nothing forces a law into a team that it is not for
+        policy.join(setup.plant)
         try:
             policy = load_policy(path, setup, compare_laws=options.wn_pitch is None, seconds=seconds)
         except InputError as error:

@@ -6,7 +6,7 @@ Importing it needs the standard library only.
 from mjxball.config._leaf import Range
 from mjxball.config._learning import Gradient, Ppo, Sac
 from mjxball.config._load import follow_plant
-from mjxball.config._plant import LEAST_LIFTING, Drone, Plant
+from mjxball.config._plant import Drone, Plant
 from mjxball.config._plant_file import PLANT_PARTS, PLANTS, PlantFile, read_plant, with_plant
 from mjxball.config._plausible import check_lift, thrust_over_weight, total_mass
 from mjxball.config._presets import PRESETS, preset
@@ -40,7 +40,6 @@ from mjxball.config._validate import ball_limit, cg_limit, validate
 
 __all__ = [
     "CONSTANT",
-    "LEAST_LIFTING",
     "PLANTS",
     "PLANT_PARTS",
     "PRESETS",

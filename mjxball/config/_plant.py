@@ -8,8 +8,6 @@ from typing import Literal
 from mjxball.config._leaf import Vector3, setting
 from mjxball.errors import InputError
 
-LEAST_LIFTING = 4  # drones of a team that lifts apart: with three, two followers lift without the leader
-
 
 @dataclass(frozen=True)
 class Drone:

@@ -45,7 +45,6 @@ RENAMED = {
     "scenario.unknown_share": "scenario.unknown_mass_probability",
     "follower.washout": "follower.washout_time",
     "follower.shares_integrals": "follower.residual_on_pid",
-    "follower.load_by_lift": "follower.differential_thrust_share",
     "leader.level_gain": "leader.tilt_integral_gain",
     "leader.integral_band": "leader.integral_error_limit",
     "leader.integral_lead": "leader.integral_lead_time",
@@ -71,6 +70,9 @@ CONSTANT: dict[str, Any] = {
     "sac.gradient_clip": 0.0,
     "sac.max_grad_norm": 0.0,
     "ppo.curriculum": 0.0,
+    "follower.base": "pd",
+    "follower.differential_thrust_share": 0.0,
+    "follower.load_by_lift": 0.0,
 }
 
 

@@ -105,18 +105,6 @@ class Follower:
     action: Literal["residual", "direct"] = setting(
         "residual", "residual: added to the PD law on its own observation; direct: the command itself"
     )
-    base: Literal["pd", "lqg"] = setting(
-        "pd",
-        "what a residual action is added to: the PD law, or an offset-free LQG that estimates the load's torque (in a "
-        "team one of each follower's own)",
-    )
-    differential_thrust_share: float = setting(
-        0.0,
-        "in a team of four or more, with base lqg: share of the load's torque that followers hold by lifting apart, "
-        "the rest by tilting",
-        low=0,
-        high=1,
-    )
     action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", above=0, high=1.2)
     action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", above=0)
     residual_on_pid: bool = setting(

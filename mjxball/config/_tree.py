@@ -52,6 +52,9 @@ def override(config: Config, path: str, text: str) -> Config:
 
     Raises InputError for an unknown path or a text that does not parse to the leaf's type.
     """
+    if path in CONSTANT:
+        check_constant(path, _parse(path, text, CONSTANT[path], float))
+        return config
     for known, value, item in leaves(config):
         if known == current_name(path):
             whole = "int" in str(item.type)

@@ -9,7 +9,7 @@ import math
 import typing
 from typing import Any, Literal
 
-from mjxball.config._plant import LEAST_LIFTING, Plant
+from mjxball.config._plant import Plant
 from mjxball.config._plausible import check_units
 from mjxball.config._settings import Config
 from mjxball.config._tree import leaves
@@ -81,8 +81,6 @@ def validate(config: Config) -> Config:
     _validate_team(config)
     _validate_autopilot(config)
     _validate_motion(config)
-    if config.follower.recurrent_units and config.follower.base == "lqg":
-        raise InputError("follower.recurrent_units is for follower.base pd: an LQG is a memory of its own")
     start, goal = config.scenario.start_position, config.scenario.goal_range
     farthest = math.sqrt(3) * (start + goal)
     if farthest >= config.scenario.termination_distance:
@@ -150,21 +148,9 @@ def _validate_plant(plant: Plant) -> None:
         raise InputError(f"plant.ball_stop {plant.ball_stop:g} m lies off the object, where a ball reaches {end:.4g} m")
 
 
-def _check_lifting(config: Config) -> None:
-    if config.follower.base != "lqg":
-        raise InputError("follower.differential_thrust_share is of teams with follower.base lqg")
-    smallest = min(config.scenario.team_sizes, default=config.plant.count)
-    if smallest < LEAST_LIFTING:
-        raise InputError(
-            f"follower.differential_thrust_share needs teams of at least {LEAST_LIFTING} drones, not {smallest}"
-        )
-
-
 def _validate_team(config: Config) -> None:
     """What is for teams, and what is for pairs alone."""
     plant, scenario = config.plant, config.scenario
-    if config.follower.differential_thrust_share:
-        _check_lifting(config)
     if config.follower.residual_on_pid and plant.count > 2:
         raise InputError("follower.residual_on_pid is for a pair, whose two drones lift each other's integral away")
     if len(plant.directions) == 1 and (scenario.cg_width[1] > 0 or scenario.cg_lissajous_probability > 0):

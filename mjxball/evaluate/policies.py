@@ -12,6 +12,7 @@ from mjxball.config import Config, with_current_names
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
+from mjxball.policy.file import law_of
 from mjxball.sim.outside import outside
 
 
@@ -42,7 +43,7 @@ def beyond_card(card: dict[str, Any], drones: int, seconds: float) -> list[str]:
 
 def _fitting(path: Path, config: Config, compare_laws: bool) -> Policy:
     policy = Policy.load(path)
-    policy.join(config.plant, config.attitude)
+    policy.join(config.plant)
     period = config.timing.control_period
     if abs(policy.control_period - period) > 1e-9:
         raise InputError(f"{path} was made for a control period of {policy.control_period:g} s, not {period:g} s")
@@ -73,8 +74,7 @@ def _fitting(path: Path, config: Config, compare_laws: bool) -> Policy:
 
 def flies_any_rig(policy: Policy) -> bool:
     """Whether `policy` flies any rig, of which it is told where the drones are mounted alone."""
-    version = policy.card["format_version"]
-    return bool(version == 4 or (version == 5 and "context" in policy.card and trained_rigs(policy).rigs.number))
+    return law_of(policy.card).geometry and trained_rigs(policy).rigs.number > 0
 
 
 def trained_rigs(policy: Policy) -> Config:

@@ -11,10 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxball.baselines.multi_model_lqg import MultiModelOffsetFree
 from mjxball.config import Config, Plant
 from mjxball.control.followers import Law, PrivilegedInfo
-from mjxball.control.multi_model_lqg import team_geometry
+from mjxball.control.geometry import team_geometry
 from mjxball.env import PipelineState, State, TransportEnv
 from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, SETTLED, STEADY_AFTER, near_limit, power_of
 from mjxball.physics.motion import object_mass
@@ -103,7 +102,7 @@ def fly(
             effort = jax.tree.map(jnp.add, effort, _effort(state.pipeline_state, command, rig, own.plant.gravity))
             return (state, memory, far, effort), error
 
-        if isinstance(law, AnyRigLaw | AnyRigBase):
+        if isinstance(law, AnyRigLaw):
             law = law.on(rig, own.plant)
         nothing = Effort(*(jnp.zeros(()) for _ in Effort._fields))
         start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool), nothing)
@@ -145,22 +144,7 @@ class AnyRigLaw(NetworkLaw):
     def on(self, rig: RigTable, plant: Plant) -> AnyRigLaw:
         """The law of the followers of `rig`, drones like those of `plant`."""
         found = copy.copy(self)
-        found._context = team_geometry(plant, rig.numbers.mounts, rig.size)
-        return found
-
-
-class AnyRigBase(MultiModelOffsetFree):
-    """The law that a policy for any rig adds its action to, alone, told every rig's geometry."""
-
-    name = "lqg-multi-model"
-
-    def __init__(self, config: Config):
-        super().__init__(config, None)
-
-    def on(self, rig: RigTable, plant: Plant) -> AnyRigBase:
-        """The law of the followers of `rig`, drones like those of `plant`."""
-        found = copy.copy(self)
-        found._context = team_geometry(plant, rig.numbers.mounts, rig.size)
+        found._geometry = team_geometry(plant, rig.numbers.mounts, rig.size)
         return found
 
 

@@ -23,7 +23,6 @@ SAME = (
     "history",
     "previous_action",
     "filters",
-    "lqg",
     "action_mode",
     "action_reach",
     "command_limits",

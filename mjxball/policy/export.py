@@ -14,13 +14,11 @@ import numpy as np
 from mjxball import __version__
 from mjxball.config import Config, config_hash, to_dict
 from mjxball.control.follower_law import FollowerLaw
+from mjxball.control.geometry import GEOMETRY
 from mjxball.control.motors import firmware
-from mjxball.control.multi_model_lqg import MultiModelLqg
 from mjxball.control.observation import ACTION, OBSERVATION, commanded
-from mjxball.control.team_lqg import TeamLqg
 from mjxball.files import write_whole
 from mjxball.policy.file import PolicyFile
-from mjxball.policy.law_fields import CONTEXTS
 
 
 def policy_file(
@@ -28,21 +26,16 @@ def policy_file(
 ) -> PolicyFile:
     """The policy file of what has been learnt, see `mjxball.algorithms.base.Policy`.
 
-    `law`: that of `config` (`baselines.follower_law`). `origin` (command, seed, commit, ...) is added to the card.
+    `law`: that of `config` (`sim.follower.follower_law`). `origin` (command, seed, commit, ...) is added to the card.
     """
     weights, biases = _layers(learnt)
     follower, leader = config.follower, config.leader
-    mask = np.array(law.mask(follower.ignore_position))
-    gru = _gru(learnt)
-    size = len(mask) - law.units  # behind it stand a GRU's state and what only critics saw, whose weights never moved
-    mask = mask[:size]
+    size = law.input_size  # behind it stand a GRU's state and what only critics saw, whose weights never moved
+    mask = np.array(law.mask(follower.ignore_position))[:size]
     deviation = np.asarray(learnt.deviation, np.float64)[:size]
     action_scale = [follower.action_scale_tilt, follower.action_scale_vertical]
-    version = 5 if law.units else 1 if law.lqg is None else 2
-    if isinstance(law.lqg, TeamLqg | MultiModelLqg):
-        version = 4 if isinstance(law.lqg, MultiModelLqg) else 3
     card = {
-        "format_version": version,
+        "format_version": 5 if law.units else 1,
         "observation": [list(slot) for slot in OBSERVATION],
         "history": follower.history,
         "previous_action": follower.previous_action,
@@ -50,8 +43,7 @@ def policy_file(
         **({"recurrent_units": law.units} if law.units else {}),
         "action": [list(slot) for slot in ACTION],
         "action_mode": follower.action,
-        **({} if law.lqg is None else {"lqg": _numbers(law.lqg)}),
-        **({"context": list(CONTEXTS[version])} if law.needs_context else {}),
+        **({"context": list(GEOMETRY)} if law.geometry else {}),
         "action_reach": action_scale,
         "command_limits": [config.command.tilt_limit, config.command.vertical_limit],
         "leader_kp": list(leader.kp),
@@ -78,7 +70,7 @@ def policy_file(
         observation_scale=(mask / deviation).astype(np.float32),
         action_scale=np.array([action_scale[0], action_scale[0], action_scale[1]], np.float32),
         card=card,
-        gru=gru,
+        gru=_gru(learnt),
     )
 
 
@@ -146,8 +138,3 @@ def is_sound(policy: PolicyFile) -> bool:
             *(policy.gru or ()),
         )
     )
-
-
-def _numbers(lqg: Any) -> dict[str, Any]:
-    """The numbers of `lqg` that a card holds; what it leaves out is None."""
-    return {name: np.asarray(value).tolist() for name, value in lqg._asdict().items() if value is not None}

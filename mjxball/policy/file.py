@@ -13,22 +13,24 @@ from typing import Any
 import numpy as np
 
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.multi_model_lqg import MultiModelLqg
-from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, ObservationHistory
-from mjxball.control.offset_free import OffsetFreeLqg
-from mjxball.control.team_lqg import TeamLqg
+from mjxball.control.geometry import GEOMETRY
+from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, ObservationHistory
 from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.policy.container import PolicyFileError, read_arrays
-from mjxball.policy.law_fields import LQG_SHAPES, MAX_NUMBER, check_lqg, is_finite
 from mjxball.reading import parse_json
 
-# 2: with the numbers of an offset-free LQG of a pair, card field `lqg`; 3: of a team, and what a follower has to know
-# of its team before a flight, card field `context`; 4: of attitude loops that nobody knows; 5: with a GRU below the
-# network, arrays GRU_ARRAYS, and no law inside.
-FORMAT_VERSIONS = (1, 2, 3, 4, 5)
+# 5: with a GRU below the network, arrays GRU_ARRAYS; if it is told where drones are mounted, with card field `context`.
+FORMAT_VERSIONS = (1, 5)
+ENDED = {  # formats that stood on an LQG with numbers of its own
+    2: "an LQG of a pair",
+    3: "an LQG of one of a team",
+    4: "LQGs for attitude loops that nobody knows",
+}
+LAST_VERSION = "0.1.0"  # of mjxball that flies them
 GRU_ARRAYS = ("gru_kernel", "gru_recurrent", "gru_bias")
 MAX_UNITS = 512
+MAX_NUMBER = 1e6  # of any number in a card or any weight: larger ones only serve to overflow
 FOLDER = "policies"  # of those that come with mjxball
 ARCHIVE = "archive"  # in it: earlier ones, which documents name
 READ_OF_CONFIG = ("leader", "attitude", "reward")  # by evaluation, where a card has the configuration
@@ -71,7 +73,7 @@ class PolicyFile:
 
 
 def law_of(card: dict[str, Any]) -> FollowerLaw:
-    """The laws around the network of a policy file; `filters` is absent from the first files."""
+    """What is around the network of a policy file; `filters` is absent from the first files."""
     filters = tuple(card.get("filters", ()))
     return FollowerLaw(
         history=ObservationHistory(card["history"], card["previous_action"], filters, float(card["control_period"])),
@@ -81,22 +83,9 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
         kd=tuple(card["leader_kd"]),
         gravity=card["gravity"],
         residual=card["action_mode"] == "residual",
-        lqg=_lqg_of(card),
         units=card.get("recurrent_units", 0),
         geometry=card["format_version"] == 5 and "context" in card,
     )
-
-
-def _lqg_of(card: dict[str, Any]) -> OffsetFreeLqg | TeamLqg | MultiModelLqg | None:
-    lqg = card.get("lqg")
-    if lqg is None:
-        return None
-    numbers: dict[str, Any] = {name: np.array(value) for name, value in lqg.items()}
-    if card["format_version"] == 4:
-        return MultiModelLqg(**numbers)
-    if card["format_version"] == 3:
-        return TeamLqg(**numbers)
-    return OffsetFreeLqg._make(np.array(lqg[name]) for name in LQG_SHAPES)
 
 
 def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
@@ -167,7 +156,7 @@ def check(policy: PolicyFile, name: str) -> None:
     """Raise PolicyFileError unless every field, shape, dtype and value of `policy` is sound."""
     _check_card(policy.card, name)
     law = law_of(policy.card)
-    size = OBSERVATION_SIZE + law.shown - law.units
+    size = law.input_size
     vectors = [
         ("observation_mean", policy.observation_mean, size),
         ("observation_scale", policy.observation_scale, size),
@@ -217,6 +206,11 @@ def _check_array(name: str, label: str, array: np.ndarray, shape: tuple[int, ...
 
 def _check_version(card: dict[str, Any], name: str) -> None:
     version = card.get("format_version")
+    if type(version) is int and version in ENDED:
+        raise PolicyFileError(
+            f"{name} has policy format {version}, a network on top of {ENDED[version]}: mjxball {LAST_VERSION} is the "
+            "last version that flies it"
+        )
     if version not in FORMAT_VERSIONS or isinstance(version, bool):
         known = ", ".join(map(str, FORMAT_VERSIONS))
         raise PolicyFileError(f"{name} has policy format {version!r}; this version reads formats {known}")
@@ -253,7 +247,7 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
         numbers = card[field]
         if len(numbers) != length or not all(is_finite(value) and value >= 0 for value in numbers):
             raise PolicyFileError(f"{name}: card field {field} must be {length} finite numbers")
-    check_lqg(card, name)
+    _check_geometry(card, name)
     _check_flown(card.get("flown"), name)
     units, most = card.get("recurrent_units", 0), MAX_UNITS if card["format_version"] == 5 else 0
     if type(units) is not int or not min(most, 1) <= units <= most:
@@ -268,6 +262,35 @@ def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     odd = sorted(set(card["bounds"]) - set(BOUNDED))
     if odd:
         raise PolicyFileError(f"{name}: card field bounds names {odd[0]!r}; known are {', '.join(BOUNDED)}")
+
+
+def _check_geometry(card: dict[str, Any], name: str) -> None:
+    """Raise PolicyFileError unless a policy that is told where drones are mounted names what it can be told."""
+    if card["format_version"] != 5 or "context" not in card:
+        return
+    if card["context"] != list(GEOMETRY):
+        raise PolicyFileError(f"{name} needs another context than this version's {', '.join(GEOMETRY)}")
+    if "team" in card:
+        _check_team(card["team"], name)
+
+
+def _check_team(team: Any, name: str) -> None:
+    """Raise PolicyFileError unless `team` says in which team, and as which of its drones, a policy flies."""
+    if not isinstance(team, dict) or team.keys() != {"drone", "mount_angle", "context"}:
+        raise PolicyFileError(f"{name}: card field team must hold drone, mount_angle and context")
+    if not (is_finite(team["drone"]) and is_finite(team["mount_angle"])):
+        raise PolicyFileError(f"{name}: card fields team.drone and team.mount_angle must be finite numbers")
+    context = team["context"]
+    if not (isinstance(context, list) and len(context) == len(GEOMETRY) and all(map(is_finite, context))):
+        raise PolicyFileError(f"{name}: card field team.context must be {len(GEOMETRY)} finite numbers")
+    share, _, _, room = context
+    if share <= 1 or room <= 0:
+        raise PolicyFileError(f"{name}: card field team.context: command_share must be above 1 and rotor_room positive")
+
+
+def is_finite(value: Any) -> bool:
+    """Whether `value` of a card is one number within bounds, no truth value."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER
 
 
 def _check_flown(flown: Any, name: str) -> None:

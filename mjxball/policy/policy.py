@@ -9,18 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.config import LEAST_LIFTING, Attitude, Plant
+from mjxball.config import Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.followers import OneThread, checked_observation
-from mjxball.control.multi_model_lqg import CONTEXT, MultiModelLqg, team_geometry
+from mjxball.control.geometry import team_geometry
 from mjxball.control.network import Network
-from mjxball.control.team_lqg import team_context
 from mjxball.errors import InputError
-from mjxball.plant import plant_parameters
 from mjxball.policy.file import PolicyFile, law_of, load_file
-from mjxball.policy.single import SingleFollower, single_follower
-from mjxball.policy.single_network import SinglePdFollower
+from mjxball.policy.single import SingleFollower
 
 Array = Any
 ROUNDED = 1e-5  # that a GRU's state may be beyond 1
@@ -31,30 +28,13 @@ def not_told(name: str) -> InputError:
     return InputError(f"policy {name} has to be told its team: --plant NAME or FILE.toml, such as team4")
 
 
-def context_of(name: str, card: dict[str, Any], plant: Plant | None, attitude: Attitude | None) -> np.ndarray:
-    """What each follower of a team on `plant` is told, (F, c), or (c,) of one follower.
-
-    `name` and `card` of a policy of format 3 (`team_lqg.team_context`) or 4 (`multi_model_lqg.team_geometry`, for any
-    team). Raises InputError if the attitude loops are not those that its law is for, or without a plant.
-    """
-    if plant is None or attitude is None:
-        raise not_told(name)
-    if card["format_version"] in (4, 5):
-        mounts = np.array([drone.mount for drone in plant.drones])
-        return np.asarray(team_geometry(plant, mounts, np.float64(plant.count)))
-    made_for, found = float(card["lqg"]["stiffness"]) ** 0.5, attitude.natural_frequency[:2]
-    if plant.stand != "free" or max(abs(frequency - made_for) for frequency in found) > 1e-6 * made_for:
-        raise InputError(
-            f"policy {name} was made for free flight with attitude loops of {made_for:g} rad/s, "
-            f"not {found[0]:g} and {found[1]:g} on a stand that is {plant.stand}"
-        )
-    if float(card["lqg"].get("lifting", 0)) > 0 and plant.count < LEAST_LIFTING:
-        raise InputError(f"policy {name} needs a team of at least {LEAST_LIFTING} drones, not {plant.count}")
-    return np.asarray(team_context(plant_parameters(plant, attitude), plant, np.float64(plant.object_mass)))
+def geometry_of(plant: Plant) -> np.ndarray:
+    """What each follower of a team on `plant` is told, `control.geometry`: (F, 4), or (4,) of one follower."""
+    return np.asarray(team_geometry(plant, np.array([drone.mount for drone in plant.drones]), np.float64(plant.count)))
 
 
-def known_context(card: dict[str, Any], name: str) -> np.ndarray | None:
-    """What a policy of format 3 or 4 has in its card of the team that it is for, (c,); None for other formats.
+def known_geometry(card: dict[str, Any], name: str) -> np.ndarray | None:
+    """What a policy has in its card of the team that it is for, (4,); None if it is told nothing.
 
     Raises InputError if it is told its team by `Policy.join` alone.
     """
@@ -86,12 +66,11 @@ class Policy:
         gru: Any = None if contents.gru is None else tuple(np.ascontiguousarray(part, dtype) for part in contents.gru)
         self._network = Network(self._weights, self._biases, self._mean, self._scale, gru)
         self._law = law_of(card)
-        told = self._law.needs_context and "team" in card
-        self._context: Array | None = np.array(card["team"]["context"], dtype) if told else None
+        told = self._law.geometry and "team" in card
+        self._geometry: Array | None = np.array(card["team"]["context"], dtype) if told else None
         self._memory: Array | None = None
         self._thread = OneThread()
-        self._single: SingleFollower | SinglePdFollower | None = None
-        self._answers_alone = True  # as far as is known
+        self._single: SingleFollower | None = None
         self._ahead = False  # whether `_single` has the memory, newer than `_memory`
 
     @classmethod
@@ -99,15 +78,10 @@ class Policy:
         """Load a policy file; raise PolicyFileError with one sentence if it is unsound."""
         return cls(load_file(path), Path(path).stem)
 
-    def join(self, plant: Plant, attitude: Attitude) -> None:
-        """Tell it the team in which it flies, if it needs to know; before its first call.
-
-        Raises InputError if the team's attitude loops are not those that its law is for.
-        """
-        if self._law.needs_context:
-            if not plant.is_team and not self._law.told:
-                raise InputError(f"policy {self.name} was made for teams, or a load that moves in the plane")
-            self._context = context_of(self.name, self.card, plant, attitude).astype(self._dtype)
+    def join(self, plant: Plant) -> None:
+        """Tell it the team in which it flies, if it needs to know; before its first call."""
+        if self._law.geometry:
+            self._geometry = geometry_of(plant).astype(self._dtype)
 
     def reset(self) -> None:
         """Forget past observations: the next call starts an episode."""
@@ -134,9 +108,8 @@ class Policy:
     @property
     def hidden(self) -> Array | None:
         """State of the network's GRU (..., H) in `memory`, each number from -1 to 1; None: no GRU, or nothing yet."""
-        units, first = self._law.units, self._law.history.size
-        memory = self.memory if units else None
-        return None if memory is None else memory[..., first : first + units]
+        memory = self.memory if self._law.units else None
+        return None if memory is None else self._law.hidden(memory)
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which share neither the buffers of `_single` nor the thread."""
@@ -144,7 +117,7 @@ class Policy:
 
     def scaled(self, observation: Array) -> Array:
         """The network's action in [-1, 1] (..., 3) for `observation` (..., 18), remembered if need be."""
-        return self._answer(observation)[0]
+        return np.asarray(self._answer(observation)[0], self._dtype)
 
     def __call__(self, observation: Array) -> Array:
         """Command (..., 3) = roll, pitch [rad], vertical acceleration [m/s2] for `observation` (..., 18).
@@ -152,7 +125,7 @@ class Policy:
         Raises InputError for what is no observation (`checked_observation`) or has no finite answer, and remembers
         nothing of it; RuntimeError if the flight that it remembers is another thread's.
         """
-        return self._answer(observation)[1]
+        return np.asarray(self._answer(observation)[1], self._dtype)
 
     def _answer(self, observation: Array) -> tuple[Array, Array]:
         """(action in [-1, 1], command) for `observation`, remembered if need be."""
@@ -160,7 +133,7 @@ class Policy:
         remembers = self._law.size > 0
         if remembers:
             self._thread.check(self.name)
-        if observation.ndim == 1 and remembers and self._answers_alone:
+        if observation.ndim == 1 and remembers and len(self._weights) > 1:
             alone = self._answer_alone(observation)
             if alone is not None:
                 return alone
@@ -176,21 +149,17 @@ class Policy:
     def _answer_alone(self, observation: Array) -> tuple[Array, Array] | None:
         """`_answer` to one observation (18,), by a `SingleFollower`; None if that cannot answer it."""
         if self._single is None:
-            self._single = single_follower(self._law, self._network)
-            self._answers_alone = self._single is not None
-        if self._single is None:
-            return None
+            self._single = SingleFollower(self._law, self._network)
         if not self._ahead:
             memory = self.law.start(observation) if self._memory is None else self._memory
-            # Of several followers, or one whose share of the command is 0, by which it divides.
-            if memory.ndim > 1 or (isinstance(self._law.lqg, MultiModelLqg) and memory[-CONTEXT] <= 0):
+            if memory.ndim > 1:  # of several followers
                 return None
             self._single.memory = memory
         found = self._single.answer(observation)
         if found is None:
             return None
         self._ahead = True
-        return np.array(found[0], self._dtype), np.array(found[1], self._dtype)
+        return found
 
     def _checked(self, memory: Array) -> Array:
         """A copy of `memory`, or InputError unless it is one that this policy may have."""
@@ -201,8 +170,7 @@ class Policy:
             own = np.array(given, self._dtype)
         if not np.isfinite(own).all():
             raise InputError(f"a memory of policy {self.name} must be finite, and this one is not finite")
-        first = self._law.history.size
-        if (np.abs(own[..., first : first + self._law.units]) > 1 + ROUNDED).any():
+        if (np.abs(self._law.hidden(own)) > 1 + ROUNDED).any():
             raise InputError(f"a memory of policy {self.name} has a GRU's state beyond 1: it is another policy's")
         return own
 
@@ -219,20 +187,15 @@ class NetworkLaw:
         self.name = policy.name
         self._network = policy._network
         self._law = policy._law
-        self._context = policy._context
+        self._geometry = policy._geometry
 
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
-        return self._law.start(observation, _known(self.name, self._law, self._context))
+        return self._law.start(observation, _known(self.name, self._law, self._geometry))
 
-    @property
-    def units(self) -> int:
-        """H of the network's GRU, whose state ends what is `shown`; 0 without one."""
-        return self._law.units
-
-    def shown(self, observation: Array, memory: Array) -> Array:
-        """What the network sees of its `memory` (..., s)."""
-        return self._law.network_input(observation, memory)[..., layout.OBSERVATION_SIZE :]
+    def hidden(self, memory: Array) -> Array:
+        """State (..., H) of the network's GRU in `memory` (..., m)."""
+        return self._law.hidden(memory)
 
     def step(self, memory: Array, observation: Array, privileged: Any) -> tuple[Array, Array]:
         """(memory, command (..., 3)) at `observation` (..., 18); `privileged` is not read."""
@@ -241,16 +204,14 @@ class NetworkLaw:
 
     def answer(self, memory: Array, observation: Array) -> tuple[Array, Array, Array]:
         """(action in [-1, 1] (..., 3), command (..., 3), memory of the next step) at `observation` (..., 18)."""
-        known = self._law.known(observation, memory)
-        seen = self._law.network_input(observation, memory, known) if self._law.size else observation
+        seen = self._law.network_input(observation, memory) if self._law.size else observation
         answer = self._network.like(observation)(seen)
-        command = self._law.command(answer, observation, memory, known)
-        remembered = self._law.next(memory, observation, answer, command, known)
+        command, remembered = self._law.command(answer, observation), self._law.next(memory, observation, answer)
         return answer[..., : layout.ACTION_SIZE], command, remembered
 
 
-def _known(name: str, law: FollowerLaw, context: Array | None) -> Array | None:
-    """`context`, or InputError if the law needs one and there is none."""
-    if law.needs_context and context is None:
+def _known(name: str, law: FollowerLaw, geometry: Array | None) -> Array | None:
+    """`geometry`, or InputError if the law needs it and there is none."""
+    if law.geometry and geometry is None:
         raise InputError(f"policy {name} has to be told its team before it flies (Policy.join)")
-    return context
+    return geometry

@@ -14,14 +14,14 @@ from mjxball.control.motors import firmware
 from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of
-from mjxball.policy.policy import context_of, not_told
+from mjxball.policy.policy import geometry_of, not_told
 
 CRAZYFLIES = Path("crazyflie")  # the plant that a policy for any rig flies where none is named
 
 
 def is_for_any(card: dict[str, Any]) -> bool:
     """True for the card of a policy for any rig that has not been told which."""
-    return law_of(card).told > 0 and "team" not in card
+    return law_of(card).geometry and "team" not in card
 
 
 def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | None = None) -> PolicyFile:
@@ -29,7 +29,7 @@ def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | N
 
     Its card then has `team`, and plant and configuration of that team. Raises InputError for what does not fit.
     """
-    if not law_of(policy.card).needs_context:
+    if not law_of(policy.card).geometry:
         if config is not None or drone is not None:
             raise InputError(f"{name} is told nothing of its team: leave --plant and --drone out")
         return policy
@@ -41,12 +41,10 @@ def in_team(policy: PolicyFile, name: str, config: Config | None, drone: int | N
     place = 0 if drone is None else followers.index(drone)
     if config is None:
         raise not_told(name)
-    context = context_of(name, policy.card, config.plant, config.attitude)
-    told = context.reshape(-1, context.shape[-1])[place].tolist()
     team = {
         "drone": followers[place],
         "mount_angle": float(np.ravel(mount_frames(config.plant))[place]),
-        "context": told,
+        "context": np.atleast_2d(geometry_of(config.plant))[place].tolist(),
     }
     return replace(policy, card={**policy.card, **_card_of(config, policy.card), "team": team})
 

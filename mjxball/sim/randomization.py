@@ -195,9 +195,7 @@ class ResetDistribution:
         margin, tilt = self.config.scenario.trim_margin, self.config.follower.action_scale_tilt
         flying = (jnp.asarray(numbers.drone_mass) > 0).sum() - 1
         gain = jnp.min(jnp.asarray(numbers.gains.kp)[..., :2], axis=-1)
-        held = (1 - margin) * flying * gain * tilt / (numbers.gravity * object_mass)
-        by_lift = self.config.follower.differential_thrust_share
-        return held / (1 - by_lift) if by_lift < 1 else jnp.full_like(held, jnp.inf)
+        return (1 - margin) * flying * gain * tilt / (numbers.gravity * object_mass)
 
     def _varied(self, load: Load, key: Array) -> Load:
         """`load` with rotors and inertia of its own."""

@@ -142,8 +142,7 @@ class LoadedEnv(TransportEnv):
         loop, observation = self._loop_of(()).start(plant, flight.goal, Sample(), delay, flight.integral)
         history = flight.history if self._law.size else ()
         moved = world._replace(loop=loop, load=load, goal=flight.goal, history=history)
-        moved, seen = self.seeing(moved, observation)
-        return state.replace(pipeline_state=moved, obs=seen)
+        return state.replace(pipeline_state=moved, obs=self.seen(moved, observation))
 
 
 def fine_tuning_config(flown: Config, gradient: dict[str, Any]) -> Config:

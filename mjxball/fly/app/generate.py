@@ -54,11 +54,7 @@ def ident_of(policy: PolicyFile, int8: bool) -> int:
 
 
 def check_policy(policy: PolicyFile, name: str) -> Config:
-    """The configuration of a policy that can fly on board. Raises InputError for another plant or rate.
-
-    A follower of a team whose law lifts one drone more than the other at will must not lift more than the rotors can
-    hold level by what it is told of them.
-    """
+    """The configuration of a policy that can fly on board. Raises InputError for another plant or rate."""
     plant = policy.card["plant"]
     drones = plant.get("drones", ())
     if policy.card.get("firmware") is None or (drones and len(drones) != 2):
@@ -67,16 +63,6 @@ def check_policy(policy: PolicyFile, name: str) -> Config:
     if abs(period - round(period)) > 1e-6 or not PERIODS[0] <= round(period) <= PERIODS[1]:
         wanted = f"whole milliseconds from {PERIODS[0]} to {PERIODS[1]}"
         raise InputError(f"{name} has a control period of {period:g} ms; an app keeps {wanted}")
-    team, lqg = policy.card.get("team"), policy.card.get("lqg")
-    if team and lqg:
-        share, roll, pitch, *room = team["context"]
-        wanted = min(share * lqg["limits"][1], policy.card["command_limits"][1])  # [m/s2]
-        held = min(room) / max(math.hypot(roll, pitch), 1e-9)
-        if wanted > held:
-            raise InputError(
-                f"{name} may lift {wanted:.2g} m/s2 more than the leader, and the rotors of this pair hold {held:.2g}: "
-                "train with a smaller --command.vertical_limit"
-            )
     return card.config_of(policy.card)
 
 

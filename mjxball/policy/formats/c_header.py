@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control import swing
 from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, FollowerLaw
-from mjxball.control.multi_model_lqg import LEAST_ROOM, MultiModelLqg, is_pair
+from mjxball.control.geometry import GEOMETRY_SIZE
 from mjxball.control.observation import (
     ACTION_SIZE,
     ERROR,
@@ -21,77 +20,16 @@ from mjxball.control.observation import (
     OBSERVATION,
     OBSERVATION_SIZE,
 )
-from mjxball.control.offset_free import OffsetFreeLqg
-from mjxball.control.team_lqg import TeamLqg
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
-from mjxball.policy.formats.c_multi_model import MULTI_MODEL_LQG
-from mjxball.policy.policy import known_context
+from mjxball.policy.policy import known_geometry
 from mjxball.policy.quantize import Rows, balanced, rows_of
 
 FLOAT = 4  # bytes
 WIDEST_INT8 = 512  # products of 8 and 16 bits whose sum fits into 32
 LARGEST = 1e6  # of an observation's absolute sum: no flight comes near it, and floats can filter it
 APP = "mjxball"  # what the names in an app on board begin with, of which there is one a program
-# Of `MultiModelLqg`: a pair's numbers about roll, and those of every team that they replace.
-PAIR_ROLL = {"pair_roll_gain": "axis_gain", "pair_roll_certainty": "certainty", "pair_roll_prior": "prior"}
-MACROS = {"pair_roll_room", "rig_axes", "held_room", "by_size"}  # of `MultiModelLqg`, no arrays in a header
-LQG_TEXTS = {  # helpers, law
-    type(None): ("", ""),
-    OffsetFreeLqg: (c_texts.COSINE, c_texts.LQG),
-    TeamLqg: (c_texts.ROOT + c_texts.WITHIN, c_texts.TEAM_LQG),
-    MultiModelLqg: (c_texts.ROOT + c_texts.WITHIN, MULTI_MODEL_LQG),
-}
-
-
-def _lifts(lqg: Any) -> bool:
-    return isinstance(lqg, TeamLqg) and lqg.lifting > 0
-
-
-def _lqg_text(lqg: Any) -> str:
-    """The law's text."""
-    text = LQG_TEXTS[type(lqg)][1]
-    for plain, lifting in c_texts.LIFTS_APART.items() if _lifts(lqg) else ():
-        text = text.replace(plain, lifting)
-    return text
-
-
-def _pair(lqg: Any, context: Any) -> float:
-    """1 for a pair's follower with a law of format 4, which is told `context`; 0 for other teams and laws."""
-    return float(is_pair(np.float64(context[0]))) if isinstance(lqg, MultiModelLqg) and context is not None else 0.0
-
-
-def _lqg_numbers(lqg: Any, context: Any) -> dict[str, Any]:
-    """Arrays of the law that the header of a follower with `context` holds; those about a pair's roll for it alone."""
-    pair, left_out = _pair(lqg, context), {*MACROS, *([] if _lifts(lqg) else ["lifting"])}
-    if pair == 0:
-        left_out |= PAIR_ROLL.keys()
-    fields = {} if lqg is None else lqg._asdict()
-    numbers = {name: value for name, value in fields.items() if value is not None and name not in left_out}
-    for name in numbers.keys() & PAIR_ROLL.keys():
-        every = numbers[PAIR_ROLL[name]]
-        numbers[name] = every + pair * (numbers[name] - every)
-    if isinstance(lqg, MultiModelLqg) and lqg.by_size is not None:
-        error, rate, tilts, lift = (1.0,) * 4 if context is None else lqg.of_size(np.float64(context[0]))
-        numbers["tilt"] = numbers["tilt"] * [error, rate, 1.0, 1.0]
-        numbers["small"] = np.array([tilts, tilts, lift])
-    return numbers
-
-
-def _rooms_and_axes(lqg: MultiModelLqg, context: Any, numbers: dict[str, Any]) -> list[str]:
-    """Macros of rooms, swings, the direction of the filters' axes, and the arrays among `numbers` about roll."""
-    wider = 1.0 + (float(lqg.pair_roll_room) - 1.0) * _pair(lqg, context)
-    cos, sin = lqg.frame(np.array(context, np.float64)) or (1.0, 0.0)
-    lines = [f"#define MJXBALL_RIG_{name} {_number(value)}" for name, value in (("COS", cos), ("SIN", sin))]
-    lines += [f"#define MJXBALL_LEAST_ROOM {_number(LEAST_ROOM)}", f"#define MJXBALL_ROLL_ROOM {_number(wider)}"]
-    lines += [f"#define MJXBALL_SWINGS {lqg.swings}", f"#define MJXBALL_SHARPNESS {swing.SHARPNESS}"]
-    lines += [f"#define MJXBALL_LEAST_ENERGY {_number(swing.LEAST_ENERGY)}"]
-    lines += [f"#define MJXBALL_HELD_ROOM {_number(float(lqg.held_room) * (1.0 - _pair(lqg, context)))}"]
-    for name, every in PAIR_ROLL.items():
-        macro = name.removeprefix("pair_").upper()
-        lines += [f"#define MJXBALL_{macro} mjxball_lqg_{name if name in numbers else every}"]
-    return lines
 
 
 @dataclass(frozen=True)
@@ -105,15 +43,13 @@ class Footprint:
 
 def footprint(policy: PolicyFile, int8: bool = False) -> Footprint:
     """Bytes that the header of `policy` needs, see `c_header`."""
-    weights, biases = layers_of(policy)
-    size, units = len(policy.observation_mean), law_of(policy.card).units
+    (weights, biases), law = layers_of(policy), law_of(policy.card)
+    size, units = len(policy.observation_mean), law.units
     outputs = [weight.shape[1] for weight in weights]
     widest = max(outputs[2 if units else 0 :])
-    lqg, told = law_of(policy.card).lqg, policy.card.get("team", {}).get("context")
-    constants = 2 * ACTION_SIZE + sum(np.size(value) for value in _lqg_numbers(lqg, told).values()) + len(told or ())
-    own = OBSERVATION_SIZE + 2 * lqg.models + 4 if isinstance(lqg, MultiModelLqg) else 0  # `seen`, `known`
-    own += 11 * units + size if units else 0  # `given`, `kept`, `next`, `joined`, and behind both of `hidden`
-    state, stack = FLOAT * law_of(policy.card).size + 4, FLOAT * (size + 2 * widest + own)
+    constants = 2 * ACTION_SIZE + GEOMETRY_SIZE * law.geometry
+    own = 11 * units + size if units else 0  # `given`, `kept`, `next`, `joined`, and behind both of `hidden`
+    state, stack = FLOAT * law.size + 4, FLOAT * (size + 2 * widest + own)
     if int8:
         flash = len(weight_bytes(policy)) + FLOAT * constants
         return Footprint(flash, state + FLOAT, stack + 2 * (_most_inputs(weights) + 7))
@@ -132,10 +68,10 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     All names begin with `prefix`, `prefix_of(name)` by default, so that headers of several policies fit into one
     program; of two with the same names a compiler says so, since a header's guard is that of its contents. With `int8`
     the weights are whole numbers of 8 bits (`policy.quantize`) in one struct, for which another one of the same layout
-    may be put in place at run time, `follower.weights`. A policy of formats 3 and 4 is that of the one follower that
+    may be put in place at run time, `follower.weights`. A policy that is told its team is that of the one follower that
     `team` in its card names; InputError without it, and for layers too wide for `int8`.
     """
-    context = known_context(policy.card, name)
+    geometry = known_geometry(policy.card, name)
     law, card, cost = law_of(policy.card), policy.card, footprint(policy, int8)
     history = law.history
     weights, _ = layers_of(policy)
@@ -146,18 +82,9 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     arrays = _float_arrays(policy) if not int8 else []
     tilt, vertical = card["command_limits"]
     arrays += [_array("action_scale", policy.action_scale), _array("limit", [tilt, tilt, vertical])]
-    numbers = _lqg_numbers(law.lqg, context)
-    arrays += [
-        _array("lqg_tilts" if name == "tilt" else f"lqg_{name}", np.atleast_1d(value))
-        for name, value in numbers.items()
-    ]
-    if context is not None:
-        arrays += [_array("lqg_context", context)]
-    if isinstance(law.lqg, MultiModelLqg):
-        arrays += _rooms_and_axes(law.lqg, context, numbers)
+    arrays += [] if geometry is None else [_array("geometry", geometry)]
     helpers = c_texts.EXPONENTIAL + (c_texts.LAYER_INT8 if int8 else c_texts.LAYER)
-    helpers += (c_texts.APPROACH if history.filters else "") + LQG_TEXTS[type(law.lqg)][0]
-    helpers += c_texts.GRU if law.units else ""
+    helpers += (c_texts.APPROACH if history.filters else "") + (c_texts.GRU if law.units else "")
     text = c_texts.HEADER.format(
         name=_plain(name),
         origin=_plain(f"preset {card['preset']}, configuration {card['config_hash']}, {card['training_steps']} steps"),
@@ -183,15 +110,14 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
         memory_size=law.size,
         memory_field=f"    mjxball_real memory[{law.size}];\n" if law.size else "",
         helpers=helpers,
-        lqg=_lqg_text(law.lqg),
-        team="" if context is None else _team(card["team"]),
-        mount_angle="" if context is None else f"#define MJXBALL_MOUNT_ANGLE {_number(card['team']['mount_angle'])}\n",
+        team="" if geometry is None else _team(card["team"]),
+        mount_angle="" if geometry is None else f"#define MJXBALL_MOUNT_ANGLE {_number(card['team']['mount_angle'])}\n",
         memory_pointer="    mjxball_real *memory = follower->memory;\n" if law.size else "",
         arrays="\n".join(arrays),
-        history=_history(law, card),
+        history=_history(law),
         history_update=_history_update(law),
         network=_network(law, policy, int8),
-        command=_command(law, card),
+        command=_command(law),
     )
     return _named(text, prefix or prefix_of(name))
 
@@ -265,14 +191,9 @@ def _table() -> str:
     return "\n".join(f" *   {slot:2d}  {name:<22}{unit}" for slot, (name, unit) in enumerate(OBSERVATION))
 
 
-def _seen(law: FollowerLaw) -> str:
-    """The observation that the law's filters are about."""
-    return "seen" if isinstance(law.lqg, MultiModelLqg) else "observation"
-
-
-def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
+def _history(law: FollowerLaw) -> str:
     """Lines that make the network's input of observation and memory (see `control.follower_law.FollowerLaw`)."""
-    history, seen = law.history, _seen(law)
+    history = law.history
     if not law.size:
         return "    (void)follower;"
     older, width = (history.length - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
@@ -282,11 +203,9 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
         lines += [f"        mjxball_copy(memory + {k * OBSERVATION_SIZE}, observation, {OBSERVATION_SIZE});"]
     for k in range(len(history.filters)):
         lines += [f"        mjxball_copy(memory + {older + k * width}, observation, {OBSERVATION_SIZE});"]
-    if law.lqg is not None:
-        lines += [f"        mjxball_lqg_start(memory + {history.size}, {seen});"]
     if law.geometry:
         kept = f"memory[{history.size + law.units} + i]"
-        lines += [f"        for (i = 0; i < {law.told}; i++) {kept} = mjxball_lqg_context[i];"]
+        lines += [f"        for (i = 0; i < {GEOMETRY_SIZE}; i++) {kept} = mjxball_geometry[i];"]
     lines += ["        follower->running = 1;", "    }"]
     lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
     for k in range(len(history.filters)):
@@ -294,19 +213,6 @@ def _history(law: FollowerLaw, card: dict[str, Any]) -> str:
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
     if law.units:
         lines += _saturated(law, OBSERVATION_SIZE + history.size)
-    if law.lqg is not None:
-        known = _known(law)
-        lines = ["    mjxball_real led[3];", f"    mjxball_copy_law({seen}, led);", *lines]
-        lines = ["    mjxball_known known;", *lines] if known else lines
-        lines += [f"    mjxball_lqg_estimate(memory + {history.size}, {seen}{known});"]
-        features = f"input + {OBSERVATION_SIZE + history.size}"
-        lines += [f"    mjxball_lqg_features(memory + {history.size}, {seen}{known}, {features});"]
-    if seen != "observation":
-        turned = (
-            f"for (i = 3; i < {OBSERVATION_SIZE}; i += 3) mjxball_turn({seen} + i, {seen} + i + 1, MJXBALL_RIG_SIN);"
-        )
-        head = [f"mjxball_real {seen}[{OBSERVATION_SIZE}];", f"mjxball_copy({seen}, observation, {OBSERVATION_SIZE});"]
-        lines = [*(f"    {line}" for line in (*head, turned)), *lines]
     return "\n".join(lines)
 
 
@@ -318,13 +224,8 @@ def _saturated(law: FollowerLaw, place: int) -> list[str]:
         lines += [f"    for (i = 0; i < 3; i++) input[{place} + i] = mjxball_tanh({small});"]
         place += 3
     if law.geometry:
-        lines += [f"    mjxball_copy(input + {place}, memory + {law.history.size + law.units}, {law.told});"]
+        lines += [f"    mjxball_copy(input + {place}, memory + {law.history.size + law.units}, {GEOMETRY_SIZE});"]
     return lines
-
-
-def _known(law: FollowerLaw) -> str:
-    """The argument of what is known at an observation, for laws that pass it on."""
-    return ", &known" if isinstance(law.lqg, MultiModelLqg) else ""
 
 
 def _history_update(law: FollowerLaw) -> str:
@@ -344,12 +245,6 @@ def _history_update(law: FollowerLaw) -> str:
         lines += [f"    mjxball_copy(memory + {history.size - ACTION_SIZE}, action, {ACTION_SIZE});"]
     if law.units:
         lines += [f"    mjxball_copy(memory + {history.size}, next, {law.units});"]
-    if isinstance(law.lqg, MultiModelLqg):
-        lines += [f"    mjxball_lqg_next(memory + {history.size}, led, own, command);"]
-    elif isinstance(law.lqg, TeamLqg):
-        lines += [f"    mjxball_lqg_next(memory + {history.size}, led, own);"]
-    elif law.lqg is not None:
-        lines += [f"    mjxball_lqg_next(memory + {history.size}, observation, led, command);"]
     return "\n".join(lines)
 
 
@@ -478,36 +373,13 @@ def _leader(card: dict[str, Any], to: str) -> list[str]:
     ]
 
 
-def _command(law: FollowerLaw, card: dict[str, Any]) -> str:
-    """Lines that make the command of `action`, which is added to a law unless it is direct."""
-    added = "mjxball_action_scale[i] * action[i]"
-    if isinstance(law.lqg, MultiModelLqg) and law.lqg.by_size is not None:
-        size = "(action[i] < 0 ? -action[i] : action[i])"
-        added += f" * (mjxball_lqg_small[i] + (1 - mjxball_lqg_small[i]) * {size})"
-    if isinstance(law.lqg, TeamLqg | MultiModelLqg):
-        lifts = _lifts(law.lqg)
-        lines = [f"    mjxball_real own[{6 if lifts else 3}];"]
-        lines += [f"    mjxball_lqg_command(memory + {law.history.size}, {_seen(law)}{_known(law)}, led, own);"]
-        base = "own[i] + (i == 2 ? own[3] : 0)" if lifts else "own[i]"
-        if isinstance(law.lqg, MultiModelLqg):
-            lines += ["    mjxball_copy(command, own, 3);"]
-            lines += ["    mjxball_turn(command, command + 1, -MJXBALL_RIG_SIN);"]
-            base = "command[i]"
-        lines += [f"    for (i = 0; i < 3; i++) command[i] = mjxball_clip({base} + {added}, mjxball_limit[i]);"]
-        return "\n".join(lines)
-    if law.lqg is not None:
-        lines = [f"    for (i = 0; i < 3; i++) command[i] = {added};"]
-        lines += [f"    mjxball_lqg_command(memory + {law.history.size}, observation, led, command);"]
-        return "\n".join(
-            [*lines, "    for (i = 0; i < 3; i++) command[i] = mjxball_clip(command[i], mjxball_limit[i]);"]
-        )
-    lines = (
-        ["    mjxball_copy_law(observation, command);"]
-        if law.residual
-        else ["    for (i = 0; i < 3; i++) command[i] = 0;"]
+def _command(law: FollowerLaw) -> str:
+    """Lines that make the command of `action`, which is added to the PD law unless it is direct."""
+    base = "mjxball_copy_law(observation, command);"
+    return "\n".join(
+        [
+            f"    {base if law.residual else 'for (i = 0; i < 3; i++) command[i] = 0;'}",
+            "    for (i = 0; i < 3; i++)",
+            "        command[i] = mjxball_clip(command[i] + mjxball_action_scale[i] * action[i], mjxball_limit[i]);",
+        ]
     )
-    lines += [
-        "    for (i = 0; i < 3; i++)",
-        f"        command[i] = mjxball_clip(command[i] + {added}, mjxball_limit[i]);",
-    ]
-    return "\n".join(lines)

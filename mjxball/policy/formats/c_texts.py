@@ -60,7 +60,6 @@ static inline int mjxball_is_sound(const mjxball_real *values, int count) {{
 static inline void mjxball_copy_law(const mjxball_real *observation, mjxball_real *to) {{
 {leader}
 }}
-{lqg}
 /* Forget the past: the next call starts a flight. */
 static inline void mjxball_reset(mjxball_follower *follower) {{
     follower->running = 0;
@@ -93,70 +92,6 @@ static inline void mjxball_approach(mjxball_real *average, const mjxball_real *v
     for (int i = 0; i < count; i++) average[i] += share * (value[i] - average[i]);
 }
 """
-LQG = """
-/* LQG with estimates of the load; its memory: the filter's state (8) and what drives it (2). */
-static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *observation) {
-    memory[0] = observation[4];
-    memory[1] = observation[10];
-    memory[5] = -observation[17];
-}
-
-static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
-    mjxball_real predicted[8], off[3];
-    for (int row = 0; row < 8; row++) {
-        predicted[row] = 0;
-        for (int k = 0; k < 10; k++) predicted[row] += mjxball_lqg_transition[10 * row + k] * memory[k];
-    }
-    off[0] = observation[4] - predicted[0];
-    off[1] = observation[10] - predicted[1];
-    off[2] = -observation[17] - predicted[5];
-    for (int row = 0; row < 8; row++) {
-        memory[row] = predicted[row];
-        for (int k = 0; k < 3; k++) memory[row] += mjxball_lqg_gain[3 * row + k] * off[k];
-    }
-}
-
-static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
-    to[0] = observation[4] - memory[0];
-    to[1] = observation[10] - memory[1];
-    to[2] = -observation[17] - memory[5];
-    mjxball_copy(to + 3, memory + 2, 3);
-    mjxball_copy(to + 6, memory + 6, 4);
-}
-
-static inline mjxball_real mjxball_lqg_tilt(int axis, int along, const mjxball_real *observation) {
-    const float *gain = mjxball_lqg_tilts + 4 * axis;
-    mjxball_real far = gain[0] * observation[12 + along] + gain[1] * observation[15 + along];
-    return mjxball_clip(far, mjxball_lqg_limits[0]) - gain[2] * observation[3 + axis] - gain[3] * observation[9 + axis];
-}
-
-static inline mjxball_real mjxball_lqg_difference(
-    mjxball_real led, mjxball_real vertical, const mjxball_real *observation) {
-    mjxball_real level = mjxball_cos(observation[3]) * mjxball_cos(observation[4]);
-    mjxball_real ahead = mjxball_lqg_carried[0] * ((mjxball_real)MJXBALL_GRAVITY + led);
-    return (ahead - mjxball_lqg_carried[1] * ((mjxball_real)MJXBALL_GRAVITY + vertical)) / level;
-}
-
-/* command: what is added to the law's, then the sum, of which the vertical part is within its limit. */
-static inline void mjxball_lqg_command(
-    const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *command) {
-    mjxball_real rise = mjxball_lqg_height[0] * observation[14] + mjxball_lqg_height[1] * observation[17], against;
-    rise = mjxball_clip(rise, mjxball_lqg_limits[1]) - memory[7];
-    command[2] = mjxball_clip(2 * rise - led[2] + command[2], mjxball_limit[2]);
-    against = mjxball_lqg_half_length[0] * mjxball_lqg_difference(led[2], command[2], observation) - memory[2];
-    against = mjxball_clip(against / mjxball_lqg_stiffness[0], mjxball_lqg_limits[2]);
-    command[0] += 2 * mjxball_lqg_tilt(0, 1, observation) - led[0];
-    command[1] += 2 * mjxball_lqg_tilt(1, 0, observation) - led[1] + against;
-}
-
-static inline void mjxball_lqg_next(
-    mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, const mjxball_real *command) {
-    memory[8] = mjxball_lqg_stiffness[0] * (led[1] + command[1])
-        - mjxball_lqg_half_length[0] * mjxball_lqg_difference(led[2], command[2], observation);
-    memory[9] = (mjxball_real)0.5 * (led[2] + command[2]);
-}
-"""
-
 LAYER = """
 /* Products and sums as instructions of their own, where one for both takes longer (Cortex-M4). */
 #ifdef __ARM_FEATURE_DSP
@@ -193,125 +128,6 @@ static inline void mjxball_layer(
     }
 }
 """
-ROOT = """
-/* By Heron, from above: the same bits on every machine. */
-static inline mjxball_real mjxball_root(mjxball_real square) {
-    mjxball_real last, value = (mjxball_real)0.5 * (1 + square);
-    do {
-        last = value;
-        value = (mjxball_real)0.5 * (last + square / last);
-    } while (value < last);
-    return last;
-}
-"""
-WITHIN = """
-/* Two numbers as a vector no longer than `limit`. */
-static inline void mjxball_within(mjxball_real *vector, mjxball_real limit) {
-    mjxball_real square = vector[0] * vector[0] + vector[1] * vector[1] + (mjxball_real)1e-12;
-    if (square <= limit * limit) return;
-    limit /= mjxball_root(square);
-    vector[0] *= limit;
-    vector[1] *= limit;
-}
-"""
-TEAM_LQG = """
-/* LQG of one of a team; its memory: the filter's state about roll (5), about pitch (5), of the height (3), and what it
- * is told of its team (5). */
-static inline void mjxball_lqg_start(mjxball_real *memory, const mjxball_real *observation) {
-    for (int axis = 0; axis < 2; axis++) {
-        memory[5 * axis] = observation[3 + axis];
-        memory[5 * axis + 1] = observation[9 + axis];
-    }
-    memory[10] = -observation[17];
-    for (int k = 0; k < 5; k++) memory[13 + k] = mjxball_lqg_context[k];
-}
-
-static inline void mjxball_lqg_estimate(mjxball_real *memory, const mjxball_real *observation) {
-    mjxball_real off = -observation[17] - memory[10];
-    for (int row = 0; row < 3; row++) memory[10 + row] += off * mjxball_lqg_height_gain[row];
-    for (int axis = 0; axis < 2; axis++, memory += 5) {
-        mjxball_real angle = observation[3 + axis] - memory[0], rate = observation[9 + axis] - memory[1];
-        for (int row = 0; row < 5; row++)
-            memory[row] += angle * mjxball_lqg_axis_gain[2 * row] + rate * mjxball_lqg_axis_gain[2 * row + 1];
-    }
-}
-
-static inline void mjxball_lqg_features(const mjxball_real *memory, const mjxball_real *observation, mjxball_real *to) {
-    for (int axis = 0; axis < 2; axis++) {
-        to[axis] = observation[3 + axis] - memory[5 * axis];
-        to[2 + axis] = observation[9 + axis] - memory[5 * axis + 1];
-        mjxball_copy(to + 5 + 3 * axis, memory + 5 * axis + 2, 3);
-    }
-    to[4] = -observation[17] - memory[10];
-    mjxball_copy(to + 11, memory + 11, 7);
-}
-
-/* own: the law's command, to which the network's is added. */
-static inline void mjxball_lqg_command(
-    const mjxball_real *memory, const mjxball_real *observation, const mjxball_real *led, mjxball_real *own) {
-    const mjxball_real *context = memory + 13, share = context[0], damping = mjxball_lqg_damping[0];
-    mjxball_real far[2], load[2], room[2], rest[2];
-    mjxball_real rise = mjxball_lqg_rise[0] * observation[14] + mjxball_lqg_rise[1] * observation[17];
-    rise = mjxball_clip(rise, mjxball_lqg_limits[1]) - memory[12];
-    own[2] = mjxball_clip(share * rise - (share - 1) * led[2], mjxball_limit[2]);
-    far[0] = -(mjxball_lqg_tilts[0] * observation[13] + mjxball_lqg_tilts[1] * observation[16]);
-    far[1] = mjxball_lqg_tilts[0] * observation[12] + mjxball_lqg_tilts[1] * observation[15];
-    mjxball_within(far, mjxball_lqg_limits[0]);
-    for (int i = 0; i < 2; i++)
-        load[i] = memory[5 * i + 2] / mjxball_lqg_stiffness[0] + context[1 + i] * (own[2] - led[2]);
-    mjxball_within(load, mjxball_lqg_limits[2]);
-    for (int i = 0; i < 2; i++) {
-        mjxball_real wanted = far[i] - mjxball_lqg_tilts[2] * observation[3 + i];
-        wanted = wanted - mjxball_lqg_tilts[3] * observation[9 + i] - load[i];
-        own[i] = share * wanted - (share - 1) * led[i];
-        rest[i] = observation[3 + i] + damping * observation[9 + i];
-        room[i] = (own[i] - rest[i]) / context[3 + i];
-    }
-    mjxball_within(room, 1);
-    for (int i = 0; i < 2; i++) own[i] = rest[i] + context[3 + i] * room[i];
-}
-
-static inline void mjxball_lqg_next(mjxball_real *memory, const mjxball_real *led, const mjxball_real *own) {
-    const mjxball_real *context = memory + 13;
-    mjxball_real drive[3], before[5];
-    for (int i = 0; i < 3; i++) drive[i] = (own[i] + (context[0] - 1) * led[i]) / context[0];
-    for (int i = 0; i < 2; i++) drive[i] += context[1 + i] * (own[2] - led[2]);
-    for (int i = 0; i < 3; i++) {
-        const int states = i < 2 ? 5 : 3;
-        const float *row = i < 2 ? mjxball_lqg_axis : mjxball_lqg_height;
-        mjxball_real *state = memory + 5 * i;
-        mjxball_copy(before, state, states);
-        for (int k = 0; k < states; k++, row += states + 1) {
-            state[k] = row[states] * drive[i];
-            for (int j = 0; j < states; j++) state[k] += row[j] * before[j];
-        }
-    }
-}
-"""
-# For laws that lift apart: what stands first in TEAM_LQG is replaced by what stands second.
-LIFTS_APART = {
-    "/* own: the law's command, to": """
-/* What a follower lifts more to hold its share of `load`, which is taken off: apart[0], the share behind it. */
-static inline void mjxball_lqg_apart(const mjxball_real *context, mjxball_real *load, mjxball_real *apart) {
-    mjxball_real square = context[1] * context[1] + context[2] * context[2] + (mjxball_real)1e-12;
-    mjxball_real length = mjxball_root(square), count = context[0] / (context[0] - 1), along = 0;
-    for (int i = 0; i < 2; i++) {
-        apart[1 + i] = mjxball_lqg_lifting[0] * load[i];
-        load[i] -= apart[1 + i];
-        along += context[1 + i] / length * apart[1 + i];
-    }
-    along /= count - 3;
-    apart[0] = -(apart[2] + context[2] / length * along * 2 - along) * 2 / (count * length);
-}
-
-/* own: the law's command, and behind it what `mjxball_lqg_apart` says, to""",
-    "    mjxball_within(load, mjxball_lqg_limits[2]);\n": """    mjxball_within(load, mjxball_lqg_limits[2]);
-    mjxball_lqg_apart(context, load, own + 3);
-""",
-    "context[1 + i] * (own[2] - led[2]);\n    for (int i = 0; i < 3; i++) {": (
-        "context[1 + i] * (own[2] - led[2]) - own[4 + i];\n    for (int i = 0; i < 3; i++) {"
-    ),
-}
 LAYER_INT8 = """
 /* The nearest whole number of a value within 16 bits. */
 static inline int16_t mjxball_whole(mjxball_real value) {
@@ -411,12 +227,6 @@ static inline mjxball_fraction mjxball_fraction_of(mjxball_real x) {
     return one;
 }
 
-static inline mjxball_real mjxball_decay(mjxball_real x) {
-    if (!(x < 40)) return 0;
-    const mjxball_fraction one = mjxball_fraction_of(x);
-    return one.share * ((one.even - one.odd) / (one.even + one.odd));
-}
-
 /* NaN stays NaN. */
 static inline mjxball_real mjxball_tanh(mjxball_real x) {
     const mjxball_real size = x < 0 ? -x : x;
@@ -438,17 +248,5 @@ static inline void mjxball_gru(
         mjxball_real candidate = mjxball_tanh(given[2 * units + k] + reset * kept[2 * units + k]);
         next[k] = candidate + update * (state[k] - candidate);
     }
-}
-"""
-COSINE = """
-/* Angles in radians of any size; turns beyond 1e6 are not counted. */
-static inline mjxball_real mjxball_cos(mjxball_real x) {
-    const mjxball_real turn = (mjxball_real)6.2831853071795865;
-    mjxball_real square, value = 1;
-    if (!(x > -1000000 && x < 1000000)) return 1;
-    x -= turn * (mjxball_real)(int)(x / turn + (x < 0 ? (mjxball_real)-0.5 : (mjxball_real)0.5));
-    square = x * x;
-    for (int k = 18; k > 0; k -= 2) value = 1 - square * value / (mjxball_real)(k * (k - 1));
-    return value;
 }
 """

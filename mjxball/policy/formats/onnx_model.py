@@ -16,7 +16,7 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from mjxball.control import observation as layout
 from mjxball.policy.file import PolicyFile, law_of
-from mjxball.policy.policy import NetworkLaw, Policy, known_context
+from mjxball.policy.policy import NetworkLaw, Policy, known_geometry
 
 Array = Any
 OPSET, IR_VERSION = 17, 8  # of 2022: read by every runtime of the last years
@@ -100,12 +100,6 @@ class TracedArray:
         name = self.graph.add("Gather", self, np.array(place % size, np.int64), axis=axis)
         return TracedArray(self.graph, name, *before, *after), 0
 
-    def sum(self, axis: int, keepdims: bool = False) -> TracedArray:
-        """Over an `axis` counted from the end."""
-        name = self.graph.add("ReduceSum", self, np.array([axis], np.int64), keepdims=int(keepdims))
-        left, kept = len(self.sizes) + axis, [1] if keepdims else []
-        return TracedArray(self.graph, name, *self.sizes[:left], *kept, *self.sizes[left + 1 :])
-
     def __neg__(self) -> TracedArray:
         return self.unary("Neg")
 
@@ -125,33 +119,7 @@ _add_operators()
 class Namespace:
     """The part of the array namespace that a policy's laws use."""
 
-    sin = staticmethod(np.sin)  # of the desired yaw, a constant
-
-    @staticmethod
-    def cos(value: Any) -> Any:
-        """Elementwise; of a constant it is one."""
-        return value.unary("Cos") if isinstance(value, TracedArray) else np.cos(value)
-
-    @staticmethod
-    def sqrt(value: TracedArray) -> TracedArray:
-        """Elementwise."""
-        return value.unary("Sqrt")
-
-    @staticmethod
-    def exp(value: TracedArray) -> TracedArray:
-        """Elementwise."""
-        return value.unary("Exp")
-
-    @staticmethod
-    def log(value: TracedArray) -> TracedArray:
-        """Elementwise."""
-        return value.unary("Log")
-
-    @staticmethod
-    def max(value: TracedArray, axis: int, keepdims: bool) -> TracedArray:
-        """Over the last axis, which stays."""
-        name = value.graph.add("ReduceMax", value, axes=[axis], keepdims=int(keepdims))
-        return TracedArray(value.graph, name, *value.sizes[:-1], 1)
+    sin, cos = staticmethod(np.sin), staticmethod(np.cos)  # of the desired yaw, a constant
 
     @staticmethod
     def tanh(value: TracedArray) -> TracedArray:
@@ -169,12 +137,6 @@ class Namespace:
         return value.binary("Sub", value, value)
 
     @staticmethod
-    def ones_like(value: TracedArray) -> TracedArray:
-        """Ones (N, ...)."""
-        zero = Namespace.zeros_like(value)
-        return zero.binary("Add", zero, 1.0)
-
-    @staticmethod
     def broadcast_to(value: np.ndarray, shape: tuple[Any, ...]) -> TracedArray:
         """A constant (k,) for each of N flights, (N, k)."""
         flights: TracedArray = shape[0]
@@ -190,13 +152,6 @@ class Namespace:
     def clip(value: TracedArray, low: Any, high: Any) -> TracedArray:
         """Elementwise."""
         return value.binary("Min", value.binary("Max", value, low), high)
-
-    @staticmethod
-    def reshape(value: TracedArray, shape: tuple[Any, ...]) -> TracedArray:
-        """The flights stay the first axis; one of the others may be -1."""
-        sizes = np.zeros(value.sizes).reshape(shape[1:]).shape
-        name = value.graph.add("Reshape", value, np.array([0, *sizes], np.int64))
-        return TracedArray(value.graph, name, *sizes)
 
     @staticmethod
     def concat(values: Sequence[TracedArray], axis: int) -> TracedArray:
@@ -222,13 +177,13 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
 
     Inputs: `observation` (N, 18); with a memory of m numbers also `memory` (N, m) and `start` (N, 1) bool, true at
     the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
-    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m). A policy of format 3
-    or 4 is that of the one follower that `team` in its card names, and sees and commands in its mount frame.
+    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m). A policy that is
+    told its team is that of the one follower that `team` in its card names, and sees and commands in its mount frame.
     """
     graph, around = Graph(), law_of(contents.card)
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
-    memory = around.start(observation, known_context(contents.card, name))
+    memory = around.start(observation, known_geometry(contents.card, name))
     if around.size:
         inputs += [_value("memory", TensorProto.FLOAT, around.size), _value("start", TensorProto.BOOL, 1)]
         start, given = TracedArray(graph, "start", 1), TracedArray(graph, "memory", around.size)
