@@ -45,6 +45,7 @@ Cell = tuple[float, float, float]  # CG speed [rad/s], amplitude [m], mass [kg]
 EVERY: list[Cell] = [(w, a, m) for w in SPEEDS for a in AMPLITUDES for m in MASSES]
 MARGIN, BELIEVED = 0.15, 0.2
 WANTED = ("peak", "overshoot", "settling", "rmse")
+EFFORT = ("rotors_at_limit", "rotor_power")  # see docs/metrics.md
 
 
 def numbers_of(metrics: Any) -> dict[str, float]:
@@ -73,7 +74,8 @@ def medians(flown: list[Any], cells: int) -> list[dict[str, Any]]:
         runs = flown[i::cells]
         middle = {name: statistics.median(numbers_of(run)[name] for run in runs) for name in WANTED}
         failed = sum(run.failed for run in runs)
-        found.append({**(dict.fromkeys(WANTED, math.inf) if failed else middle), "failed": failed})
+        effort = {name: statistics.median(getattr(run, name) for run in runs) for name in EFFORT if not failed}
+        found.append({**(dict.fromkeys(WANTED, math.inf) if failed else middle), **effort, "failed": failed})
     return found
 
 
@@ -113,11 +115,14 @@ def show(where: str, name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
     whole = sum(len(row["wins"]) == len(WANTED) for row in rows)
     failed = sum(row["failed"] for row in rows)
     peaks = {who: statistics.median(row["peaks"][who] for row in rows) for who in rows[0]["peaks"]}
+    flown = [row for row in rows if not row["failed"]]
+    effort = {key: statistics.median(row[key] for row in flown) if flown else None for key in EFFORT}
     counts = ", ".join(f"{key} {count}" for key, count in won.items())
     medians = ", ".join(f"{who} {1e3 * value:.1f}" for who, value in peaks.items())
     print(
         f"{where} ({name}): all four in {whole} of {len(rows)}; {counts}; {failed} flights failed; "
-        f"peaks [mm] {medians}",
+        f"peaks [mm] {medians}; "
+        + ", ".join(f"{key} {'-' if value is None else f'{value:.3f}'}" for key, value in effort.items()),
         flush=True,
     )
     return {
@@ -128,6 +133,7 @@ def show(where: str, name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
         **won,
         "failed": failed,
         "median peaks": peaks,
+        "median effort": effort,
     }
 
 
