@@ -6,12 +6,22 @@ its measurements are late. Its fixed point is found by flying and by Newton's me
 float64. A network with ReLU units is linear around almost every point, so the eigenvalues say what a small error
 does, no more. A recurrent follower may have several fixed points, and circle about one with millimetres: the one
 nearest to the flight's mean is taken.
+
+    python benchmarks/hover_stability.py policies/universal.npz --plants team3 team4 team6 --json FILE
+
+A team's map holds every follower's memory, and so the modes that the load cannot see: followers against each other. The
+table has the slowest mode of each hover, its time constant, negative where it grows, and how much of it is the load's.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -19,12 +29,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from mjxball import cli
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import Law
+from mjxball.evaluate.policies import load_policy
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import jax_repeat, make_control_step, start_state
+from mjxball.policy import Policy
+from mjxball.policy.file import load_file
 from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.disturbances import Sample, SensorModel, SensorState
@@ -35,6 +49,9 @@ SETTLE, WATCHED = 3000, 1000  # control steps flown towards the fixed point, and
 NEWTON, HALVINGS = 40, 12  # then steps of Newton's method, each as short as makes the residual smallest
 SOUND = 1e-8  # largest change over a control step, in SI units, of what counts as a fixed point
 NEUTRAL = 1e-6  # a memory that the loop does not use keeps its value: eigenvalue 1
+KEPT = 1e-9  # of an eigenvalue from 1: a memory that never changes, as where the drones are mounted
+LOAD = slice(12)  # of what the map is of: position, attitude, velocity and rates of the carrier and its load
+OFFSETS, DELAYS = (0.0, 0.05), (0, 2)  # of a team's hovers: the CG [m], control steps
 
 
 @dataclass(frozen=True)
@@ -51,6 +68,8 @@ class Hover:
     swing: (
         float  # half of what the position still moves after `SETTLE` steps of flight, of the axis that moves most [m]
     )
+    slowest: float  # largest |eigenvalue| but those of memories that never change
+    seen: float  # share of the load's numbers in that mode's length; the rest is rotors and memories
 
     @property
     def stable(self) -> bool:
@@ -85,7 +104,7 @@ def linearised(
         [
             Hover(
                 *(offset, mass, delay, float(left), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4]))),
-                *(_radius(jacobian), float(swing)),
+                *(_radius(jacobian), float(swing), *_slowest(jacobian)),
             )
             for (offset, mass, _), z, left, jacobian, swing in zip(cases, *one, strict=True)
         ]
@@ -96,6 +115,16 @@ def linearised(
 def _radius(jacobian: np.ndarray) -> float:
     """Largest |eigenvalue|, infinite where the flight towards the fixed point ran away."""
     return float(np.abs(np.linalg.eigvals(jacobian)).max()) if np.isfinite(jacobian).all() else np.inf
+
+
+def _slowest(jacobian: np.ndarray) -> tuple[float, float]:
+    """(largest |eigenvalue| but those that are 1, share of the load in that mode)."""
+    if not np.isfinite(jacobian).all():
+        return np.inf, np.nan
+    values, modes = np.linalg.eig(jacobian)
+    number = int(np.argmax(np.where(np.abs(values - 1) < KEPT, 0.0, np.abs(values))))
+    mode = np.abs(modes[:, number])
+    return float(np.abs(values[number])), float(np.linalg.norm(mode[LOAD]) / np.linalg.norm(mode))
 
 
 def delay_margins(
@@ -181,3 +210,49 @@ def _linearise(start: Array, step: Callable[[Array], Array]) -> tuple[Array, Arr
     mean = total / WATCHED
     _, z, change, slope = jax.lax.fori_loop(0, NEWTON, polish, (mean, mean, mean, still))
     return z, jnp.abs(change).max(), slope + still, (high - low)[:3].max() / 2
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Slowest modes of whole teams."""
+    parser = cli.make_parser("python benchmarks/hover_stability.py", __doc__.split("\n\n")[0])
+    parser.add_argument("policies", nargs="+", type=Path, metavar="POLICY.npz")
+    parser.add_argument("--plants", nargs="+", default=["team3", "team4", "team6"], metavar="NAME|FILE")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    options = parser.parse_args(arguments)
+    rows: list[dict[str, Any]] = []
+    for path in options.policies:
+        for plant in options.plants:
+            config = cli.plant_setup(Path(plant))
+            law, mass = in_float64(path, config), config.plant.object_mass
+            for delay in DELAYS:
+                for hover in linearised_hovers(config, law, [(offset, mass, mass) for offset in OFFSETS], delay):
+                    rows.append(row_of(path.stem, plant, hover, config.timing.control_period))
+    if options.json:
+        options.json.write_text(json.dumps({"rows": rows}, indent=1, allow_nan=False) + "\n")
+    return 0
+
+
+def in_float64(path: Path, config: Config) -> Law:
+    """The law of a policy file on the plant of `config`, in double precision."""
+    load_policy(path, config)  # which refuses and warns
+    policy = Policy(load_file(path), path.stem, np.float64)
+    policy.join(config.plant)
+    return policy.law
+
+
+def row_of(policy: str, plant: str, hover: Hover, period: float) -> dict[str, Any]:
+    """A hover in the table, which is printed; None where there is no fixed point."""
+    found = hover.residual < SOUND and math.isfinite(hover.slowest) and hover.slowest not in (0.0, 1.0)
+    constant = -period / math.log(hover.slowest) if found else None
+    row = {"policy": policy, "plant": plant, **dataclasses.asdict(hover), "time_constant": constant}
+    shown = f"{constant:8.1f} s, {hover.seen:.1%} of it the load's" if constant is not None else "   no hover found"
+    print(
+        f"{policy:12} {plant:8} CG {hover.offset:.2f} m, delay {hover.delay}: slowest mode {hover.slowest:.6f}, {shown}"
+    )
+    return {
+        name: value if not isinstance(value, float) or math.isfinite(value) else None for name, value in row.items()
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run_command(main))

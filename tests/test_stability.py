@@ -74,3 +74,13 @@ def test_the_margin_of_a_case_is_the_last_delay_before_its_first_unstable_one(
     assert delay_margins(paper, law, [CASES[0]] * 4, longest=3) == [1, -1, 0, 2]
     assert delay_margins(paper, law, CASES[:1], longest=3) == [1]
     assert asked == [0, 1, 2, 3, 0, 1, 2]  # no further than the first delay that nobody bears
+
+
+def test_the_slowest_mode_is_no_memory_that_never_changes() -> None:
+    """Two modes of a known map: one of the load's numbers, one that it cannot see, and a number that is kept."""
+    jacobian = np.diag([0.5] * 12 + [0.99, 1.0])
+    slowest, seen = hover_stability._slowest(jacobian)
+    assert (slowest, seen) == (0.99, 0.0)
+    jacobian[0, 0] = 0.999
+    slowest, seen = hover_stability._slowest(jacobian)
+    assert (slowest, seen) == (0.999, 1.0)
