@@ -1,7 +1,7 @@
 """One follower on 1000 rigs that no training drew, beside laws that are told each rig.
 
     python benchmarks/rigs.py policies/universal.npz --json benchmarks/results/rigs.json
-    python benchmarks/rigs.py policies/universal.npz --steps --sizes 2 4 --figure docs/rigs-steps.png
+    python benchmarks/rigs.py policies/universal.npz --steps --sizes 2 4 --figure steps.png
 
 Rigs of 2 to 6 drones in equal numbers, three random flights of 30 s each, the same for everybody; noise, drift and
 delay as in training (settings of the preset `universal`). The object's mass stays what it is; with --mass-step it
