@@ -40,9 +40,12 @@ def cores_of(path: Path, weights: str) -> tuple[Library, Library]:
 def world_of(
     path: Path, seconds: float, curve: str = "linear", record: bool = True, onboard: str = "", **around: Any
 ) -> VirtualTwin:
-    """A flight of the policy in `path` that is about to begin, its laws `onboard` (float32, int8) or on the laptop."""
+    """A flight of the policy in `path` that is about to begin, its laws `onboard` (float32, int8) or on the laptop.
+
+    The drones are those of its card.
+    """
     policy = Policy.load(path)
-    drone = drone_kind("2.1", curve)
+    drone = drone_kind(Controller(policy).config.autopilot.drone.removesuffix("-legacy") or "2.1", curve)
     surroundings = Surroundings(**around)
     return VirtualTwin(
         policy,
