@@ -120,6 +120,13 @@ def test_leaving_terminates_all(team: Config):
     assert max(reward.values()) < -10  # the cost of an end
 
 
+def test_a_recurrent_preset_leaves_the_memory_to_the_trainer():
+    """No agent has to answer with the state of a GRU."""
+    env = FollowersParallelEnv("team")
+    assert {env.action_space(agent).shape for agent in env.possible_agents} == {(3,)}
+    assert FollowerEnv("balance", physics="newton-euler").action_space.shape == (3,)
+
+
 @pytest.mark.slow
 def test_teams_of_several_sizes():
     """Worlds have 1, 2, 3 or 5 agents; what pads a smaller team is no agent."""

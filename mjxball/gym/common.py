@@ -74,8 +74,9 @@ class Picklable:
 
 
 def settings(preset: str, config: Config | None) -> Config:
-    """`config`, validated, or else the preset called `preset`."""
-    return configs.preset(preset) if config is None else configs.validate(config)
+    """`config`, validated, or else the preset called `preset`; without a GRU: a trainer brings its own network."""
+    found = configs.preset(preset) if config is None else configs.validate(config)
+    return configs.replace(found, "follower.recurrent_units", 0)
 
 
 def pair_settings(preset: str, config: Config | None) -> Config:
