@@ -77,24 +77,6 @@ def task_reward(weights: Reward, step: Transition) -> Scalar:
     return total
 
 
-def descent_reward(step: Transition) -> Scalar:
-    """What four drones can still do after one is lost (ours): come down slowly and upright, wherever that is.
-
-    A metre from the goal the error's cost levels off: until the loss it holds the team there, afterwards it hardly
-    counts. Speeds to 0.6 m/s downwards and tilts to 0.3 rad cost little; what tumbles costs hardly more the faster it
-    does, so that gradients come from flights that can still be saved.
-    """
-    xp = step.error.__array_namespace__()
-    rise, fall = xp.maximum(step.velocity[..., 2], 0.0), xp.maximum(-step.velocity[..., 2], 0.0)
-    tilt = xp.sqrt((step.euler[..., :2] ** 2).sum(axis=-1) + 1e-6)
-    cost = 0.1 * rise**2 + fall**2 + 5.0 * xp.maximum(fall - 0.6, 0.0) ** 2
-    cost = cost + 2.0 * tilt**2 + 50.0 * xp.maximum(tilt - 0.3, 0.0) ** 2 + 0.2 * (step.rates**2).sum(axis=-1)
-    cost = cost + 0.05 * (step.velocity[..., :2] ** 2).sum(axis=-1)
-    distance = (step.error**2).sum(axis=-1)
-    cost = cost + 3.0 * distance / (1.0 + distance)
-    return -cost / (1.0 + cost / 15.0) - 0.02 * (step.action**2).mean(axis=-1)
-
-
 def _used(weight: Scalar | float) -> bool:
     """False for a weight of 0; one that a sweep traces may be anything."""
     return not isinstance(weight, (int, float)) or weight != 0
@@ -103,8 +85,6 @@ def _used(weight: Scalar | float) -> bool:
 def reward(weights: Reward, step: Transition) -> Scalar:
     """The reward of `weights.kind`, less the cost of a termination."""
     xp = step.error.__array_namespace__()
-    if weights.kind == "paper":
-        earned = paper_reward(step.leader_command, step.follower_command)
-    else:
-        earned = descent_reward(step) if weights.kind == "descent" else task_reward(weights, step)
+    paper = weights.kind == "paper"
+    earned = paper_reward(step.leader_command, step.follower_command) if paper else task_reward(weights, step)
     return earned - xp.where(step.terminated, weights.termination, 0.0)

@@ -250,30 +250,6 @@ def _lost() -> Config:
     )
 
 
-def _descent() -> Config:
-    """Four drones of which one is lost, which no rotors can make up for: they come down slowly and upright."""
-    lost = _lost()
-    four = read_plant("team4").settings
-    return replace(
-        apply_overrides(replace(lost, scenario=replace(lost.scenario, cg_amplitude=(0.0, 0.0))), four),
-        preset="descent",
-        follower=replace(lost.follower, action_scale_tilt=0.6, action_scale_vertical=12.0),
-        scenario=replace(
-            lost.scenario,
-            cg_amplitude=(0.0, 0.0),
-            object_mass=(0.4, 0.4),
-            lost_follower_probability=0.95,
-            trim_margin=-0.5,  # nothing of this can be trimmed
-            termination_distance=25.0,
-        ),
-        bounds=Bounds(x_peak=0.05, settling_time=0.0, rmse=0.36),
-        reward=Reward(kind="descent"),
-        sac=replace(lost.sac, num_envs=528, replay_size=528_000),
-        ppo=Ppo(num_envs=528),
-        gradient=replace(lost.gradient, gradient_steps=600, num_envs=528, windows_per_episode=4, learning_rate=4e-3),
-    )
-
-
 def _universal() -> Config:
     """One follower for teams of any drones and loads, told where they are mounted alone."""
     large = _transport_large()
@@ -335,7 +311,7 @@ PRESETS: types.MappingProxyType[str, Config] = types.MappingProxyType(
         made.preset: made
         for made in (
             *(_transport(), _paper(), _transport_large(), _robust(), _balance()),
-            *(_team(), _lost(), _descent(), _plate(), _universal(), stand(), flight()),
+            *(_team(), _lost(), _plate(), _universal(), stand(), flight()),
         )
     }
 )

@@ -233,12 +233,9 @@ class ScenarioRanges:
 
 @dataclass(frozen=True)
 class Reward:
-    """Reward of one control step. `paper` mimics the leader; `task` and `descent` (ours) score what the user wants."""
+    """Reward of one control step. `paper` mimics the leader; `task` (ours) scores what the user wants."""
 
-    kind: Literal["paper", "task", "descent"] = setting(
-        "task",
-        "paper (leader mimicry), task (balance), or descent (slow and upright, fixed weights)",
-    )
+    kind: Literal["paper", "task"] = setting("task", "paper (leader mimicry) or task (balance)")
     error: float = setting(1.0, "weight of |e_o| over error_scale, saturating [1]", low=0)
     error_scale: float = setting(0.1, "|e_o| at which the error's cost turns from square to linear [m]", above=0)
     velocity: float = setting(0.1, "weight of |de_o/dt|^2 [s2/m2]", low=0)
