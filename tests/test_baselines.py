@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from mjxball.baselines import LAWS, lqg, lqg_design, make_baseline, make_law
-from mjxball.baselines.assembly_model import ideal_model
+from mjxball.baselines.assembly_model import assembly_model, ideal_model
 from mjxball.config import preset, replace
+from mjxball.control.followers import copy_gains
+from mjxball.control.observation import ERROR_RATE, copy_command
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure
 from mjxball.evaluate.results import Result, fly_scenarios
@@ -17,6 +21,7 @@ from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 
 SPEEDS = (0.31, 0.62, 1.0, 2.0, 3.1)
+CLIMB = ERROR_RATE.stop - 1  # of an observation, downwards
 # From an independent float64 simulation, RK4 at 1 kHz, attitude loop at 500 Hz:
 # settling [s], RMSE [m], x-peak [m] at SPEEDS, largest tilt [deg], paper return (first speed).
 REFERENCE_NUMBERS = {
@@ -162,3 +167,38 @@ def test_every_baseline_commands_within_its_limits(cells) -> None:
 
 def test_reference_scenario_is_the_first_cell(cells) -> None:
     assert cells["copy", 0.31].scenario == REFERENCE
+
+
+def test_the_observer_takes_off_a_torque_and_a_mass_that_nobody_told() -> None:
+    """A load at rest at 3 cm, 0.3 kg believed 0.2 kg: the PD law alone stays away."""
+    config = preset("paper")
+    scenario = Scenario(omega=0.0, phase=math.pi / 2, amplitude=0.03, mass=0.3, believed_mass=0.2, seconds=45.0)
+    left = {
+        name: np.abs(simulate(config, make_baseline(name, config), scenario, "newton-euler").error[-1]).max()
+        for name in ("copy", "observer")
+    }
+    assert left["copy"] > 0.1
+    assert left["observer"] < 2e-4
+
+
+def test_the_observer_sees_a_step_of_torque_and_of_lift_by_its_time_constants() -> None:
+    """1 - (1 - w T)^k of it after k periods T, whatever the law itself commands."""
+    config = preset("paper")
+    law, pair, observation = make_law("observer", config), assembly_model(config, "test"), np.zeros(18)
+    bandwidth = np.array([law.gains.torque_bandwidth, law.gains.lift_bandwidth])
+    step, state, seen = np.array([0.05 / pair.inertia[1], 0.4]), law.start(observation), []  # [rad/s2, m/s2]
+    for _ in range(100):
+        seen.append(bandwidth * (observation[10] - state.rate, -observation[CLIMB] - state.climb))
+        state, command = law.step(state, observation, None)
+        both = copy_command(observation, *copy_gains(config)) + command
+        turn = pair.kp[1] * (both[1] - 2 * observation[4]) - 2 * pair.kd[1] * observation[10]
+        observation[4] += pair.period * observation[10]
+        observation[10] += pair.period * (turn / pair.inertia[1] + step[0])
+        observation[CLIMB] -= pair.period * (0.5 * both[2] + step[1])
+    expected = step * (1 - (1 - bandwidth * pair.period) ** np.arange(100)[:, None])
+    np.testing.assert_allclose(seen, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_the_observer_is_of_the_pair() -> None:
+    with pytest.raises(InputError, match="free pair along x"):
+        make_law("observer", preset("team"))

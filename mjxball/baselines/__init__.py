@@ -11,6 +11,7 @@ from collections.abc import Callable
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
 from mjxball.baselines.lqg import KnownFailuresLqg, Lqg, Memoryless, SlowLqg
+from mjxball.baselines.observer import Observer
 from mjxball.baselines.offset_free import OffsetFree
 from mjxball.baselines.reference import Oracle, Random, Stay
 from mjxball.baselines.team_lqg import TeamOffsetFree
@@ -28,6 +29,7 @@ __all__ = [
     "KnownFailuresLqg",
     "Lqg",
     "Memoryless",
+    "Observer",
     "OffsetFree",
     "Oracle",
     "Random",
@@ -45,6 +47,7 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "adaptive-mass": lambda config: Adaptive(config, adapts_mass=True),
     "oracle": Oracle,
     "memoryless": Memoryless,
+    "observer": Observer,
     "lqg": lambda config: CrazyflieLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
     "lqg-slow": SlowLqg,
     "lqg-offset-free": lambda config: TeamOffsetFree(config) if config.plant.is_team else OffsetFree(config),
@@ -53,7 +56,7 @@ LAWS: dict[str, Callable[[Config], Law]] = {
 # Where no drone fails `lqg-known-failures` is `lqg`.
 SUITE_BASELINES = tuple(name for name in LAWS if name != "lqg-known-failures")  # of benchmark suites
 FORMER_NAMES = {"lqg-told": "lqg-known-failures"}
-VARIANTS = ("adaptive-mass", "lqg-slow", "lqg-offset-free")
+VARIANTS = ("adaptive-mass", "observer", "lqg-slow", "lqg-offset-free")
 BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # of `eval.py`
 
 

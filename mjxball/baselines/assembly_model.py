@@ -152,6 +152,15 @@ def ideal_model(config: Config, name: str) -> AssemblyModel:
     return assembly_model(config, name)
 
 
+def pair_model(config: Config, name: str) -> AssemblyModel:
+    """`ideal_model`; InputError unless the plant is a free pair along x with ideal loops, led by its first drone."""
+    plant = config.plant
+    alike = plant.count == 2 and plant.leader == 0 and plant.cg_axis == "x" and plant.stand == "free"
+    if not alike or config.autopilot.kind != "ideal":
+        raise InputError(f"follower {name!r} balances a free pair along x with ideal loops; this plant is another")
+    return ideal_model(config, name)
+
+
 def assembly_model(config: Config, name: str) -> AssemblyModel:
     """The assembly for the follower `name`; InputError if a stand locks the axis that the load turns.
 

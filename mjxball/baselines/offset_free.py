@@ -12,14 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.baselines.assembly_model import AssemblyModel, ideal_model
+from mjxball.baselines.assembly_model import pair_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, THETA_NOISE, Tuning, feedback, steady_filter
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.leader import clip_command
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
-from mjxball.errors import InputError
 from mjxball.plant.parts import clipped, joined
 
 Array = Any
@@ -49,7 +48,7 @@ class Design(NamedTuple):
 
 def design(config: Config) -> Design:
     """The law for the plant of `config`; InputError unless it is a free pair along x with ideal attitude loops."""
-    pair = pair_model(config)
+    pair = pair_model(config, NAME)
     kp, kd = pair.kp[1], pair.kd[1]
     a, b = np.zeros((STATES, STATES)), np.zeros((STATES, DRIVES))
     a[0, 1] = a[2, 3] = 1.0
@@ -71,15 +70,6 @@ def design(config: Config) -> Design:
         half_length=0.5 * float(pair.mounts[0, 0] - pair.mounts[1, 0]),
         carried=pair.known_mass + pair.share * config.plant.object_mass,
     )
-
-
-def pair_model(config: Config) -> AssemblyModel:
-    """`ideal_model`; InputError unless the plant is a free pair along x with ideal loops."""
-    plant = config.plant
-    alike = plant.count == 2 and plant.leader == 0 and plant.cg_axis == "x" and plant.stand == "free"
-    if not alike or config.autopilot.kind != "ideal":
-        raise InputError(f"follower {NAME!r} balances a free pair along x with ideal loops; this plant is another")
-    return ideal_model(config, NAME)
 
 
 class OffsetFree:

@@ -1,0 +1,78 @@
+"""A PD law and a disturbance observer: what a control engineer would try first on the paper's pair (ours).
+
+Its gains are the best of `benchmarks/observer_tuning.py` for flights with and without noise and delay.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from mjxball.baselines.assembly_model import pair_model
+from mjxball.config import Config
+from mjxball.control import leader
+from mjxball.control.followers import PrivilegedInfo, copy_gains
+from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
+from mjxball.plant.parts import clipped, joined
+
+Array = Any
+
+
+class ObserverGains(NamedTuple):
+    """PD law of the position, and how quickly the observers follow, each (...)."""
+
+    position: Array = 0.737  # [rad/m]
+    velocity: Array = 0.575  # [rad s/m]
+    tilt_limit: Array = 0.124  # of the PD law [rad]
+    height: Array = 2.8  # vertical acceleration for an error [1/s2]
+    climb: Array = 2.66  # and for a velocity [1/s]
+    torque_bandwidth: Array = 15.8  # [rad/s]
+    lift_bandwidth: Array = 3.47  # [rad/s]
+
+
+class ObserverState(NamedTuple):
+    """What both commands and the disturbance seen so far explain of the motion."""
+
+    rate: Array  # (...) of pitch [rad/s]
+    climb: Array  # (...) [m/s]
+
+
+class Observer:
+    """A PD law that brings the pair to the goal, less the torque and the lift that a disturbance observer sees.
+
+    The observer (Ohnishi's, of first order) compares pitch rate and climb with the integral of what both drones command
+    and of what it has seen: d = w (rate - integral). The leader's command is known, for the law is.
+    """
+
+    name = "observer"
+    needs_privileged = False
+    gains = ObserverGains()
+
+    def __init__(self, config: Config):
+        pair = pair_model(config, self.name)
+        self._period, self._kp, self._kd, self._inertia = pair.period, pair.kp[1], pair.kd[1], pair.inertia[1]
+        self._leader = copy_gains(config)
+
+    def start(self, observation: Array) -> ObserverState:
+        """See `Law.start`."""
+        return ObserverState(observation[..., 10], -observation[..., ERROR_RATE][..., 2])
+
+    def step(self, state: ObserverState, observation: Array, privileged: PrivilegedInfo) -> tuple[ObserverState, Array]:
+        """See `Law.step`."""
+        own, led, limits = self.gains, copy_command(observation, *self._leader), self._leader[-2:]
+        error, velocity = observation[..., ERROR], observation[..., ERROR_RATE]
+        seen = own.torque_bandwidth * (observation[..., 10] - state.rate)  # [rad/s2]
+        lift = own.lift_bandwidth * (-velocity[..., 2] - state.climb)  # [m/s2]
+        reach = own.tilt_limit
+        ahead, aside = (
+            clipped(own.position * error[..., axis] + own.velocity * velocity[..., axis], -reach, reach)
+            for axis in (0, 1)
+        )
+        rise = own.height * error[..., 2] + own.climb * velocity[..., 2] - lift
+        pitch = 2.0 * ahead - led[..., 1] - self._inertia * seen / self._kp
+        command = leader.clip_command(joined([-2.0 * aside - led[..., 0], pitch, 2.0 * rise - led[..., 2]]), *limits)
+        torque = self._kp * (led[..., 1] + command[..., 1] - 2.0 * observation[..., 4])
+        turn = (torque - 2.0 * self._kd * observation[..., 10]) / self._inertia
+        climb = 0.5 * (led[..., 2] + command[..., 2])
+        return ObserverState(
+            state.rate + self._period * (turn + seen), state.climb + self._period * (climb + lift)
+        ), command
