@@ -61,7 +61,7 @@ def gradient_of(
 
     `swept` settings are traced, as in a population.
     """
-    settings = {"num_envs": 32, "windows_per_episode": 33, "policy_layers": (), **settings}
+    settings = {"num_envs": 32, "windows_per_episode": (33,), "policy_layers": (), **settings}
     environments = Environments(LinearQuadratic(), 32, Shards())
     states = environments.reset(jax.random.PRNGKey(0))
     kernel = jnp.concatenate([-jnp.asarray(gain.T, jnp.float32), jnp.zeros((2, 1))], axis=1)
@@ -148,7 +148,7 @@ def test_an_impulse_response_begins_to_count_late_in_one_branch_for_all_members(
     losses = [gradient_of(transport, gain, horizon=steps, impulse_response=weight)[1] for weight in (0.0, 0.3)]
     own = dataclasses.replace(
         transport.gradient,
-        **{"num_envs": 32, "windows_per_episode": 99, "policy_layers": (), "horizon": steps},
+        **{"num_envs": 32, "windows_per_episode": (99,), "policy_layers": (), "horizon": steps},
         **{"gradient_steps": 100, "impulse_response": 0.3, "impulse_response_from": 0.4},
     )
     environments = Environments(LinearQuadratic(), 32, Shards())

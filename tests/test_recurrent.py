@@ -112,7 +112,7 @@ class Recalling(LinearQuadratic):
         )  # fmt: skip
 
 
-BY_GRADIENTS = {"num_envs": 64, "horizon": EPISODE, "windows_per_episode": 1, "policy_layers": (8,),
+BY_GRADIENTS = {"num_envs": 64, "horizon": EPISODE, "windows_per_episode": (1,), "policy_layers": (8,),
                 "learning_rate": 2e-2, "max_grad_norm": 1.0, "state_gradient_clip": 1e4}  # fmt: skip
 BY_SAC = {"num_envs": 64, "batch_size": 320, "recurrent_steps": EPISODE, "replay_size": 64_000, "policy_layers": (8,),
           "critic_layers": (32,), "learning_rate": 1e-2, "discount": 0.0, "alpha": 1e-3, "alpha_fixed": True,
@@ -137,7 +137,7 @@ def algorithm_of(name: str, transport: Config) -> tuple[Any, Environments]:
 def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent) -> None:
     """The loss beside flights, one with a small impulse of the first action: observations, actions, GRU and all."""
     worlds, steps, weight, small = 3, 6, 0.3, 2e-3
-    own = {"num_envs": worlds, "horizon": steps, "windows_per_episode": 99}
+    own = {"num_envs": worlds, "horizon": steps, "windows_per_episode": (99,)}
     env, network = TransportEnv(recurrent.config, "newton-euler"), recurrent.network
     key = jax.random.PRNGKey(2)
     with jax.default_matmul_precision("highest"):

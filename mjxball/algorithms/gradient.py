@@ -54,8 +54,9 @@ class FirstOrderGradient:
     """Backpropagation through windows of `gradient.horizon` steps of all environments, then one step of Adam.
 
     `collect` flies a window and differentiates its mean reward with respect to the policy's weights; `update` takes
-    the step. Windows follow one another in an episode of `gradient.windows_per_episode`; the environments begin theirs
-    in turn, so that every window has flights towards the goal and flights at it. `gradient.gradient_decay` multiplies
+    the step. Windows follow one another in an episode of `gradient.windows_per_episode`, of several lengths if it has
+    several; the environments begin theirs in turn, so that every window has flights towards the goal and flights at
+    it. `gradient.gradient_decay` multiplies
     the gradient that passes from one control step to the one before, and `gradient.state_gradient_clip` limits it in
     each environment. A recurrent network's own state passes it whole: that is what it is to learn to remember by.
     `gradient.impulse_response` asks for a closed loop that is well damped about every flight, however small its errors.
@@ -129,7 +130,9 @@ class FirstOrderGradient:
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
         """One window of all environments and its gradient; the first one gives the observations' statistics."""
         own = self._environments
-        turn = (own.turn + state.windows) % self._config.windows_per_episode == 0
+        lengths = np.asarray(self._config.windows_per_episode)
+        kind, turn = own.turn % len(lengths), own.turn // len(lengths) + state.windows
+        turn = turn % jnp.asarray(lengths)[kind] == 0
         envs = own.restart(envs, keys[0], turn & phase.recording)
         # Also by the first states, where they allow it: JAX then sees at once what the loop carries a gradient of.
         arguments = (0, 2) if own.smooth else (0,)
@@ -164,23 +167,18 @@ class FirstOrderGradient:
         respond = jax.checkpoint(functools.partial(self._respond, policy))
 
         def step(carry: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
-            envs, flies, response, impulse = carry
+            envs, response, impulse = carry
             envs = envs._replace(states=self._damped(envs.states))
             seen, lasting = envs.states.obs, 0.0
             if response:
                 response, lasting = respond(envs, response, impulse)
             envs, after = self._environments.step(envs, policy(seen), None)
-            reward = after.reward - lasting
-            reward = reward * flies if self._config.until_termination else reward
             impulse = jax.tree.map(jnp.zeros_like, impulse)  # over after one step
-            return (_forget(envs), flies * (1.0 - after.terminated), response, impulse), (
-                reward,
-                jax.lax.stop_gradient(seen),
-            )
+            return (_forget(envs), response, impulse), (after.reward - lasting, jax.lax.stop_gradient(seen))
 
         answers = isinstance(impulse, jax.Array)
         response = jax.tree.map(jnp.zeros_like, _floats(envs.states)) if answers else []
-        start: Any = envs, jnp.ones_like(envs.states.reward), response, impulse
+        start: Any = envs, response, impulse
         (envs, *_), (rewards, seen) = jax.lax.scan(step, start, length=self._config.horizon)
         return -rewards.mean(), (envs, seen.mean(axis=(0, 1)), (seen**2).mean(axis=(0, 1)))
 

@@ -85,7 +85,9 @@ class Gradient:
     gradient_steps: int = setting(120, "steps of Adam, each on one window of all environments", low=1)
     num_envs: int = setting(32, "environments that are flown at once", low=1)
     horizon: int = setting(100, "control steps of a window, through which the reward is differentiated", low=1)
-    windows_per_episode: int = setting(4, "windows after which an environment starts anew", low=1)
+    windows_per_episode: tuple[int, ...] = setting(
+        (4,), "windows after which an environment starts anew; of several numbers environments have one each", low=1
+    )
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
     learning_rate: float = setting(2e-2, "Adam's rate at the start", above=0)
     learning_rate_final_ratio: float = setting(
@@ -114,7 +116,3 @@ class Gradient:
         0.0, "share of the gradient steps after which impulse_response begins to count", low=0, high=1
     )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
-    until_termination: bool = setting(
-        False,
-        "what follows the end of an episode counts no more until the next window, whose gradient it would dominate",
-    )

@@ -120,7 +120,7 @@ def _robust() -> Config:
 
 # What flies through a termination counts: its gradient is limited in every environment.
 RECURRENT_GRADIENT = Gradient(
-    windows_per_episode=3,
+    windows_per_episode=(3,),
     learning_rate=6e-3,
     learning_rate_final_ratio=0.003,
     adam_betas=(0.9, 0.99),
@@ -246,7 +246,7 @@ def _lost() -> Config:
         scenario=replace(team.scenario, team_sizes=(), object_mass=(0.3, 2.4), lost_follower_probability=0.6),
         sac=replace(team.sac, num_envs=560, replay_size=560_000),
         ppo=Ppo(num_envs=560),
-        gradient=replace(team.gradient, gradient_steps=900, num_envs=560, windows_per_episode=6),
+        gradient=replace(team.gradient, gradient_steps=900, num_envs=560, windows_per_episode=(6,)),
     )
 
 

@@ -70,6 +70,7 @@ CONSTANT: dict[str, Any] = {
     "sac.gradient_clip": 0.0,
     "sac.max_grad_norm": 0.0,
     "ppo.curriculum": 0.0,
+    "gradient.until_termination": False,
     "follower.base": "pd",
     "follower.differential_thrust_share": 0.0,
     "follower.load_by_lift": 0.0,

@@ -66,7 +66,7 @@ SETTINGS: dict[str, Any] = {  # of `config.gradient`
     "learning_rate_final_ratio": 0.1,
     "max_grad_norm": 1.0,
     "gradient_decay": 0.97,
-    "windows_per_episode": 1_000_000,  # one flight, window after window
+    "windows_per_episode": (1_000_000,),  # one flight, window after window
 }
 
 
