@@ -14,6 +14,10 @@ from pathlib import Path
 
 from mjxball import cli, config
 from mjxball.baselines import BASELINES, LAWS, SUITE_BASELINES, make_baseline
+from mjxball.bench.entry import run as run_entry
+from mjxball.bench.entry import table as table_of
+from mjxball.bench.followers import entrant
+from mjxball.bench.tracks import TRACKS
 from mjxball.commands.flight_log import evaluate_log
 from mjxball.commands.scenarios import SCENARIO_FLAGS, native_scenarios, scenarios_of, setup_of
 from mjxball.control.followers import Baseline, Follower
@@ -33,7 +37,7 @@ from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policies
 from mjxball.sim.scenario import Scenario
-from mjxball.train.run_directory import versions
+from mjxball.train.run_directory import commit, versions
 
 # What `--figures` fixes itself.
 NOT_WITH_FIGURES = ("suite", "num_seeds", "check", "followers", "json", "wn_pitch", "plant", *SCENARIO_FLAGS)
@@ -94,6 +98,17 @@ def parser() -> cli.Parser:
     )
     result.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
     result.add_argument("--list", action="store_true", help="list the benchmark suites and stop")
+    result.add_argument(
+        "--benchmark",
+        metavar="FOLLOWER",
+        help="fly mjxball-bench, write the entry to --out FILE.json: a policy, MODEL.onnx, module:Class, or a name",
+    )
+    result.add_argument(
+        "--tracks", nargs="+", metavar="NAME", help=f"of --benchmark: {', '.join(TRACKS)} (default all)"
+    )
+    result.add_argument(
+        "--draw", type=int, metavar="N", help="other flights of --benchmark (default 0, the published ones)"
+    )
     return result
 
 
@@ -123,6 +138,10 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.list:
         print(list_suites())  # noqa: T201
         return 0
+    if options.benchmark is not None:
+        return _entry(options, arguments)
+    if options.tracks or options.draw is not None:
+        raise InputError("--tracks and --draw belong to --benchmark")
     if options.figures is not None:
         return _figures(options, arguments)
     setup = setup_of(options)
@@ -153,6 +172,28 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if chosen:
         return _benchmark(groups[0], chosen, options, command, team)
     return _compare(groups, options, command)
+
+
+def _entry(options: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Fly mjxball-bench and write the entry; its flights are its own, so that hardly any other flag goes with them."""
+    given = [name for name in ("figures", *NOT_WITH_FIGURES) if getattr(options, name) not in (None, False, [])]
+    if options.policies or given:
+        what = "the policies" if options.policies else f"--{given[0].replace('_', '-')}"
+        raise InputError(f"--benchmark flies one follower on flights of its own; drop {what}")
+    if options.out is None or options.out.suffix != ".json":
+        raise InputError("--benchmark needs --out FILE.json, where the entry is written")
+    cli.output_file(options.out, ".json")
+    started = time.monotonic()
+
+    def progress(text: str) -> None:
+        print(f"{time.monotonic() - started:6.1f} s  {text}", file=sys.stderr)  # noqa: T201
+
+    name, make = entrant(options.benchmark)
+    found = run_entry(name, make, options.tracks or (), options.draw or 0, progress)
+    known = {"command": shlex.join(["python", "eval.py", *arguments]), "commit": commit(), "versions": versions()}
+    write_whole(options.out, json.dumps({**found, **known}, indent=1, allow_nan=False) + "\n")
+    print(f"{table_of(found)}\nthe entry is {options.out}")  # noqa: T201
+    return 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,85 @@
+#!/usr/bin/env python3
+"""Write docs/leaderboard.md from the entries in benchmarks/leaderboard/.
+
+`python docs/leaderboard.py [FILE]`; entries of another version are refused.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from mjxball.bench import NAME, VERSION
+from mjxball.bench.entry import cells, read_entry
+from mjxball.bench.score import CONDITIONS
+from mjxball.bench.tracks import FLIGHTS, SECONDS, TRACKS
+
+REPOSITORY = Path(__file__).parents[1]
+ENTRIES, PAGE = REPOSITORY / "benchmarks" / "leaderboard", REPOSITORY / "docs" / "leaderboard.md"
+HEAD = f"""# Leaderboard
+
+{NAME}, version {VERSION}: every follower flies the same random flights, {FLIGHTS} of {SECONDS:g} s in each track and
+condition. A flight is **met** if it does not fail and is as good as the best classical follower that knows the plant:
+its peak after 20 s is at most 3 mm larger, it settles (2 %) at most 10 % or 0.1 s later, and it overshoots by at most
+1 % more. The best is taken in each number apart, of `lqg`, `lqg-slow` and `lqg-offset-free` in the same flight; of
+random rigs, of the two LQGs that are told the rig; of Crazyflies, of `lqg`. Every load leaves 15 % of the rotors.
+
+| track | plant and flights | disturbed |
+|---|---|---|
+| pair, mass known | the paper's; CG 2 - 17 cm at 0.2 - 3.1 rad/s, 0.1 - 0.6 kg | noise, 40 ms |
+| pair, mass unknown | the same, believed to be 0.2 kg; the references know it | noise, 40 ms |
+| teams of 3 to 6 | rings; the load on a path in the plane | noise, 40 ms |
+| any rig | rigs that no training draws, masses and thrusts not as believed | noise, 20 ms |
+| two Crazyflies | simulated 2.1 with a ball, masses and thrusts off | noise / 2, drift, 30 ms, the radio's resolution |
+
+Columns: share met and its 95 % interval, flights that failed, median settling time, 90 % quantile of the peaks, time
+with a rotor at its limit, rms change of commands from step to step. A dash: never, or nothing to measure.
+
+## Send an entry
+
+```bash
+python eval.py --benchmark my_policy.npz --out my_policy.json
+```
+
+`my_policy.npz` may be an ONNX file with the inputs of [our exports](policy-file.md#export), or `module:Class`
+([your own follower](howto/own-baseline.md)). A track takes up to ten minutes on two cores; `--tracks pair` flies one. A
+track whose plants the follower refuses is left out. Add the file to `benchmarks/leaderboard/`, run
+`python docs/leaderboard.py`, and open a pull request. We repeat it with `--draw`, on flights that nobody has seen.
+"""
+
+
+def page(entries: list[dict[str, Any]]) -> str:
+    """The whole page."""
+    parts = [HEAD]
+    for name, track in TRACKS.items():
+        rows = sorted(
+            (entry for entry in entries if name in entry["tracks"]),
+            key=lambda entry: (entry["date"], [entry["tracks"][name][one]["met"] for one in CONDITIONS]),
+            reverse=True,
+        )
+        parts.append(f"## {track.title[0].upper()}{track.title[1:]}\n")
+        parts.append(
+            "| follower | | met % | 95 % | failed % | settles s | 90 % peak mm | limit % | change mrad | date, commit |"
+        )
+        parts.append("|---|---|---|---|---|---|---|---|---|---|")
+        for entry in rows:
+            for condition in CONDITIONS:
+                made = f"{entry['date']}, {entry['commit'][:7]}" if condition == CONDITIONS[0] else ""
+                called = f"`{entry['follower']}`" if condition == CONDITIONS[0] else ""
+                shown = " | ".join(cells(entry["tracks"][name][condition]))
+                parts.append(f"| {called} | {condition} | {shown} | {made} |")
+        parts.append("")
+    return "\n".join(parts)
+
+
+def main() -> int:
+    """Write the page."""
+    entries = [read_entry(path) for path in sorted(ENTRIES.glob("*.json"))]
+    out = Path(sys.argv[1]) if len(sys.argv) > 1 else PAGE
+    out.write_text(page(entries))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

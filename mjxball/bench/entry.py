@@ -1,0 +1,91 @@
+"""Entries of the benchmark: what a follower came to, in a file that the leaderboard reads."""
+
+from __future__ import annotations
+
+import datetime
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mjxball.bench import NAME, VERSION
+from mjxball.bench.followers import Make
+from mjxball.bench.score import CONDITIONS, measure, worlds_of
+from mjxball.bench.tracks import TRACKS
+from mjxball.errors import InputError
+from mjxball.files import read_text
+
+HEADS = ["track", "", "met %", "95 %", "failed %", "settle s", "90 % peak mm", "limit %", "change mrad"]
+KEYS = {"benchmark", "version", "draw", "follower", "date", "command", "commit", "versions", "tracks", "not_flown"}
+
+
+def run(
+    name: str, make: Make, tracks: Sequence[str], draw: int, progress: Callable[[str], None] = lambda text: None
+) -> dict[str, Any]:
+    """The entry of a follower, without what `mjxball.commands` knows of the machine.
+
+    A track whose plants it refuses is left out with its sentence. Raises InputError if that is so of all tracks.
+    """
+    unknown = [track for track in tracks if track not in TRACKS]
+    if unknown:
+        raise InputError(f"unknown track {unknown[0]!r}; tracks are {', '.join(TRACKS)}")
+    if draw < 0:
+        raise InputError(f"--draw must not be negative, but is {draw}")
+    found: dict[str, Any] = {}
+    refused: dict[str, str] = {}
+    for track in tracks or TRACKS:
+        try:
+            for world in worlds_of(track, draw):
+                make(world.config)
+        except InputError as error:
+            refused[track] = str(error)
+            continue
+        found[track] = measure(track, draw, make, progress)
+    if not found:
+        raise InputError(f"{name} flies no track: {next(iter(refused.values()))}")
+    date = datetime.datetime.now(datetime.UTC).date().isoformat()
+    whole = {"benchmark": NAME, "version": VERSION, "draw": draw, "follower": name, "date": date}
+    return {**whole, "tracks": found, "not_flown": refused}
+
+
+def read_entry(path: Path) -> dict[str, Any]:
+    """An entry of this version; InputError with one sentence for anything else."""
+    try:
+        entry = json.loads(read_text(path, "entry"))
+    except ValueError:
+        raise InputError(f"entry {path} is no JSON") from None
+    if not isinstance(entry, dict) or entry.get("benchmark") != NAME:
+        raise InputError(f"{path} is no entry of {NAME}")
+    other = entry.get("version")
+    if other != VERSION:
+        raise InputError(f"entry {path} is of version {other!r} of {NAME}, and this is version {VERSION}")
+    missing = sorted(KEYS - set(entry))
+    tracks = entry.get("tracks")
+    if missing or not isinstance(tracks, dict) or not all(set(CONDITIONS) <= set(one) for one in tracks.values()):
+        raise InputError(f"entry {path} is not whole: {', '.join(missing) or 'tracks'} is missing")
+    return entry
+
+
+def table(entry: dict[str, Any]) -> str:
+    """The entry as text, one line a track and condition."""
+    rows: list[Sequence[str]] = [HEADS]
+    for track, found in entry["tracks"].items():
+        rows += [(TRACKS[track].title, condition, *cells(found[condition])) for condition in CONDITIONS]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADS))]
+    sides = [str.ljust, str.ljust, *[str.rjust] * (len(HEADS) - 2)]
+    lines = ["  ".join(side(text, width) for side, text, width in zip(sides, row, widths, strict=True)) for row in rows]
+    left_out = [f"{TRACKS[track].title}: not flown, {why}" for track, why in entry["not_flown"].items()]
+    return "\n".join([*(line.rstrip() for line in lines), *left_out])
+
+
+def cells(found: dict[str, Any]) -> tuple[str, ...]:
+    """Numbers of one condition as text: met, its interval, failed, settling, peak, rotors at a limit, change."""
+
+    def shown(name: str, factor: float, digits: int) -> str:
+        return "-" if found[name] is None else f"{factor * found[name]:.{digits}f}"
+
+    interval = f"{100 * found['low']:.0f} - {100 * found['high']:.0f}"
+    return (
+        *(shown("met", 100, 0), interval, shown("failed", 100, 0), shown("settling_50", 1, 2)),
+        *(shown("peak_90", 1e3, 1), shown("rotors_at_limit", 100, 1), shown("command_change", 1e3, 1)),
+    )

@@ -1,0 +1,202 @@
+"""The flights of mjxball-bench, version 1. Frozen: whoever changes a number here makes another version.
+
+A draw is a number; entries of the leaderboard are of draw 0, and any other draw is flights that nobody tuned to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mjxball.baselines import make_baseline
+from mjxball.baselines.lqg import KnownRigLqg, SlowKnownRigLqg
+from mjxball.bench import VERSION
+from mjxball.config import Config, cg_limit, preset, with_plant
+from mjxball.control.constants import trim_limit
+from mjxball.control.followers import Baseline
+from mjxball.plant.teams import ring_config
+from mjxball.plant.trim import largest_amplitude, largest_margin
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.rigs import draw_rigs, rig_config, unpadded
+from mjxball.sim.scenario import CgPath, Scenario
+
+SECONDS = 30.0  # of a flight
+FLIGHTS = 120  # of a track, undisturbed, and as many disturbed
+MARGIN = 0.15  # of the rotors' range that the trim of every load leaves
+SPEEDS = (0.2, 3.1)  # of the CG [rad/s]
+AMPLITUDES = (0.02, 0.17)  # of the pair's CG [m]
+MASSES, BELIEVED = (0.1, 0.6), 0.2  # of the pair's object [kg]
+TEAMS = (3, 4, 5, 6)  # drones
+LOADS = (0.5, 1.5)  # a team's object over that of its plant
+DIRECTIONS = tuple((math.cos(angle), math.sin(angle)) for angle in np.pi * np.arange(8) / 8)
+RATIOS = (1.0, 1.5, 2.0)  # of both speeds of a path
+RIGS, EACH_RIG = (2, 3, 4, 5, 6), 3  # drones of a rig, flights of each rig
+RIG_LENGTH = 0.17  # [m] of the pair, for which a bar in metres is meant
+NOISE, DELAY, RIG_DELAY = 1.0, 0.04, 0.02  # level, [s], [s] of random rigs
+THRUST = (0.985, 1.015)  # of the Crazyflies' rotors, over what is asked
+CRAZYFLIE = {"noise": 0.5, "estimator_drift": 1.0, "delay": 0.03, "quantize": True}
+Pair = tuple[Scenario, Scenario]  # undisturbed, disturbed
+
+
+@dataclass(frozen=True)
+class World:
+    """Flights on one plant, and who knows that plant."""
+
+    config: Config
+    scenarios: tuple[Pair, ...]
+    references: tuple[Callable[[Config], Baseline], ...]
+    told: tuple[Scenario, ...] = ()  # what the references fly where the entrant is told less: undisturbed, disturbed
+    length: float = 1.0  # factor on bars in metres
+
+
+@dataclass(frozen=True)
+class Track:
+    """A part of the benchmark, with a number of its own."""
+
+    name: str
+    title: str
+    worlds: Callable[[int], list[World]]  # of a draw
+
+
+def _knowing(*names: str) -> tuple[Callable[[Config], Baseline], ...]:
+    return tuple(lambda config, name=name: make_baseline(name, config) for name in names)
+
+
+PAIR_REFERENCES = _knowing("lqg", "lqg-slow", "lqg-offset-free")
+TEAM_REFERENCES = _knowing("lqg", "lqg-slow", "lqg-offset-free")
+RIG_REFERENCES = (
+    lambda config: Baseline(KnownRigLqg(config), config),
+    lambda config: Baseline(SlowKnownRigLqg(config), config),
+)
+
+
+def _random(draw: int, track: int) -> np.random.Generator:
+    return np.random.default_rng([VERSION, track, draw])
+
+
+def _goal(random: np.random.Generator, reach: float = 1.0) -> tuple[float, float, float]:
+    """From 0.3 to 1 times `reach` away along each axis, either way: an overshoot of less is of no size."""
+    sides = random.choice([-1.0, 1.0], 3)
+    x, y, z = map(float, reach * sides * random.uniform(0.3, 1.0, 3))
+    return x, y, z
+
+
+def _both(scenario: Scenario, random: np.random.Generator, delay: float = DELAY) -> Pair:
+    disturbed = Disturbance(noise=NOISE, delay=delay, seed=int(random.integers(2**31)))
+    return scenario, replace(scenario, disturbance=disturbed)
+
+
+def _pair(draw: int, known: bool) -> list[World]:
+    config, random, scenarios = preset("paper"), _random(draw, 0 if known else 1), list[Pair]()
+    while len(scenarios) < FLIGHTS:
+        mass, amplitude = (float(random.uniform(*most)) for most in (MASSES, AMPLITUDES))
+        scenario = Scenario(
+            omega=float(random.uniform(*SPEEDS)),
+            amplitude=amplitude,
+            mass=mass,
+            phase=float(random.uniform(0, 2 * math.pi)),
+            goal=_goal(random),
+            seconds=SECONDS,
+        )
+        if amplitude <= trim_limit(config.plant, mass, MARGIN, mass if known else BELIEVED):
+            scenarios.append(_both(scenario, random))
+    if known:
+        return [World(config, tuple(scenarios), PAIR_REFERENCES)]
+    blind = tuple(
+        (replace(calm, believed_mass=BELIEVED), replace(rough, believed_mass=BELIEVED)) for calm, rough in scenarios
+    )
+    return [World(config, blind, PAIR_REFERENCES, tuple(one for pair in scenarios for one in pair))]
+
+
+def _team(draw: int) -> list[World]:
+    worlds, random, base = [], _random(draw, 2), with_plant(preset("paper"), "team6")
+    for size in TEAMS:
+        config, scenarios = ring_config(base, size), list[Pair]()
+        widest = cg_limit(config.plant)
+        while len(scenarios) < FLIGHTS // len(TEAMS):
+            mass = config.plant.object_mass * float(random.uniform(*LOADS))
+            reach = min(largest_amplitude(config, mass, MARGIN, way) for way in DIRECTIONS)
+            width = float(random.uniform(0, 1))
+            path = CgPath(
+                direction=float(random.uniform(0, 2 * math.pi)),
+                width=width,
+                ratio=float(random.choice(RATIOS)),
+                lead=float(random.uniform(0, 2 * math.pi)),
+            )
+            scenario = Scenario(
+                omega=float(random.uniform(*SPEEDS)),
+                amplitude=float(random.uniform(0, 1)) * min(reach, widest) / math.hypot(1, width),
+                mass=mass,
+                phase=float(random.uniform(0, 2 * math.pi)),
+                path=path,
+                goal=_goal(random),
+                seconds=SECONDS,
+            )
+            if reach > 0:
+                scenarios.append(_both(scenario, random))
+        worlds.append(World(config, tuple(scenarios), TEAM_REFERENCES))
+    return worlds
+
+
+def _rigs(draw: int) -> list[World]:
+    worlds, random, base = [], _random(draw, 3), preset("universal")
+    each = FLIGHTS // (EACH_RIG * len(RIGS))  # rigs of a size
+    for size in RIGS:
+        rigs = unpadded(draw_rigs(base, size, each, 1000 + draw).rigs, size)
+        for row in range(each):
+            config = rig_config(base, rigs, row)
+            scenarios = []
+            for _ in range(EACH_RIG):
+                path = CgPath(float(random.uniform(0, 2 * math.pi)), float(random.uniform(0, 1)), 1.0, math.pi / 2)
+                scenario = Scenario(
+                    omega=float(random.uniform(*SPEEDS)),
+                    amplitude=float(random.uniform(0, rigs.reach[row])),
+                    mass=float(rigs.object_mass[row]),
+                    believed_mass=float(rigs.believed_mass[row]),
+                    thrust=tuple(map(float, rigs.thrust[row])),
+                    phase=float(random.uniform(0, 2 * math.pi)),
+                    path=path,
+                    goal=_goal(random),
+                    seconds=SECONDS,
+                )
+                scenarios.append(_both(scenario, random, RIG_DELAY))
+            length = max(1.0, float(rigs.length[row]) / RIG_LENGTH)
+            worlds.append(World(config, tuple(scenarios), RIG_REFERENCES, length=length))
+    return worlds
+
+
+def _crazyflie(draw: int) -> list[World]:
+    config, random, scenarios = preset("flight"), _random(draw, 4), list[Pair]()
+    ranges = config.scenario
+    while len(scenarios) < FLIGHTS:
+        scenario = Scenario(
+            omega=float(random.uniform(*ranges.cg_speed)),
+            amplitude=float(random.uniform(*ranges.cg_amplitude)),
+            mass=float(random.uniform(*ranges.object_mass)),
+            believed_mass=config.plant.object_mass,
+            phase=float(random.uniform(0, 2 * math.pi)),
+            goal=_goal(random, ranges.goal_range),
+            thrust=tuple(map(float, random.uniform(*THRUST, 2))),
+            seconds=SECONDS,
+        )
+        rough = Disturbance(**CRAZYFLIE, seed=int(random.integers(2**31)))  # type: ignore[arg-type]
+        known = scenario.believed_mass, (), False, scenario.thrust
+        trims = [largest_margin(config, scenario.mass, side * scenario.amplitude, *known) for side in (-1, 1)]
+        if min(trim.margin for trim in trims) >= MARGIN:
+            scenarios.append((scenario, replace(scenario, disturbance=rough)))
+    return [World(config, tuple(scenarios), _knowing("lqg"))]
+
+
+TRACKS: dict[str, Track] = {
+    track.name: track
+    for track in (
+        Track("pair", "pair, mass known", lambda draw: _pair(draw, True)),
+        Track("pair-unknown", "pair, mass unknown", lambda draw: _pair(draw, False)),
+        Track("team", "teams of 3 to 6", _team),
+        Track("rigs", "any rig", _rigs),
+        Track("crazyflie", "two Crazyflies", _crazyflie),
+    )
+}
