@@ -18,7 +18,7 @@ from command_line import TRANSPORT, assert_refused
 from conftest import with_settings
 
 from mjxball.algorithms.base import Phase, Shards
-from mjxball.algorithms.gradient import FirstOrderGradient
+from mjxball.algorithms.gradient import FirstOrderGradient, starts_anew
 from mjxball.commands.train import main
 from mjxball.config import Config, preset
 from mjxball.errors import InputError
@@ -345,3 +345,17 @@ def test_what_does_not_fit_is_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert word in assert_refused(main, flags, tmp_path, capsys)
+
+
+def test_environments_have_episodes_of_each_length_and_begin_them_in_turn():
+    turn = np.arange(48)
+    begins = np.array([starts_anew(turn, windows, (3, 8)) for windows in range(48)])
+    for place, length in ((0, 3), (1, 8)):
+        gaps = [np.diff(np.flatnonzero(begins[:, number])) for number in turn[place::2]]
+        assert {int(gap) for one in gaps for gap in one} == {length}
+        each = begins[:, place::2].sum(axis=1)
+        assert each.max() - each.min() <= 1, "as many begin in every window"
+    assert (
+        np.array([starts_anew(turn, windows, (4,)) for windows in range(8)])
+        == ((turn + np.arange(8)[:, None]) % 4 == 0)
+    ).all()

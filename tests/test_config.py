@@ -315,6 +315,13 @@ class TestOldNames:
         assert configs.override(Config(), "sac.worlds", "64").sac.num_envs == 64
         assert configs.apply_overrides(Config(), {"sac.target_rate": 1}).sac.tau == 1.0
 
+    def test_one_length_of_an_episode_as_earlier_versions_wrote_it(self):
+        recorded = configs.to_dict(Config())
+        recorded["gradient"] |= {"windows_per_episode": 7, "until_termination": False}
+        assert configs.from_dict(recorded).gradient.windows_per_episode == (7,)
+        with pytest.raises(InputError, match="until_termination is no setting any more"):
+            configs.from_dict({**recorded, "gradient": {**recorded["gradient"], "until_termination": True}})
+
     def test_two_names_of_one_setting_contradict_each_other(self):
         recorded = configs.to_dict(Config())
         recorded["sac"]["worlds"] = 64

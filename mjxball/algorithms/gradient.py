@@ -130,10 +130,8 @@ class FirstOrderGradient:
     def collect(self, state: GradientState, envs: Any, keys: Sequence[Array], phase: Phase) -> tuple[Any, Any]:
         """One window of all environments and its gradient; the first one gives the observations' statistics."""
         own = self._environments
-        lengths = np.asarray(self._config.windows_per_episode)
-        kind, turn = own.turn % len(lengths), own.turn // len(lengths) + state.windows
-        turn = turn % jnp.asarray(lengths)[kind] == 0
-        envs = own.restart(envs, keys[0], turn & phase.recording)
+        begins = starts_anew(own.turn, state.windows, self._config.windows_per_episode)
+        envs = own.restart(envs, keys[0], begins & phase.recording)
         # Also by the first states, where they allow it: JAX then sees at once what the loop carries a gradient of.
         arguments = (0, 2) if own.smooth else (0,)
         differentiated = jax.value_and_grad(self._window, arguments, has_aux=True, allow_int=True)
@@ -264,6 +262,16 @@ class FirstOrderGradient:
                 f"gradient.num_envs = {self._config.num_envs} cannot be split over {parts} devices evenly; "
                 "make it a multiple"
             )
+
+
+def starts_anew(turn: Any, windows: Any, lengths: Sequence[int]) -> Any:
+    """(count,) which environments begin an episode when `windows` of it are flown.
+
+    `turn` (count,): their place in turn (`Environments.turn`). Neighbours have different `lengths`, and those of one
+    length begin in turn.
+    """
+    own = jnp.asarray(lengths)[turn % len(lengths)]
+    return (turn // len(lengths) + windows) % own == 0
 
 
 def _forget(envs: Any) -> Any:

@@ -261,7 +261,7 @@ def _universal() -> Config:
         # In the middle of what rigs are drawn with.
         attitude=Attitude(natural_frequency=(7.0, 7.0, 3.0), damping=0.8, design_object_mass=0.4),
         command=Command(tilt_limit=0.6, vertical_limit=8.0),
-        follower=replace(RECURRENT, action_scale_tilt=0.6, action_scale_vertical=8.0),
+        follower=replace(RECURRENT, recurrent_units=60, action_scale_tilt=0.6, action_scale_vertical=8.0),
         scenario=replace(
             large.scenario,
             team_sizes=(2, 3, 4, 6),
@@ -280,7 +280,8 @@ def _universal() -> Config:
         reward=replace(_team().reward, rates=0.5),
         sac=replace(large.sac, num_envs=528, replay_size=528_000),
         ppo=Ppo(num_envs=528),
-        gradient=replace(TEAM_GRADIENT, num_envs=1100, gradient_steps=1700),  # for a GPU
+        # For a GPU. With short flights alone followers drift against each other, with long ones alone they settle late.
+        gradient=replace(TEAM_GRADIENT, num_envs=1100, gradient_steps=2600, windows_per_episode=(3, 12)),
     )
 
 

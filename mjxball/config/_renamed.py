@@ -75,6 +75,8 @@ CONSTANT: dict[str, Any] = {
     "follower.differential_thrust_share": 0.0,
     "follower.load_by_lift": 0.0,
 }
+# Settings of several numbers that were one number before.
+ONCE_ONE = ("gradient.windows_per_episode",)
 
 
 def current_name(path: str) -> str:
@@ -98,6 +100,10 @@ def with_current_names(data: Any) -> Any:
     plant = found.get("plant")
     if isinstance(plant, dict) and isinstance(plant.get("drones"), (list, tuple)):
         plant["drones"] = [dict(drone) if isinstance(drone, dict) else drone for drone in plant["drones"]]
+    for path in ONCE_ONE:
+        part, _, name = path.partition(".")
+        if isinstance(found.get(part), dict) and type(found[part].get(name)) is int:
+            found[part][name] = [found[part][name]]
     for old in (*RENAMED, *CONSTANT):
         part, _, name = old.partition(".")
         if not isinstance(found.get(part), dict) or name not in found[part]:

@@ -139,8 +139,6 @@ def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
             value = tuple(map(float, value)) if _is_float_tuple(hints[name], value) else tuple(value)
         elif hints[name] is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
-        elif typing.get_args(hints[name]) == (int, ...) and type(value) is int:
-            value = (value,)  # one number, as earlier versions had it
         values[name] = value
     return kind(**values)
 
