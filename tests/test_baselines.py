@@ -169,16 +169,16 @@ def test_reference_scenario_is_the_first_cell(cells) -> None:
     assert cells["copy", 0.31].scenario == REFERENCE
 
 
-def test_the_observer_takes_off_a_torque_and_a_mass_that_nobody_told() -> None:
+def test_observer_integrals_and_mpc_take_off_a_torque_and_a_mass_that_nobody_told() -> None:
     """A load at rest at 3 cm, 0.3 kg believed 0.2 kg: the PD law alone stays away."""
-    config = preset("paper")
+    config, offset_free = preset("paper"), ("observer", "pid", "mpc")
     scenario = Scenario(omega=0.0, phase=math.pi / 2, amplitude=0.03, mass=0.3, believed_mass=0.2, seconds=45.0)
     left = {
         name: np.abs(simulate(config, make_baseline(name, config), scenario, "newton-euler").error[-1]).max()
-        for name in ("copy", "observer")
+        for name in ("copy", *offset_free)
     }
     assert left["copy"] > 0.1
-    assert left["observer"] < 2e-4
+    assert max(left[name] for name in offset_free) < 2e-4, left
 
 
 def test_the_observer_sees_a_step_of_torque_and_of_lift_by_its_time_constants() -> None:
@@ -199,6 +199,29 @@ def test_the_observer_sees_a_step_of_torque_and_of_lift_by_its_time_constants() 
     np.testing.assert_allclose(seen, expected, rtol=1e-9, atol=1e-12)
 
 
-def test_the_observer_is_of_the_pair() -> None:
-    with pytest.raises(InputError, match="free pair along x"):
-        make_law("observer", preset("team"))
+def test_the_pids_integrals_stand_still_where_they_would_wind_up() -> None:
+    """Far away the command is at its limits; of a small error it integrates `gain` times the error."""
+    config, privileged = preset("paper"), None
+    law = make_law("pid", config)
+    gains, period = law.gains, config.timing.control_period
+    resting = np.zeros(18)
+    resting[4] = -1e-3  # pitch below the reference, which starts there
+    state = law.start(np.zeros(18))
+    moved, _ = law.step(state, resting, privileged)
+    assert moved.pitch == pytest.approx(period * gains.pitch_integral * 1e-3, rel=1e-9)
+    diving = np.zeros(18)
+    diving[4] = 0.9  # the command is at -0.6 rad, and the error asks for less
+    moved, command = law.step(state, diving, privileged)
+    assert command[1] == -config.command.tilt_limit
+    assert moved.pitch == 0.0
+    nudged = state._replace(pitch=np.asarray(3.0))  # at the limit on the other side: the error brings it back
+    diving[4] = 0.2
+    moved, command = law.step(nudged, diving, privileged)
+    assert command[1] == config.command.tilt_limit
+    assert moved.pitch == pytest.approx(3.0 - period * gains.pitch_integral * gains.pitch_band)
+
+
+def test_observer_and_pid_are_of_the_pair() -> None:
+    for name in ("observer", "pid"):
+        with pytest.raises(InputError, match="free pair along x"):
+            make_law(name, preset("team"))

@@ -11,8 +11,10 @@ from collections.abc import Callable
 from mjxball.baselines.adaptive import Adaptive
 from mjxball.baselines.crazyflie_lqg import CrazyflieLqg
 from mjxball.baselines.lqg import KnownFailuresLqg, Lqg, Memoryless, SlowLqg
+from mjxball.baselines.mpc import Mpc
 from mjxball.baselines.observer import Observer
 from mjxball.baselines.offset_free import OffsetFree
+from mjxball.baselines.pid import Pid
 from mjxball.baselines.reference import Oracle, Random, Stay
 from mjxball.baselines.team_lqg import TeamOffsetFree
 from mjxball.config import Config
@@ -29,9 +31,11 @@ __all__ = [
     "KnownFailuresLqg",
     "Lqg",
     "Memoryless",
+    "Mpc",
     "Observer",
     "OffsetFree",
     "Oracle",
+    "Pid",
     "Random",
     "SlowLqg",
     "Stay",
@@ -47,16 +51,18 @@ LAWS: dict[str, Callable[[Config], Law]] = {
     "adaptive-mass": lambda config: Adaptive(config, adapts_mass=True),
     "oracle": Oracle,
     "memoryless": Memoryless,
+    "pid": Pid,
     "observer": Observer,
     "lqg": lambda config: CrazyflieLqg(config) if config.autopilot.kind == "crazyflie" else Lqg(config),
     "lqg-slow": SlowLqg,
     "lqg-offset-free": lambda config: TeamOffsetFree(config) if config.plant.is_team else OffsetFree(config),
+    "mpc": Mpc,
     "lqg-known-failures": KnownFailuresLqg,
 }
-# Where no drone fails `lqg-known-failures` is `lqg`.
-SUITE_BASELINES = tuple(name for name in LAWS if name != "lqg-known-failures")  # of benchmark suites
+# Of benchmark suites. Where no drone fails `lqg-known-failures` is `lqg`; `mpc` needs an extra, and time.
+SUITE_BASELINES = tuple(name for name in LAWS if name not in ("lqg-known-failures", "mpc"))
 FORMER_NAMES = {"lqg-told": "lqg-known-failures"}
-VARIANTS = ("adaptive-mass", "observer", "lqg-slow", "lqg-offset-free")
+VARIANTS = ("adaptive-mass", "pid", "observer", "lqg-slow", "lqg-offset-free", "mpc")
 BASELINES = tuple(name for name in SUITE_BASELINES if name not in VARIANTS)  # of `eval.py`
 
 

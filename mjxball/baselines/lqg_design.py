@@ -107,13 +107,19 @@ def steady_filter(
     a state, by its number; K has a column for each.
     """
     transition, drive = discretise(a, b, period)
-    process_noise = np.zeros_like(a)
+    return transition, drive, steady_gain(transition, period, walks, noise)
+
+
+def steady_gain(
+    transition: np.ndarray, period: float, walks: Mapping[int, float], noise: Mapping[int, float]
+) -> np.ndarray:
+    """K (n, k) of the steady-state Kalman filter of x <- A x with `transition` A (n, n); see `steady_filter`."""
+    process_noise = np.zeros_like(transition)
     for state, intensity in walks.items():
         process_noise[state, state] = intensity * period
-    measured, measurement_noise = np.eye(len(a))[list(noise)], np.diag([value**2 for value in noise.values()])
+    measured, measurement_noise = np.eye(len(transition))[list(noise)], np.diag([v**2 for v in noise.values()])
     predicted = solve_discrete_are(transition.T, measured.T, process_noise, measurement_noise)
-    gain = predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + measurement_noise)
-    return transition, drive, gain
+    return predicted @ measured.T @ np.linalg.inv(measured @ predicted @ measured.T + measurement_noise)
 
 
 def discretise(a: np.ndarray, b: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:

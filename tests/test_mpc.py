@@ -1,0 +1,182 @@
+"""Model-predictive control of the pair: its LQR, its quadratic program, and what it does at limits."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+
+import jax
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from mjxball.baselines import make_baseline, make_law
+from mjxball.baselines.lqg_design import TILT
+from mjxball.baselines.mpc import BEYOND, BLOCKS, MASSES, Mpc, Program, limit_rows
+from mjxball.baselines.mpc_design import (
+    EX,
+    LOAD,
+    PITCH,
+    PITCH_RATE,
+    ROLL,
+    ROLL_RATE,
+    STATES,
+    VX,
+    Design,
+    MpcTuning,
+    design,
+    limits_of,
+)
+from mjxball.config import preset
+from mjxball.control.followers import PrivilegedInfo
+from mjxball.errors import InputError
+from mjxball.evaluate.batch import Batch
+from mjxball.evaluate.metrics import measure_batch
+from mjxball.sim.disturbances import Disturbance
+from mjxball.sim.rollout import simulate_batch
+from mjxball.sim.scenario import Scenario
+
+PAPER = preset("paper")
+TUNING, LIMITS = Mpc.tuning, limits_of(PAPER)
+NOMINAL = MASSES.index(0.2)
+HOVER = np.array([1.1 * 9.81 / 4])  # [N] of each rotor, with 0.2 kg
+
+
+def law(tuning: MpcTuning = TUNING) -> Design:
+    return design(PAPER, tuning, MASSES[NOMINAL])
+
+
+def cost(own: Design, x: np.ndarray, corrections: np.ndarray) -> float:
+    """Of errors, speeds and mean commands along x until the motion has died out, after `corrections` (k,) of pitch."""
+    total = 0.0
+    for step in range(1500):
+        moved = np.array([0.0, corrections[step] if step < len(corrections) else 0.0, 0.0])
+        command = own.feedback @ x + own.correction @ moved
+        mean = 0.5 * (command + own.led @ x)[1]
+        total += (x[EX] / TUNING.position) ** 2 + (x[VX] / TUNING.velocity) ** 2 + (mean / TILT) ** 2
+        x = own.transition @ x + own.drive @ command
+    return total
+
+
+def test_a_correction_costs_its_square_on_top_of_the_lqr() -> None:
+    """J = x'Px + sum of W v^2: without limits the best v is none, and the law the LQR."""
+    own, random = law(), np.random.default_rng(0)
+    x, corrections = np.zeros(STATES), 0.1 * random.normal(size=20)
+    x[[EX, VX, PITCH]] = 0.4, -0.2, 0.05
+    more = cost(own, x, corrections) - cost(own, x, np.zeros(0))
+    assert more == pytest.approx(own.cost[1] * (corrections**2).sum(), rel=1e-6)
+
+
+def test_within_the_limits_it_is_the_lqr() -> None:
+    config, follower = PAPER, make_law("mpc", PAPER)
+    own, observation = law(), np.zeros(18)
+    observation[12:15], observation[3:5] = (0.02, -0.01, 0.01), (0.005, -0.01)
+    nobody = PrivilegedInfo(np.array(config.plant.object_mass), *[np.array(0.0)] * 3)
+    state = follower.start(observation)
+    _, command = follower.step(state, observation, nobody)
+    # Nothing was commanded before, and measurements are taken to be a step old.
+    x = own.transition @ state[:STATES]
+    assert not Program(own, LIMITS, MASSES[NOMINAL]).broken(x[None], HOVER).any()
+    np.testing.assert_allclose(command, own.feedback @ x, rtol=1e-9)
+    assert follower.solved == follower.failed == 0
+
+
+def test_the_program_is_solved_as_another_solver_does() -> None:
+    """The same program with its slack eliminated, v'Wv + cost of what goes beyond, by L-BFGS."""
+    own, random = law(), np.random.default_rng(1)
+    program, count = Program(own, LIMITS, MASSES[NOMINAL]), 3 * len(BLOCKS)
+    states, rows, low, high, lifting = limit_rows(own, LIMITS, 1.1)
+    weights = np.outer(BLOCKS, own.cost).ravel()
+    scaled = np.maximum(np.linalg.norm(rows / np.sqrt(weights), axis=1), 1e-3)
+    for _ in range(5):
+        x = np.zeros(STATES)
+        x[[EX, VX, PITCH, LOAD]] = random.uniform(-1, 1, 4) * (1.0, 0.5, 0.1, 0.2)
+        taken = states @ x + HOVER[0] * lifting
+
+        def value(v: np.ndarray, taken: np.ndarray = taken) -> tuple[float, np.ndarray]:
+            at = rows @ v + taken
+            beyond = (at - np.clip(at, low, high)) / scaled
+            slope = weights * v + BEYOND * rows.T @ (beyond / scaled)
+            return 0.5 * float(weights @ v**2 + BEYOND * beyond @ beyond), slope
+
+        options = {"maxiter": 5000, "ftol": 1e-15, "gtol": 1e-10}
+        best = minimize(value, np.zeros(count), jac=True, method="L-BFGS-B", options=options)
+        first, known = program.corrections(x[None], HOVER)
+        assert known.all()
+        np.testing.assert_allclose(first[0], best.x[:3], atol=5e-3)  # [rad]; [m/s2]: OSQP's tolerance
+    assert program.solved > 0
+
+
+def test_limits_are_kept_that_the_lqr_breaks() -> None:
+    """A metre away, on the linear model: tilt to 5 % of its limit, rotors to 0.6 N, by which clipping cuts."""
+    own, program = law(), Program(law(), LIMITS, MASSES[NOMINAL])
+    for follows in (False, True):
+        x, tilts, forces = np.zeros(STATES), [], []
+        x[EX] = 1.0
+        for _ in range(150):
+            first = program.corrections(x[None], HOVER)[0][0] if follows else np.zeros(3)
+            command = own.feedback @ x + own.correction @ first
+            torque = LIMITS.kp * (command[:2] - x[[ROLL, PITCH]]) - LIMITS.kd * x[[ROLL_RATE, PITCH_RATE]]
+            forces.append(HOVER + LIMITS.rotors @ np.array([1.1 * command[2], *torque]))
+            tilts.append(abs(x[PITCH]))
+            x = own.transition @ x + own.drive @ command
+        assert (max(tilts) < 1.05 * TUNING.tilt_limit) == follows
+        assert (np.min(forces) > -0.6 and np.max(forces) < LIMITS.rotor_force + 0.6) == follows
+        assert abs(x[EX]) < 0.05
+    assert program.failed == 0
+
+
+@pytest.fixture(scope="module")
+def heavy() -> list[Scenario]:
+    """Half a kilogram at 10 cm takes 85 % of what the follower's rotors have."""
+    common = {"mass": 0.5, "amplitude": 0.1, "omega": 3.1, "seconds": 21.0}
+    return [Scenario(**common), Scenario(**common, disturbance=Disturbance(noise=1.0, delay=0.04))]
+
+
+def test_a_load_near_the_rotors_limits_does_not_throw_it_over(heavy) -> None:
+    """`lqg-offset-free` overshoots by 60 % of the way, undisturbed, and falls with noise and delay."""
+    flights = [(make_baseline(name, PAPER), heavy) for name in ("mpc", "lqg-offset-free")]
+    flown = measure_batch(simulate_batch(PAPER, flights, "newton-euler"), 2.5, PAPER.plant.rotor_force_max, 0)
+    assert max(run.overshoot for run in flown[:2]) < 0.2
+    assert min(run.overshoot for run in flown[2:]) > 0.5
+
+
+def test_a_jax_program_calls_it_back(heavy) -> None:
+    """float32 and a tolerance of 1e-3 in the programs: a millimetre."""
+    follower = make_baseline("mpc", PAPER)
+    batched = Batch(PAPER, follower).fly(heavy)
+    recorded = simulate_batch(PAPER, [(follower, heavy)], "newton-euler")
+    for mine, other in zip(batched, measure_batch(recorded, 2.5, PAPER.plant.rotor_force_max, 0), strict=True):
+        assert mine.rmse == pytest.approx(other.rmse, abs=1e-3)
+    assert follower.law.solved > 100
+    assert follower.law.failed == 0
+
+
+def test_it_has_no_derivative() -> None:
+    follower, zero = make_law("mpc", PAPER), jax.numpy.zeros(())
+    nobody = PrivilegedInfo(zero + 0.2, zero, zero, zero)
+
+    def command(observation: jax.Array) -> jax.Array:
+        return follower.step(follower.start(observation), observation, nobody)[1]
+
+    with pytest.raises(InputError, match="no derivative"):
+        jax.jacobian(command)(jax.numpy.zeros(18))
+
+
+def test_copies_solve_by_themselves(heavy) -> None:
+    follower = make_law("mpc", PAPER)
+    observation = np.zeros(18)
+    observation[12:15] = 1.0
+    nobody = PrivilegedInfo(np.array(0.2), *[np.array(0.0)] * 3)
+    _, first = follower.step(follower.start(observation), observation, nobody)
+    again = pickle.loads(pickle.dumps(follower))
+    assert again.solved == 0 < follower.solved
+    np.testing.assert_array_equal(again.step(again.start(observation), observation, nobody)[1], first)
+
+
+def test_what_it_cannot_do_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match="free pair along x"):
+        make_law("mpc", preset("team"))
+    monkeypatch.setitem(sys.modules, "osqp", None)
+    with pytest.raises(InputError, match=r"mjxball\[mpc\]"):
+        make_law("mpc", PAPER)
