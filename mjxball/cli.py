@@ -167,9 +167,14 @@ def read_plant(path: Path) -> configs.PlantFile:
 
 
 def plant_setup(path: Path | None, default: str = "paper") -> configs.Config:
-    """The preset `default`, or on the plant `path` the one that it belongs to, if it says so; validated."""
-    found = None if path is None else read_plant(path).preset
-    return apply_plant(configs.preset(found or default), path)
+    """The preset `default`, or on the plant `path` the one that it belongs to, if it says so; validated.
+
+    What is flown is this plant: the other teams and rigs that the preset trains on are left out.
+    """
+    if path is None:
+        return configs.preset(default)
+    preset = configs.preset(read_plant(path).preset or default)
+    return apply_plant(configs.apply_overrides(preset, {"scenario.team_sizes": (), "rigs.number": 0}), path)
 
 
 def apply_plant(config: configs.Config, path: Path | None) -> configs.Config:

@@ -16,7 +16,7 @@ from mjxball.cli import make_parser, output_file, plant_setup, quit_on_interrupt
 from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.policy import team
-from mjxball.policy.file import PolicyFile, load_file, save_file
+from mjxball.policy.file import PolicyFile, load_file, policy_path, save_file
 
 
 def policy_of_run(run: Path) -> PolicyFile:
@@ -111,7 +111,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.export`."""
     about, formats = __doc__.split("\n\n")
     parser = make_parser("python -m mjxball.export", about, epilog=formats)
-    parser.add_argument("source", metavar="POLICY|RUN", type=Path, help="policy file or run directory of train.py")
+    about_source = "policy file, name of a shipped one, or run directory of train.py"
+    parser.add_argument("source", metavar="POLICY|RUN", type=policy_path, help=about_source)
     parser.add_argument("out", metavar="OUT", type=Path, help="file to write, .npz, .onnx or .h; must not exist")
     parser.add_argument("--crazyflie", action="store_true", help="OUT is a directory: apps for a pair of Crazyflies")
     parser.add_argument("--int8", action="store_true", help="weights of 8 bits; .npz: rounded to them")

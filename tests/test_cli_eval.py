@@ -108,6 +108,13 @@ def test_copy_without_cg_motion_settles_as_the_reference_says(standard: list[dic
     assert cell["max_tilt"] == pytest.approx(np.deg2rad(3.6), rel=0.05)
 
 
+def test_the_line_below_the_table_names_the_reference(capsys: pytest.CaptureFixture[str]) -> None:
+    for more, said in ((["--omega", 1], "omega 0.31, ampl. 0.05, mass 0.2"), (["--rolling", 0.05], "is mass 0.2")):
+        assert call(main, [*FAST, "--followers", "copy", "--seconds", 1, *more]) == 0
+        *_, last = capsys.readouterr().out.splitlines()
+        assert said in last
+
+
 def test_lists_are_crossed_and_short_flights_have_no_peaks(tmp_path: Path) -> None:
     lists = ["--omega", 0.3, 1, "--amplitude", 0, 0.05, "--mass", 0.1, 0.3]
     path = tmp_path / "cells.json"
@@ -122,6 +129,42 @@ def test_lists_are_crossed_and_short_flights_have_no_peaks(tmp_path: Path) -> No
         assert cell["believed_mass"] == 0.2
         assert [cell[f"{axis}_peak"] for axis in "xyz"] == [None] * 3
         assert cell["settling_time"] is None
+
+
+OWN = """
+import numpy as np
+
+from mjxball.control.followers import Copy
+
+class Law(Copy):
+    pass
+
+class Level:
+    def __init__(self, config): pass
+    def reset(self): pass
+    def __call__(self, observation): return np.zeros((*observation.shape[:-1], 3))
+
+class Two(Level):
+    def __call__(self, observation): return np.zeros(2)
+"""
+
+
+def test_followers_of_ones_own_fly_beside_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    (tmp_path / "own_eval.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    own = ["copy", "own_eval:Law", "own_eval:Level", "stay"]
+    assert call(main, [*FAST, "--followers", *own, "--seconds", 2, "--json", "cells.json"]) == 0
+    rmse = {cell["follower"]: cell["rmse"] for cell in cells_of(tmp_path / "cells.json")}
+    assert list(rmse) == ["copy", "Law", "Level", "stay"]
+    assert rmse["Law"] == rmse["copy"]
+    assert rmse["Level"] != rmse["copy"]
+    capsys.readouterr()
+    for name, said in (("Two", "answered shape (2,) where (1, 3)"), ("Gone", "own_eval has no Gone")):
+        assert call(main, [*FAST, "--followers", f"own_eval:{name}", "--seconds", 2]) == 2
+        errors = capsys.readouterr().err
+        assert_one_line(errors)
+        assert said in errors
 
 
 def test_out_holds_the_cells_and_a_figure_for_each_scenario(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from mjxball.commands.train import main
 from mjxball.config import Config, preset, with_plant
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
+from mjxball.policy import load_file, load_network
 from mjxball.train import program as programs
 from mjxball.train import train
 from mjxball.train.extensions import Extensions, find, make_env
@@ -136,13 +137,35 @@ def test_a_run_on_an_environment_of_ones_own(tmp_path: Path, monkeypatch: pytest
     flags = [word for name, value in SMALL.items() for word in (f"--sac.{name}", str(value).strip("() "))]
     flags = [word.replace(" ", "") for word in flags]
     flags += ["--timing.episode_steps", "60", "--sac.total_steps", "1600"]
-    assert main(["--env", "toys:DoubleIntegrator", *flags, "--out", "run"]) == 0
+    assert main(["--env", "toys:DoubleIntegrator", *flags]) == 0
+    (run,) = Path("runs").iterdir()
+    assert run.name.startswith("DoubleIntegrator-")
+    run.rename("run")
     with np.load("run/policy.npz", allow_pickle=False) as policy:
         assert (policy["weight_0"].shape, policy["bias_2"].shape) == ((2, 16), (2,))
         assert json.loads(str(policy["card"]))["extensions"] == {"env": "toys:DoubleIntegrator"}
+        hidden = np.zeros((3, 2)) - policy["observation_mean"]
+        hidden *= policy["observation_scale"]
+        for number in (0, 1):
+            hidden = np.maximum(hidden @ policy[f"weight_{number}"] + policy[f"bias_{number}"], 0)
+        action = np.tanh(hidden @ policy["weight_2"] + policy["bias_2"])[:, :1]
+    np.testing.assert_allclose(load_network("run/policy.npz")(np.zeros((3, 2), np.float32)), action, atol=1e-6)
+    with pytest.raises(InputError, match=r"load_network reads that of another environment"):
+        load_file("run/policy.npz")
+    np.savez("run/other.npz", weight_0=np.zeros((2, 2)), observation_mean=np.zeros(2))
+    with pytest.raises(InputError, match=r"other.npz holds no network"):
+        load_network("run/other.npz")
     columns = Path("run/metrics.csv").read_text().splitlines()[0].split(",")
     assert columns[4:6] == ["distance", "alpha"]
     assert columns[-1] == "eval_distance"
+
+
+@pytest.mark.slow
+def test_an_import_of_brax_says_nothing_of_warp(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("from brax.envs.base import Env\n")
+    command = [sys.executable, "-c", "from mjxball.train.extensions import find; find('mine:Env', '--env')"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 @pytest.mark.parametrize(

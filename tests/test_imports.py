@@ -32,7 +32,7 @@ FLOORS = (
     {"algorithms"},
     {"train"},
     {"evaluate"},
-    {"fly", "gym"},
+    {"fly", "gym", "bench"},
     {"view"},
     {"rig"},
     {"commands", "export"},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -16,8 +17,13 @@ import pytest
 from command_line import REPOSITORY
 
 from mjxball import __version__
-from mjxball.policy import Policy, shipped_policies, shipped_policy
+from mjxball.commands.evaluate import main as evaluate
+from mjxball.commands.train import parser as train_parser
+from mjxball.export import main as export
+from mjxball.fly.main import make_parser as fly_parser
+from mjxball.policy import Policy, policy_path, shipped_policies, shipped_policy
 from mjxball.policy.file import load_file
+from mjxball.view.command import main as view
 
 PARTS = ("mjxball", "policies", "docs", "tests", "benchmarks")
 FILES = ("*.toml", "*.md", "*.py", "*.cff", "LICENSE", "MANIFEST.in", "constraints.txt")
@@ -150,3 +156,18 @@ def test_a_source_tree_finds_the_policies_beside_it() -> None:
 def test_an_unknown_policy_is_refused_with_the_names_of_those_there_are() -> None:
     with pytest.raises(ValueError, match=r"'nobody'.*balance.*paper.*robust"):
         shipped_policy("nobody")
+
+
+def test_commands_take_a_shipped_policy_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert evaluate(["balance", "--physics", "newton-euler", "--seconds", "1", "--json", "cells.json"]) == 0
+    assert {cell["follower"] for cell in json.loads(Path("cells.json").read_text())["cells"]} == {"balance"}
+    assert view(["balance", "--seconds", "1", "--out", "flight.html"]) == 0
+    assert export(["flight", "flight.h"]) == 0
+    assert fly_parser().parse_args(["flight"]).policy == shipped_policy("flight")
+    assert train_parser().parse_args(["--start-from", "universal"]).start_from == shipped_policy("universal")
+    Path("balance").write_text("of the user's own")
+    assert policy_path("balance") == Path("balance")
+    capsys.readouterr()
+    assert evaluate(["balanced"]) == 2
+    assert "balanced does not exist; by name there are balance, " in capsys.readouterr().err

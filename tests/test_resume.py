@@ -17,7 +17,7 @@ from command_line import STEPS, tiny
 from command_line import environment as child_environment
 
 from mjxball.commands.train import main as train
-from mjxball.train.checkpoint import CHECKPOINTS
+from mjxball.train.checkpoint import CHECKPOINTS, Checkpoints
 from mjxball.train.run_directory import PACKAGE, SOURCES
 
 REPOSITORY = Path(__file__).parents[1]
@@ -74,11 +74,19 @@ def test_killed_run_resumes_to_the_bit_identical_policy(whole: Path, tmp_path: P
 
 @pytest.mark.slow
 def test_damaged_checkpoint_is_skipped_with_a_warning(
-    whole: Path, tmp_path: Path, short_verdict: None, capsys: pytest.CaptureFixture[str]
+    whole: Path,
+    tmp_path: Path,
+    short_verdict: None,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     run = tmp_path / "damaged"
-    shutil.copytree(whole, run)
-    newest = complete(run)[-1]
+    assert len(complete(whole)) == 1  # of a finished run
+    with monkeypatch.context() as unfinished:
+        unfinished.setattr(Checkpoints, "keep_newest", lambda self: None)
+        assert train(["--out", str(run), *tiny()]) == 0
+    capsys.readouterr()
+    _, newest = complete(run)
     for path in (run / CHECKPOINTS / str(newest)).rglob("*"):
         if path.is_file() and path.stat().st_size > 200:
             path.write_bytes(path.read_bytes()[:100])

@@ -19,7 +19,8 @@ from mjxball.config import Config, Drone, Plant, preset, validate, with_plant
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import group_by_plant
-from mjxball.evaluate.scenarios import REFERENCE, rig_line, standard_scenarios
+from mjxball.evaluate.scenarios import REFERENCE, heaviest, rig_line, standard_scenarios
+from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario, of_plant
@@ -78,6 +79,9 @@ def test_every_command_flies_the_object_of_the_plant(tmp_path: Path, capsys: pyt
     assert [cell["mass"] for cell in json.loads(out.read_text())["cells"]] == [0.35]
     first = capsys.readouterr().out.splitlines()[0]
     assert first == rig_line(rig)
+    held = heaviest(rig, 0.05)
+    assert f"can hover objects of up to {held:.3g} kg, 0.05 m off" in first
+    assert largest_margin(rig, held, 0.05).margin == pytest.approx(rig.scenario.trim_margin, abs=5e-3)
     # 8 rotors of 5.5 N, two drones of 1 kg
     assert "2.35 kg with an object of 0.35 kg" in first
     assert f"thrust over weight {44 / (2.35 * 9.81):.3g}," in first
@@ -154,6 +158,14 @@ def test_flags_and_plant_file_are_refused_or_taken_together(tmp_path: Path, caps
     assert chosen.scenario.object_mass == (0.2, 0.3)
     assert train.main(["team", "--plant", ring, "--out", str(tmp_path / "run")]) == 2
     assert "set scenario.team_sizes to 3 or less" in capsys.readouterr().err
+    assert train.main(["team", "--plant", str(written(tmp_path, RING.replace('cg_axis = "xy"', ""), "line.toml"))]) == 2
+    assert "set plant.cg_axis to xy" in capsys.readouterr().err
+
+
+@rows("name", ["team", "universal"])
+def test_a_file_for_a_preset_of_many_teams_is_flown_as_its_own(name: str, tmp_path: Path) -> None:
+    setup = cli.plant_setup(written(tmp_path, f'preset = "{name}"\n{RING}'))
+    assert (setup.preset, setup.plant.count, setup.scenario.team_sizes) == (name, 3, ())
 
 
 @rows(

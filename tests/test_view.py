@@ -83,6 +83,15 @@ def test_a_run_directory_and_a_baseline_are_flown(flight: Flight, tmp_path: Path
     np.testing.assert_array_equal(copy["leader_command"], copy["follower_command"])
 
 
+def test_a_law_of_ones_own_is_flown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "own_view.py").write_text("from mjxball.control.followers import Copy\nclass Law(Copy): pass\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    own, ours = (flight_from(name, {"seconds": 1.0}, "newton-euler") for name in ("own_view:Law", "copy"))
+    assert own.title == ours.title.replace("copy", "Law")
+    np.testing.assert_array_equal(own["position"], ours["position"])
+
+
 @pytest.mark.parametrize(("name", "place"), [("team3", "on a circle of 5 cm"), ("plate4", "ball from 8 cm")])
 def test_teams_are_flown_and_saved(name: str, place: str, tmp_path: Path):
     shown = flight_from("adaptive", {"seconds": 1.0}, "newton-euler", Path(name))
@@ -323,6 +332,7 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture):
     ("arguments", "message"),
     [
         (["nobody"], "nobody is no flight"),
+        (["nowhere:Law"], "there is no module nowhere"),
         (["log.csv"], "is no flight (.npz), flight log (.jsonl)"),
         (["log.jsonl"], "does not begin with a header"),
         (["empty"], "has no policy.npz"),

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjxball.baselines import LAWS, make_baseline
+from mjxball.baselines import LAWS
 from mjxball.config import Config
-from mjxball.control.followers import Baseline, Follower
+from mjxball.control.followers import Follower
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
+from mjxball.evaluate.followers import Make, answered, find_follower, said
 from mjxball.evaluate.policies import load_policy
-from mjxball.policy import Policy
-from mjxball.train.extensions import find
+from mjxball.policy import Policy, policy_path
 
-Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
+__all__ = ["Make", "checked", "entrant"]
+
 SLOWEST = 0.020  # [s] that a call for one flight may take, in the median
 CALLS = 20
 INPUTS = {"observation", "memory", "start"}
@@ -28,25 +28,20 @@ INPUTS = {"observation", "memory", "start"}
 def entrant(text: str) -> tuple[str, Make]:
     """(name, what makes it for a plant) of the follower that `text` says; InputError if there is none.
 
-    `text`: a classical follower's name, POLICY.npz, MODEL.onnx, or package.module:Class. Such a class is called with
-    the `Config` and is a law (`mjxball.control.followers.Law`) or a follower (`Follower`).
+    `text`: POLICY.npz or a shipped one's name, MODEL.onnx, or what `evaluate.followers.find_follower` finds.
     """
-    if text in LAWS:
-        return text, lambda config: make_baseline(text, config)
-    path = Path(text)
+    path = policy_path(text)
     if path.suffix == ".npz":
         Policy.load(path)  # refused at once where it is none
         return path.stem, lambda config: load_policy(path, config)
     if path.suffix == ".onnx":
         session = _session(path)
         return path.stem, lambda config: OnnxFollower(path.stem, session)
-    if ":" not in text:
+    if text not in LAWS and ":" not in text:
         raise InputError(
             f"--benchmark takes a file .npz or .onnx, package.module:Class, or one of {', '.join(LAWS)}, not {text!r}"
         )
-    made = find(text, "--benchmark")
-    name = text.rpartition(":")[2]
-    return name, lambda config: _outside(name, made, config)
+    return find_follower(text, "--benchmark")
 
 
 class OnnxFollower:
@@ -86,7 +81,7 @@ def _session(path: Path) -> Any:
     try:
         session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     except Exception as error:  # whatever the runtime raises for a file that is no model
-        raise InputError(f"{path} is no ONNX model: {_said(error)}") from None
+        raise InputError(f"{path} is no ONNX model: {said(error)}") from None
     inputs, outputs = ({one.name for one in part} for part in (session.get_inputs(), session.get_outputs()))
     wanted = {"command", "next_memory"} if "memory" in inputs else {"command"}
     if "observation" not in inputs or not inputs <= INPUTS or not wanted <= outputs:
@@ -100,79 +95,6 @@ def _session(path: Path) -> Any:
     return session
 
 
-class Outside:
-    """A follower from outside, whose every answer is checked."""
-
-    def __init__(self, name: str, answer: Any):
-        self.name, self._answer = name, answer
-
-    def reset(self) -> None:
-        """See `Follower.reset`."""
-        _guarded(self.name, self._answer.reset)
-
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """See `Follower.__call__`; InputError if it raises, or answers what is no command."""
-        return _answered(self.name, _guarded(self.name, self._answer, observation), observation)
-
-
-class OutsideLaw:
-    """A law from outside, likewise."""
-
-    def __init__(self, name: str, law: Any):
-        self.name, self._law = name, law
-        self.needs_privileged = bool(getattr(law, "needs_privileged", False))
-
-    def start(self, observation: Any) -> Any:
-        """See `Law.start`."""
-        return _guarded(self.name, self._law.start, observation)
-
-    def step(self, state: Any, observation: Any, privileged: Any) -> Any:
-        """See `Law.step`."""
-        answer = _guarded(self.name, self._law.step, state, observation, privileged)
-        if not isinstance(answer, tuple) or len(answer) != 2:
-            raise InputError(
-                f"follower {self.name} answered {type(answer).__name__}; a law's step gives (state, command)"
-            )
-        return answer[0], _answered(self.name, answer[1], observation)
-
-
-def _outside(name: str, made: Any, config: Config) -> Follower:
-    found = _guarded(name, made, config)
-    if all(callable(getattr(found, part, None)) for part in ("start", "step")):
-        return Baseline(OutsideLaw(name, found), config)
-    if callable(found) and callable(getattr(found, "reset", None)):
-        return Outside(name, found)
-    raise InputError(
-        f"follower {name} has neither start and step nor reset and __call__; see docs/howto/own-baseline.md"
-    )
-
-
-def _guarded(name: str, function: Any, *arguments: Any) -> Any:
-    try:
-        return function(*arguments)
-    except InputError:
-        raise
-    except Exception as error:  # whatever somebody else's code raises
-        raise InputError(f"follower {name} raised {_said(error)}") from None
-
-
-def _answered(name: str, command: Any, observation: Any) -> np.ndarray:
-    try:
-        command = np.asarray(command, float)
-    except (TypeError, ValueError):
-        raise InputError(f"follower {name} answered {type(command).__name__}, no array of numbers") from None
-    wanted = (*np.shape(observation)[:-1], 3)
-    if command.shape != wanted:
-        raise InputError(f"follower {name} answered shape {command.shape} where {wanted} was wanted")
-    if not np.isfinite(command).all():
-        raise InputError(f"follower {name} answered a number that is not finite")
-    return command
-
-
-def _said(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}".splitlines()[0]
-
-
 def checked(make: Make, config: Config) -> Follower:
     """`make(config)`, after calls for a flight at rest. InputError if a call takes too long or answers no command."""
     follower, count = make(config), len(config.plant.followers)
@@ -181,7 +103,7 @@ def checked(make: Make, config: Config) -> Follower:
     follower.reset()
     for _ in range(CALLS):
         begun = time.perf_counter()
-        _answered(follower.name, follower(observation), observation)
+        answered(follower.name, follower(observation), observation)
         taken.append(time.perf_counter() - begun)
     follower.reset()
     middle = statistics.median(taken)

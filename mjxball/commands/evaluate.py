@@ -13,17 +13,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mjxball import cli, config
-from mjxball.baselines import BASELINES, LAWS, SUITE_BASELINES, make_baseline
+from mjxball.baselines import BASELINES, LAWS, SUITE_BASELINES
 from mjxball.bench.entry import run as run_entry
 from mjxball.bench.entry import table as table_of
 from mjxball.bench.followers import entrant
 from mjxball.bench.tracks import TRACKS
 from mjxball.commands.flight_log import evaluate_log
 from mjxball.commands.scenarios import SCENARIO_FLAGS, native_scenarios, scenarios_of, setup_of
-from mjxball.control.followers import Baseline, Follower
+from mjxball.control.followers import Follower
 from mjxball.errors import InputError
 from mjxball.evaluate import paper_figures
 from mjxball.evaluate.benchmark import run_benchmark, scores_of, text_table
+from mjxball.evaluate.followers import Make, find_follower
 from mjxball.evaluate.plots import write_results
 from mjxball.evaluate.policies import check_bounds, group_by_plant, load_policy, native_config
 from mjxball.evaluate.report import MADE, write_page, write_report
@@ -35,7 +36,7 @@ from mjxball.evaluate.variants import Suite
 from mjxball.files import write_whole
 from mjxball.physics.step import ENGINES
 from mjxball.policy import Policy
-from mjxball.policy.file import shipped_policies
+from mjxball.policy.file import policy_path, shipped_policies
 from mjxball.sim.scenario import Scenario
 from mjxball.train.run_directory import commit, versions
 
@@ -51,8 +52,11 @@ def parser() -> cli.Parser:
         epilog="Without policies, followers or scenarios: every shipped policy and baseline on the standard scenarios.",
     )
     names = ", ".join(LAWS)
-    result.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="policy files")
-    result.add_argument("--followers", nargs="+", default=[], metavar="NAME", help=f"baselines: {names}")
+    about = "policy files, or names of shipped ones"
+    result.add_argument("policies", nargs="*", type=policy_path, metavar="POLICY.npz", help=about)
+    result.add_argument(
+        "--followers", nargs="+", default=[], metavar="NAME", help=f"baselines: {names}; or module:Class, your own"
+    )
     result.add_argument("--omega", nargs="+", type=float, metavar="W", help="CG speeds [rad/s] (default 0.31)")
     result.add_argument(
         "--amplitude",
@@ -155,6 +159,8 @@ def _evaluate(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     listed = [name for name in (*options.followers, *(options.suite or [])) if name.endswith(".npz")]
     files = [*options.policies, *map(Path, listed)]
     named = [name for name in options.followers if not name.endswith(".npz")]
+    for name in named:
+        _maker(name)  # refused at once where there is none
     asked = bool(files or named)
     paths = files if asked else shipped_policies()
     if options.check and not paths:
@@ -202,7 +208,7 @@ class Group:
 
     setup: config.Config
     scenarios: Sequence[Scenario]
-    named: list[str]  # baselines
+    named: list[str]  # baselines, and followers of the user's own
     paths: list[Path]  # policies
     asked: bool  # false: every baseline
 
@@ -216,9 +222,13 @@ class Group:
             raise InputError(f"the card of policy {unbounded[0]} has no bounds to check")
         return found
 
-    def baselines(self, every: Sequence[str]) -> list[Baseline]:
-        """The baselines, `every` one if none was asked for."""
-        return [make_baseline(name, self.setup) for name in dict.fromkeys(self.named if self.asked else every)]
+    def baselines(self, every: Sequence[str]) -> list[Follower]:
+        """Those that are no policies, `every` baseline if none was asked for."""
+        return [_maker(name)(self.setup) for name in dict.fromkeys(self.named if self.asked else every)]
+
+
+def _maker(name: str) -> Make:
+    return find_follower(name, "--followers")[1]
 
 
 def _benchmark(
@@ -240,7 +250,7 @@ def _benchmark(
         found: list[Follower] = []
         for name in dict.fromkeys(group.named if group.asked else [*SUITE_BASELINES, "lqg-known-failures"]):
             with contextlib.suppress(InputError):
-                found.append(make_baseline(name, known))
+                found.append(_maker(name)(known))
         for path in (*group.paths, *team):
             with contextlib.suppress(InputError):
                 found.append(load_policy(path, known))
@@ -272,7 +282,7 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
             print(f"\n{group.setup.preset}: its own plant and scenarios")  # noqa: T201
         if options.plant or group.setup.plant != config.Plant():
             print(rig_line(group.setup, max(scenario.mass for scenario in group.scenarios)))  # noqa: T201
-        print(table(results))  # noqa: T201
+        print(table(results, standard_scenarios(group.setup)[-1]))  # noqa: T201
         if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
             every += results
         if options.out:

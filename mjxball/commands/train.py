@@ -27,6 +27,7 @@ from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
 from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
+from mjxball.policy.file import policy_path
 from mjxball.quiet import import_jax
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
@@ -67,13 +68,14 @@ def parser() -> cli.Parser:
         "--num-seeds", "--seeds", type=int, metavar="K", help="train K followers at once, seeds N, N + 1 ..."
     )
     result.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
-    result.add_argument("--out", type=Path, metavar="DIR", help="run directory (default runs/PRESET-<time>)")
+    about = "run directory (default runs/PRESET-<time>, with --env runs/CLASS-<time>)"
+    result.add_argument("--out", type=Path, metavar="DIR", help=about)
     result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
     result.add_argument(
         "--start-from",
-        type=Path,
+        type=policy_path,
         metavar="POLICY",
-        help="begin with the weights of a policy file, or each member with those of a run's",
+        help="begin with the weights of a policy file or shipped policy, or each member with those of a run's",
     )
     result.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
     result.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state), your own")
@@ -231,7 +233,8 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     for section in ALGORITHMS:
         if (units := getattr(getattr(settings, section), "activation", "relu")) != "relu":
             raise InputError(f"--{section}.activation {units}: policy files hold relu; see mjxball.train.train")
-    out = _output_directory(options.out or Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}")
+    called = options.env.rpartition(":")[2] if options.env else name
+    out = _output_directory(options.out or Path("runs") / f"{called}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)
     members = 1 if options.num_seeds is None else options.num_seeds
     if not 1 <= members <= MOST_MEMBERS:
@@ -374,8 +377,9 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
     from mjxball.train.curves import POLICIES, draw_members
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
-    results = fly_scenarios(settings, policies, standard_scenarios(settings)[-1:], origin["physics"])
-    print(table(results))
+    reference = standard_scenarios(settings)[-1]
+    results = fly_scenarios(settings, policies, [reference], origin["physics"])
+    print(table(results, reference))
     compared = ("rmse", "settling_time", "x_peak", "overshoot")
     chosen = load_file(out / POLICY)
     seeds = [int(result.follower.removeprefix("seed")) for result in results]
@@ -435,7 +439,7 @@ def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) ->
     scenarios = standard_scenarios(settings)
     trained = load_policy(policy, settings)
     results = fly_scenarios(settings, [make_baseline("copy", settings), trained], scenarios, physics)
-    print(table(results))
+    print(table(results, scenarios[-1]))
     write_results(results, out / "eval")
     reference = next(
         result for result in results if result.follower == trained.name and result.scenario == scenarios[-1]

@@ -127,7 +127,10 @@ def _validate_plant(plant: Plant) -> None:
                 f"plant.drones.{number}.mount lies beyond {FARTHEST:g} m from O; {far:g} mm would be {far / 1000:g} m"
             )
     if plant.carrier_mass > 0 and min(plant.carrier_inertia) <= 0:
-        raise InputError(f"plant.carrier_inertia {plant.carrier_inertia!r} is singular, and the carrier has a mass")
+        raise InputError(
+            f"plant.carrier_inertia {plant.carrier_inertia!r} is singular, and the carrier has a mass: set it, of a "
+            "disc of mass m and radius r m r^2 / 4, m r^2 / 4, m r^2 / 2"
+        )
     if len(plant.directions) == 1:
         along = plant.directions[0]
         places = [drone.mount[along] for drone in plant.drones]
@@ -155,7 +158,8 @@ def _validate_team(config: Config) -> None:
         raise InputError("follower.residual_on_pid is for a pair, whose two drones lift each other's integral away")
     if len(plant.directions) == 1 and (scenario.cg_width[1] > 0 or scenario.cg_lissajous_probability > 0):
         raise InputError(
-            "scenario.cg_width and cg_lissajous_probability are for a load that moves in the plane, plant.cg_axis xy"
+            "scenario.cg_width and cg_lissajous_probability are for a load that moves in the plane: set plant.cg_axis "
+            "to xy, or both of them to 0"
         )
     if scenario.battery[1] > 0 and plant.count > 2:
         raise InputError("scenario.battery is for a pair of Crazyflies")

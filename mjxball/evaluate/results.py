@@ -88,8 +88,8 @@ COLUMNS = (
 )
 
 
-def table(results: Sequence[Result]) -> str:
-    """One line per result; a dash where a metric does not exist."""
+def table(results: Sequence[Result], reference: Scenario) -> str:
+    """One line per result, a dash where a metric does not exist, and a line that explains them."""
     # Where the load moves along a line, the error in the plane is hardly more than along it; a pair has no spread.
     in_plane = any(np.ndim(result.flight.cg_offset) > 1 for result in results)
     several = any(result.metrics.command_spread is not None for result in results)
@@ -106,7 +106,16 @@ def table(results: Sequence[Result]) -> str:
             row.append("-" if value is None else f"{value * factor:.{digits}f}")
         rows.append([*row, "FAILED" if result.metrics.failed else ""])
     widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    return "\n".join("  ".join(text.rjust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+    lines = ["  ".join(text.rjust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join([*lines, _legend(reference, results[0].motion)])
+
+
+def _legend(reference: Scenario, motion: str) -> str:
+    sine = f"omega {reference.omega:g}, ampl. {reference.amplitude:g}, " if motion == "sine" else ""
+    return (
+        "x-peak is the largest |error along x| from 20 s on; - says that there is none, or that it never settled; "
+        f"the reference scenario is {sine}mass {reference.mass:g}"
+    )
 
 
 def to_json(results: Sequence[Result]) -> str:

@@ -24,6 +24,7 @@ STANDARD = (
     *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.31, 0.62, 1.0, 2.0, 3.1)),
 )
 MOST_SAMPLES = 100_000
+HALVINGS = 12  # of the range of masses in which the heaviest object is looked for
 SLOWEST = 60.0  # [s] between two samples of a waveform, as a rule
 
 
@@ -57,14 +58,26 @@ def standard_scenarios(settings: Config) -> tuple[Scenario, ...]:
 def rig_line(settings: Config, mass: float | None = None) -> str:
     """What a user should see of a rig before its results, with an object of `mass` [kg], None: the reference's."""
     plant, margin = settings.plant, settings.scenario.trim_margin
-    mass = of_plant(settings, Scenario()).mass if mass is None else mass
+    reference = of_plant(settings, Scenario())
+    mass = reference.mass if mass is None else mass
     offset = largest_amplitude(settings, mass, margin)
     trimmed = f"CG trimmed up to {offset:.3g} m" if offset >= 0 else "CG not trimmed even at O"
     return (
         f"rig: {plant.count} drones, {total_mass(plant, mass):.4g} kg with an object of {mass:g} kg, "
         f"thrust over weight {thrust_over_weight(plant, mass):.3g}, {trimmed} with {margin:.0%} of what rotors "
-        "and commands reach left"
+        f"and commands reach left; so it can hover objects of up to {heaviest(settings, reference.amplitude):.3g} kg, "
+        f"{reference.amplitude:g} m off"
     )
+
+
+def heaviest(settings: Config, amplitude: float) -> float:
+    """The heaviest object [kg] whose CG can be held `amplitude` [m] off O with the plant's `trim_margin`, 0: none."""
+    plant, margin = settings.plant, settings.scenario.trim_margin
+    low, high = 0.0, thrust_over_weight(plant, 0.0) * total_mass(plant, 0.0)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if largest_amplitude(settings, middle, margin) >= amplitude else (low, middle)
+    return low
 
 
 def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:

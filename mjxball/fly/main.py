@@ -42,7 +42,7 @@ from mjxball.fly.retrain import Retrainer
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
-from mjxball.policy import Policy
+from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.reading import parse_json
 
@@ -63,7 +63,7 @@ def make_parser() -> cli.Parser:
     about = "Fly a policy with two Crazyflies, or rehearse it with their software twin."
     parser = cli.make_parser("python -m mjxball.fly", about)
     add = parser.add_argument
-    add("policy", type=Path, metavar="POLICY.npz", help="the follower")
+    add("policy", type=policy_path, metavar="POLICY.npz", help="the follower, a file or a shipped one's name")
     add("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
     add("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")
     add("--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given")

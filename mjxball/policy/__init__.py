@@ -5,7 +5,15 @@ roll, pitch, vertical_acceleration = policy(observation)  # SI units
 """
 
 from mjxball.policy.container import PolicyFileError
-from mjxball.policy.file import PolicyFile, load_file, save_file, shipped_policies, shipped_policy
+from mjxball.policy.file import (
+    PolicyFile,
+    load_file,
+    load_network,
+    policy_path,
+    save_file,
+    shipped_policies,
+    shipped_policy,
+)
 from mjxball.policy.policy import Policy
 
 __all__ = [
@@ -13,6 +21,8 @@ __all__ = [
     "PolicyFile",
     "PolicyFileError",
     "load_file",
+    "load_network",
+    "policy_path",
     "save_file",
     "shipped_policies",
     "shipped_policy",

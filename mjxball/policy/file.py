@@ -14,6 +14,7 @@ import numpy as np
 
 from mjxball.control.follower_law import FollowerLaw
 from mjxball.control.geometry import GEOMETRY
+from mjxball.control.network import Network
 from mjxball.control.observation import ACTION, ACTION_SIZE, OBSERVATION, ObservationHistory
 from mjxball.errors import InputError
 from mjxball.files import write_whole
@@ -109,10 +110,18 @@ def save_file(path: str | os.PathLike[str], policy: PolicyFile) -> None:
 def load_file(path: str | os.PathLike[str]) -> PolicyFile:
     """Read and verify a policy file; raise PolicyFileError with one sentence on anything unsound."""
     name = str(path)
-    arrays = read_arrays(name)
+    try:
+        arrays = read_arrays(name)
+    except PolicyFileError as error:
+        if os.path.lexists(path):
+            raise
+        raise PolicyFileError(f"{error}; by name there are {', '.join(_shipped()) or 'none'}") from None
     for needed in ("observation_mean", "observation_scale", "action_scale", "card"):
         if needed not in arrays:
-            raise PolicyFileError(f"{name} is not a policy file: it has no {needed}")
+            foreign = (
+                "; mjxball.policy.load_network reads that of another environment" if needed == "action_scale" else ""
+            )
+            raise PolicyFileError(f"{name} is not a policy file: it has no {needed}{foreign}")
     card = _read_card(name, arrays.pop("card"))
     _check_version(card, name)  # before the arrays, which later formats may have others of
     layers = 0
@@ -136,6 +145,26 @@ def load_file(path: str | os.PathLike[str]) -> PolicyFile:
     )
     check(policy, name)
     return policy
+
+
+def load_network(path: str | os.PathLike[str]) -> Network:
+    """The network in `policy.npz` of a run on an environment of one's own.
+
+    It answers observations (..., n) of float32 with actions (..., a) in [-1, 1]. Raises PolicyFileError if the file
+    holds no such network.
+    """
+    arrays = read_arrays(str(path))
+    layers = sum(name.startswith("weight_") for name in arrays)
+    try:
+        weights = [arrays[f"weight_{number}"] for number in range(layers)]
+        biases = [arrays[f"bias_{number}"] for number in range(layers)]
+        mean, scale = arrays["observation_mean"], arrays["observation_scale"]
+        half = len(biases[-1]) // 2  # the other one is of the deviation
+        found = Network([*weights[:-1], weights[-1][:, :half]], [*biases[:-1], biases[-1][:half]], mean, scale)
+        found(np.zeros_like(mean))
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise PolicyFileError(f"{path} holds no network of layers from weight_0 and bias_0 on that fit") from None
+    return found
 
 
 def _read_card(name: str, text: np.ndarray) -> dict[str, Any]:
@@ -311,10 +340,20 @@ def shipped_policies() -> list[Path]:
 
 def shipped_policy(name: str) -> Path:
     """The shipped file called `name`, such as `balance`, archived ones too; raise InputError if there is none."""
-    known = {path.stem: path for path in (*shipped_policies(), *sorted((_folder() / ARCHIVE).glob("*.npz")))}
+    known = _shipped()
     if name not in known:
         raise InputError(f"no shipped policy is called {name!r}; there are {', '.join(known) or 'none'}")
     return known[name]
+
+
+def policy_path(text: str | os.PathLike[str]) -> Path:
+    """The path that `text` names: what exists there, else the shipped policy of that name, else `text` itself."""
+    path = Path(text)
+    return path if os.path.lexists(path) else _shipped().get(str(text), path)
+
+
+def _shipped() -> dict[str, Path]:
+    return {path.stem: path for path in (*shipped_policies(), *sorted((_folder() / ARCHIVE).glob("*.npz")))}
 
 
 def _folder() -> Path:

@@ -1,4 +1,4 @@
-"""Checkpoints of a run with Orbax: the whole training state, written in the background, the newest few kept."""
+"""Checkpoints of a run with Orbax: the whole training state, written in the background, two kept, one in the end."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mjxball.train.processes import is_writer
 from mjxball.train.program import TrainState
 from mjxball.train.run_directory import CHECKPOINTS, read_config
 
-KEEP = 2
+KEEP = 2  # while training, so that one is left if the newest is damaged
 CHECKSUMS = "checksums"
 # What is wrong with a checkpoint is said here, in one line.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
@@ -116,6 +116,13 @@ class Checkpoints:
         if (checksums != _checksums(arrays)).any():
             raise ValueError("its arrays are not what was written")
         return arrays
+
+    def keep_newest(self) -> None:
+        """Delete all but the newest, once that is on disk: nothing of a finished run is continued."""
+        with self._written():
+            self._manager.wait_until_finished()
+            for step in self.steps()[1:]:
+                self._manager.delete(step)
 
     def close(self) -> None:
         """Wait until everything is on disk."""

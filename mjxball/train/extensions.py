@@ -47,6 +47,8 @@ def find(name: str, flag: str) -> Any:
         raise InputError(f"{flag} takes {''.join(f'{one}, ' for one in ours)}package.module:Name, not {name!r}")
     if str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))
+    if flag == "--env":
+        import_brax_env()  # before the user's module does, and prints that Warp is absent
     try:
         found = importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -147,6 +147,8 @@ class Run:
                 beside()
                 self._loop(stop)
                 self._save()
+                if self._pending and not self._ended:
+                    self._pending = self._writer.submit(_keep_newest, self._pending, self._checkpoints)
                 self.progress.say(self._cost())
             return not self._ended
 
@@ -339,6 +341,12 @@ def _open_checkpoints(out: Path) -> Any:
 
 def _write(checkpoints: Future[Any], kept: TrainState) -> None:
     checkpoints.result().save(processes.gather(kept))
+
+
+def _keep_newest(written: Future[None], checkpoints: Future[Any] | None) -> None:
+    written.result()
+    if checkpoints:
+        checkpoints.result().keep_newest()
 
 
 def _count(state: TrainState) -> int:

@@ -23,7 +23,8 @@ def parser() -> Parser:
     result.add_argument(
         "source",
         metavar="POLICY|RUN|LOG",
-        help="recorded flight (.npz), flight log (.jsonl), or what to fly: a run directory, policy or baseline",
+        help="recorded flight (.npz), flight log (.jsonl), or what to fly: a run directory, policy, baseline or "
+        "module:Class, your own",
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
     result.add_argument("--save", type=Path, metavar="FILE.npz", help="write the flight itself too")

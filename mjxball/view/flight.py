@@ -25,6 +25,7 @@ from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.policy.container import read_arrays
+from mjxball.policy.file import policy_path
 from mjxball.reading import check_times, parse_json
 
 if TYPE_CHECKING:
@@ -136,10 +137,10 @@ def flight_from(
 ) -> Flight:
     """The flight that `source` names; with `hidden`, what its follower's GRU remembers as well.
 
-    A flight file or a flight log is read. A policy file, a run directory (its `policy.npz`) or the name of a classical
-    follower is flown through its reference scenario with `changes` to the fields of `Scenario`, on the paper's plant;
-    a policy made for Crazyflies on its own; or on `plant`, a plant file or a shipped one's name. Raises InputError if
-    it is none of these, or has no GRU where its state is asked for.
+    A flight file or a flight log is read. A policy file, a run directory (its `policy.npz`), the name of a classical
+    follower or module:Class, one's own, is flown through its reference scenario with `changes` to the fields of
+    `Scenario`, on the paper's plant; a policy made for Crazyflies on its own; or on `plant`, a plant file or a shipped
+    one's name. Raises InputError if it is none of these, or has no GRU where its state is asked for.
     """
     path = Path(source)
     if path.suffix == ".npz" and path.is_file() and is_flight(path):
@@ -192,15 +193,16 @@ def read_log(path: Path) -> Flight:
 
 
 def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None, hidden: bool) -> Flight:
-    from mjxball.baselines import LAWS, make_baseline
+    from mjxball.baselines import LAWS
+    from mjxball.evaluate.followers import find_follower
     from mjxball.evaluate.policies import load_policy, native_config
     from mjxball.evaluate.scenarios import standard_scenarios
     from mjxball.sim.rollout import simulate
 
     setup, path = plant_setup(plant), Path(source)
     tuples: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in changes.items()}
-    if source in LAWS:
-        follower: Any = make_baseline(source, setup)
+    if source in LAWS or (":" in source and not path.exists() and path.suffix != ".npz"):
+        follower: Any = find_follower(source, "python -m mjxball.view")[1](setup)
     else:
         file = _policy_file(path)
         native = native_config(file)
@@ -233,6 +235,7 @@ def _remembered(follower: Any, observations: np.ndarray) -> np.ndarray | None:
 
 
 def _policy_file(path: Path) -> Path:
+    path = policy_path(path)
     if path.is_dir():
         if not (path / "policy.npz").exists():
             raise InputError(f"run directory {path} has no policy.npz; python -m mjxball.export makes one")
@@ -241,4 +244,4 @@ def _policy_file(path: Path) -> Path:
         return path
     from mjxball.baselines import LAWS
 
-    raise InputError(f"{path} is no flight, policy file, run directory or one of {', '.join(LAWS)}")
+    raise InputError(f"{path} is no flight, policy file, run directory, module:Class or one of {', '.join(LAWS)}")

@@ -1,0 +1,103 @@
+"""Followers of the user's own, `module:Class`, beside the classical ones: found by name, every answer checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjxball.baselines import LAWS, make_baseline
+from mjxball.config import Config
+from mjxball.control.followers import Baseline, Follower
+from mjxball.errors import InputError
+from mjxball.train.extensions import find
+
+Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
+
+
+def find_follower(text: str, flag: str) -> tuple[str, Make]:
+    """(name, what makes it for a plant) of a classical follower, or of the class that `text` = module:Class names.
+
+    Such a class is called with the `Config` and is a law (`mjxball.control.followers.Law`) or a follower
+    (`Follower`). Raises InputError, which says `flag`, if there is none of that name.
+    """
+    if text in LAWS or ":" not in text:
+        return text, lambda config: make_baseline(text, config)
+    made, name = find(text, flag), text.rpartition(":")[2]
+    return name, lambda config: _outside(name, made, config)
+
+
+class Outside:
+    """A follower from outside, whose every answer is checked."""
+
+    def __init__(self, name: str, answer: Any):
+        self.name, self._answer = name, answer
+
+    def reset(self) -> None:
+        """See `Follower.reset`."""
+        _guarded(self.name, self._answer.reset)
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """See `Follower.__call__`; InputError if it raises, or answers what is no command."""
+        return answered(self.name, _guarded(self.name, self._answer, observation), observation)
+
+
+class OutsideLaw:
+    """A law from outside, likewise."""
+
+    def __init__(self, name: str, law: Any):
+        self.name, self._law = name, law
+        self.needs_privileged = bool(getattr(law, "needs_privileged", False))
+
+    def start(self, observation: Any) -> Any:
+        """See `Law.start`."""
+        return _guarded(self.name, self._law.start, observation)
+
+    def step(self, state: Any, observation: Any, privileged: Any) -> Any:
+        """See `Law.step`."""
+        answer = _guarded(self.name, self._law.step, state, observation, privileged)
+        if not isinstance(answer, tuple) or len(answer) != 2:
+            raise InputError(
+                f"follower {self.name} answered {type(answer).__name__}; a law's step gives (state, command)"
+            )
+        return answer[0], answered(self.name, answer[1], observation)
+
+
+def _outside(name: str, made: Any, config: Config) -> Follower:
+    found = _guarded(name, made, config)
+    if all(callable(getattr(found, part, None)) for part in ("start", "step")):
+        return Baseline(OutsideLaw(name, found), config)
+    if callable(found) and callable(getattr(found, "reset", None)):
+        return Outside(name, found)
+    raise InputError(
+        f"follower {name} has neither start and step nor reset and __call__; see docs/howto/own-baseline.md"
+    )
+
+
+def _guarded(name: str, function: Any, *arguments: Any) -> Any:
+    try:
+        return function(*arguments)
+    except InputError:
+        raise
+    except Exception as error:  # whatever somebody else's code raises
+        raise InputError(f"follower {name} raised {said(error)}") from None
+
+
+def answered(name: str, command: Any, observation: Any) -> np.ndarray:
+    """`command` (..., 3) of follower `name` to `observation` (..., 18); InputError if it is none."""
+    try:
+        command = np.asarray(command, float)
+    except (TypeError, ValueError):
+        raise InputError(f"follower {name} answered {type(command).__name__}, no array of numbers") from None
+    wanted = (*np.shape(observation)[:-1], 3)
+    if command.shape != wanted:
+        raise InputError(f"follower {name} answered shape {command.shape} where {wanted} was wanted")
+    if not np.isfinite(command).all():
+        raise InputError(f"follower {name} answered a number that is not finite")
+    return command
+
+
+def said(error: Exception) -> str:
+    """`error` in one line."""
+    return f"{type(error).__name__}: {error}".splitlines()[0]

@@ -1,0 +1,123 @@
+"""README's table of tasks: every cell runs where nothing but its extra is installed."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import REPOSITORY, TINY, environment
+from packaging.requirements import Requirement
+
+README = (REPOSITORY / "README.md").read_text()
+ROWS = re.findall(r"^\| (?!task)(.+?) \| `(.+?)` \| `?(\w+)`?.*? \|$", README, flags=re.MULTILINE)
+# What a cell is given besides, so that it takes seconds.
+TRAINING = shlex.join(str(part) for pair in TINY.items() for part in pair)
+GRADIENT = "--gradient.impulse_response 0 --gradient.gradient_steps 2 --gradient.num_envs 8 --gradient.horizon 20"
+SHORTER = {
+    "train.py balance": GRADIENT,
+    "train.py --distributed": TRAINING,
+    "train.py --plant": TRAINING,
+    "--benchmark": "--tracks pair",
+    "--rehearse": "--seconds 5",
+}
+
+
+def shown(found: dict[str, Any], key: str, factor: float, digits: int) -> str:
+    values = [found[condition][key] for condition in ("undisturbed", "disturbed")]
+    return ", ".join("never" if value is None else f"{factor * value:.{digits}f}" for value in values)
+
+
+def test_the_table_of_followers_is_the_leaderboards() -> None:
+    """Every row, from the entry that the page shows."""
+    rows = re.findall(r"^\| \**`([\w-]+)`.*? \| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", README, flags=re.MULTILINE)
+    assert {"copy", "adaptive", "pid", "observer", "lqg-offset-free", "mpc", "sac", "balance"} <= {
+        row[0] for row in rows
+    }
+    for name, settling, peak, met, unknown in rows:
+        tracks = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())["tracks"]
+        known = tracks["pair"]
+        wanted = (shown(known, "settling_50", 1, 2), shown(known, "peak_90", 1e3, 0), shown(known, "met", 100, 0))
+        assert (settling, peak, met) == wanted, name
+        assert unknown == shown(tracks["pair-unknown"], "met", 100, 0), name
+
+
+def needed(extra: str) -> set[str]:
+    """Names of the distributions that `pip install mjxball[extra]` would bring, of those installed here."""
+    found: set[str] = set()
+    open_ones = [("mjxball", extra)]
+    seen: set[tuple[str, str]] = set()
+    while open_ones:
+        name, own = open_ones.pop()
+        if (name, own) in seen:
+            continue
+        seen.add((name, own))
+        try:
+            requires = metadata.requires(name) or []
+        except metadata.PackageNotFoundError:
+            continue  # of another platform
+        if name != "mjxball":
+            found.add(name)
+        for text in requires:
+            one = Requirement(text)
+            if one.marker is None or one.marker.evaluate({"extra": own}):
+                open_ones += [(one.name.lower(), wanted) for wanted in ("", *one.extras)]
+    return found
+
+
+def site_of(extra: str, place: Path) -> Path:
+    """A directory of links to these distributions and nothing else."""
+    place.mkdir()
+    for name in needed(extra):
+        files = metadata.distribution(name)
+        root = Path(str(files.locate_file("")))
+        for top in {file.parts[0] for file in files.files or ()} - {"..", "__pycache__"}:
+            if not (place / top).exists():
+                (place / top).symlink_to(root / top)
+    return place
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Path:
+    """A directory that looks like a checkout, with a rig of the reader's and a run to resume."""
+    for name in ("policies", "mjxball", "train.py", "eval.py"):
+        (tmp_path / name).symlink_to(REPOSITORY / name)
+    (tmp_path / "rig.toml").write_text((REPOSITORY / "mjxball/config/plants/team3.toml").read_text())
+    return tmp_path
+
+
+def run(words: Sequence[str], here: Path, site: Path) -> None:
+    child = {**environment(), "PYTHONPATH": f"{site}{os.pathsep}{here}", "MPLBACKEND": "agg", "BROWSER": "true"}
+    command = [sys.executable, "-S", *words[1:]]
+    done = subprocess.run(command, cwd=here, env=child, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_the_table_is_read() -> None:
+    assert len(ROWS) >= 13
+    assert {extra for _, _, extra in ROWS} >= {"none", "train", "fly", "gym", "onnx", "view"}
+
+
+def test_an_extra_brings_what_it_names() -> None:
+    assert "numpy" in needed("none")
+    assert not {"jax", "cflib", "onnx", "gymnasium"} & needed("none")
+    assert "jax" in needed("train")
+    assert "cflib" in needed("fly") - needed("train")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "cell", "extra"), ROWS, ids=[cell[:40] for _, cell, _ in ROWS])
+def test_a_cell_runs_with_its_extra_alone(task: str, cell: str, extra: str, here: Path) -> None:
+    site = site_of("train" if extra == "gpu" else extra, here / "site")
+    if "--resume" in cell:
+        run(shlex.split(f"python train.py --out runs/mine {TRAINING}"), here, site)
+    more = next((flags for part, flags in SHORTER.items() if part in cell), "")
+    run(shlex.split(f"{cell} {more}"), here, site)
