@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from mjxball.bench.score import CONDITIONS, measure, worlds_of
 from mjxball.bench.tracks import TRACKS
 from mjxball.errors import InputError
 from mjxball.files import read_text
+from mjxball.reading import parse_json
 
 HEADS = ["track", "", "met %", "95 %", "failed %", "settle s", "90 % peak mm", "limit %", "change mrad"]
 KEYS = {"benchmark", "version", "draw", "follower", "date", "command", "commit", "versions", "tracks", "not_flown"}
@@ -51,7 +51,7 @@ def run(
 def read_entry(path: Path) -> dict[str, Any]:
     """An entry of this version; InputError with one sentence for anything else."""
     try:
-        entry = json.loads(read_text(path, "entry"))
+        entry = parse_json(read_text(path, "entry"))
     except ValueError:
         raise InputError(f"entry {path} is no JSON") from None
     if not isinstance(entry, dict) or entry.get("benchmark") != NAME:
