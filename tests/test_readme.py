@@ -103,7 +103,7 @@ def run(words: Sequence[str], here: Path, site: Path) -> None:
 
 def test_the_table_is_read() -> None:
     assert len(ROWS) >= 13
-    assert {extra for _, _, extra in ROWS} >= {"none", "train", "fly", "gym", "onnx", "view"}
+    assert {extra for _, _, extra in ROWS} >= {"none", "train", "fly", "gym", "onnx"}
 
 
 def test_an_extra_brings_what_it_names() -> None:
