@@ -33,6 +33,11 @@ random rigs, of the two LQGs that are told the rig; of Crazyflies, of `lqg`. Eve
 | any rig | rigs that no training draws, masses and thrusts not as believed | noise, 20 ms |
 | two Crazyflies | simulated 2.1 with a ball, masses and thrusts off | noise / 2, drift, 30 ms, the radio's resolution |
 
+`balance`, `sac`, `universal`, `flight` and `paper` are [shipped](followers.md#trained), `transport` and `robust`
+are in `policies/archive/`.
+`transport-sac` and `transport-ppo` are what `python train.py transport --physics newton-euler` comes to in a minute on
+two cores, the latter with `--algorithm ppo`.
+
 Columns: share met and its 95 % interval, flights that failed, median settling time, 90 % quantile of the peaks, time
 with a rotor at its limit, rms change of commands from step to step. A dash: never, or nothing to measure.
 
