@@ -2,7 +2,8 @@
 
 `python benchmarks/observer_tuning.py [observer|pid|mpc] [--rounds N] [--sets N] [--width W] [--json FILE]`
 
-Covariance matrix adaptation (CMA-ES, Hansen) over the logarithms of the gains, from those of the law. All flights are
+Covariance matrix adaptation (CMA-ES, Hansen) over the logarithms of the gains. It goes on from those that the law has,
+so it says whether better ones are near; how these were found stands beside the law. All flights are
 flown undisturbed and with noise at level 1 and 40 ms of delay; what is made small is the sum over both.
 
 - `observer`: 48 random feasible flights of known mass; the mean settling time, at most 30 s, and the mean peak over

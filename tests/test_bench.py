@@ -6,13 +6,13 @@ import dataclasses
 import hashlib
 import importlib.util
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from command_line import REPOSITORY, call
-from scipy import stats
 
 from mjxball.baselines import make_baseline
 from mjxball.bench import followers, score
@@ -27,11 +27,11 @@ from mjxball.sim.rollout import simulate
 BALANCE = REPOSITORY / "policies" / "balance.npz"
 # The scenarios and plants of draw 0, as text. Another hash is another version of the benchmark.
 FROZEN = {
-    "pair": "9dc8f91567e930df",
-    "pair-unknown": "5b2a7aa185f3fa8b",
-    "team": "a6d21ce1119ba00e",
-    "rigs": "0d4b26235b3452e4",
-    "crazyflie": "d7485572766e7cb0",
+    "pair": "a0cce6ed3c4be6a1",
+    "pair-unknown": "8d9811fd2c2d1e9f",
+    "team": "56226bc949f8775a",
+    "rigs": "23e14ba2e06abe65",
+    "crazyflie": "d2670ba291579c4c",
 }
 SOURCE = """
 import numpy as np
@@ -112,7 +112,9 @@ def fingerprint(worlds: list[World]) -> str:
             getattr(world.config, part) for part in ("plant", "attitude", "autopilot", "leader", "command", "timing")
         ]
         parts.append((own, world.config.scenario.termination_distance, world.scenarios, world.told, world.length))
-    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+    # Six digits: a linear program bounds some amplitudes, and its last bits are its own.
+    text = re.sub(r"-?\d+\.\d+(e-?\d+)?", lambda number: f"{float(number[0]):.6g}", repr(parts))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:
@@ -146,12 +148,6 @@ def test_references_know_the_mass_that_the_entrant_does_not():
     assert all(one.believed_mass is None for one in world.told)
     assert [one.mass for one in world.told] == [one.mass for pair in world.scenarios for one in pair]
     assert all(one.believed_mass == 0.2 for pair in world.scenarios for one in pair)
-
-
-def test_an_interval_is_scipys():
-    for met, flights in ((0, 120), (7, 120), (60, 120), (120, 120)):
-        theirs = stats.binomtest(met, flights).proportion_ci(0.95, method="wilson")
-        np.testing.assert_allclose(score.wilson(met, flights), (theirs.low, theirs.high), atol=1e-5)
 
 
 def test_a_flight_is_met_that_is_as_good_as_the_best_reference(monkeypatch: pytest.MonkeyPatch):

@@ -38,15 +38,18 @@ def shown(found: dict[str, Any], key: str, factor: float, digits: int) -> str:
 
 def test_the_table_of_followers_is_the_leaderboards() -> None:
     """Every row, from the entry that the page shows."""
-    rows = re.findall(r"^\| \**`([\w-]+)`.*? \| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", README, flags=re.MULTILINE)
+    rows = re.findall(
+        r"^\| \**`([\w-]+)`.*? \| (.+?) \| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", README, flags=re.MULTILINE
+    )
     assert {"copy", "adaptive", "pid", "observer", "lqg-offset-free", "mpc", "sac", "balance"} <= {
         row[0] for row in rows
     }
-    for name, settling, peak, met, unknown in rows:
+    for name, settling, peak, met, unknown, limit in rows:
         tracks = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())["tracks"]
         known = tracks["pair"]
         wanted = (shown(known, "settling_50", 1, 2), shown(known, "peak_90", 1e3, 0), shown(known, "met", 100, 0))
         assert (settling, peak, met) == wanted, name
+        assert limit == shown(known, "rotors_at_limit", 100, 1), name
         assert unknown == shown(tracks["pair-unknown"], "met", 100, 0), name
 
 

@@ -12,9 +12,10 @@ v = 0; OSQP (Stellato et al. 2020) solves it for the other flights of a batch al
 forbidden but dear, so that there always is a solution.
 
 Measurements are taken to be one control step late, between none and the two that flights with delay have. The tuning is
-the best of about 40 sets of `benchmarks/observer_tuning.py mpc`, on flights with and without noise and delay, of known
-and of unknown mass. Its tilt limit, 0.136 rad, missed the RMSE of `benchmarks/cells.py` under noise; 0.18 rad was then
-chosen on the flights of the search, where it settles and overshoots about as well.
+the best of about 40 sets of `benchmarks/observer_tuning.py mpc`, few, so that a longer search may find better, on
+flights with and without noise and delay, of known and of unknown mass. Its tilt limit, 0.136 rad, missed the RMSE of
+`benchmarks/cells.py` under noise; 0.18 rad was then chosen on the flights of the search, where it settles and
+overshoots about as well.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """A cascade of PD and PID laws: what an autopilot would fly the paper's pair with (ours).
 
-Its gains are the best of `benchmarks/observer_tuning.py pid` for flights with and without noise and delay.
+Its gains were found by `benchmarks/observer_tuning.py pid` on flights with and without noise and delay: 72 rounds, then
+40 in which an overshoot below 4 % cost nothing. The script goes on from them.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from mjxball.bench.followers import Make, checked
 from mjxball.bench.tracks import TRACKS, World
@@ -21,7 +22,7 @@ ENGINE = "newton-euler"
 PEAK = 0.003  # more peak [m], times the world's length
 LATER, LATER_SECONDS = 0.1, 0.1  # so much later settling, whichever is more: share, [s]
 OVERSHOOT = 0.01  # more overshoot
-NORMAL = 1.96  # of a 95 % interval
+CONFIDENCE = 0.95  # of the interval of what is met (Wilson 1927)
 CONDITIONS = ("undisturbed", "disturbed")
 
 
@@ -64,13 +65,6 @@ def bars(track: str, draw: int, number: int) -> np.ndarray:
     return np.stack([peak + PEAK * world.length, later, overshoot + OVERSHOOT], axis=1)
 
 
-def wilson(met: int, flights: int) -> tuple[float, float]:
-    """95 % interval of a share of which `met` of `flights` were seen (Wilson 1927)."""
-    share, square = met / flights, NORMAL**2 / flights
-    middle, reach = share + square / 2, NORMAL * math.sqrt(share * (1 - share) / flights + square / flights / 4)
-    return max(0.0, (middle - reach) / (1 + square)), min(1.0, (middle + reach) / (1 + square))
-
-
 def measure(track: str, draw: int, make: Make, progress: Callable[[str], None]) -> dict[str, dict[str, Any]]:
     """What the follower comes to on `track`, of undisturbed flights and of disturbed ones.
 
@@ -95,7 +89,7 @@ def measure(track: str, draw: int, make: Make, progress: Callable[[str], None]) 
 def summary(flown: Sequence[Metrics], met: Sequence[bool]) -> dict[str, Any]:
     """A track's numbers in one condition; None for what is infinite."""
     peak, settling, _ = np.array([numbers(one) for one in flown]).T
-    low, high = wilson(sum(met), len(met))
+    interval = binomtest(sum(met), len(met)).proportion_ci(CONFIDENCE, method="wilson")
     sound = [one for one in flown if not one.failed]
     limit, change = (
         [getattr(one, name) for one in sound if getattr(one, name) is not None]
@@ -104,8 +98,8 @@ def summary(flown: Sequence[Metrics], met: Sequence[bool]) -> dict[str, Any]:
     found = {
         "flights": len(flown),
         "met": sum(met) / len(met),
-        "low": low,
-        "high": high,
+        "low": float(interval.low),
+        "high": float(interval.high),
         "failed": sum(one.failed for one in flown) / len(flown),
         "settling_50": float(np.quantile(settling, 0.5, method="higher")),
         "peak_90": float(np.quantile(peak, 0.9, method="higher")),
