@@ -61,7 +61,7 @@ def test_without_colour_there_are_no_escapes() -> None:
     assert "\x1b" not in "\n".join(lines(view(State.HOLD, Fault(Event.STALE), age=1.0), LIMITS, colour=False))
 
 
-@pytest.mark.parametrize("columns", [40, 60, 80, 104, 105, 200])
+@pytest.mark.parametrize("columns", [20, 40, 60, 80, 104, 105, 200])
 def test_no_line_is_wider_than_the_terminal(columns: int) -> None:
     """A terminal breaks a line that is too long, and what is redrawn over it smears."""
     cause = Fault(Event.ESTIMATOR, "the leader's height is +12 cm from where the follower and the roll put it")
@@ -90,11 +90,26 @@ def test_what_is_redrawn_covers_what_was_drawn() -> None:
         assert max(len(re.sub(r"\x1b\[[\d;]*m", "", line).rstrip("\r")) for line in text.split("\n")) < 60
 
 
-def test_what_is_no_terminal_gets_nothing() -> None:
+def test_what_cannot_go_back_a_line_gets_one_a_phase(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = [view(State.RAMP)] * 2 + [view()] * 2 + [view(State.LAND, Fault(Event.BATTERY, "leader at 3.1 V"))] * 20
     stream = io.StringIO()
-    with Display(view, LIMITS, stream):
-        time.sleep(0.3)
-    assert stream.getvalue() == ""
+    with Display(lambda: views.pop(0) if len(views) > 1 else views[0], LIMITS, stream):
+        time.sleep(1.6)
+    assert stream.getvalue().splitlines() == [
+        "   1.00 s  ramp",
+        "   1.00 s  fly",
+        "   1.00 s  land: battery: leader at 3.1 V",
+    ]
+    monkeypatch.setenv("TERM", "dumb")
+    ours, theirs = pty.openpty()
+    with os.fdopen(theirs, "w") as terminal, Display(view, LIMITS, terminal):
+        time.sleep(0.75)
+    assert os.read(ours, 1 << 16) == b"   1.00 s  fly\r\n"
+    os.close(ours)
+
+
+def test_the_keys_are_shown() -> None:
+    assert "l lands, space stops the motors" in lines(view(), LIMITS, False)[-1]
 
 
 SCRIPT = """

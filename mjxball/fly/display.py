@@ -25,6 +25,7 @@ from mjxball.fly.supervisor import ENDED, GUIDED, State, Supervisor
 
 RED, YELLOW, GREEN, PLAIN = "\x1b[1;37;41m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
 PERIOD = 0.2  # [s]
+KEYS = "keys: l lands, space stops the motors at once"
 
 
 class View(NamedTuple):
@@ -68,7 +69,13 @@ def lines(view: View, bounds: Limits, colour: bool = True, columns: int = 120) -
             (f"thrust {sent.thrust:5d}", ""),
         ]
         shown += _wrapped(parts, columns, colour)
-    return shown
+    return [*shown, *_wrapped([(KEYS, "")], columns, colour)]
+
+
+def plain(view: View) -> str:
+    """The phase and why it was entered, for a terminal that cannot go back a line, or none at all."""
+    cause = view.supervisor.cause
+    return f"{view.time:7.2f} s  {view.supervisor.state.value}" + (f": {cause}" if cause else "")
 
 
 def _wrapped(parts: list[tuple[str, str]], columns: int, colour: bool) -> list[str]:
@@ -89,41 +96,58 @@ def _pieces(text: str, width: int) -> list[str]:
 
 
 class Display:
-    """Redraws what `view` returns until it is left. A context manager; without a terminal it prints nothing."""
+    """Redraws what `view` returns until it is left. A context manager.
+
+    Without a terminal, or in one that cannot go back a line, it prints a line a phase.
+    """
 
     def __init__(self, view: Callable[[], View | None], bounds: Limits, stream: TextIO = sys.stdout):
         self._view, self._bounds, self._stream = view, bounds, stream
         self._done = threading.Event()
+        rich = stream.isatty() and os.environ.get("TERM") != "dumb"
+        self._colour = "NO_COLOR" not in os.environ
+        self._draw = self._redraw if rich else self._print
         self._thread = threading.Thread(target=self._draw_all, name="display", daemon=True)
         self._drawn = 0
+        self._phase: object = None
 
     def __enter__(self) -> Display:
-        if self._stream.isatty():
-            self._thread.start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._done.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=1)
+        self._thread.join(timeout=1)
 
     def _columns(self) -> int:
         """Of the terminal, whose window may have changed."""
         try:
-            return max(os.get_terminal_size(self._stream.fileno()).columns, 40)
+            return max(os.get_terminal_size(self._stream.fileno()).columns, 20)
         except (OSError, ValueError):
             return 80
 
     def _draw_all(self) -> None:
         while not self._done.wait(PERIOD):
             view = self._view()
-            if view is None or (view.supervisor.state in ENDED and not self._drawn):
+            if view is None or (view.supervisor.state in ENDED and self._phase is None):
                 continue
-            text = lines(view, self._bounds, columns=self._columns())
-            up = f"\x1b[{self._drawn}A\x1b[J" if self._drawn else ""
-            self._stream.write(up + "".join(f"{line}\n" for line in text))
-            self._stream.flush()
-            self._drawn = len(text)
+            try:
+                self._draw(view)
+            except (OSError, ValueError):  # a closed terminal
+                return
+
+    def _redraw(self, view: View) -> None:
+        text = lines(view, self._bounds, self._colour, self._columns())
+        up = f"\x1b[{self._drawn}A\x1b[J" if self._drawn else ""
+        self._stream.write(up + "".join(f"{line}\n" for line in text))
+        self._stream.flush()
+        self._drawn, self._phase = len(text), view.supervisor.state
+
+    def _print(self, view: View) -> None:
+        phase = view.supervisor.state, view.supervisor.cause
+        if phase != self._phase:
+            print(plain(view), file=self._stream, flush=True)
+        self._phase = phase
 
 
 def live_view(log: Path, port: int = 0) -> Child:

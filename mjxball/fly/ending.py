@@ -55,7 +55,7 @@ class Signals:
         late = max(gap - self._period, 0.0)
         for fault in faults:
             if fault.event not in (*PLANNED, Event.INTERRUPT, Event.TIMEOUT, Event.DEADLINES):
-                self._note(fault.event, _named(fault), now - self._lead.get(fault.event, 0.0), now)
+                self._note(fault.event, str(fault), now - self._lead.get(fault.event, 0.0), now)
         missed = next((f" ({fault.detail})" for fault in faults if fault.event is Event.DEADLINES), "")
         if late > LATE or missed:
             # It explains what was neither sent nor heard meanwhile, so it comes before that.
@@ -81,11 +81,7 @@ class Signals:
         for one in sorted(known, key=lambda one: -one.last):
             if one.last >= first - APART:
                 first = min(first, one.began)
-        return [one for one in known if one.began >= first] or [Signal(cause.event, _named(cause), at, at)]
-
-
-def _named(fault: Fault) -> str:
-    return fault.event.name.lower().replace("_", " ") + (f": {fault.detail}" if fault.detail else "")
+        return [one for one in known if one.began >= first] or [Signal(cause.event, str(cause), at, at)]
 
 
 class Touchdown:
@@ -143,5 +139,5 @@ class Ending:
         parts = [f"{one.text} (at {max(one.began - start, 0.0):.2f} s)" for one in chain]
         told = [f"ended early: {'; then '.join(parts)}"]
         if supervisor.cause.event not in [one.event for one in chain]:
-            told.append(f"that led to: {_named(supervisor.cause)}")
+            told.append(f"that led to: {supervisor.cause}")
         return [*told, f"came down: {self.touchdown}"] if self.touchdown.up else told

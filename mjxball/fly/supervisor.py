@@ -76,6 +76,9 @@ class Fault(NamedTuple):
     event: Event
     detail: str = ""
 
+    def __str__(self) -> str:
+        return self.event.name.lower().replace("_", " ") + (f": {self.detail}" if self.detail else "")
+
 
 S, E = State, Event
 BEFORE_MOTORS = (S.CHECK, S.ARM)
