@@ -16,7 +16,7 @@ from typing import Any
 from hostile_files import ODD_FILES, ROOT, Content, logs, policies, rigs, series, sweeps
 from mjxball import cli, export
 from mjxball import config as configs
-from mjxball.commands import evaluate, retrain, train
+from mjxball.commands import evaluate, train
 from mjxball.fly import main as fly
 from mjxball.policy.file import shipped_policy
 from mjxball.rig import gains, identify
@@ -82,13 +82,6 @@ def programs() -> list[Program]:
         Program("export", module("export"), (balance, "out.npz"), parser_in(export.main), text),
         Program("gains", module("rig.gains"), ("--out", "gains.json"), gains.parser(), text),
         Program("identify", module("rig.identify"), ("flight.jsonl", "--out", "plant.json"), identify.parser(), text),
-        Program(
-            "retrain",
-            ("-m", "mjxball.commands.retrain"),
-            (flight, "flight.jsonl", "out.npz"),
-            parser_in(retrain.main),
-            text,
-        ),
     ]
 
 

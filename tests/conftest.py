@@ -76,12 +76,10 @@ def by_the_clock(item: pytest.Item) -> bool:
     return any(item.get_closest_marker(name) for name in ("alone", "clock"))
 
 
-# What a flight by the clock then finds compiled, and beside it what takes as long.
-FIRST = ("test_fine_tune", "test_rig_load")
 # Files that take longest, which begin first, so that no worker is left with one of them at the end.
 LONGEST = (
     *("test_fly_link", "test_fly_mocap_flight", "test_fly_main", "test_fly_watchdog", "test_fly_rehearsal"),
-    *("test_fly_retrain_flight", "test_rig_rehearsal", "test_population", "test_distributed", "test_cli_eval"),
+    *("test_rig_rehearsal", "test_population", "test_distributed", "test_cli_eval"),
     *("test_docs", "test_team_env", "test_cli_train", "test_rigs"),
     *("test_algorithms", "test_extensions", "test_figures", "test_stability", "test_fly_defects", "test_resume"),
     *("test_engines", "test_program", "test_gym"),
@@ -97,7 +95,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The second tier is what is marked `slow`, what goes by the clock (`alone`, `clock`) and what opens a browser.
 
-    Files with what goes by the clock begin after `FIRST`, on all workers together, then those that take longest.
+    Files with what goes by the clock begin first, on all workers together, then those that take longest.
     """
     for item in items:
         if by_the_clock(item):
@@ -109,7 +107,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     places = {name: number for number, name in enumerate(LONGEST)}
     items.sort(
         key=lambda item: (
-            item.path.stem not in FIRST,
             item.path not in clocked,
             places.get(item.path.stem, len(places)),
         )

@@ -21,8 +21,12 @@ from mjxball.algorithms.base import Phase, Shards
 from mjxball.algorithms.gradient import FirstOrderGradient, starts_anew
 from mjxball.commands.train import main
 from mjxball.config import Config, preset
+from mjxball.env import TransportEnv
 from mjxball.errors import InputError
+from mjxball.policy import Policy
+from mjxball.policy.export import policy_file
 from mjxball.policy.file import PolicyFile, load_file, shipped_policy
+from mjxball.sim.follower import follower_law
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions, find
 from mjxball.train.program import Environments, Program
@@ -311,6 +315,16 @@ def test_a_run_by_gradient_writes_a_policy_and_resumes(
         assert after.card["start_from"]["policy"] == f"run/members/seed{seed}.npz"
     assert main([*flags, "--num-seeds", "3", "--start-from", "run", "--out", "other"]) == 2
     assert "say --num-seeds 2" in capsys.readouterr().err
+
+
+def test_training_starts_from_what_a_policy_does(recurrent: Any) -> None:
+    """A policy file, made into what is trained and back, gives the same commands to float32."""
+    algorithm = FirstOrderGradient(recurrent.config, Environments(TransportEnv(recurrent.config, "newton-euler"), 4))
+    begun = algorithm.start_from(algorithm.init(jax.random.key(0)), recurrent.contents)
+    again = policy_file(recurrent.config, follower_law(recurrent.config), algorithm.policy(begun), steps=0)
+    observations = np.random.default_rng(1).normal(size=(50, 18))
+    old, new = (Policy(one, "one", np.float64) for one in (recurrent.contents, again))
+    np.testing.assert_allclose([new(row) for row in observations], [old(row) for row in observations], atol=1e-5)
 
 
 def test_a_policy_to_start_from_that_has_changed_is_refused() -> None:

@@ -16,7 +16,6 @@ from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
 from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
-from mjxball.fly.handover import Handover
 from mjxball.fly.limits import Limits, Times
 from mjxball.fly.telemetry import Rig
 from mjxball.policy import Policy, PolicyFile, load_file, team
@@ -168,14 +167,13 @@ class Controller:
     def __init__(self, policy: Policy):
         config = config_of(policy.card)
         self.policy, self.config, self.period = policy, config, policy.control_period
-        self.handover = Handover(policy)
         self._loop, self._angle = Laws(config), mount_angle(policy.card)
         self.reset()
 
     def reset(self) -> None:
         """Begin a flight: no integral, no memory."""
         self._integral = self._loop.zero_integral(np.zeros(3))
-        self.handover.reset()
+        self.policy.reset()
 
     @property
     def integral(self) -> np.ndarray:
@@ -186,7 +184,7 @@ class Controller:
         """Both commands at `state` on the way to `goal` (3,) of O [m]; call it once per period."""
         seen = self._loop.observe(state, goal)
         led = self._loop.leader_command(state, goal, self._integral)
-        answer = self.handover(rotations.turned_about_z(seen, -self._angle))
+        answer = np.asarray(self.policy(rotations.turned_about_z(seen, -self._angle)), float)
         followed = self._loop.follower_command(rotations.turned_about_z(answer, self._angle), self._integral)
         self._integral = self._loop.integrate(self._integral, state, goal, self.period, follower_command=followed)
         return Commands(led, followed, seen, self.policy.hidden)

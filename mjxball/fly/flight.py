@@ -13,7 +13,7 @@ from mjxball.fly.card import Commands, Controller
 from mjxball.fly.command import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
 from mjxball.fly.display import View
 from mjxball.fly.ending import Ending
-from mjxball.fly.handover import HandoverMonitor, Successor
+from mjxball.fly.figures import Flown
 from mjxball.fly.lift import LiftWatch
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.mocap import Mocap
@@ -43,12 +43,11 @@ class Flight:
         note: Note,
         watchdog: Watchdog | None = None,
         mocap: Mocap | None = None,
-        successor: Successor | None = None,
     ):
         """`variants` of leader and follower by force curve; `assumed` are the curves whose gains were uploaded."""
         self.links, self.controller, self.rig, self.settings = links, controller, rig, settings
         self.note, self.watchdog, self._mocap = note, watchdog, mocap
-        self.succession = HandoverMonitor(controller.handover, successor, note)
+        self.flown = Flown()
         self.supervisor = Supervisor()
         self.interrupts, self.kill = 0, False
         self.ready: bool | None = None  # checks before flight: not known yet, passed, failed
@@ -205,7 +204,7 @@ class Flight:
             if self.supervisor.state is State.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
                 one, other = (s.thrust / c.hover_thrust for s, c in zip(self._sent, self.maps, strict=True))
-                self.succession.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion), (one, other))
+                self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion), (one, other))
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(self._now))
             laws = [law + self._probe() for law in (self._commands.leader, self._commands.follower)]

@@ -195,12 +195,6 @@ KINDS: dict[str, Kind] = {
         age=need(ANY_NUMBER, "of the last good pose [s]"),
         text=may(TEXT, "why"),
     ),
-    "retrain": record(
-        "a retraining process, or what it hands over, in a rehearsal with --retrain",
-        what=need(TEXT, "`ready`, `identified`, `fine-tuned`, `kept`, `taken`, `returned`, `failed`"),
-        text=may(TEXT, "in words"),
-        numbers=may(JSON, "by name"),
-    ),
     "app": record(
         "an app on board is in another phase, or refuses",
         drone=need(DRONE),
@@ -218,7 +212,7 @@ KINDS: dict[str, Kind] = {
         cause=may(TEXT, "what ended the flight, if not its plan"),
         told=may(TEXTS, "why it ended and how the pair came down, a sentence each"),
         timing=may(JSON, "the loop's: ticks, missed deadlines, lateness (median, p99, largest) [s]"),
-        flown=may(JSON, "figures of the flight under both laws, see `fly.handover`"),
+        flown=may(JSON, "figures of the flight under both laws, see `fly.figures`"),
         overwritten=may(array(None), "setpoints of each link that a newer one replaced"),
     ),
 }  # fmt: skip

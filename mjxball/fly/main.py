@@ -8,7 +8,6 @@ import importlib.util
 import math
 import re
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,7 +37,6 @@ from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.mocap import KINDS, MocapSettings, ready
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.process import Child
-from mjxball.fly.retrain import Retrainer
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
@@ -47,7 +45,6 @@ from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.reading import parse_json
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
-RETRAINED = (0.004, -0.06, 15.5)  # load that --retrain puts on, unless --twin-load says more: kg, m, s
 DONGLE = re.compile(r"radio://([^/]+)/")
 # Numbers with least and most: of the battery, and of the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
@@ -78,14 +75,12 @@ def make_parser() -> cli.Parser:
         help=f"--rehearse: after S seconds with motors on; may be repeated: {kinds}",
     )
     add_twin_options(parser)
-    add("--retrain", action="store_true", help="--rehearse: put a load on in flight, and retrain the policy for it")
     about = "the laws run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
     add("--onboard", nargs="?", const="float32", choices=("float32", "int8"), help=about)
     add("--upload", action="store_true", help="--onboard int8: put the policy's weights into the follower's app first")
     add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
     add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
-    about = "time under both laws before landing (20; with --retrain 50)"
-    add("--seconds", type=float, metavar="S", help=about)
+    add("--seconds", type=float, default=20.0, metavar="S", help="time under both laws before landing (20)")
     about = "write everything to this new file (flight-DATE.jsonl; none for --rehearse)"
     add("--log", type=Path, metavar="FILE", help=about)
     about = "a live page of the log, for a browser on this machine (a free port)"
@@ -194,14 +189,8 @@ def check_twin_options(options: argparse.Namespace) -> None:
     given = [*(f"--{name}" for name in (*WORSE, "fault") if getattr(options, name)), *given_twin_options(options)]
     if given and not options.rehearse:
         raise InputError(f"{given[0]} is for --rehearse only")
-    if options.retrain and not options.rehearse:
-        raise InputError("--retrain is for --rehearse only")
-    if options.retrain and options.dry_run:
-        raise InputError("--retrain takes a flight: leave --dry-run out")
     if options.upload and options.onboard != "int8":
         raise InputError("--upload takes weights of 8 bits: --onboard int8 --upload")
-    if options.onboard and options.retrain:
-        raise InputError("--retrain changes laws on the laptop: leave --onboard out")
     if options.onboard and options.mocap:
         raise InputError("--onboard cannot show that the axes of --mocap are right: leave one of them out")
     check_twin(options)
@@ -209,17 +198,10 @@ def check_twin_options(options: argparse.Namespace) -> None:
         read_fault(fault)
 
 
-def check_loaded(config: Config, retrains: bool, of_any: bool = False) -> None:
-    """Raise InputError if the twin of `config` cannot be loaded in flight, or its policy not be retrained there.
-
-    `of_any`: the policy is for any rig.
-    """
+def check_loaded(config: Config) -> None:
+    """Raise InputError if the twin of `config` cannot be loaded in flight."""
     if not is_crazyflie(config):
         raise InputError("--twin-load is for policies that were trained on Crazyflies, such as flight")
-    if retrains and of_any:
-        raise InputError("--retrain is for policies of one rig, such as flight, and this one is for any")
-    if retrains and (config.plant.stand != "free" or config.plant.cg_axis != "y" or config.motion.kind != "sine"):
-        raise InputError("--retrain is for pairs in free flight along y whose CG follows a sine, such as flight")
 
 
 def rehearsed_options(options: argparse.Namespace) -> list[str]:
@@ -254,14 +236,10 @@ def on_board(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Fly; exit code 0 if nothing went wrong, 1 after a fault, 2 on bad input."""
     options = make_parser().parse_args(arguments)
-    if options.seconds is None:
-        options.seconds = 50.0 if options.retrain else 20.0
 
     def command() -> int:
         check_options(options)
         check_twin_options(options)
-        if options.retrain and options.twin_load is None:
-            options.twin_load = list(RETRAINED)
         capture = mocap_settings(options)
         log = options.log or (None if options.rehearse else Path(time.strftime("flight-%Y%m%d-%H%M%S.jsonl")))
         policy = Policy(load_policy(options.policy), options.policy.stem)
@@ -269,7 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config = controller.config
         more = read_gains(options.gains) if options.gains else ({}, {})
         if options.twin_load is not None:
-            check_loaded(config, options.retrain, "team" in policy.card)
+            check_loaded(config)
         rig = Rig.of_card(policy.card)
         period = policy.control_period / limits.ticks_per_command(policy.control_period)
         goal = tuple(options.goal or goal_of(config))
@@ -287,13 +265,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             setup, settings = on_board(options, setup, settings)
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
-            if options.retrain:
-                place = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-                log = log or place / "flight.jsonl"
-                asked = [str(options.policy), str(log), str(place / "retrained.npz")]
-                retrainer = stack.enter_context(Retrainer(asked, policy))
-                retrainer.wait(lambda text: print(text, flush=True))  # noqa: T201
-                setup = replace(setup, retrainer=retrainer)
             if options.rehearse:
                 flags = [*rehearsed_options(options), *twin_options(options)]
                 failure = "the twin did not start; are the ports of --leader and --follower free?"
@@ -303,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
             if options.view is not None and log is not None:
                 print(stack.enter_context(live_view(log, options.view)).line, flush=True)  # noqa: T201
-            if log and not options.log and not options.retrain:
+            if log and not options.log:
                 print(f"log: {log}", flush=True)  # noqa: T201
             return fly(uris, setup, settings, log, list(sys.argv if arguments is None else arguments))
 

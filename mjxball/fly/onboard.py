@@ -136,7 +136,7 @@ class OnboardFlight(Flight):
             self._highest_place = max(self._highest_place, self._height(seen))
             if self.supervisor.state is State.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
-                self.succession.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
+                self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion))
         return None, []
 
     def _is_off(self) -> bool:

@@ -19,16 +19,15 @@ from mjxball.fly import packets
 from mjxball.fly.card import Controller
 from mjxball.fly.command import CurveName, Variants
 from mjxball.fly.display import Display, listening
+from mjxball.fly.figures import LEAST, SETTLING
 from mjxball.fly.flight import Flight
 from mjxball.fly.flight_log import Journal
-from mjxball.fly.handover import LEAST, SETTLING
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.onboard import Apps, OnboardFlight
 from mjxball.fly.preflight import Preflight, check, prepare
 from mjxball.fly.process import Metronome, Timing, together, urgent
-from mjxball.fly.retrain import Retrainer
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.watchdog import NOTHING, Watchdog
@@ -46,7 +45,6 @@ class FlightSetup:
     rig: Rig
     preflight: Preflight
     mocap: Mocap | None = None  # ready; the caller ends it
-    retrainer: Retrainer | None = None  # likewise
     apps: Apps | None = None  # on board, if the laws are to run there
 
 
@@ -82,17 +80,11 @@ def fly(
                 if setup.apps is not None:
                     setup.apps.check(links, _say)
                 pair = (links, setup.controller, setup.variants, curves, setup.rig)
-                retrainer = setup.retrainer
-                if retrainer is not None:
-                    retrainer.note = journal.note
-                successor = None if retrainer is None else retrainer.take
                 kind = Flight if setup.apps is None else OnboardFlight
-                flight = kind(*pair, settings, journal.note, watchdog, setup.mocap, successor)
+                flight = kind(*pair, settings, journal.note, watchdog, setup.mocap)
                 flight.ready = _checked(links, setup, settings, journal)
                 flight.refusal = "" if flight.ready else "see the checks"
                 timing = run(flight)
-                if retrainer is not None:
-                    _say_of(retrainer, flight)
                 return _ended(flight, timing, journal, setup.mocap is not None)
         except KeyboardInterrupt:  # before take-off; afterwards Ctrl-C is the flight's own
             journal.note("refused", text="interrupted")
@@ -158,25 +150,23 @@ def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings
     return all(one.passed for one in checks)
 
 
-def _say_of(retrainer: Retrainer, flight: Flight) -> None:
-    """What became of retraining."""
-    for one in retrainer.said:
-        _say(f"retraining: {one['what']}{': ' + one['text'] if one['text'] else ''}")
-    if not retrainer.said:
-        _say("retraining: no load was found")
-    if flight.controller.handover.returned:
-        _say(f"retraining: the first policy came back: {flight.controller.handover.returned}")
-
-
 def _ended(flight: Flight, timing: Timing, journal: Journal, captured: bool) -> int:
     supervisor = flight.supervisor
     cause = supervisor.cause
     stayed = not (flight.settings.dry_run or flight.interrupts or flight.lifted)
     code = 0 if cause is None and not stayed else 1
     sent = [getattr(link, "overwritten", 0) for link in flight.links]
-    flown = {name: dataclasses.asdict(one) for name, one in flight.succession.figures.items()}
+    figures = flight.flown.figures
     why, told = str(cause) if cause else "", flight.how_it_ended()
-    journal.note("end", code=code, cause=why, told=told, timing=timing, overwritten=sent, flown=flown)
+    journal.note(
+        "end",
+        code=code,
+        cause=why,
+        told=told,
+        timing=timing,
+        overwritten=sent,
+        flown=None if figures is None else dataclasses.asdict(figures),
+    )
     for text in told:
         _say(text)
     if cause is None and stayed:
@@ -190,10 +180,10 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, captured: bool) -> 
         )
     late = f"median {1e3 * timing.median:.2f} ms, p99 {1e3 * timing.p99:.2f} ms, largest {1e3 * timing.largest:.2f} ms"
     _say(f"loop: {timing.ticks} ticks of {1e3 * flight.settings.period:g} ms, {timing.missed} missed; late {late}")
-    if supervisor.cause is None and not (flown or flight.settings.dry_run):
+    if supervisor.cause is None and not (figures or flight.settings.dry_run):
         _say(f"no error of the flight: it takes {SETTLING:g} s to settle and {LEAST:g} s to measure (--seconds)")
-    for name, figures in flight.succession.figures.items():
-        _say(f"{name}: {figures}" if len(flight.succession.figures) > 1 else str(figures))
+    if figures is not None:
+        _say(str(figures))
     if journal.failure:
         _say(f"the log is not complete: {journal.failure}")
     return code

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import math
@@ -70,22 +69,6 @@ def policy_file(
         observation_scale=(mask / deviation).astype(np.float32),
         action_scale=np.array([action_scale[0], action_scale[0], action_scale[1]], np.float32),
         card=card,
-        gru=_gru(learnt),
-    )
-
-
-def with_network(policy: PolicyFile, learnt: Any) -> PolicyFile:
-    """`policy` with the network that has been learnt from it: the inputs that it sees, and its card but for `flown`."""
-    weights, biases = _layers(learnt)
-    return dataclasses.replace(
-        policy,
-        card={name: value for name, value in policy.card.items() if name != "flown"},
-        weights=tuple(weights),
-        biases=tuple(biases),
-        observation_mean=np.asarray(learnt.mean, np.float32),
-        observation_scale=np.where(policy.observation_scale > 0, 1 / np.asarray(learnt.deviation), 0.0).astype(
-            np.float32
-        ),
         gru=_gru(learnt),
     )
 

@@ -18,7 +18,6 @@ from mjxball.errors import InputError
 from mjxball.fly import card
 from mjxball.fly.app.protocol import CAUSES
 from mjxball.fly.command import CURVE_NAMES
-from mjxball.fly.handover import SAME
 from mjxball.fly.telemetry import Rig
 from mjxball.policy.file import PolicyFile
 from mjxball.policy.formats.c_header import APP, c_header, float_bytes, footprint, weight_bytes
@@ -28,6 +27,21 @@ SOURCES = (*CORE, "glue.c")
 ROLES = ("leader", "follower")
 PERIODS = (5, 20)  # [ms] of laws that an app may keep
 STACK = 2400  # [bytes] of the app's task beside the network's arrays
+# Fields of a card beside the weights that leader, follower and an upload must share.
+SAME = (
+    "history",
+    "previous_action",
+    "filters",
+    "action_mode",
+    "action_reach",
+    "command_limits",
+    "leader_kp",
+    "leader_kd",
+    "gravity",
+    "control_period",
+    "plant",
+    "config",
+)
 EXACT = ("-ffp-contract=off", "-fno-math-errno")
 
 
