@@ -421,7 +421,6 @@ class TransportEnv:
         return found
 
 
-CoupledPairEnv = TransportEnv  # its former name
 
 
 def _made_when_called(make: Callable[[], ControlStep]) -> ControlStep:

@@ -284,7 +284,7 @@ def fly_again(recording: Recording, kind: DroneKind | None = None) -> Recording:
 
     Without a `kind` they are those that the log tells of (`twin_of`). The loop is open: what both disagree on adds
     up with time. The object's mass and the CG's motion, which no log knows, are those of a rehearsal
-    (`twin.coupled.Conditions.of`).
+    (`twin.conditions.Conditions.of`).
     """
     pair = pair_of(recording.config, kind or twin_of(recording), Surroundings(exact=True))
     for drone, gains in enumerate(recording.setup.gains):

@@ -17,7 +17,7 @@ LOSS_MASSES, LOSS_DIRECTIONS = 6, 8
 
 
 class Factors(NamedTuple):
-    """Factors (...) on a rig's numbers, named as in `config.Scenario`."""
+    """Factors (...) on a rig's numbers, named as in `config.ScenarioRanges`."""
 
     drone_mass_scale: Array | float = 1.0
     drone_inertia_scale: Array | float = 1.0

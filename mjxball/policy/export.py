@@ -23,7 +23,7 @@ from mjxball.policy.file import PolicyFile
 def policy_file(
     config: Config, law: FollowerLaw, learnt: Any, steps: int, origin: dict[str, Any] | None = None
 ) -> PolicyFile:
-    """The policy file of what has been learnt, see `mjxball.algorithms.base.Policy`.
+    """The policy file of what has been learnt, see `algorithms.base.PolicyNetwork`.
 
     `law`: that of `config` (`sim.follower.follower_law`). `origin` (command, seed, commit, ...) is added to the card.
     """

@@ -101,7 +101,7 @@ class Pair(Protocol):
         """The laptop sent `drone` its pose: `position` (3,) [m] and, if known, `quaternion` (4,) (w, x, y, z)."""
 
     def disturb(self, drone: int, what: str, value: float) -> None:
-        """A fault of the body of `drone`: "pose" frozen, lost or jumping, "battery", "gain"; see `faults.BODY`."""
+        """A fault of the body of `drone`: "pose" frozen, lost or jumping, "battery", "gain"; see `twin.conditions.BodyFault`."""
 
 
 CURVE = ForceCurve()
