@@ -15,7 +15,8 @@ from mjxball.fly.limits import FlightSettings
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin import virtual
 from mjxball.fly.twin.conditions import DELIVERED, DroneKind
-from mjxball.fly.twin.physics import Pair, StandIn, StandInPlant
+from mjxball.fly.twin.pair import Pair
+from mjxball.fly.twin.physics import StandIn, StandInPlant
 from mjxball.fly.twin.virtual import MemoryLog, VirtualLink
 from mjxball.policy import Policy, PolicyFile
 

@@ -13,7 +13,7 @@ from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import PARAMETERS, STOCK, gains_of, pair_gains, with_gains
 from mjxball.fly.twin.conditions import Conditions, DroneKind, Surroundings, drone_kind
 from mjxball.fly.twin.coupled import CoupledPair
-from mjxball.fly.twin.physics import PairState
+from mjxball.fly.twin.pair import PairState
 from mjxball.physics import newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_control_step, start_state

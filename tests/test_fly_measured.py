@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from captured import CapturedTwin
 from tables import rows
 
 from mjxball.control import rotations
@@ -19,7 +20,6 @@ from mjxball.fly.mocap_supervision import Pose
 from mjxball.fly.packets import DroneState
 from mjxball.fly.supervisor import Event, State
 from mjxball.fly.telemetry import Sample
-from mjxball.fly.twin.captured import CapturedTwin
 from mjxball.fly.twin.conditions import Surroundings
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.physics.step import start_state

@@ -23,7 +23,7 @@ from mjxball.policy.file import shipped_policy
 pytest.importorskip("cflib")
 pytestmark = pytest.mark.alone  # by the clock
 
-# On a machine that keeps time states are 10 ms old, ticks 0.07 - 0.5 ms late at p99: benchmarks/results/fly_loop*.json.
+# On a machine that keeps time states are 10 ms old, ticks 0.07 - 0.5 ms late at p99.
 OLD, LATE = 25.0, 2.0  # [ms]
 HEIGHTS = {"flight": (0.3, 0.6), "stand": (0.04, 0.15)}  # least and most of the highest place [m]
 

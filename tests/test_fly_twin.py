@@ -15,7 +15,8 @@ from mjxball.fly import packets
 from mjxball.fly.packets import Setpoint
 from mjxball.fly.process import wait_until
 from mjxball.fly.twin import logs, protocol
-from mjxball.fly.twin.physics import RUNNING, Modes, PairState, StandIn
+from mjxball.fly.twin.pair import RUNNING, Modes, PairState
+from mjxball.fly.twin.physics import StandIn
 from mjxball.fly.twin.server import HOST, Twin
 
 cflib = pytest.importorskip("cflib")

@@ -23,7 +23,7 @@ from mjxball.fly.twin.conditions import (
 from mjxball.fly.twin.coupled import CoupledPair
 from mjxball.fly.twin.drone import TwinDrone
 from mjxball.fly.twin.estimators import Imu
-from mjxball.fly.twin.physics import Modes, PairState
+from mjxball.fly.twin.pair import Modes, PairState
 from mjxball.fly.twin.protocol import header
 
 TICK = 0.005  # [s]

@@ -25,7 +25,7 @@ class Tuning(NamedTuple):
 
 
 # The default reproduces an independent simulation; with delayed commands it limit-cycles. SLOW settles earliest under
-# noise and 40 ms of delay among the sets in `benchmarks/lqg_tuning.py` that settle in every case.
+# noise and 40 ms of delay among the sets that settle in every case (docs/archive/training.md).
 SLOW = Tuning(0.15, 0.6, 0.003, 0.3)
 
 

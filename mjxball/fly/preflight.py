@@ -54,7 +54,7 @@ class Preflight:
 
 
 def read_gains(path: Path) -> PairGains:
-    """Parameters of leader and follower from a JSON file, see `control.crazyflie.read_pair_gains`. Raises InputError."""
+    """Parameters of leader and follower from a JSON file, see `crazyflie.read_pair_gains`. Raises InputError."""
     try:
         data = parse_json(read_text(path, "gain file"))
     except InputError:

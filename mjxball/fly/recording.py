@@ -24,7 +24,8 @@ from mjxball.fly.packets import DroneState
 from mjxball.fly.supervisor import State
 from mjxball.fly.telemetry import ObjectState, Rig, object_state
 from mjxball.fly.twin.conditions import DroneKind, Surroundings, drone_kind
-from mjxball.fly.twin.physics import PairState, pair_of
+from mjxball.fly.twin.pair import PairState
+from mjxball.fly.twin.physics import pair_of
 from mjxball.reading import check_times
 
 SILENCE = 0.1  # [s] between two states of a drone from which on the log has a gap

@@ -20,7 +20,7 @@ from mjxball.control.crazyflie import with_stock_gains
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.estimators import matrix_of, skew
 from mjxball.fly.twin.onboard import TICK, Onboard, Power
-from mjxball.fly.twin.physics import RUNNING, Modes, PairState
+from mjxball.fly.twin.pair import RUNNING, Modes, PairState
 from mjxball.physics import motion
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.mujoco import slide_force

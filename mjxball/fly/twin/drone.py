@@ -16,7 +16,7 @@ from mjxball.fly.twin import protocol
 from mjxball.fly.twin.conditions import BodyFault, DroneFaults, LinkFaults, What
 from mjxball.fly.twin.firmware import Firmware, Motors, Order
 from mjxball.fly.twin.logs import Readings, Snapshot
-from mjxball.fly.twin.physics import Modes, Pair, PairState
+from mjxball.fly.twin.pair import Modes, Pair, PairState
 from mjxball.fly.twin.protocol import Peer
 
 GRAVITY = 9.81  # [m/s2]

@@ -16,7 +16,7 @@ from mjxball.fly import packets
 from mjxball.fly.app.protocol import GROUP, LOGGED
 from mjxball.fly.packets import Setpoint
 from mjxball.fly.twin.estimators import euler_of, matrix_of
-from mjxball.fly.twin.physics import Report
+from mjxball.fly.twin.pair import Report
 
 GRAVITY = 9.81  # [m/s2]
 # Type numbers of log variables, each with its struct code (crazyflie.md).

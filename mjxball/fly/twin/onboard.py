@@ -11,7 +11,7 @@ from mjxball.control import crazyflie, motors
 from mjxball.control.crazyflie import PARAMETERS, gains_of, with_gains
 from mjxball.fly.twin.conditions import OLDER_FORCE, Battery, DroneKind, Surroundings
 from mjxball.fly.twin.estimators import Complementary, Imu, Kalman, Positioning, euler_of
-from mjxball.fly.twin.physics import RUNNING, Modes, Report, remembered
+from mjxball.fly.twin.pair import RUNNING, Modes, Report, remembered
 
 TAKEN = 0.01  # share of the measured voltage that the firmware's low-pass filter takes, 1000 times a second
 FIRST = 4.2  # [V] that the filter starts from

@@ -13,7 +13,7 @@ import numpy as np
 from mjxball.fly.app.host import Library
 from mjxball.fly.twin.conditions import Injection
 from mjxball.fly.twin.drone import TwinDrone, advance
-from mjxball.fly.twin.physics import Pair, PairState
+from mjxball.fly.twin.pair import Pair, PairState
 
 HOST = "127.0.0.1"
 PERIOD = 0.005  # of physics, firmware and sockets [s]

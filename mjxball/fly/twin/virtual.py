@@ -29,7 +29,8 @@ from mjxball.fly.telemetry import HealthSample, Note, Rig, SensedSample, Telemet
 from mjxball.fly.twin import logs
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.drone import TwinDrone, advance
-from mjxball.fly.twin.physics import Pair, PairState, pair_of
+from mjxball.fly.twin.pair import Pair, PairState
+from mjxball.fly.twin.physics import pair_of
 from mjxball.fly.twin.protocol import header
 from mjxball.fly.twin.supervisor import PERIOD
 from mjxball.policy import Policy
