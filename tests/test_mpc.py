@@ -1,7 +1,9 @@
-"""Model-predictive control of the pair: its LQR, its quadratic program, and what it does at limits."""
+"""Model-predictive control of pairs and teams: its LQR, its quadratic program, and what it does at limits."""
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import pickle
 import sys
 
@@ -9,34 +11,46 @@ import jax
 import numpy as np
 import pytest
 from scipy.optimize import minimize
+from tables import rows
 
+from mjxball import config as configs
 from mjxball.baselines import make_baseline, make_law
 from mjxball.baselines.lqg_design import TILT
 from mjxball.baselines.mpc import BEYOND, BLOCKS, MASSES, Mpc, Program, limit_rows
 from mjxball.baselines.mpc_design import (
     EX,
+    EY,
     LOAD,
+    MEASURED,
+    MEMORY,
     PITCH,
     PITCH_RATE,
     ROLL,
+    ROLL_LOAD,
     ROLL_RATE,
+    ROLLING,
     STATES,
+    TORQUE,
     VX,
+    VY,
     Design,
     MpcTuning,
     design,
     limits_of,
 )
-from mjxball.config import preset
+from mjxball.config import Config, preset, with_plant
 from mjxball.control.followers import PrivilegedInfo
+from mjxball.control.observation import mount_angles
+from mjxball.control.rotations import turned_about_z
 from mjxball.errors import InputError
 from mjxball.evaluate.batch import Batch
 from mjxball.evaluate.metrics import measure_batch
+from mjxball.plant.teams import ring_config
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.rollout import simulate_batch
-from mjxball.sim.scenario import Scenario
+from mjxball.sim.rollout import simulate, simulate_batch
+from mjxball.sim.scenario import CgPath, Scenario
 
-PAPER = preset("paper")
+PAPER, TEAM = preset("paper"), preset("team")
 TUNING, LIMITS = Mpc.tuning, limits_of(PAPER)
 NOMINAL = MASSES.index(0.2)
 HOVER = np.array([1.1 * 9.81 / 4])  # [N] of each rotor, with 0.2 kg
@@ -67,18 +81,50 @@ def test_a_correction_costs_its_square_on_top_of_the_lqr() -> None:
     assert more == pytest.approx(own.cost[1] * (corrections**2).sum(), rel=1e-6)
 
 
-def test_within_the_limits_it_is_the_lqr() -> None:
-    config, follower = PAPER, make_law("mpc", PAPER)
-    own, observation = law(), np.zeros(18)
-    observation[12:15], observation[3:5] = (0.02, -0.01, 0.01), (0.005, -0.01)
-    nobody = PrivilegedInfo(np.array(config.plant.object_mass), *[np.array(0.0)] * 3)
+@rows("plant", [PAPER, ring_config(TEAM, 3), with_plant(PAPER, "plate4")])
+def test_within_the_limits_it_is_the_lqr(plant: Config) -> None:
+    """Every follower's command, in body axes; of a team each sees them turned."""
+    follower, mass = make_law("mpc", plant), plant.plant.object_mass
+    kind = round(10 * mass)
+    own, seen, angles = follower.designs[kind], np.zeros(18), mount_angles(plant.plant)
+    seen[12:15], seen[3:5] = (0.02, -0.01, 0.01), (0.005, -0.01)
+    observation = seen if angles is None else turned_about_z(np.tile(seen, (len(angles), 1)), -angles)
+    still = np.zeros(observation.shape[:-1])
     state = follower.start(observation)
-    _, command = follower.step(state, observation, nobody)
+    _, command = follower.step(state, observation, PrivilegedInfo(still + mass, still, still, still))
     # Nothing was commanded before, and measurements are taken to be a step old.
-    x = own.transition @ state[:STATES]
-    assert not Program(own, LIMITS, MASSES[NOMINAL]).broken(x[None], HOVER).any()
-    np.testing.assert_allclose(command, own.feedback @ x, rtol=1e-9)
+    x = own.transition @ np.reshape(state, (-1, state.shape[-1]))[0, : len(own.transition)]
+    limits = limits_of(plant)
+    hover = np.array([(limits.own_mass + limits.share * mass) * 9.81 / 4])
+    assert not Program(own, limits, mass).broken(x[None], hover).any()
+    expected = np.broadcast_to(own.feedback @ x, command.shape)
+    np.testing.assert_allclose(
+        command, expected if angles is None else turned_about_z(expected, -angles), rtol=1e-9, atol=1e-15
+    )
     assert follower.solved == follower.failed == 0
+
+
+@rows("drones", [3, 6])
+def test_the_plan_expects_what_a_turned_team_does(drones: int) -> None:
+    """Roll and pitch of a ring are one law, turned, but for what uneven lifts turn: the leader is along x."""
+    own = make_law("mpc", ring_config(TEAM, drones)).designs[drones]
+    along, across = [EX, VX, PITCH, PITCH_RATE, TORQUE], [EY, VY, ROLL, ROLL_RATE, ROLLING]
+    signs = np.array([-1.0, -1.0, 1.0, 1.0, 1.0])  # pitch nose down drives along +x, roll along -y
+    np.testing.assert_allclose(own.feedback[1, along], signs * own.feedback[0, across], rtol=1e-6)
+    np.testing.assert_allclose(own.feedback[1, LOAD], own.feedback[0, ROLL_LOAD], rtol=1e-6)
+
+
+def test_estimates_of_followers_that_measure_apart_are_forgotten() -> None:
+    """Where all measure one motion, differences between them die out as the memory says, and no slower."""
+    config, apart = ring_config(TEAM, 4), []
+    for own in make_law("mpc", config).designs:
+        size = len(own.transition)
+        kept = np.hstack([np.eye(size) - own.gain @ np.eye(size)[list(MEASURED)], np.zeros((size, 3))])
+        sent = np.hstack([np.zeros((3, size)), np.eye(3)])  # the command before: measurements are taken to be late
+        moved = own.transition @ kept + own.drive @ sent
+        step = np.vstack([moved, own.feedback @ moved])
+        apart.append(np.abs(np.linalg.eigvals(step)).max())
+    np.testing.assert_allclose(apart, math.exp(-config.timing.control_period / MEMORY), atol=2e-4)
 
 
 def test_the_program_is_solved_as_another_solver_does() -> None:
@@ -107,23 +153,43 @@ def test_the_program_is_solved_as_another_solver_does() -> None:
     assert program.solved > 0
 
 
-def test_limits_are_kept_that_the_lqr_breaks() -> None:
+@rows("plant", [PAPER, ring_config(TEAM, 4)])
+def test_limits_are_kept_that_the_lqr_breaks(plant: Config) -> None:
     """A metre away, on the linear model: tilt to 5 % of its limit, rotors to 0.6 N, by which clipping cuts."""
-    own, program = law(), Program(law(), LIMITS, MASSES[NOMINAL])
+    law, limits, mass = make_law("mpc", plant), limits_of(plant), plant.plant.object_mass
+    kind = round(10 * mass)
+    own, tuning = law.designs[kind], law.team_tuning if plant.plant.is_team else law.tuning
+    program, carried = Program(own, limits, MASSES[kind]), limits.own_mass + limits.share * mass
+    hover = np.array([carried * 9.81 / 4])
     for follows in (False, True):
-        x, tilts, forces = np.zeros(STATES), [], []
+        x, tilts, forces = np.zeros(len(own.transition)), [], []
         x[EX] = 1.0
         for _ in range(150):
-            first = program.corrections(x[None], HOVER)[0][0] if follows else np.zeros(3)
+            first = program.corrections(x[None], hover)[0][0] if follows else np.zeros(3)
             command = own.feedback @ x + own.correction @ first
-            torque = LIMITS.kp * (command[:2] - x[[ROLL, PITCH]]) - LIMITS.kd * x[[ROLL_RATE, PITCH_RATE]]
-            forces.append(HOVER + LIMITS.rotors @ np.array([1.1 * command[2], *torque]))
+            torque = limits.kp * (command[:2] - x[[ROLL, PITCH]]) - limits.kd * x[[ROLL_RATE, PITCH_RATE]]
+            forces.append(hover + limits.rotors @ np.array([carried * command[2], *torque]))
             tilts.append(abs(x[PITCH]))
             x = own.transition @ x + own.drive @ command
-        assert (max(tilts) < 1.05 * TUNING.tilt_limit) == follows
-        assert (np.min(forces) > -0.6 and np.max(forces) < LIMITS.rotor_force + 0.6) == follows
+        assert (max(tilts) < 1.05 * tuning.tilt_limit) == follows
+        assert (np.min(forces) > -0.6 and np.max(forces) < limits.rotor_force + 0.6) == follows
         assert abs(x[EX]) < 0.05
     assert program.failed == 0
+
+
+@rows("drones", [2, 4])
+def test_a_team_takes_off_a_torque_and_a_mass_that_nobody_told(drones: int) -> None:
+    """A load at rest aside, 20 % heavier than believed. One follower keeps what it has estimated, several forget."""
+    config = ring_config(TEAM, drones)
+    mass = config.plant.object_mass
+    scenario = Scenario(omega=0.0, phase=math.pi / 2, amplitude=0.03, path=CgPath(direction=0.7), mass=1.2 * mass)
+    scenario = dataclasses.replace(scenario, believed_mass=mass, seconds=45.0)
+    left = {
+        name: np.abs(simulate(config, make_baseline(name, config), scenario, "newton-euler").error[-1]).max()
+        for name in ("copy", "mpc")
+    }
+    assert left["copy"] > 0.1
+    assert left["mpc"] < (2e-4 if drones == 2 else 0.02 * left["copy"]), left
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +242,11 @@ def test_copies_solve_by_themselves(heavy) -> None:
 
 def test_what_it_cannot_do_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="free pair along x"):
-        make_law("mpc", preset("team"))
+        make_law("mpc", configs.replace(PAPER, "plant.cg_axis", "y"))
+    light = dataclasses.replace(TEAM.plant.drones[1], mass=0.8)
+    drones = (TEAM.plant.drones[0], light, *TEAM.plant.drones[2:])
+    with pytest.raises(InputError, match="drones that are alike"):
+        make_law("mpc", dataclasses.replace(TEAM, plant=dataclasses.replace(TEAM.plant, drones=drones)))
     monkeypatch.setitem(sys.modules, "osqp", None)
     with pytest.raises(InputError, match=r"mjxball\[mpc\]"):
         make_law("mpc", PAPER)

@@ -1,8 +1,8 @@
-"""Offset-free model-predictive control of the paper's pair: the limits of its rotors and commands foreseen (ours).
+"""Offset-free model-predictive control of pairs and teams: the limits of rotors and commands foreseen (ours).
 
 A steady-state Kalman filter on all that the follower measures estimates the motion, the load's torque and the error of
 the lift, of which `lqg-offset-free` filters the last two alone. The law is the LQR of that motion about the target that
-the estimates ask for, with corrections v of both drones' mean command over the next second. As the cost of an LQR is
+the estimates ask for, with corrections v of all drones' mean command over the next second. As the cost of an LQR is
 x'Px plus the sum of v'Wv, W = R + B'PB, whatever v is, the best corrections are the solution of
 
     least sum of v' W v   so that the follower's commands and rotors, tilt and lift stay within their limits,
@@ -11,11 +11,16 @@ a quadratic program with the exact infinite horizon behind its last step. Where 
 v = 0; OSQP (Stellato et al. 2020) solves it for the other flights of a batch alone. To go beyond a limit is not
 forbidden but dear, so that there always is a solution.
 
-Measurements are taken to be one control step late, between none and the two that flights with delay have. The tuning is
-the best of about 40 sets of `benchmarks/observer_tuning.py mpc`, few, so that a longer search may find better, on
-flights with and without noise and delay, of known and of unknown mass. Its tilt limit, 0.136 rad, missed the RMSE of
-`benchmarks/cells.py` under noise; 0.18 rad was then chosen on the flights of the search, where it settles and
-overshoots about as well.
+Every follower of a team runs it for itself, in body axes, on what it measures, and takes the others to command as it
+does. The motion shows only the sum of what they estimate, so that each forgets the torque and the error of the lift in
+10 s: a constant load leaves a small error, of 1 % of what `copy` leaves.
+
+Measurements are taken to be one control step late, between none and the two that flights with delay have. The tuning of
+the pair is the best of about 40 sets of `benchmarks/observer_tuning.py mpc`, few, so that a longer search may find
+better, on flights with and without noise and delay, of known and of unknown mass. Its tilt limit, 0.136 rad, missed the
+RMSE of `benchmarks/cells.py` under noise; 0.18 rad was then chosen on the flights of the search, where it settles and
+overshoots about as well. That of teams is the best of 24 sets of `benchmarks/observer_tuning.py mpc-team`, which began
+at the best of about 25 by hand on such flights, the memory of 10 s among them: fewer still.
 """
 
 from __future__ import annotations
@@ -34,7 +39,7 @@ from mjxball.baselines.mpc_design import (
     PITCH_RATE,
     ROLL,
     ROLL_RATE,
-    STATES,
+    TEAM,
     Design,
     Limits,
     MpcTuning,
@@ -42,9 +47,10 @@ from mjxball.baselines.mpc_design import (
     limits_of,
 )
 from mjxball.config import Config
+from mjxball.control import rotations
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.leader import clip_command
-from mjxball.control.observation import ERROR, ERROR_RATE
+from mjxball.control.observation import ERROR, ERROR_RATE, mount_angles
 from mjxball.errors import InputError
 from mjxball.plant.parts import clipped, joined
 
@@ -92,12 +98,12 @@ class Program:
         self.solved = self.failed = 0
 
     def broken(self, x: np.ndarray, hover: np.ndarray) -> np.ndarray:
-        """(n,) whether the LQR from states `x` (n, 16) breaks a limit; a rotor at hover gives `hover` (n,) [N]."""
+        """(n,) whether the LQR from states `x` (n, k) breaks a limit; a rotor at hover gives `hover` (n,) [N]."""
         rows = x @ self._states.T + hover[:, None] * self._lifting
         return ((rows < self._low) | (rows > self._high)).any(axis=-1)
 
     def corrections(self, x: np.ndarray, hover: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(first corrections (n, 3), whether they were found (n,)) from states `x` (n, 16)."""
+        """(first corrections (n, 3), whether they were found (n,)) from states `x` (n, k)."""
         first, known = np.zeros((len(x), 3)), np.ones(len(x), bool)
         for number in np.nonzero(self.broken(x, hover))[0]:
             taken = self._states @ x[number] + hover[number] * self._lifting
@@ -112,19 +118,19 @@ class Program:
 
 
 def limit_rows(own: Design, limits: Limits, carried: float) -> tuple[np.ndarray, ...]:
-    """(rows of the state (m, 16), of the corrections (m, k), low (m,), high (m,), of the hover force (m,)).
+    """(rows of the state (m, n), of the corrections (m, k), low (m,), high (m,), of the hover force (m,)).
 
     In this order at every step that is checked: the command (3), rotor forces (4), roll, pitch and lift (3).
     """
-    count, held = 3 * len(BLOCKS), np.repeat(np.arange(len(BLOCKS)), BLOCKS)
+    size, count, held = own.drive.shape[0], 3 * len(BLOCKS), np.repeat(np.arange(len(BLOCKS)), BLOCKS)
     loop, enters = own.forecast + own.drive @ own.feedback, own.drive @ own.correction
-    asked, angles = np.diag([*limits.kp, carried])[[2, 0, 1]], np.zeros((3, STATES))  # lift, roll, pitch torque
+    asked, angles = np.diag([*limits.kp, carried])[[2, 0, 1]], np.zeros((3, size))  # lift, roll, pitch torque
     for axis, angle, rate in AXES:
         angles[1 + axis, [angle, rate]] = -limits.kp[axis], -limits.kd[axis]
-    moved, found = np.hstack([np.eye(STATES), np.zeros((STATES, count))]), []
+    moved, found = np.hstack([np.eye(size), np.zeros((size, count))]), []
     for step in range(max(CHECKED) + 1):
-        chosen = np.zeros((3, STATES + count))
-        chosen[:, STATES + 3 * held[step] :][:, :3] = np.eye(3)
+        chosen = np.zeros((3, size + count))
+        chosen[:, size + 3 * held[step] :][:, :3] = np.eye(3)
         command = own.feedback @ moved + own.correction @ chosen
         if step in CHECKED:
             rotors = limits.rotors @ (asked @ command + angles @ moved)
@@ -134,11 +140,11 @@ def limit_rows(own: Design, limits: Limits, carried: float) -> tuple[np.ndarray,
     high = np.concatenate([limits.command, np.full(4, limits.rotor_force), own.far_limit])
     low = np.concatenate([-limits.command, np.zeros(4), -own.far_limit])
     lifting = np.repeat([0.0, 1.0, 0.0], [3, 4, 3])
-    return rows[:, :STATES], rows[:, STATES:], *(np.tile(part, steps) for part in (low, high, lifting))
+    return rows[:, :size], rows[:, size:], *(np.tile(part, steps) for part in (low, high, lifting))
 
 
 class Mpc:
-    """The law as a follower; its state (..., 16 + 3 `delay`) is the filter's, and the newest commands.
+    """The law as a follower; its state (..., n + 3 `delay`) is the filter's, and the newest commands.
 
     It reads the believed mass of the object. `solved` and `failed` count its programs; where one is not solved within
     `ITERATIONS`, the LQR is clipped.
@@ -146,16 +152,21 @@ class Mpc:
 
     name = NAME
     needs_privileged = False
-    tuning = MpcTuning()
+    tuning, team_tuning = MpcTuning(), TEAM
     delay = 1  # control steps by which measurements are taken to be late
 
     def __init__(self, config: Config):
         _osqp()
-        self._limits, self._leader, self._gravity = limits_of(config), copy_gains(config), config.plant.gravity
-        self.designs = [design(config, self.tuning, mass) for mass in MASSES]
+        plant, self._limits, self._leader = config.plant, limits_of(config), copy_gains(config)
+        self._gravity, self._angles, self._others = plant.gravity, mount_angles(plant), plant.count - 1
+        tuning = self.team_tuning if plant.is_team else self.tuning
+        self.designs = [design(config, tuning, mass) for mass in MASSES]
         self._stacked = Design(*(np.stack(parts) for parts in zip(*self.designs, strict=True)))
-        self._behind = -float(config.plant.drones[1].mount[0])  # from O to the follower [m]
+        self._mounts = np.array([drone.mount for drone in plant.drones])[[*plant.followers], :2]  # from O [m]
+        if self._others == 1:
+            self._mounts = self._mounts[0]
         self._programs: dict[int, Program] = {}
+        self._states = self._stacked.drive.shape[-2]
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies, which solve by themselves."""
@@ -173,44 +184,57 @@ class Mpc:
 
     def start(self, observation: Array) -> Array:
         """See `Law.start`."""
-        found = dict(zip(MEASURED, self._measured(observation), strict=True))
+        found = dict(zip(MEASURED, self._measured(self._seen(observation)), strict=True))
         zero = observation.__array_namespace__().zeros_like(observation[..., 0])
-        return joined([found.get(place, zero) for place in range(STATES)] + [zero] * (3 * self.delay))
+        return joined([found.get(place, zero) for place in range(self._states)] + [zero] * (3 * self.delay))
 
     def step(self, state: Array, observation: Array, privileged: PrivilegedInfo) -> tuple[Array, Array]:
         """See `Law.step`."""
         xp, dtype, mass = observation.__array_namespace__(), observation.dtype, privileged.believed_mass
+        observation = self._seen(observation)
         kind = xp.round(clipped(mass, 0.0, MASSES[-1]) / MASSES[1]).astype(int)
         own = Design(*(xp.asarray(part, dtype=dtype)[kind] for part in self._stacked))
         hover = (self._limits.own_mass + self._limits.share * mass) * self._gravity / 4.0
-        x, commands = self._estimate(own, state, observation), state[..., STATES:]
+        x, commands = self._estimate(own, state, observation), state[..., self._states :]
         now = x
         for late in range(self.delay):
             now = self._moved(own, now, commands[..., 3 * late : 3 * late + 3], hover)
         command = self._command(own, now, hover, kind)
         commands = xp.concat([commands, command], axis=-1)
-        return xp.concat([self._moved(own, x, commands[..., :3], hover), commands[..., 3:]], axis=-1), command
+        moved = self._moved(own, x, commands[..., :3], hover)
+        return xp.concat([moved, commands[..., 3:]], axis=-1), self._sent(command)
 
     def _estimate(self, own: Design, state: Array, observation: Array) -> Array:
-        """The filter's state (..., 16) at `observation`, as old as its measurements are taken to be."""
+        """The filter's state (..., n) at `observation`, as old as its measurements are taken to be."""
         left = joined(self._measured(observation)) - joined([state[..., place] for place in MEASURED])
-        return state[..., :STATES] + _times(own.gain, left)
+        return state[..., : self._states] + _times(own.gain, left)
+
+    def _seen(self, observation: Array) -> Array:
+        """`observation` (..., 18), of a team in mount frames, in body axes."""
+        return observation if self._angles is None else rotations.turned_about_z(observation, self._angles)
+
+    def _sent(self, command: Array) -> Array:
+        """`command` (..., 3) in body axes as it is sent, of a team in mount frames."""
+        if self._angles is None:
+            return command
+        return clip_command(rotations.turned_about_z(command, -self._angles), *self._leader[-2:])
 
     def _measured(self, observation: Array) -> list[Array]:
         """What is `MEASURED`; velocities are the mean of the object's and of what the follower's own are at O."""
         error, rate, own = observation[..., ERROR], observation[..., ERROR_RATE], observation[..., 6:9]
         (roll, pitch), (p, q, r) = ((observation[..., place] for place in places) for places in ((3, 4), (9, 10, 11)))
-        x = 0.5 * (rate[..., 0] - own[..., 0])
-        y = 0.5 * (rate[..., 1] - own[..., 1] - self._behind * r)
-        z = 0.5 * (rate[..., 2] - own[..., 2] + self._behind * q)
+        ahead, left = observation.__array_namespace__().asarray(self._mounts.T, dtype=observation.dtype)
+        x = 0.5 * (rate[..., 0] - own[..., 0] - left * r)
+        y = 0.5 * (rate[..., 1] - own[..., 1] + ahead * r)
+        z = 0.5 * (rate[..., 2] - own[..., 2] + left * p - ahead * q)
         return [error[..., 0], x, pitch, q, error[..., 1], y, roll, p, error[..., 2], z]
 
     def _moved(self, own: Design, x: Array, command: Array, hover: Array) -> Array:
-        """State (..., 16) a period after `x` with the follower's `command` (..., 3), of rotors that have limits."""
+        """State (..., n) a period after `x` with the follower's `command` (..., 3), of rotors that have limits."""
         led, lost = _times(own.led, x), 0.0
-        for sent in (led, command):
+        for drones, sent in ((1.0, led), (self._others, command)):
             room, asked = self._room(sent[..., 2], hover)[..., None], self._asked(sent, x)
-            lost = lost + clipped(asked, -room, room) - asked
+            lost = lost + drones * (clipped(asked, -room, room) - asked)
         return _times(own.transition, x) + _times(own.drive, command) + _times(own.torque_drive, lost)
 
     def _asked(self, sent: Array, x: Array) -> Array:
@@ -225,7 +249,7 @@ class Mpc:
         return self._limits.torque_per_force * clipped(left, 0.0, self._limits.rotor_force)
 
     def _command(self, own: Design, x: Array, hover: Array, kind: Array) -> Array:
-        """The command (..., 3) at state `x` (..., 16), its vertical part clipped first: it takes what rotors have."""
+        """The command (..., 3) at state `x` (..., n), its vertical part clipped first: it takes what rotors have."""
         xp, (tilt_limit, vertical_limit) = x.__array_namespace__(), self._leader[-2:]
         wanted, far = _times(own.feedback, x), _times(own.far, x)
         correction, known = self._corrections(x, hover, kind)
@@ -248,7 +272,7 @@ class Mpc:
     def _solve(self, x: Any, hover: Any, kind: Any) -> tuple[np.ndarray, np.ndarray]:
         x, batch = np.asarray(x), np.shape(x)[:-1]
         hover, kind = (np.broadcast_to(np.asarray(part), batch).ravel() for part in (hover, kind))
-        states, first, known = x.reshape(-1, STATES).astype(float), np.zeros((len(kind), 3)), np.ones(len(kind), bool)
+        states, first, known = x.reshape(-1, self._states).astype(float), np.zeros((kind.size, 3)), kind >= 0
         for one in np.unique(kind).tolist():
             if one not in self._programs:
                 self._programs[one] = Program(self.designs[one], self._limits, MASSES[one])
