@@ -91,7 +91,7 @@ def test_a_flight_log_with_hostile_texts_in_the_viewer(browser: Any, log: Path, 
         assert flight.title.startswith(NAME[:80])
         assert elements(tab) == {"script": 2, "img": 0, "style": 1, "iframe": 0, "object": 0}
         told = json.loads(tab.locator("#flight").text_content())
-        assert told == json.loads(json.dumps(page_contents(flight)))
+        assert told == json.loads(json.dumps([page_contents(flight)]))
         tab.close()
 
 
@@ -101,13 +101,13 @@ def test_hostile_names_of_what_is_plotted_stay_text(browser: Any, log: Path, tmp
     (tmp_path / "page.html").write_text(flight_page(shown), encoding="utf-8")
     tab = opened(browser, tmp_path / "page.html", 1000)
     tab.evaluate(
-        """(text) => new Plot(document.getElementById('plots'), text, text, player.flight.time,
-             [{ name: text, colour: `red"><img src=x onerror=document.title='gone'>`,
-                values: player.flight.time }], () => {})""",
+        """(text) => new Plot(document.getElementById('plots'), { title: text, unit: text, series: [{ name: text,
+             colour: `red"><img src=x onerror=document.title='gone'>`, value: (row) => row }] },
+             player.panes[0].flight, [], player)""",
         TEXT,
     )
     plot = tab.locator(".plot").last
-    assert plot.locator("h2").text_content() == f"{TEXT} [{TEXT}]"
+    assert plot.locator("h3").text_content() == f"{TEXT} [{TEXT}]"
     assert plot.locator(".legend span").text_content().strip() == TEXT
     assert elements(tab) == {"script": 2, "img": 0, "style": 1, "iframe": 0, "object": 0}
     tab.close()

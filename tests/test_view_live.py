@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import REPOSITORY, TRANSPORT, assert_one_line, call, environment
+from conftest import opened
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
@@ -31,8 +32,10 @@ from mjxball.fly.recording import read_recording
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.physics import make_pair
 from mjxball.view.command import main
+from mjxball.view.flight import flight_from
 from mjxball.view.live import LiveView, Server
 from mjxball.view.live_log import COLUMNS, STEP, LiveLog, columns
+from mjxball.view.page import flight_page
 
 LIMIT = 20.0  # [s] that anything may take here on a busy machine
 
@@ -62,7 +65,11 @@ def test_rows_are_the_recording(lines: list[bytes], tmp_path: Path) -> None:
     log, recording = read_all(path), read_recording(path)
     shown = {name: values.reshape(len(log.rows), -1) for name, values in columns(log.rows).items()}
     time = shown["time"][:, 0]
-    assert (log.ended, log.text, log.level) == (True, "the flight has ended, exit code 0: time up", "busy")
+    assert (log.status.ended, log.status.text, log.status.level) == (
+        True,
+        "the flight has ended, exit code 0: time up",
+        "good",
+    )
     np.testing.assert_allclose(np.diff(time), STEP, atol=2e-3)
     # A recording counts from where the motors turned, the view from the first tick.
     first = [json.loads(line)["t"] for line in lines if b'"tick"' in line]
@@ -78,14 +85,70 @@ def test_rows_are_the_recording(lines: list[bytes], tmp_path: Path) -> None:
         np.testing.assert_allclose(shown[name][time > turned + 0.005], wanted[rows], atol=1e-6)  # float32
 
 
+def test_a_recorded_log_has_the_marks_of_the_live_view(lines: list[bytes], browser: Any, tmp_path: Path) -> None:
+    """Counted from where the motors turned, in which phase a recording begins; a good end is green in both."""
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(b"".join(lines))
+    live, recorded = read_all(path).marks, flight_from(str(path), {}, "")
+    assert recorded.marks[0].time == pytest.approx(0.0, abs=1e-6)
+    assert [mark[1:] for mark in recorded.marks] == [mark[1:] for mark in live[-len(recorded.marks) :]]
+    assert [mark.text for mark in recorded.marks[:-1]] == ["spin", "ramp", "fly", "land", "stop", "done"]
+    shifts = [old.time - new.time for old, new in zip(live[-6:-2], recorded.marks[-6:-2], strict=True)]
+    np.testing.assert_allclose(shifts, shifts[0], atol=1e-9)
+    fly = next(mark for mark in recorded.marks if mark.text == "fly")
+    phases = np.array(read_recording(path).phase)
+    assert fly.time == pytest.approx(recorded["time"][np.argmax(phases == "fly")], abs=0.011)  # a tick
+    page = tmp_path / "page.html"
+    page.write_text(flight_page(recorded), encoding="utf-8")
+    tab = opened(browser, page, 400)
+    assert [mark.text_content() for mark in tab.locator(".marks .phase").all()] == [m.text for m in recorded.marks[:-1]]
+    assert tab.locator(".marks .fault").count() == 0
+    green = "getComputedStyle(document.querySelector('.marks .end')).backgroundColor === colour('good')"
+    assert tab.evaluate(green)
+    tab.locator(".marks .phase", has_text="fly").click()
+    assert tab.evaluate("player.now") == pytest.approx(fly.time)
+    assert tab.inner_text(".now-phase") == "fly"
+    tab.close()
+
+
+def test_a_fault_is_marked_where_it_happened(lines: list[bytes], browser: Any, tmp_path: Path) -> None:
+    records = [json.loads(line) for line in lines]
+    flying = [number for number, one in enumerate(records) if one.get("state") == "fly"]
+    now = records[flying[len(flying) // 2]]["t"]
+    fault = {"t": now, "kind": "transition", "before": "fly", "after": "hold", "events": ["STALE: <b>follower</b>"]}
+    back = {"t": now + 0.1, "kind": "transition", "before": "hold", "after": "fly", "events": ["RESUMED"]}
+    end = {**records[-1], "code": 1}
+    path = tmp_path / "log.jsonl"
+    path.write_text(
+        "".join(json.dumps(one) + "\n" for one in [*records[: flying[-1]], fault, back, *records[flying[-1] : -1], end])
+    )
+    live, shown = read_all(path), flight_from(str(path), {}, "")
+    start = next(one["t"] for one in records if one["kind"] == "tick")
+    (mark,) = [one for one in live.marks if one.kind == "fault"]
+    assert (mark.time, mark.text) == (pytest.approx(now - start), "stale: <b>follower</b>")
+    assert live.status.level == live.marks[-1].level == "bad"
+    assert [one.text for one in shown.marks if one.kind == "fault"] == [mark.text]
+    page = tmp_path / "page.html"
+    page.write_text(flight_page(shown), encoding="utf-8")
+    tab = opened(browser, page, 1300)
+    triangle = tab.locator(".marks .fault")
+    assert triangle.get_attribute("title").endswith(f"s: {mark.text}")
+    axis, place = tab.locator(".marks").bounding_box(), triangle.bounding_box()
+    (own,) = [one.time for one in shown.marks if one.kind == "fault"]
+    share = (place["x"] + place["width"] / 2 - axis["x"]) / axis["width"]
+    assert share == pytest.approx(own / shown["time"][-1], abs=0.005)
+    assert tab.locator(".marks .end.bad").count() == 1
+    tab.close()
+
+
 def test_a_clock_that_goes_back_is_told(lines: list[bytes], tmp_path: Path) -> None:
     path, records = tmp_path / "log.jsonl", [json.loads(line) for line in lines]
     middle = records[len(records) // 2]["t"]
     late = [{**one, "t": one["t"] - 3.0 * (one["t"] > middle)} for one in records]
     path.write_text("".join(json.dumps(one) + "\n" for one in late))
     log = read_all(path)
-    assert log.level == "bad"
-    assert "time goes back by" in log.text
+    assert log.status.level == "bad"
+    assert "time goes back by" in log.status.text
     assert (np.diff([row[0] for row in log.rows]) > 0).all()
 
 
@@ -95,16 +158,17 @@ def test_a_log_in_pieces_gives_the_same_rows(lines: list[bytes], tmp_path: Path)
     whole.write_bytes(b"".join(lines))
     log = LiveLog(pieces)
     assert not log.update()
-    assert log.text == "waiting for pieces.jsonl"
+    assert log.status.text == "waiting for pieces.jsonl"
     damaged = [b"{torn\n", b"[]\n", b'{"t": 1, "kind": "tick"}\n', b'{"t": 1, "kind": "state", "drone": 7}\n', b"\n"]
     text = b"".join([lines[0], *damaged, *lines[1:]])
     with pieces.open("ab", buffering=0) as stream:
         for start in range(0, len(text), 1777):
             stream.write(text[start : start + 1777])
             log.update()
-            assert log.level == ("good" if log.text in ("fly", "land: time up") else "busy")
+            good = ("fly", "land: time up", "stop: time up", "done: time up")
+            assert log.status.level == ("good" if log.status.text in good or log.status.ended else "busy")
     assert log.rows == read_all(whole).rows
-    assert log.ended
+    assert log.status.ended
 
 
 @pytest.mark.parametrize(
@@ -165,6 +229,14 @@ def server(lines: list[bytes], tmp_path: Path) -> Iterator[Server]:
     yield result
     result.shutdown()
     result.server_close()
+
+
+def test_a_second_viewer_on_one_port_is_refused(server: Server, tmp_path: Path, capsys: Any) -> None:
+    assert call(main, ["--live", tmp_path / "log.jsonl", "--port", server.server_port]) == 2
+    errors = capsys.readouterr().err
+    assert_one_line(errors)
+    assert f"port {server.server_port} cannot be had" in errors
+    assert asked(server, "/")[0] == 200
 
 
 def asked(server: Server, path: str, method: str = "GET", host: str | None = None) -> tuple[int, bytes]:
@@ -244,17 +316,20 @@ def test_a_page_follows_a_log(lines: list[bytes], browser: Any, tmp_path: Path) 
             half = flying[len(flying) // 2]  # the log pauses in the middle of free flight
             stream.write(b"".join(lines[1:half]) + lines[half][:40])
             tab.wait_for_function("time => player && player.now > time", arg=newest(lines[:half]) - 1.5 * STEP)
-            assert float(tab.inner_text("#now-time").split()[0]) <= newest(lines[:half]) + 0.005
+            assert float(tab.inner_text("#time").split()[0]) <= newest(lines[:half]) + 0.005
             shows("fly")
             shows("nothing new for")
             tab.evaluate("player.seek(0.5)")
             stream.write(lines[half][40:] + b"".join(lines[half + 1 :]))
         shows("the flight has ended, exit code 0: time up")
-        assert tab.inner_text("#now-time") == "0.48 s"
+        assert tab.inner_text("#time") == "0.50 s"
+        live = [mark.inner_text() for mark in tab.locator(".marks .phase").all()]
+        assert live[-5:] == ["ramp", "fly", "land", "stop", "done"]
+        assert tab.locator(".marks .end.good").get_attribute("title").endswith("exit code 0: time up")
         tab.click("#newest")
         assert tab.evaluate("player.now") == pytest.approx(newest(lines), abs=1.5 * STEP)
-        assert {"Battery [V]", "Lateness of the loop [ms]"} <= set(tab.locator(".plot h2").all_inner_texts())
-        assert not tab.is_visible("#now-cg")  # nobody measures it
+        assert {"Battery [V]", "Lateness of the loop [ms]"} <= set(tab.locator(".plot h3").all_inner_texts())
+        assert not tab.is_visible(".now-cg")  # nobody measures it
         assert "exit code 0: time up" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait(LIMIT) == 0
@@ -305,4 +380,4 @@ def test_a_fault_is_told(lines: list[bytes], tmp_path: Path) -> None:
     fault = {"t": 1.0, "kind": "transition", "before": "fly", "after": "descend", "events": ["FENCE: leader left"]}
     path.write_bytes(lines[0] + json.dumps(fault).encode() + b"\n")
     log = read_all(path)
-    assert (log.text, log.level, log.ended) == ("descend: fence: leader left", "bad", False)
+    assert (log.status.text, log.status.level, log.status.ended) == ("descend: fence: leader left", "bad", False)

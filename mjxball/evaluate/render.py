@@ -1,32 +1,49 @@
-"""Flights side by side as one animated picture, rendered by MuJoCo.
+"""Flights side by side as one moving picture, rendered by MuJoCo.
 
 Rendering runs in a child process: a broken GL library may abort the interpreter.
 """
 
 from __future__ import annotations
 
-import io
+import contextlib
+import itertools
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjxball import config as configs
 from mjxball.config import Plant
+from mjxball.errors import InputError
 from mjxball.reading import parse_json
 from mjxball.sim.rollout import Trajectory
 
-PANEL = (360, 360)  # height, width of one flight's panel
-FRAMES_PER_SECOND = 12.5
-TIME_LIMIT = 240  # [s]
+TIME_LIMIT = 240  # [s] for a picture of a report
 TRAIL = 3.0  # [s] of the path that is drawn
 TEXT = (29, 35, 41)
+
+
+class Kind(NamedTuple):
+    """A kind of file, by its suffix."""
+
+    rate: float  # frames per second of playing time; of a GIF, whose clock ticks 10 ms, 100 over an integer
+    panel: tuple[int, int]  # height, width of one flight [pixels]
+    most: int  # frames: beyond it there is no file that anybody would show
+
+
+KINDS = {
+    ".webp": Kind(12.5, (360, 360), 1_000),
+    ".gif": Kind(12.5, (360, 360), 1_000),
+    ".mp4": Kind(30.0, (720, 720), 40_000),
+}
+PANEL = KINDS[".webp"].panel
 
 
 def film(
@@ -36,90 +53,191 @@ def film(
 
     `speed` is flight time over playing time.
     """
+    shown = {
+        label: {
+            "time": flight.time,
+            "position": flight.position,
+            "quaternion": flight.quaternion,
+            "cg_offset": flight.cg_offset,
+            "target": flight.target,
+        }
+        for label, flight in flights.items()
+    }
+    try:
+        return render([plant] * len(shown), shown, ".webp", seconds, start, speed, TIME_LIMIT), ""
+    except InputError as error:
+        return None, str(error)
+
+
+def render(
+    plants: Sequence[Plant],
+    flights: Mapping[str, Mapping[str, np.ndarray]],
+    suffix: str,
+    seconds: float | None = None,
+    start: float = 0.0,
+    speed: float = 1.0,
+    limit: float | None = None,
+) -> bytes:
+    """The file of kind `suffix` that shows `flights`, arrays of a `Trajectory` by label, each on its plant of `plants`.
+
+    From `start` for `seconds` of flight time, None for all of it; who has ended stays where it was. `limit` is the time
+    that it may take [s]. Raises InputError if it cannot be made.
+    """
+    kind = KINDS[suffix]
+    last = max(float(flight["time"][-1]) for flight in flights.values())
+    until = last if seconds is None else min(start + seconds, last)
+    number = int((until - start) * kind.rate / speed + 1e-6) + 1
+    if number > kind.most:
+        raise InputError(
+            f"a {suffix} of {(until - start) / speed:.0f} s is too long, {kind.most / kind.rate:.0f} s is the most: "
+            "show it faster (--speed)"
+        )
+    coder = _coder() if suffix == ".mp4" else ""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        np.savez(folder / "flights.npz", **_arrays(list(flights.values()), start, seconds, speed))
-        about = {"plant": configs.to_dict(plant), "labels": list(flights), "speed": speed}
-        (folder / "about.json").write_text(json.dumps(about))
+        np.savez(
+            folder / "flights.npz", **_arrays(list(flights.values()), start + np.arange(number) * speed / kind.rate)
+        )
+        about = {"plants": [configs.to_dict(one) for one in plants], "labels": list(flights), "suffix": suffix}
+        (folder / "about.json").write_text(json.dumps({**about, "coder": coder}))
         environment = {**os.environ, "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
         command = [sys.executable, "-m", "mjxball.evaluate.render", str(folder)]
         try:
-            done = subprocess.run(
-                command, env=environment, capture_output=True, text=True, timeout=TIME_LIMIT, check=False
-            )
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit, check=False)
         except subprocess.TimeoutExpired:
-            return None, f"MuJoCo's renderer took longer than {TIME_LIMIT} s"
-        picture = folder / "film.webp"
+            raise InputError(f"MuJoCo's renderer took longer than {limit} s") from None
+        picture = folder / f"film{suffix}"
         if done.returncode or not picture.exists():
             lines = [line for line in done.stderr.splitlines() if line.strip()]
-            return None, f"MuJoCo's renderer found no working GL library ({lines[-1][:160] if lines else 'no message'})"
-        return picture.read_bytes(), ""
+            why = lines[-1][:160] if lines else "no message"
+            what = "the coder of .mp4 failed" if "coder" in why else "MuJoCo's renderer found no working GL library"
+            raise InputError(f"{what} ({why})")
+        return picture.read_bytes()
 
 
-def _arrays(flights: Sequence[Trajectory], start: float, seconds: float, speed: float) -> dict[str, Any]:
-    time = flights[0].time
-    every = max(1, round(speed / FRAMES_PER_SECOND / (time[1] - time[0])))
-    rows = slice(int(np.searchsorted(time, start - 1e-9)), int(np.searchsorted(time, start + seconds - 1e-9)), every)
+def _coder() -> str:
+    """The program ffmpeg: the one on PATH, or imageio-ffmpeg's."""
+    if found := shutil.which("ffmpeg"):
+        return found
+    try:
+        import imageio_ffmpeg
+
+        return str(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ImportError, RuntimeError):
+        raise InputError(
+            "an .mp4 needs ffmpeg, which is not on PATH: install it, or pip install 'mjxball[video]', or write a .gif"
+        ) from None
+
+
+def _arrays(flights: Sequence[Mapping[str, np.ndarray]], times: np.ndarray) -> dict[str, Any]:
+    """Rows of `flights` at `times` (n,), as `frames` takes them."""
+    rows = [np.clip(np.searchsorted(flight["time"], times - 1e-9), 0, len(flight["time"]) - 1) for flight in flights]
+
+    def stacked(name: str) -> np.ndarray:
+        return np.stack([flight[name][own] for flight, own in zip(flights, rows, strict=True)])
+
+    offsets = [flight["cg_offset"][own].reshape(len(times), -1) for flight, own in zip(flights, rows, strict=True)]
     return {
-        "time": time[rows],
-        "position": np.stack([flight.position[rows] for flight in flights]),
-        "quaternion": np.stack([flight.quaternion[rows] for flight in flights]),
-        "offset": np.stack([flight.cg_offset[rows] for flight in flights]),
-        "goal": flights[0].target[rows],
+        "time": times,
+        "position": stacked("position"),
+        "quaternion": stacked("quaternion"),
+        "offset": np.stack([np.pad(own, ((0, 0), (0, 2 - own.shape[1]))) for own in offsets]),
+        "goal": stacked("target"),
     }
 
 
-def frames(plant: Plant, labels: Sequence[str], arrays: Mapping[str, Any], panel: tuple[int, int] = PANEL) -> list[Any]:
-    """One PIL image per row of `arrays` (see `_arrays`): the flights side by side, labelled, with |e_o| and time."""
+def frames(
+    plants: Sequence[Plant], labels: Sequence[str], arrays: Mapping[str, Any], panel: tuple[int, int] = PANEL
+) -> Iterator[Any]:
+    """One PIL image for each of `arrays`' times (n,): the flights side by side, labelled, with |e_o| and time.
+
+    The other arrays (flights, n, ...) are "position", "quaternion", "goal", and "offset" with two numbers, of which the
+    second counts in a plane.
+    """
     from PIL import Image, ImageDraw, ImageFont
 
     from mjxball.scene import Scene
 
     position, goal, time = arrays["position"], arrays["goal"], arrays["time"]
-    look_at, distance = _framing(plant, position, goal)
-    scene = Scene(plant, goal[0], panel, look_at, distance)
-    trail, pictures = round(TRAIL / (time[1] - time[0])), []
+    look_at, distance = _framing(plants, position, goal)
+    trail = round(TRAIL / (time[1] - time[0])) if len(time) > 1 else 0
+    every = max(1, trail // 20)
     large, small = (ImageFont.load_default(size) for size in (panel[0] // 17, panel[0] // 22))
-    for row in range(len(time)):
-        scene.move_goal(goal[row], look_at)
-        views = []
-        for k in range(len(labels)):
-            path = position[k, max(0, row - trail) : row + 1 : 2]
-            views.append(scene.picture(position[k, row], arrays["quaternion"][k, row], arrays["offset"][k, row], path))
-        image = Image.fromarray(np.concatenate(views, axis=1))
-        draw = ImageDraw.Draw(image)
-        for k, label in enumerate(labels):
-            left, error = k * panel[1] + 12, float(np.linalg.norm(goal[row] - position[k, row]))
-            draw.text((left, 8), label, fill=TEXT, font=large)
-            draw.text((left, panel[0] - 32), f"error {100 * error:5.1f} cm", fill=TEXT, font=small)
-            if k:
-                draw.line([(k * panel[1], 0), (k * panel[1], panel[0])], fill="white", width=3)
-        clock = f"{time[row]:.1f} s"
-        draw.text((image.width - 12, panel[0] - 32), clock, fill=TEXT, font=small, anchor="ra")
-        pictures.append(image)
-    scene.close()
-    return pictures
+    with contextlib.ExitStack() as stack:
+        scenes = [Scene(plant, goal[k, 0], panel, look_at, distance) for k, plant in enumerate(plants)]
+        for scene in scenes:
+            stack.callback(scene.close)
+        for row in range(len(time)):
+            views = []
+            for k, scene in enumerate(scenes):
+                scene.move_goal(goal[k, row], look_at)
+                path = position[k, max(0, row - trail) : row + 1 : every]
+                offset = arrays["offset"][k, row, : len(plants[k].directions)]
+                views.append(scene.picture(position[k, row], arrays["quaternion"][k, row], offset, path))
+            image = Image.fromarray(np.concatenate(views, axis=1))
+            draw = ImageDraw.Draw(image)
+            for k, label in enumerate(labels):
+                left, error = k * panel[1] + 12, float(np.linalg.norm(goal[k, row] - position[k, row]))
+                draw.text((left, 8), label, fill=TEXT, font=large)
+                draw.text((left, panel[0] - panel[0] // 11), f"error {100 * error:5.1f} cm", fill=TEXT, font=small)
+                if k:
+                    draw.line([(k * panel[1], 0), (k * panel[1], panel[0])], fill="white", width=3)
+            clock = f"{time[row]:.1f} s"
+            draw.text((image.width - 12, panel[0] - panel[0] // 11), clock, fill=TEXT, font=small, anchor="ra")
+            yield image
 
 
-def _framing(plant: Plant, position: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float]:
+def _framing(plants: Sequence[Plant], position: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float]:
     """(what the camera looks at (3,), its distance [m]) so that all of the flights are seen."""
-    points = np.concatenate([position.reshape(-1, 3), goal])
-    centre = np.median(goal, axis=0)
+    points = np.concatenate([position.reshape(-1, 3), goal.reshape(-1, 3)])
+    centre = np.median(goal.reshape(-1, 3), axis=0)
     points = points[np.abs(points - centre).max(axis=-1) < 3.0]  # a flight that failed leaves the picture
     low, high = points.min(axis=0), points.max(axis=0)
-    arms = max(np.linalg.norm(drone.mount) for drone in plant.drones) + 1.6 * plant.arm
+    arms = max(float(np.linalg.norm(drone.mount)) + 1.6 * plant.arm for plant in plants for drone in plant.drones)
     radius = 1.08 * (np.linalg.norm(high - low) / 2 + arms)  # what comes nearer to the camera looks larger
     return (low + high) / 2, float(radius / np.tan(np.radians(22.5)))
 
 
 def _render(folder: Path) -> None:
     about = parse_json((folder / "about.json").read_text())
-    plant = configs.from_record({"plant": about["plant"]}).plant
+    plants = [configs.from_record({"plant": one}).plant for one in about["plants"]]
+    kind, out = KINDS[about["suffix"]], folder / f"film{about['suffix']}"
     with np.load(folder / "flights.npz") as stored:
-        pictures = frames(plant, about["labels"], {name: stored[name] for name in stored.files})
-    stream, options = io.BytesIO(), {"duration": round(1000 / FRAMES_PER_SECOND), "loop": 0, "quality": 60, "method": 3}
-    pictures[0].save(stream, "WEBP", save_all=True, append_images=pictures[1:], **options)
-    (folder / "film.webp").write_bytes(stream.getvalue())
+        pictures = frames(plants, about["labels"], {name: stored[name] for name in stored.files}, kind.panel)
+        if about["coder"]:
+            _write_mp4(out, pictures, kind.rate, about["coder"])
+        elif about["suffix"] == ".gif":
+            _write_gif(out, pictures, kind.rate)
+        else:
+            first = next(pictures)
+            options = {"duration": round(1000 / kind.rate), "loop": 0, "quality": 60, "method": 3}
+            first.save(out, "WEBP", save_all=True, append_images=list(pictures), **options)
+
+
+def _write_gif(out: Path, pictures: Iterator[Any], rate: float) -> None:
+    """One palette, without dither: what stands still is stored once."""
+    from PIL import Image
+
+    first = next(pictures).quantize(128, dither=Image.Dither.NONE)
+    rest = (picture.quantize(palette=first, dither=Image.Dither.NONE) for picture in pictures)
+    first.save(out, save_all=True, append_images=rest, duration=round(1000 / rate), loop=0, optimize=True)
+
+
+def _write_mp4(out: Path, pictures: Iterator[Any], rate: float, coder: str) -> None:
+    first = next(pictures)
+    size = f"{first.width}x{first.height}"
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(rate), "-i", "-"]
+    command = [coder, "-loglevel", "error", *source, "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(out)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as coding:
+        if coding.stdin is None or coding.stderr is None:
+            raise RuntimeError
+        with contextlib.suppress(BrokenPipeError):
+            for picture in itertools.chain([first], pictures):
+                coding.stdin.write(picture.tobytes())
+            coding.stdin.close()
+        said = coding.stderr.read().decode(errors="replace").strip()
+    if coding.returncode:
+        sys.exit(f"coder: {said.splitlines()[-1] if said else 'no message'}")
 
 
 if __name__ == "__main__":

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import tempfile
 import webbrowser
+from collections.abc import Sequence
 from pathlib import Path
 
 from mjxball.cli import Parser, make_parser, output_file, run_command
 from mjxball.errors import InputError
 from mjxball.files import write_whole
-from mjxball.view.flight import flight_from, save_flight
+from mjxball.view.flight import Flight, flight_from, save_flight
 from mjxball.view.page import flight_page
 
+VIDEOS = (".mp4", ".gif")
 CHANGES = ("omega", "amplitude", "mass", "goal", "seconds")  # flags, and fields of a scenario
 
 
@@ -22,15 +25,21 @@ def parser() -> Parser:
     result = make_parser("python -m mjxball.view", about)
     result.add_argument(
         "source",
+        nargs="+",
         metavar="POLICY|RUN|LOG",
         help="recorded flight (.npz), flight log (.jsonl), or what to fly: a run directory, policy, baseline or "
-        "module:Class, your own",
+        "module:Class, your own; two are shown side by side with one clock",
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
     result.add_argument("--save", type=Path, metavar="FILE.npz", help="write the flight itself too")
     result.add_argument(
         "--hidden", action="store_true", help="show what the follower's recurrent network remembers as well"
     )
+    film = result.add_argument_group("video by MuJoCo's renderer")
+    film.add_argument(
+        "--video", type=Path, metavar="FILE.mp4|FILE.gif", help="write a video instead of a page, and open nothing"
+    )
+    film.add_argument("--speed", type=float, metavar="X", help="flight time over playing time (1)")
     live = result.add_argument_group("while it is flown")
     live.add_argument(
         "--live", action="store_true", help="follow a flight log that is being written, on a page of this machine alone"
@@ -57,34 +66,68 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _view(options: argparse.Namespace) -> int:
+    if len(options.source) > 2:
+        raise InputError(f"two flights fit side by side, not {len(options.source)}")
+    if options.speed is not None and not options.video:
+        raise InputError("--speed is of --video; a page has its own")
     if options.live:
         return _follow(options)
+    _check(options)
+    given = {name: getattr(options, name) for name in CHANGES if getattr(options, name) is not None}
+    flights = [flight_from(one, given, options.physics, options.plant, options.hidden) for one in options.source]
+    if len({flight.title for flight in flights}) < len(flights):  # else nobody could tell which is which
+        named = zip(options.source, flights, strict=True)
+        flights = [dataclasses.replace(one, title=f"{Path(source).name}: {one.title}"[:200]) for source, one in named]
+    if options.video:
+        write_whole(options.video, _video(flights, options.video.suffix, options.speed or 1.0))
+        print(f"the video is {options.video}")  # noqa: T201
+    if options.save:
+        save_flight(options.save, flights[0])
+        print(f"the flight is {options.save}")  # noqa: T201
+    if options.out or not options.video:
+        page = options.out or Path(tempfile.mkdtemp(prefix="mjxball-")) / "flight.html"
+        write_whole(page, flight_page(*flights).encode())
+        print(f"the page is {page}")  # noqa: T201
+        if not options.out:
+            webbrowser.open(page.as_uri())
+    return 0
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse what does not go together, before anything is flown."""
     if options.port is not None:
         raise InputError("--port is the port of --live; any other page needs no server")
-    for path, suffix in ((options.out, ".html"), (options.save, ".npz")):
+    if options.save and len(options.source) > 1:
+        raise InputError("--save writes one flight: leave one of the two out")
+    if options.speed is not None and not 0.01 <= options.speed <= 100:
+        raise InputError(f"--speed must be 0.01 to 100, not {options.speed:g}")
+    if options.video and options.video.suffix not in VIDEOS:
+        raise InputError(f"--video must end in {' or '.join(VIDEOS)}, not {options.video}")
+    for path, suffix in ((options.out, ".html"), (options.save, ".npz"), (options.video, None)):
         if path:
-            output_file(path, suffix)
-    given = {name: getattr(options, name) for name in CHANGES if getattr(options, name) is not None}
-    flight = flight_from(options.source, given, options.physics, options.plant, options.hidden)
-    if options.save:
-        save_flight(options.save, flight)
-        print(f"the flight is {options.save}")  # noqa: T201
-    page = options.out or Path(tempfile.mkdtemp(prefix="mjxball-")) / "flight.html"
-    write_whole(page, flight_page(flight).encode())
-    print(f"the page is {page}")  # noqa: T201
-    if not options.out:
-        webbrowser.open(page.as_uri())
-    return 0
+            output_file(path, suffix or path.suffix)
+
+
+def _video(flights: Sequence[Flight], suffix: str, speed: float) -> bytes:
+    from mjxball.evaluate.render import render
+
+    labels = [flight.title.partition(":")[0].partition(",")[0] for flight in flights]
+    if len(set(labels)) < len(labels):
+        labels = [f"{label} {number}" for number, label in enumerate(labels, 1)]
+    shown = {label: flight.arrays for label, flight in zip(labels, flights, strict=True)}
+    return render([flight.plant for flight in flights], shown, suffix, speed=speed)
 
 
 def _follow(options: argparse.Namespace) -> int:
     from mjxball.view.live import follow
 
+    if len(options.source) > 1:
+        raise InputError("--live follows one log")
     if options.hidden:
         raise InputError("--hidden is of a flight that has ended: leave it out of --live")
-    if options.out or options.save:
-        raise InputError("--live writes no file; play the log with --out or --save once the flight has ended")
-    path, port = Path(options.source), options.port or 0
+    if options.out or options.save or options.video:
+        raise InputError("--live writes no file; play the log with --out, --save or --video once the flight has ended")
+    path, port = Path(options.source[0]), options.port or 0
     if not 0 <= port <= 65535:
         raise InputError(f"--port must be 1 to 65535, not {port}")
     if not path.absolute().parent.is_dir():

@@ -27,6 +27,7 @@ from mjxball.files import write_whole
 from mjxball.policy.container import read_arrays
 from mjxball.policy.file import policy_path
 from mjxball.reading import check_times, parse_json
+from mjxball.view.marks import Mark, marks_of_log, read_marks
 
 if TYPE_CHECKING:
     from mjxball.sim.rollout import Trajectory
@@ -65,6 +66,7 @@ class Flight:
     title: str
     plant: Plant
     arrays: dict[str, np.ndarray]
+    marks: tuple[Mark, ...] = ()  # of a flight that was really flown
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.arrays[name]
@@ -78,7 +80,7 @@ def flight_of(trajectory: Trajectory, plant: Plant, title: str, hidden: np.ndarr
 
 def save_flight(path: str | os.PathLike[str], flight: Flight) -> None:
     """Write `flight` to `path`, whole or not at all."""
-    about = {"format": FORMAT, "title": flight.title, "plant": configs.to_dict(flight.plant)}
+    about = {"format": FORMAT, "title": flight.title, "plant": configs.to_dict(flight.plant), "marks": flight.marks}
     stream = BytesIO()
     arrays: dict[str, Any] = {name: array.astype(np.float32) for name, array in flight.arrays.items() if name != "time"}
     np.savez_compressed(stream, about=np.array(json.dumps(about)), time=flight["time"], **arrays)
@@ -94,9 +96,10 @@ def load_flight(path: str | os.PathLike[str]) -> Flight:
             raise ValueError
         title = str(about["title"])
         plant = configs.from_record({"plant": about["plant"]}).plant
-    except (KeyError, TypeError, ValueError, RecursionError):
+        marks = read_marks(about.get("marks", []))
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError):
         raise InputError(f"{path} is not a flight that this version reads") from None
-    return check_flight(Flight(title[:200], plant, arrays), str(path))
+    return check_flight(Flight(title[:200], plant, arrays, marks), str(path))
 
 
 def check_flight(flight: Flight, name: str) -> Flight:
@@ -120,7 +123,7 @@ def check_flight(flight: Flight, name: str) -> Flight:
         raise InputError(f"{name}: time must increase from row to row: {error}") from None
     for phrase in told:
         print(f"warning: {name}: {phrase}", file=sys.stderr)  # noqa: T201
-    return Flight(flight.title, flight.plant, {field: flight[field] for field in wanted})
+    return dataclasses.replace(flight, arrays={field: flight[field] for field in wanted})
 
 
 def is_flight(path: Path) -> bool:
@@ -189,7 +192,8 @@ def read_log(path: Path) -> Flight:
         **({"hidden": np.nan_to_num(recording.hidden)} if recording.hidden.shape[1] else {}),
     }
     title = f"{recording.policy}, flown (ball and contact forces were not measured)"
-    return check_flight(Flight(title, recording.config.plant, arrays), str(path))
+    marks = marks_of_log(path, float(recording.time[-1]))
+    return check_flight(Flight(title, recording.config.plant, arrays, marks), str(path))
 
 
 def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | None, hidden: bool) -> Flight:

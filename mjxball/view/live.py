@@ -57,13 +57,14 @@ class LiveView:
             log = self._log
             total = len(log.rows) if len(log.rows) > 1 else 0  # a plot needs two
             rows = log.rows[after : min(total, after + BATCH)]
-            text, level, ended, plant = log.text, log.level, log.ended, log.plant
+            text, level, ended, plant = log.status.text, log.status.level, log.status.ended, log.plant
+            marks = [mark._asdict() for mark in log.marks]
             self.last_request, self.all_sent = now, ended and after + len(rows) >= total
         silent = now - self._last_news
         if plant and not ended and silent > SILENCE:
             text, level = f"nothing new for {silent:.0f} s; last: {text}", "bad"
         arrays = {name: packed(column) for name, column in columns(rows).items()}
-        known = {"text": text, "level": level, "ended": ended, "plant": plant}
+        known = {"text": text, "level": level, "ended": ended, "plant": plant, "marks": marks}
         return {**known, "total": total, "rows": len(rows), "arrays": arrays}
 
 
@@ -161,10 +162,10 @@ def _watch(view: LiveView, log: LiveLog, leave: threading.Event, attached: bool)
     announced = False
     while True:
         busy = view.update()
-        if log.ended and not announced and not attached:
+        if log.status.ended and not announced and not attached:
             announced = True
-            print(f"{log.text}; Ctrl-C ends the view", flush=True)  # noqa: T201
-        if leave.wait(0 if busy and not log.ended else PERIOD):
+            print(f"{log.status.text}; Ctrl-C ends the view", flush=True)  # noqa: T201
+        if leave.wait(0 if busy and not log.status.ended else PERIOD):
             return
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,8 @@ from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
 from mjxball.fly.recording import LONGEST, FirmwareSetup
-from mjxball.fly.supervisor import FAULTS, State
 from mjxball.fly.telemetry import Rig, object_state
+from mjxball.view.marks import FlightStatus, Mark, placed
 from mjxball.view.page import plant_of
 
 # A row, in this order: name and number of values, in SI units.
@@ -29,42 +28,44 @@ COLUMNS = {
     "leader_command": 3,
     "follower_command": 3,
     "target": 3,
-    "error": 3,
     "thrust": 2,
     "battery": 2,
     "late": 1,
 }
 STEP = 0.04  # [s] between two rows at least: nobody sees more while it happens
 NO_LAW = (0.0, 0.0, 0.0)
-SEVERITY = {state.value: state.severity for state in State}
-FAULT_NAMES = {event.name for event in FAULTS}
 
 
 class LiveLog:
-    """A log that is being written. `update` reads on; `rows`, `text`, `level` and `ended` say what is known."""
+    """A log that is being written. `update` reads on; `rows` and `status` say what is known."""
 
     def __init__(self, path: Path):
         """Follow the log `path`, which need not exist yet."""
         self.path = path
         self.rows: list[list[float]] = []
         self.plant: dict[str, Any] | None = None  # None: the log has not begun
-        self.text = f"waiting for {path.name}"
-        self.level = "busy"  # good: the laws are in command; bad: a fault
-        self.ended = False
+        self.status = FlightStatus(f"waiting for {path.name}")
         self._tail = Tail(path)
         self._newest: list[DroneState | None] = [None, None]
         self._start: float | None = None
-        self._why = ""
+        self._firmware: FirmwareSetup  # once the log has begun
 
     def update(self) -> bool:
         """Read what was added, a chunk at most; true if there was something. Raises InputError: no flight log."""
         records = self._tail.read()
         for record in records or ():
+            self.status.take(record)
             self._take(record)
-        if self._tail.misplaced and self.level != "bad":
-            self.level, self._why = "bad", self._tail.misplaced
-            self.text = f"the log cannot be placed in time: {self._why}"
+        if self._tail.misplaced:
+            self.status.fail(self._tail.misplaced)
         return records is not None
+
+    @property
+    def marks(self) -> tuple[Mark, ...]:
+        """On the time axis of `rows`."""
+        if self._start is None or not self.rows:
+            return ()
+        return placed(self.status.marks, self._start, self.rows[-1][0])
 
     def close(self) -> None:
         """Close the log."""
@@ -77,8 +78,9 @@ class LiveLog:
             self._newest[NAMES.index(record["drone"])] = record["raw"].state
         elif record["kind"] == "tick":
             self._tick(record)
-        else:
-            self._note(record["kind"], record)
+        elif record["kind"] == "thrust":
+            self._firmware = self._firmware.after(record, self._config)
+            self._curves = self._firmware.force_curves(self._config)
 
     def _begin(self, header: Record) -> None:
         self._config, self._firmware = header["config"], FirmwareSetup.of_header(header)
@@ -89,10 +91,8 @@ class LiveLog:
         known = [own.map.curve for one in variants(self._config) for own in one.values()]
         strongest = max(curve.force(packets.THRUST_CEILING) for curve in (*self._curves, *known))
         self.plant = {**plant_of(plant), "thrust": strongest}
-        self.text = "connecting and checking"
 
     def _tick(self, record: Record) -> None:
-        self._state(record["state"])
         seen = [state for state in self._newest if state is not None]
         now = record["t"]
         self._start = now if self._start is None else self._start
@@ -110,45 +110,11 @@ class LiveLog:
             "leader_command": record.get("leader", NO_LAW),
             "follower_command": record.get("follower", NO_LAW),
             "target": record["goal"],
-            "error": record["goal"] - pair.position,
             "thrust": thrust,
             "battery": [state.battery for state in seen],
             "late": record.get("late", 0.0),
         }
         self.rows.append([float(value) for name in COLUMNS for value in np.ravel(values[name])])
-
-    def _state(self, name: str) -> None:
-        """What the supervisor does, and why once it is on the way down."""
-        if self.ended:
-            return
-        self.text = f"{name}: {self._why}" if self._why else name
-        if self.level != "bad":
-            self.level = "good" if name in (State.FLY.value, State.LAND.value) else "busy"
-
-    def _note(self, kind: str, record: Record) -> None:
-        """Note anything but states and ticks."""
-        if kind == "thrust":
-            self._firmware = self._firmware.after(record, self._config)
-            self._curves = self._firmware.force_curves(self._config)
-        elif kind == "check":
-            self.text = f"{'good' if record['passed'] else 'BAD'}: {record['name']}: {record['found']}"
-        elif kind == "transition":
-            self._transition(record["after"], record["events"])
-        elif kind == "refused":
-            self.ended, self.level, self.text = True, "bad", f"refused: {record['text']}"
-        elif kind == "end":
-            why = f": {self._why}" if self._why else ""
-            self.ended, self.text = True, f"the flight has ended, exit code {record['code']}{why}"
-            self.level = "bad" if record["code"] else "busy"
-
-    def _transition(self, after: str, events: Sequence[str]) -> None:
-        severity = SEVERITY.get(after, 0)
-        causes = [event for event in events if event.partition(":")[0] in FAULT_NAMES]
-        if causes:
-            self.level = "bad"
-        if causes or (severity > State.FLY.severity and events):
-            self._why = self._why or (causes or events)[0].lower().replace("_", " ")
-        self._state(after)
 
 
 def columns(rows: list[list[float]]) -> dict[str, np.ndarray]:

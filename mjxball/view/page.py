@@ -18,12 +18,13 @@ from mjxball.view.flight import Flight
 
 PARTS = Path(__file__).parent / "parts"
 UNMEASURED = ("cg_offset", "object_mass", "contact_force")  # in a flight log
-SCRIPTS = ("space.js", "scene.js", "plots.js", "player.js")
+SHOWN = ("time", "position", "euler", "quaternion", "leader_command", "follower_command", "target", "hidden")
+SCRIPTS = ("space.js", "flight.js", "scene.js", "plots.js", "player.js", "controls.js")
 
 
-def flight_page(flight: Flight) -> str:
-    """The page's text; the flight is inside, as float32."""
-    return _page(flight.title, page_contents(flight), "recorded.js")
+def flight_page(*flights: Flight) -> str:
+    """The page's text; the flights, one or two side by side, are inside, as float32."""
+    return _page(" | ".join(flight.title for flight in flights), [page_contents(one) for one in flights], "recorded.js")
 
 
 def live_page(title: str, token: str) -> str:
@@ -45,16 +46,16 @@ def _page(title: str, data: Any, start: str) -> str:
 
 
 def page_contents(flight: Flight) -> dict[str, Any]:
-    """The JSON inside the page of `flight`: title, packed arrays, and the plant that is drawn."""
-    thrust = flight["rotor_force"].sum(axis=-1)
-    shown = {**flight.arrays, "thrust": thrust, "error": flight["target"] - flight["position"]}
-    if not flight["contact_force"].any():  # whatever is carried pushes: these zeros stand for what nobody measured
-        shown = {name: array for name, array in shown.items() if name not in UNMEASURED}
+    """The JSON inside the page of `flight`: title, packed arrays, marks, and the plant that is drawn."""
+    shown = {name: flight[name] for name in SHOWN if name in flight.arrays}
+    if flight["contact_force"].any():  # whatever is carried pushes: zeros stand for what nobody measured
+        shown |= {name: flight[name] for name in UNMEASURED}
     return {
         "title": flight.title,
         "rows": len(flight["time"]),
-        "arrays": {name: packed(array) for name, array in shown.items() if name != "rotor_force"},
+        "arrays": {name: packed(array) for name, array in (shown | {"thrust": flight["rotor_force"].sum(-1)}).items()},
         "plant": plant_of(flight.plant),
+        "marks": [mark._asdict() for mark in flight.marks],
     }
 
 

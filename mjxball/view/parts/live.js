@@ -1,11 +1,9 @@
 // A flight that is being flown: asks the server for new rows, and stays at the newest until somebody looks back.
 class LivePlayer extends Player {
   grow(answer) {
-    const { flight } = this, there = this.row === flight.rows - 1 && !this.playing;
-    flight.grow(answer);
-    this.recipes().forEach(({ series }, k) => this.plots[k].grow(flight.time, series));
-    this.scene.fit();
-    this.seeker.max = flight.rows - 1;
+    const there = this.now >= this.last && !this.playing;
+    this.panes[0].flight.grow(answer);
+    this.fit();
     if (there) this.seek(Infinity); else this.draw();
   }
 }
@@ -13,15 +11,13 @@ class LivePlayer extends Player {
 class Live {
   constructor(token) {
     Object.assign(this, { token, rows: 0 });
-    this.status = document.createElement('p');
+    this.status = element('p');
     this.status.id = 'status';
-    document.querySelector('.view').before(this.status);
-    this.newest = document.createElement('button');
+    document.getElementById('views').before(this.status);
+    this.newest = element('button', 'now');
     this.newest.id = 'newest';
-    this.newest.textContent = 'now';
     this.newest.onclick = () => { if (player) { if (player.playing) player.toggle(); player.seek(Infinity); } };
     document.querySelector('.transport').append(this.newest);
-    document.getElementById('now-cg').parentElement.hidden = true;
     document.getElementById('width').value = '20';
     this.ask();
   }
@@ -45,7 +41,7 @@ class Live {
       return;
     }
     this.tell(answer.text, answer.level);
-    if (answer.rows) this.take(answer);
+    this.take(answer);
     if (answer.ended && this.rows === answer.total) return;
     // A slow browser asks less often: most of its time is its own.
     const spent = performance.now() - begun;
@@ -54,10 +50,11 @@ class Live {
 
   take(answer) {
     this.rows += answer.rows;
-    if (player) player.grow(answer);
-    else { player = new LivePlayer(new Flight(answer)); player.seek(Infinity); }
+    const news = answer.rows || answer.marks.length !== player?.panes[0].flight.marks.length;
+    if (player && news) player.grow(answer);
+    else if (answer.rows) { player = new LivePlayer([new Flight(answer)]); player.seek(Infinity); }
   }
 }
 
 let player;
-const live = new Live(JSON.parse(document.getElementById('flight').textContent).token);
+const live = canDraw() && new Live(JSON.parse(document.getElementById('flight').textContent).token);

@@ -1,234 +1,228 @@
-// The player: reads the flight, moves the time, and keeps scene, plots and controls together.
-class Flight {
-  constructor({ rows, arrays, plant }) {
-    this.rows = rows;
-    this.plant = plant;
-    this.arrays = {};
-    for (const [name, text] of Object.entries(arrays)) this.arrays[name] = Flight.unpacked(text);
-    this.time = this.arrays.time;
+// The player: one clock and one camera for all flights, and what is seen of each: a scene, numbers, marks and plots.
+
+// The array that each part of a scene is drawn from.
+const NEEDED = { thrust: 'thrust', contact: 'contact_force', weight: 'object_mass', path: 'position' };
+const DEGREES = 180 / Math.PI;
+
+// What is plotted of the arrays that a flight has.
+function recipes(flight) {
+  const line = (name, its, value, dash) => ({ name, colour: its, value, dash });
+  const { leader, axes: along } = flight.plant;
+  const drones = flight.plant.drones.map(({ name }, drone) => [name, flight.colour(drone)]);
+  const command = (index, factor) => drones.map(([name, its], drone) => (drone === leader
+    ? line(name, its, (row) => factor * flight.get('leader_command', row, index), [5, 3])
+    : line(name, its, (row) => factor
+      * flight.get('follower_command', row, 3 * (drone < leader ? drone : drone - 1) + index))));
+  const of = (array) => drones.map(([name, its], k) => line(name, its, (row) => flight.get(array, row, k)));
+  const found = [];
+  const plot = (needed, title, unit, series) => {
+    if (flight.has(needed)) found.push({ title, unit, series: series() });
+  };
+  plot('target', 'Error to the goal', 'm', () => ['x', 'y', 'z'].map((name, k) =>
+    line(name, name, (row) => flight.error(row, k))));
+  plot('cg_offset', 'CG from the centre', 'cm', () => along.map((axis, k) => {
+    const [name, its] = along.length === 1 ? ['offset', 'cg'] : ['xy'[axis], 'xy'[axis]];
+    return line(name, its, (row) => 100 * flight.get('cg_offset', row, k));
+  }));
+  plot('euler', 'Attitude', '°', () => ['roll', 'pitch', 'yaw'].map((name, k) =>
+    line(name, 'xyz'[k], (row) => DEGREES * flight.get('euler', row, k))));
+  plot('leader_command', 'Commanded pitch', '°', () => command(1, DEGREES));
+  plot('leader_command', 'Commanded roll', '°', () => command(0, DEGREES));
+  plot('leader_command', 'Commanded vertical acceleration', 'm/s²', () => command(2, 1));
+  plot('thrust', 'Thrust', 'N', () => of('thrust'));
+  plot('contact_force', 'Contact force on the object', 'N', () =>
+    drones.map(([name, its], drone) => line(name, its, (row) => flight.push(row, drone))));
+  plot('hidden', 'What the follower’s network remembers', 'units, −1 blue to 1 red', () =>
+    [{ name: '', colour: 'none', array: 'hidden', units: flight.width('hidden'), value: () => 0 }]);
+  plot('battery', 'Battery', 'V', () => of('battery'));
+  plot('late', 'Lateness of the loop', 'ms', () =>
+    [line('late', 'weight', (row) => 1000 * flight.get('late', row, 0))]);
+  return found;
+}
+
+// One flight on the page.
+class Pane {
+  constructor(flight, player) {
+    this.flight = flight;
+    const view = document.getElementById('view').content.cloneNode(true).firstElementChild;
+    document.getElementById('views').append(view);
+    view.querySelector('h2').textContent = flight.title;
+    this.tell = (name, text) => { view.querySelector(`.now-${name}`).textContent = text; };
+    view.querySelector('.now-cg').parentElement.hidden = !flight.has('cg_offset');
+    this.phase = view.querySelector('.now-phase').parentElement;
+    this.scene = new Scene(view.querySelector('canvas'), flight, player.camera, player.shown);
+    this.marks = element('div', '', 'marks');
+    document.getElementById('marks').append(this.marks);
   }
 
-  static unpacked(text) {
-    return new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
+  // The marks on the time axis, which goes from `from` to `to`.
+  mark(from, to, player) {
+    const { marks } = this.flight, phases = marks.filter(({ kind }) => kind === 'phase');
+    const share = (time) => 100 * clamp((time - from) / (to - from), 0, 1);
+    this.marks.hidden = !marks.length;
+    this.marks.replaceChildren(...marks.map((mark) => {
+      const made = element('span', mark.kind === 'phase' ? mark.text : '', `${mark.kind} ${mark.level}`);
+      const next = phases[phases.indexOf(mark) + 1];
+      made.title = `${mark.time.toFixed(1)} s: ${mark.text}`;
+      made.style.left = `${share(mark.time)}%`;
+      if (mark.kind === 'phase') {
+        made.style.width = `${share(next ? next.time : this.flight.last) - share(mark.time)}%`;
+      }
+      made.onclick = () => player.seek(mark.time);
+      return made;
+    }));
   }
 
-  // Rows that came later, packed alike.
-  grow({ rows, arrays }) {
-    for (const [name, text] of Object.entries(arrays)) {
-      const before = this.arrays[name], added = Flight.unpacked(text), all = new Float32Array(before.length + added.length);
-      all.set(before);
-      all.set(added, before.length);
-      this.arrays[name] = all;
+  draw(now) {
+    this.scene.draw(this.flight.rowAt(now));
+    this.plots.forEach((plot) => plot.draw(now));
+  }
+
+  // The numbers of the moment.
+  read(now) {
+    const { flight } = this, row = flight.rowAt(now), phase = flight.markAt('phase', now);
+    const [roll, pitch] = flight.at('euler', row);
+    this.tell('error', `${Math.hypot(...[0, 1, 2].map((k) => flight.error(row, k))).toFixed(3)} m`);
+    this.tell('tilt', `${(DEGREES * Math.hypot(roll, pitch)).toFixed(1)}°`);
+    if (flight.has('cg_offset')) {
+      const offset = flight.at('cg_offset', row).map((c) => (100 * c).toFixed(1).replace('-', '−'));
+      this.tell('cg', `${offset.join(', ')} cm`);
     }
-    this.rows += rows;
-    this.time = this.arrays.time;
-  }
-
-  // A flight that is being flown knows no CG, object mass or contact force.
-  has(name) { return name in this.arrays; }
-
-  // Row `row` of the array `name`, flat.
-  at(name, row) {
-    const array = this.arrays[name], width = array.length / this.rows;
-    return Array.from(array.subarray(row * width, (row + 1) * width));
-  }
-
-  column(name, index, factor = 1) {
-    const array = this.arrays[name], width = array.length / this.rows;
-    return Float32Array.from({ length: this.rows }, (_, row) => factor * array[row * width + index]);
-  }
-
-  largest(name) { return this.arrays[name].reduce((most, value) => Math.max(most, Math.abs(value)), 1e-6); }
-
-  largestContact() {
-    let most = 1e-6;
-    for (let row = 0; row < this.rows; row++) {
-      const force = this.at('contact_force', row);
-      for (let k = 0; k < force.length; k += 3) most = Math.max(most, length(force.slice(k, k + 3)));
-    }
-    return most;
-  }
-
-  // Of drone number `drone`, in the scene and in the plots.
-  colour(drone) {
-    const { leader } = this.plant;
-    return drone === leader ? COLOURS.leader : FOLLOWERS[(drone < leader ? drone : drone - 1) % FOLLOWERS.length];
-  }
-
-  bounds() {
-    const low = [Infinity, Infinity, Infinity], high = low.map((v) => -v);
-    for (const name of ['position', 'target']) {
-      this.arrays[name].forEach((value, k) => {
-        low[k % 3] = Math.min(low[k % 3], value);
-        high[k % 3] = Math.max(high[k % 3], value);
-      });
-    }
-    return { low, high };
-  }
-
-  // Some of the places where the object is, or should be.
-  places() {
-    const every = Math.ceil(this.rows / 200), found = [];
-    for (let row = 0; row < this.rows; row += every) found.push(this.at('position', row), this.at('target', row));
-    return found;
-  }
-
-  rowAt(time) {
-    let low = 0, high = this.rows - 1;
-    while (low < high) {
-      const middle = (low + high + 1) >> 1;
-      if (this.time[middle] <= time + 1e-6) low = middle; else high = middle - 1;
-    }
-    return low;
+    this.phase.hidden = !phase;
+    if (phase) this.tell('phase', phase.text);
+    this.plots.forEach((plot) => plot.read(row));
   }
 }
 
-// The array that each part of the scene is drawn from.
-const NEEDED = { thrust: 'thrust', contact: 'contact_force', weight: 'object_mass', path: 'position' };
-
 class Player {
-  constructor(flight) {
-    Object.assign(this, { flight, playing: false, now: flight.time[0] });
-    this.scene = new Scene(document.getElementById('scene'), flight);
-    this.play = document.getElementById('play');
-    this.seeker = document.getElementById('seek');
-    this.speed = document.getElementById('speed');
-    this.width = document.getElementById('width');
-    this.width.onchange = () => this.draw();
-    this.seeker.max = flight.rows - 1;
-    this.plots = this.makePlots();
+  constructor(flights) {
+    Object.assign(this, { camera: new Camera(), shown: {}, playing: false });
+    for (const name of ['play', 'seek', 'speed', 'width', 'time']) {
+      this[`${name}Control`] = document.getElementById(name);
+    }
+    document.querySelector('main').classList.toggle('pair', flights.length > 1);
+    this.panes = flights.map((flight) => new Pane(flight, this));
+    this.makePlots();
     this.makeToggles();
-    document.getElementById('now-cg').parentElement.hidden = !flight.has('cg_offset');
-    this.play.onclick = () => this.toggle();
-    this.seeker.oninput = () => this.seek(flight.time[+this.seeker.value]);
-    this.listen();
+    this.widthControl.onchange = () => this.draw();
+    this.playControl.onclick = () => this.toggle();
+    this.seekControl.oninput = () => this.seek(+this.seekControl.value);
+    this.panes.forEach(({ scene }) => listen(scene, this));
+    document.addEventListener('keydown', (event) => keyed(event, this));
+    document.addEventListener('theme', () => this.draw());
+    document.addEventListener('scroll', () => this.draw(), true);  // plots that are out of sight are not drawn
     new ResizeObserver(() => this.draw()).observe(document.body);
-    this.seek(this.now);
+    this.fit();
+    this.seek(this.first);
   }
 
+  get first() { return Math.min(...this.panes.map(({ flight }) => flight.first)); }
+
+  get last() { return Math.max(...this.panes.map(({ flight }) => flight.last)); }
+
+  // Plots of the same kind stand side by side.
   makePlots() {
-    const parent = document.getElementById('plots');
-    return this.recipes().map(({ title, unit, series }) =>
-      new (series[0].rows ? Strips : Plot)(parent, title, unit, this.flight.time, series, (time) => this.seek(time)));
-  }
-
-  // What is plotted of the arrays that the flight has.
-  recipes() {
-    const { flight } = this, degrees = 180 / Math.PI;
-    const line = (name, colour, values, dash) => ({ name, colour, values, dash });
-    const axes = ['#c92a2a', '#2b8a3e', '#1864ab'];
-    const { leader, axes: along } = flight.plant;
-    const drones = flight.plant.drones.map(({ name }, drone) => [name, flight.colour(drone)]);
-    const command = (index, factor) => drones.map(([name, colour], drone) => (drone === leader
-      ? line(name, colour, flight.column('leader_command', index, factor), [5, 3])
-      : line(name, colour, flight.column('follower_command', 3 * (drone < leader ? drone : drone - 1) + index, factor))));
-    const push = (drone) => Float32Array.from({ length: flight.rows }, (_, row) =>
-      length(flight.at('contact_force', row).slice(3 * drone, 3 * drone + 3)));
-    const of = (name) => drones.map(([drone, colour], k) => line(drone, colour, flight.column(name, k)));
-    const found = [];
-    const plot = (needed, title, unit, series) => { if (flight.has(needed)) found.push({ title, unit, series: series() }); };
-    plot('error', 'Error to the goal', 'm', () => ['x', 'y', 'z'].map((name, k) => line(name, axes[k], flight.column('error', k))));
-    plot('cg_offset', 'CG from the centre', 'cm', () => (along.length === 1
-      ? [line('offset', COLOURS.cg, flight.column('cg_offset', 0, 100))]
-      : along.map((axis, k) => line('xy'[axis], axes[axis], flight.column('cg_offset', k, 100)))));
-    plot('euler', 'Attitude', '°', () => ['roll', 'pitch', 'yaw'].map((name, k) => line(name, axes[k], flight.column('euler', k, degrees))));
-    plot('leader_command', 'Commanded pitch', '°', () => command(1, degrees));
-    plot('leader_command', 'Commanded roll', '°', () => command(0, degrees));
-    plot('leader_command', 'Commanded vertical acceleration', 'm/s²', () => command(2, 1));
-    plot('thrust', 'Thrust', 'N', () => of('thrust'));
-    plot('contact_force', 'Contact force on the object', 'N', () => drones.map(([name, colour], k) => line(name, colour, push(k))));
-    plot('hidden', 'What the follower’s network remembers', 'units, −1 blue to 1 red', () => [{
-      name: '', colour: 'transparent', values: flight.arrays.hidden, rows: flight.arrays.hidden.length / flight.rows }]);
-    plot('battery', 'Battery', 'V', () => of('battery'));
-    plot('late', 'Lateness of the loop', 'ms', () => [line('late', COLOURS.weight, flight.column('late', 0, 1000))]);
-    return found;
-  }
-
-  makeToggles() {
-    const parent = document.getElementById('shown'), { reach } = this.scene;
-    const scaleOf = (kind) => `${short(0.1 / reach[kind])} N per 10 cm`;
-    const labels = { thrust: `thrust, ${scaleOf('thrust')}`, contact: `contact forces, ${scaleOf('contact')}`, weight: 'object’s weight at the CG', path: 'path' };
-    for (const [kind, text] of Object.entries(labels)) {
-      if (!this.flight.has(NEEDED[kind])) continue;
-      const label = element('label'), box = element('input');
-      Object.assign(box, { type: 'checkbox', checked: true, id: `show-${kind}` });
-      box.onchange = (event) => { this.scene.shown[kind] = event.target.checked; this.draw(); };
-      label.append(box, swatch(COLOURS[kind]), text);
-      parent.append(label);
+    const parent = document.getElementById('plots'), peers = {};
+    const found = this.panes.map(({ flight }) => recipes(flight));
+    const titles = new Set(found.flat().map(({ title }) => title));
+    this.panes.forEach((pane) => { pane.plots = []; });
+    for (const title of titles) {
+      found.forEach((own, k) => {
+        const { flight, plots } = this.panes[k], recipe = own.find((one) => one.title === title);
+        peers[title] ||= [];
+        const kind = recipe?.series[0].units ? Strips : Plot;
+        if (recipe) plots.push(new kind(parent, recipe, flight, peers[title], this));
+        else parent.append(element('div'));
+      });
     }
   }
 
-  listen() {
-    const { canvas, camera } = this.scene, fingers = new Map();
-    const apart = () => { const [a, b] = [...fingers.values()]; return Math.hypot(a[0] - b[0], a[1] - b[1]); };
-    canvas.addEventListener('pointerdown', (event) => {
-      fingers.set(event.pointerId, [event.clientX, event.clientY]);
-      canvas.setPointerCapture(event.pointerId);
-    });
-    canvas.addEventListener('pointermove', (event) => {
-      const last = fingers.get(event.pointerId);
-      if (!last) return;
-      const before = fingers.size === 2 ? apart() : 0;
-      fingers.set(event.pointerId, [event.clientX, event.clientY]);
-      if (fingers.size === 1) camera.turn(event.clientX - last[0], event.clientY - last[1]);
-      else if (fingers.size === 2 && before > 0) camera.zoom(before / Math.max(apart(), 1));
-      this.draw();
-    });
-    for (const name of ['pointerup', 'pointercancel']) canvas.addEventListener(name, (event) => fingers.delete(event.pointerId));
-    canvas.addEventListener('wheel', (event) => { event.preventDefault(); camera.zoom(Math.exp(0.001 * event.deltaY)); this.draw(); }, { passive: false });
-    canvas.addEventListener('dblclick', () => { camera.reset(); this.draw(); });
-    document.addEventListener('keydown', (event) => {
-      if (event.target.matches('input, select, button')) return;
-      if (event.key === ' ') { event.preventDefault(); this.toggle(); }
-      if (event.key === 'ArrowRight') this.seek(this.now + 0.1);
-      if (event.key === 'ArrowLeft') this.seek(this.now - 0.1);
-    });
+  makeToggles() {
+    const parent = document.getElementById('shown'), { reach } = this.world();
+    const scale = (kind) => `${short(0.1 / reach[kind])} N per 10 cm`;
+    const labels = {
+      thrust: () => `thrust, ${scale('thrust')}`,
+      contact: () => `contact forces, ${scale('contact')}`,
+      weight: () => `weight, ${scale('contact')}`,
+      path: () => 'path',
+    };
+    const toggle = (id, checked, change, ...contents) => {
+      const label = element('label'), box = element('input');
+      Object.assign(box, { type: 'checkbox', checked, id });
+      box.onchange = () => { change(box.checked); this.draw(); };
+      label.append(box, ...contents);
+      parent.append(label);
+      return box;
+    };
+    this.followControl = toggle('follow', false, (on) => this.follow(on), 'follow the rig');
+    for (const [kind, text] of Object.entries(labels)) {
+      if (!this.panes.some(({ flight }) => flight.has(NEEDED[kind]))) continue;
+      this.shown[kind] = true;
+      toggle(`show-${kind}`, true, (on) => { this.shown[kind] = on; }, swatch(kind), text());
+    }
+  }
+
+  world() { return surroundings(this.panes.map(({ flight }) => flight), this.camera); }
+
+  // Put the camera where all of the flights are seen, but leave how somebody has turned and zoomed.
+  fit() {
+    const world = this.world(), { camera } = this, zoomed = camera.distance / camera.home.distance;
+    camera.home.distance = world.distance;
+    camera.distance = zoomed * world.distance;
+    this.panes.forEach((pane) => { pane.scene.world = world; });
+    Object.assign(this.seekControl, { min: this.first, max: this.last });
+    this.panes.forEach((pane) => pane.mark(this.first, this.last, this));
+  }
+
+  // The rig comes to the middle; once it is left, the picture stays.
+  follow(on) {
+    const { camera, panes: [{ scene, flight }] } = this, row = flight.rowAt(this.now);
+    const before = scene.target(row);
+    camera.follow = on;
+    camera.pan = on ? [0, 0, 0] : add(camera.pan, sub(before, scene.target(row)));
+    this.followControl.checked = on;
+    this.draw();
   }
 
   toggle() {
     this.playing = !this.playing;
-    const { time, rows } = this.flight;
-    if (this.playing && this.row === rows - 1) this.seek(time[0]);
-    this.play.textContent = this.playing ? '❚❚' : '▶';
-    this.play.setAttribute('aria-label', this.playing ? 'pause' : 'play');
-    this.last = undefined;
+    if (this.playing && this.now >= this.last) this.seek(this.first);
+    this.playControl.textContent = this.playing ? '❚❚' : '▶';
+    this.playControl.setAttribute('aria-label', this.playing ? 'pause' : 'play');
+    this.stamp = undefined;
     if (this.playing) requestAnimationFrame((stamp) => this.frame(stamp));
   }
 
   frame(stamp) {
     if (!this.playing) return;
-    const passed = this.last === undefined ? 0 : Math.min(0.25, (stamp - this.last) / 1000);
-    this.last = stamp;
-    this.seek(this.now + passed * +this.speed.value);
-    if (this.row === this.flight.rows - 1) this.toggle();
+    const passed = this.stamp === undefined ? 0 : Math.min(0.25, (stamp - this.stamp) / 1000);
+    this.stamp = stamp;
+    this.seek(this.now + passed * +this.speedControl.value);
+    if (this.now >= this.last) this.toggle();
     else requestAnimationFrame((next) => this.frame(next));
   }
 
   seek(time) {
-    const { flight } = this;
-    this.now = Math.max(flight.time[0], Math.min(flight.time[flight.rows - 1], time));
-    this.row = flight.rowAt(this.now);
-    this.seeker.value = this.row;
+    this.now = clamp(time, this.first, this.last);
+    this.seekControl.value = this.now;
     this.draw();
   }
 
   // The plots show the whole flight, or some seconds around now.
   span() {
-    const { time, rows } = this.flight, wanted = +this.width.value, first = time[0], last = time[rows - 1];
+    const wanted = +this.widthControl.value, { first, last } = this, plots = this.panes.flatMap((pane) => pane.plots);
     const from = wanted ? Math.max(first, Math.min(this.now - wanted / 2, last - wanted)) : first;
-    this.plots.forEach((plot) => plot.span(from, wanted ? Math.min(last, from + wanted) : last));
+    const to = wanted ? Math.min(last, from + wanted) : last;
+    const rows = this.panes.reduce((sum, { flight }) => sum + flight.rows, 0), of = `${from} ${to} ${rows}`;
+    if (this.spanned !== of) plots.forEach((plot) => plot.span(from, to));
+    this.spanned = of;
+    plots.forEach((plot) => plot.range());
   }
 
   draw() {
-    const { flight, row } = this, euler = flight.at('euler', row);
-    const tilt = Math.hypot(euler[0], euler[1]) * 180 / Math.PI;
-    const tell = (name, text) => { document.getElementById(`now-${name}`).textContent = text; };
-    tell('time', `${flight.time[row].toFixed(2)} s`);
-    tell('error', `${length(flight.at('error', row)).toFixed(3)} m`);
-    tell('tilt', `${tilt.toFixed(1)}°`);
-    if (flight.has('cg_offset')) tell('cg', `${flight.at('cg_offset', row).map((c) => (100 * c).toFixed(1).replace('-', '−')).join(', ')} cm`);
     this.span();
-    this.scene.draw(row);
-    this.plots.forEach((plot) => plot.draw(row));
+    this.panes.forEach((pane) => pane.draw(this.now));
+    this.timeControl.textContent = `${this.now.toFixed(2)} s`;
+    this.panes.forEach((pane) => pane.read(this.now));
   }
 }

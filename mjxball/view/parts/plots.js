@@ -13,76 +13,123 @@ function ticks(low, high, count) {
 const short = (value) => String(+value.toPrecision(3)).replace('-', '−');
 
 // Names are text: nothing is written as HTML.
-function element(kind, text = '') {
+function element(kind, text = '', className = '') {
   const made = document.createElement(kind);
   made.textContent = text;
+  made.className = className;
   return made;
 }
 
-function swatch(colour) {
-  const made = element('i');
-  made.className = 'swatch';
-  made.style.background = colour;
+function swatch(name) {
+  const made = element('i', '', 'swatch');
+  made.style.background = `var(--${name})`;
   return made;
 }
 
 class Plot {
-  // series: [{ name, colour, values, dash }]
-  constructor(parent, title, unit, time, series, seek) {
-    Object.assign(this, { time, series });
-    const block = document.createElement('div');
-    block.className = 'plot';
-    const head = element('h2', `${title} `), legend = element('div');
+  // series: [{ name, colour, value, dash }], where value(row) is a number. `peers` are the plots of the same kind, of
+  // several flights, which have one y-range: that of what is seen, unless it is pinned.
+  constructor(parent, { title, unit, series }, flight, peers, player) {
+    Object.assign(this, { series, flight, peers });
+    const block = element('div', '', 'plot'), head = element('h3', `${title} `), legend = element('div', '', 'legend');
+    this.pin = element('button', 'pin', 'pin');
+    this.pin.title = 'keep this y-range';
+    this.pin.onclick = () => {
+      const pinned = !this.pinned;
+      peers.forEach((plot) => plot.keep(pinned));
+      player.draw();
+    };
     head.append(element('small', `[${unit}]`));
-    legend.className = 'legend';
     this.canvas = element('canvas');
-    block.append(head, legend, this.canvas);
+    block.append(this.pin, head, legend, this.canvas);
     parent.append(block);
-    this.readouts = series.map(({ name, colour }) => {
+    this.readouts = series.map(({ name, colour: its }) => {
       const label = element('span'), value = element('b');
-      label.append(swatch(colour), `${name} `, value);
+      label.append(swatch(its), `${name} `, value);
       legend.append(label);
       return value;
     });
-    this.range();
-    this.span(time[0], time[time.length - 1]);
+    peers.push(this);
+    this.keep(false);
     const move = (event) => {
       if (event.type === 'pointermove' && !event.buttons) return;
       const box = this.canvas.getBoundingClientRect();
       const share = (event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT);
-      seek(this.from + Math.max(0, Math.min(1, share)) * (this.to - this.from));
+      player.seek(this.from + clamp(share, 0, 1) * (this.to - this.from));
     };
     this.canvas.addEventListener('pointerdown', move);
     this.canvas.addEventListener('pointermove', move);
   }
 
-  // The same lines, longer.
-  grow(time, series) {
-    Object.assign(this, { time, series, size: '' });
-    this.range();
+  keep(pinned) {
+    this.pinned = pinned;
+    this.pin.setAttribute('aria-pressed', pinned);
   }
 
-  range() {
+  // Show the time from `from` to `to` [s].
+  span(from, to) {
+    [this.from, this.to] = [from, to];
+    const { time, rows } = this.flight;
+    // One row more on both sides, so that lines go on to the edges.
+    let first = this.flight.rowAt(from), last = this.flight.rowAt(to);
+    if (time[first] < from && first < last) first += 1;
+    if (time[last] > to && first < last) last -= 1;
+    this.rows = [Math.max(0, first - 1), Math.min(rows - 1, last + 1)];
+    [this.least, this.most] = this.extent(first, last);
+  }
+
+  // Lowest and highest value of some rows.
+  extent(first, last) {
     let low = Infinity, high = -Infinity;
-    for (const { values } of this.series) for (const v of values) { low = Math.min(low, v); high = Math.max(high, v); }
+    for (const { value } of this.series) {
+      for (let row = first; row <= last; row++) {
+        const v = value(row);
+        if (v < low) low = v;
+        if (v > high) high = v;
+      }
+    }
+    return [low, high];
+  }
+
+  // Call once all peers have their span.
+  range() {
+    if (this.pinned) return;
+    const low = Math.min(...this.peers.map((plot) => plot.least));
+    const high = Math.max(...this.peers.map((plot) => plot.most));
     const margin = Math.max(0.06 * (high - low), 1e-3 * Math.max(Math.abs(low), Math.abs(high)), 1e-6);
     [this.low, this.high] = [low - margin, high + margin];
   }
 
-  // Show the time from `from` to `to` [s].
-  span(from, to) { [this.from, this.to] = [from, to]; }
+  // The line of `value`: of the rows that fall on one pixel the lowest and the highest.
+  trace(c, value, x, y, ratio) {
+    let place, low, high;
+    const end = () => { c.lineTo(place, y(low)); if (high !== low) c.lineTo(place, y(high)); };
+    c.beginPath();
+    for (let row = this.rows[0]; row <= this.rows[1]; row++) {
+      const v = value(row), here = Math.round(x(this.flight.time[row]) * ratio) / ratio;
+      if (here === place) {
+        if (v < low) low = v;
+        if (v > high) high = v;
+        continue;
+      }
+      if (place !== undefined) end();
+      [place, low, high] = [here, v, v];
+    }
+    end();
+    c.stroke();
+  }
 
-  // The lines are drawn once for each size of the canvas and each span.
+  // The lines are drawn once for each size of the canvas, span and range.
   still(width, height, ratio) {
     const picture = document.createElement('canvas');
-    [picture.width, picture.height] = [width * ratio, height * ratio];
-    const c = picture.getContext('2d'), { time, low, high, from, to } = this;
+    [picture.width, picture.height] = [Math.round(width * ratio), Math.round(height * ratio)];
+    const c = picture.getContext('2d'), { low, high, from, to } = this;
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.x = (t) => LEFT + (width - LEFT - RIGHT) * (t - from) / (to - from);
     const y = (v) => TOP + (height - TOP - BOTTOM) * (high - v) / (high - low);
     c.font = '11px system-ui, sans-serif';
-    c.fillStyle = '#5c6670';
-    c.strokeStyle = '#e3e8ec';
+    c.fillStyle = colour('soft');
+    c.strokeStyle = colour('grid');
     c.textAlign = 'right';
     c.textBaseline = 'middle';
     for (const v of ticks(low, high, 3)) {
@@ -91,61 +138,74 @@ class Plot {
     }
     c.textAlign = 'center';
     const marks = ticks(from, to, Math.max(2, width / 90));
-    marks.forEach((t, k) => c.fillText(short(t) + (k === marks.length - 1 ? ' s' : ''), Math.min(this.x(t), width - 14), height - 7));
+    marks.forEach((t, k) => {
+      c.fillText(short(t) + (k === marks.length - 1 ? ' s' : ''), Math.min(this.x(t), width - 14), height - 7);
+    });
     c.beginPath(); c.rect(LEFT, 0, width - LEFT - RIGHT, height); c.clip();
+    const phasesFirst = [...this.flight.marks].sort((a, b) => (b.kind === 'phase') - (a.kind === 'phase'));
+    for (const { time, kind, level } of phasesFirst) {
+      c.strokeStyle = colour(kind === 'phase' ? 'line' : level || 'bad');
+      c.setLineDash(kind === 'phase' ? [2, 3] : []);
+      c.beginPath(); c.moveTo(this.x(time), TOP); c.lineTo(this.x(time), height - BOTTOM); c.stroke();
+    }
     c.lineWidth = 1.5;
-    c.lineJoin = 'round';
-    for (const { values, colour, dash } of this.series.filter(({ rows }) => !rows)) {
-      c.strokeStyle = colour;
+    c.lineJoin = 'bevel';
+    for (const { value, colour: its, dash, units } of this.series) {
+      if (units) continue;
+      c.strokeStyle = colour(its);
       c.setLineDash(dash || []);
-      c.beginPath();
-      for (let k = 0; k < time.length; k++) {
-        if (time[k] >= from - 0.1 && time[k] <= to + 0.1) c.lineTo(this.x(time[k]), y(values[k]));
-      }
-      c.stroke();
+      this.trace(c, value, this.x, y, ratio);
     }
     return picture;
   }
 
-  draw(row) {
-    const { canvas } = this, ratio = window.devicePixelRatio || 1;
-    const width = canvas.clientWidth, height = canvas.clientHeight;
-    if (!width) return;
-    const size = `${width} ${height} ${ratio} ${this.from} ${this.to}`;
-    if (this.size !== size) {
-      this.size = size;
+  draw(now) {
+    const { canvas, flight } = this, ratio = window.devicePixelRatio || 1;
+    const { width, height, top, bottom } = canvas.getBoundingClientRect();
+    if (!width || bottom < 0 || top > window.innerHeight) return;  // scrolled away
+    const { from, to, low, high } = this, { rows, marks } = flight;
+    const of = String([width, height, ratio, from, to, low, high, rows, marks.length, colour('ink')]);
+    if (this.of !== of) {
+      this.of = of;
       this.picture = this.still(width, height, ratio);
       [canvas.width, canvas.height] = [this.picture.width, this.picture.height];
     }
-    const c = canvas.getContext('2d');
+    const c = canvas.getContext('2d'), x = this.x(clamp(now, this.from, this.to));
     c.setTransform(1, 0, 0, 1, 0, 0);
     c.clearRect(0, 0, canvas.width, canvas.height);
     c.drawImage(this.picture, 0, 0);
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
-    c.strokeStyle = '#1d2329';
-    c.beginPath(); c.moveTo(this.x(this.time[row]), TOP); c.lineTo(this.x(this.time[row]), height - BOTTOM); c.stroke();
-    this.series.forEach(({ values, rows }, k) => { this.readouts[k].textContent = rows ? '' : short(values[row]); });
+    c.strokeStyle = colour('ink');
+    c.beginPath(); c.moveTo(x, TOP); c.lineTo(x, height - BOTTOM); c.stroke();
+  }
+
+  // The numbers of the legend. Call once all is drawn: to write text between two drawings would lay the page out twice.
+  read(row) {
+    this.series.forEach(({ value, units }, k) => { this.readouts[k].textContent = units ? '' : short(value(row)); });
   }
 }
 
 // Many values from -1 to 1 over time, one row of colour each: red is positive, blue negative.
 class Strips extends Plot {
-  range() { [this.low, this.high] = [0, this.series[0].rows]; }
+  extent() { return [0, this.series[0].units]; }
 
   still(width, height, ratio) {
-    const [{ rows, values }] = this.series, { time, from, to } = this;
+    const [{ units, array }] = this.series, { flight, from, to } = this;
     const picture = super.still(width, height, ratio), c = picture.getContext('2d');
-    const tall = (height - TOP - BOTTOM) / rows, wide = Math.ceil(width - LEFT - RIGHT);
-    let row = 0;
+    const wide = Math.ceil(width - LEFT - RIGHT), image = new ImageData(wide, units), values = flight.arrays[array];
     for (let x = 0; x < wide; x++) {
-      const now = from + (to - from) * x / wide;
-      while (row < time.length - 1 && time[row + 1] <= now) row++;
-      for (let unit = 0; unit < rows; unit++) {
-        const value = values[row * rows + unit], shade = Math.round(235 * (1 - Math.min(1, Math.abs(value))));
-        c.fillStyle = value > 0 ? `rgb(235 ${shade} ${shade})` : `rgb(${shade} ${shade} 235)`;
-        c.fillRect(LEFT + x, TOP + (rows - 1 - unit) * tall, 1.5, tall + 0.5);
+      const row = flight.rowAt(from + (to - from) * x / wide);
+      for (let unit = 0; unit < units; unit++) {
+        const value = values[row * units + unit], shade = 235 * (1 - Math.min(1, Math.abs(value)));
+        const pixel = [value > 0 ? 235 : shade, shade, value > 0 ? shade : 235, 255];
+        image.data.set(pixel, 4 * (x + wide * (units - 1 - unit)));
       }
     }
+    const small = document.createElement('canvas');
+    [small.width, small.height] = [wide, units];
+    small.getContext('2d').putImageData(image, 0, 0);
+    c.imageSmoothingEnabled = false;
+    c.drawImage(small, LEFT, TOP, wide, height - TOP - BOTTOM);
     return picture;
   }
 }

@@ -1,2 +1,3 @@
-// A recorded flight is in the page.
-const player = new Player(new Flight(JSON.parse(document.getElementById('flight').textContent)));
+// Recorded flights are in the page.
+const told = JSON.parse(document.getElementById('flight').textContent);
+const player = canDraw() && new Player(told.map((one) => new Flight(one)));

@@ -1,45 +1,63 @@
 // The scene: faces, lines and arrows, sorted by depth and drawn on a plain 2D canvas.
-const COLOURS = {
-  leader: '#2563a8', goal: '#2f9e44', cg: '#e0a800', thrust: '#0c8599', contact: '#c2255c',
-  weight: '#868e96', path: '#8fa1b3',
-};
-// Of several followers, one after the other.
-const FOLLOWERS = ['#d9730d', '#9c36b5', '#0ca678', '#e03131', '#7a5c3e', '#66a80f', '#495057', '#f06595'];
 const LIGHT = [0.36, -0.48, 0.8];
+const THRUST = 0.3, CONTACT = 0.4, GOAL = 0.1;  // arrows of the largest forces and the goal's ring [m], of a rig of
+const RIG = 0.36;  // this radius or more; smaller ones have smaller ones
 
-function shaded(colour, light, alpha) {
-  const mix = [1, 3, 5].map((k) => Math.round(parseInt(colour.slice(k, k + 2), 16) * (0.62 + 0.38 * light)));
+// Colours have a name, and are what the style sheet says of it in the theme of the moment.
+const palette = new Map();
+function colour(name) {
+  if (!palette.has(name)) {
+    const probe = document.getElementById('probe');
+    probe.style.color = '';
+    probe.style.color = `var(--${name})`;
+    palette.set(name, getComputedStyle(probe).color);
+  }
+  return palette.get(name);
+}
+
+function shaded(name, light, alpha) {
+  const mix = colour(name).match(/[\d.]+/g).slice(0, 3).map((value) => Math.round(value * (0.62 + 0.38 * light)));
   return `rgba(${mix.join(',')},${alpha})`;
 }
 
+// What several flights share, so that they are seen from one place and their arrows have one scale.
+function surroundings(flights, camera) {
+  const bounds = flights.map((flight) => flight.bounds());
+  const low = [0, 1, 2].map((k) => Math.min(...bounds.map((one) => one.low[k])));
+  const high = [0, 1, 2].map((k) => Math.max(...bounds.map((one) => one.high[k])));
+  const middle = times(0.5, add(low, high));
+  const drones = flights.flatMap(({ plant }) => plant.drones);
+  const rig = Math.max(...drones.map(({ mount, arm }) => length(mount) + 1.6 * arm));
+  const places = flights.flatMap((flight) => flight.places()).map((place) => sub(place, middle));
+  const size = Math.min(1, rig / RIG), arrows = places.map((place) => add(place, [0, 0, size * THRUST]));
+  const touching = flights.filter((flight) => flight.has('contact_force'));
+  return {
+    middle,
+    floor: Math.min(low[2] - 0.25, -0.25),
+    extent: Math.max(high[0] - low[0], high[1] - low[1]) / 2 + 0.5,
+    goal: size * GOAL,
+    distance: camera.whole([...places, ...arrows], rig),
+    // [m/N]; of a flight that goes on, for the largest that there can be.
+    reach: {
+      thrust: size * THRUST / Math.max(...flights.map((flight) => flight.plant.thrust || flight.largest('thrust'))),
+      contact: touching.length ? size * CONTACT / Math.max(...touching.map((flight) => flight.largestContact())) : 0,
+    },
+  };
+}
+
 class Scene {
-  constructor(canvas, flight) {
-    this.canvas = canvas;
-    this.context = canvas.getContext('2d');
-    this.flight = flight;
-    this.shown = { thrust: true, contact: flight.has('contact_force'), weight: flight.has('object_mass'), path: true };
-    this.camera = new Camera([0, 0, 0], 1);
-    this.fit();
-    // Arrows: this long [m] for the largest of its kind; of a flight that goes on, for the largest that there can be.
-    this.reach = {
-      thrust: 0.3 / (flight.plant.thrust || flight.largest('thrust')),
-      contact: flight.has('contact_force') ? 0.4 / flight.largestContact() : 0,
-    };
+  // `shown` says which parts are drawn; it and the camera belong to all scenes.
+  constructor(canvas, flight, camera, shown) {
+    Object.assign(this, { canvas, flight, camera, shown, context: canvas.getContext('2d') });
   }
 
-  // Put the camera where all of the flight is seen, but leave how somebody has turned and zoomed.
-  fit() {
-    const { low, high } = this.flight.bounds(), { camera } = this, zoomed = camera.distance / camera.home.distance;
-    this.middle = times(0.5, add(low, high));
-    this.floor = Math.min(low[2] - 0.25, -0.25);
-    const places = this.flight.places().map((place) => sub(place, this.middle));
-    const rig = Math.max(...this.flight.plant.drones.map(({ mount, arm }) => length(mount) + 1.6 * arm));
-    Object.assign(camera.home, { target: this.middle, distance: camera.whole(places, rig) });
-    Object.assign(camera, { target: this.middle, distance: zoomed * camera.home.distance });
-  }
+  has(kind) { return this.shown[kind] && this.flight.has(NEEDED[kind]); }
+
+  // What the camera orbits.
+  target(row) { return this.camera.follow ? this.flight.at('position', row) : this.world.middle; }
 
   draw(row) {
-    const { canvas, context, camera } = this, ratio = window.devicePixelRatio || 1;
+    const { canvas, context } = this, ratio = window.devicePixelRatio || 1;
     const width = canvas.clientWidth, height = canvas.clientHeight;
     if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
       canvas.width = Math.round(width * ratio);
@@ -47,35 +65,38 @@ class Scene {
     }
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     const sky = context.createLinearGradient(0, 0, 0, height);
-    sky.addColorStop(0, '#ffffff');
-    sky.addColorStop(1, '#e9eef3');
+    sky.addColorStop(0, colour('sky-high'));
+    sky.addColorStop(1, colour('sky-low'));
     context.fillStyle = sky;
     context.fillRect(0, 0, width, height);
-    camera.aim(width, height);
+    this.lens = new Lens(this.camera, this.target(row), width, height);
     this.parts = [];
     this.ground();
     this.paint();
+    // Whatever the load's depth: neither the goal nor the path hides it.
     this.goal(row);
-    if (this.shown.path) this.path(row);
+    if (this.has('path')) this.path(row);
+    this.paint();
     this.team(row);
     this.paint();
     this.arrows(row);
     if (this.flight.has('cg_offset')) this.centreOfGravity(row);
     this.paint();
+    this.scales(row, height);
   }
 
-  face(points, colour, alpha = 1, edge = 'rgba(30,40,50,0.35)') {
+  face(points, name, alpha = 1) {
     const normal = cross(sub(points[1], points[0]), sub(points[2], points[0])), size = length(normal) || 1;
-    this.parts.push({ points, fill: shaded(colour, Math.abs(dot(normal, LIGHT)) / size, alpha), edge });
+    this.parts.push({ points, fill: shaded(name, Math.abs(dot(normal, LIGHT)) / size, alpha), edge: colour('edge') });
   }
 
-  line(points, colour, width = 1, dash = []) { this.parts.push({ points, line: colour, width, dash }); }
+  line(points, style, width = 1, dash = []) { this.parts.push({ points, line: style, width, dash }); }
 
-  ball(centre, radius, colour) { this.parts.push({ points: [centre], radius, colour }); }
+  ball(centre, radius, name) { this.parts.push({ points: [centre], radius, name }); }
 
   paint() {
     for (const part of this.parts) {
-      part.seen = part.points.map((point) => this.camera.project(point));
+      part.seen = part.points.map((point) => this.lens.project(point));
       part.depth = part.seen.reduce((sum, p) => sum + p[2], 0) / part.seen.length;
     }
     this.parts.sort((a, b) => b.depth - a.depth);
@@ -87,10 +108,10 @@ class Scene {
     const c = this.context;
     c.beginPath();
     if (part.radius) {
-      const [x, y, depth] = part.seen[0], r = Math.max(2.5, part.radius * this.camera.focal / depth);
+      const [x, y, depth] = part.seen[0], r = Math.max(2.5, part.radius * this.lens.focal / depth);
       const glow = c.createRadialGradient(x - 0.35 * r, y - 0.35 * r, 0.1 * r, x, y, r);
-      glow.addColorStop(0, shaded(part.colour, 1.9, 1));
-      glow.addColorStop(1, shaded(part.colour, 0.55, 1));
+      glow.addColorStop(0, shaded(part.name, 1.9, 1));
+      glow.addColorStop(1, shaded(part.name, 0.55, 1));
       c.arc(x, y, r, 0, 2 * Math.PI);
       c.fillStyle = glow;
       c.fill();
@@ -110,60 +131,60 @@ class Scene {
   }
 
   ground() {
-    const step = 0.5, z = this.floor, [cx, cy] = this.middle.map((v) => Math.round(v / step) * step), reach = 2.5;
+    const { floor, extent, middle } = this.world, step = [0.5, 1, 2, 5, 10, 20, 50].find((k) => 5 * k >= extent) || 100;
+    const [cx, cy] = middle.map((v) => Math.round(v / step) * step), reach = 5 * step;
     for (let k = -reach; k <= reach; k += step) {
-      this.line([[cx + k, cy - reach, z], [cx + k, cy + reach, z]], '#d5dce3');
-      this.line([[cx - reach, cy + k, z], [cx + reach, cy + k, z]], '#d5dce3');
+      this.line([[cx + k, cy - reach, floor], [cx + k, cy + reach, floor]], colour('grid'));
+      this.line([[cx - reach, cy + k, floor], [cx + reach, cy + k, floor]], colour('grid'));
     }
-    const base = [cx - reach, cy - reach, z];
+    const base = [cx - reach, cy - reach, floor];
     ['x', 'y', 'z'].forEach((name, k) => {
       const tip = [...base];
-      tip[k] += 0.5;
-      this.line([base, tip], ['#c92a2a', '#2b8a3e', '#1864ab'][k], 2);
+      tip[k] += step;
+      this.line([base, tip], colour(name), 2);
     });
   }
 
+  // A thin ring that faces the eye, with four strokes outwards and nothing in its middle, and its foot on the floor.
   goal(row) {
-    const goal = this.flight.at('target', row), foot = [goal[0], goal[1], this.floor];
-    this.line([goal, foot], COLOURS.goal, 1, [4, 4]);
-    this.ball(goal, 0.03, COLOURS.goal);
-    for (const [u, v] of [[0, 1], [1, 2], [0, 2]]) {
-      const ring = [];
-      for (let k = 0; k <= 32; k++) {
-        const point = [...goal];
-        point[u] += 0.08 * Math.cos(k * Math.PI / 16);
-        point[v] += 0.08 * Math.sin(k * Math.PI / 16);
-        ring.push(point);
-      }
-      this.line(ring, COLOURS.goal, 1.2);
+    const goal = this.flight.at('target', row), { right, up } = this.lens, radius = this.world.goal;
+    const around = (share, angle) => add(goal, times(share * radius,
+      add(times(Math.cos(angle), right), times(Math.sin(angle), up))));
+    this.line([goal, [goal[0], goal[1], this.world.floor]], colour('goal'), 1, [4, 4]);
+    this.line(Array.from({ length: 33 }, (_, k) => around(1, k * Math.PI / 16)), colour('goal'), 1.5);
+    for (const angle of [0, 1, 2, 3].map((k) => k * Math.PI / 2)) {
+      this.line([around(0.8, angle), around(1.4, angle)], colour('goal'), 1.5);
     }
   }
 
   path(row) {
-    const points = [], every = Math.max(1, Math.floor(row / 600));
-    for (let k = 0; k < row; k += every) points.push(this.flight.at('position', k));
-    points.push(this.flight.at('position', row));
-    for (let k = 0; k + 1 < points.length; k += 6) this.line(points.slice(k, k + 7), COLOURS.path, 1.6);
+    const points = [];
+    for (const k of this.flight.trail()) {
+      if (k >= row) break;
+      points.push(this.flight.at('position', k));
+    }
     const here = this.flight.at('position', row);
-    this.line([here, [here[0], here[1], this.floor]], '#c3ccd5', 1, [2, 5]);
+    points.push(here);
+    for (let k = 0; k + 1 < points.length; k += 12) this.line(points.slice(k, k + 13), colour('path'), 1.6);
+    this.line([here, [here[0], here[1], this.world.floor]], colour('path'), 1, [2, 5]);
   }
 
   team(row) {
-    const { flight } = this, { size, drones, disc, axes, rim } = flight.plant, plane = axes.length === 2;
+    const { flight } = this, { size, drones, disc, axes: along, rim } = flight.plant, plane = along.length === 2;
     const place = flight.at('position', row), turn = flight.at('quaternion', row);
     const world = (point) => add(place, rotate(turn, point));
     const half = size.map((edge, k) => (plane && k === 2 ? 0.2 : 1) * edge / 2);
-    if (disc) this.disc(world, [0, 0, 0], half[0], '#c8b07a', 0.4);
-    else this.box(world, [0, 0, 0], half, '#c8b07a', 0.4);
-    if (plane && rim) this.line(this.circle(world, [0, 0, half[2]], rim), '#8d6e28', 1.5);
+    if (disc) this.disc(world, [0, 0, 0], half[0], 'object', 0.4);
+    else this.box(world, [0, 0, 0], half, 'object', 0.4);
+    if (plane && rim) this.line(this.circle(world, [0, 0, half[2]], rim), colour('rim'), 1.5);
     drones.forEach(({ mount, rotors, arm }, drone) => {
-      const colour = flight.colour(drone), hub = 0.18 * arm, high = 0.028;
-      if (drones.length > 2) this.line([world([0, 0, 0]), world(mount)], '#a08a55', 3);
-      this.box(world, mount, [hub * 1.3, hub * 1.3, 0.022], colour, 1);
+      const name = flight.colour(drone), hub = 0.18 * arm, high = 0.028;
+      if (drones.length > 2) this.line([world([0, 0, 0]), world(mount)], colour('rim'), 3);
+      this.box(world, mount, [hub * 1.3, hub * 1.3, 0.022], name, 1);
       rotors.forEach(([x, y]) => {
         const tip = add(mount, [x, y, high]);
-        this.line([world(add(mount, [hub * x, hub * y, 0])), world(tip)], shaded(colour, 0, 1), 3);
-        this.disc(world, tip, 0.6 * arm, colour, 0.42);
+        this.line([world(add(mount, [hub * x, hub * y, 0])), world(tip)], shaded(name, 0, 1), 3);
+        this.disc(world, tip, 0.6 * arm, name, 0.42);
       });
     });
   }
@@ -177,7 +198,7 @@ class Scene {
     return found;
   }
 
-  disc(world, centre, radius, colour, alpha) { this.face(this.circle(world, centre, radius), colour, alpha); }
+  disc(world, centre, radius, name, alpha) { this.face(this.circle(world, centre, radius), name, alpha); }
 
   // Where the object's CG is, in body axes.
   offset(row) {
@@ -189,10 +210,10 @@ class Scene {
   // Drawn last: it is inside the object.
   centreOfGravity(row) {
     const { flight } = this, turned = rotate(flight.at('quaternion', row), this.offset(row));
-    this.ball(add(flight.at('position', row), turned), flight.plant.ball, COLOURS.cg);
+    this.ball(add(flight.at('position', row), turned), flight.plant.ball, 'cg');
   }
 
-  box(world, centre, half, colour, alpha) {
+  box(world, centre, half, name, alpha) {
     for (let k = 0; k < 3; k++) {
       for (const side of [-1, 1]) {
         const corners = [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([u, v]) => {
@@ -202,32 +223,36 @@ class Scene {
           point[(k + 2) % 3] = v * half[(k + 2) % 3];
           return world(add(centre, point));
         });
-        this.face(corners, colour, alpha);
+        this.face(corners, name, alpha);
       }
     }
   }
 
   arrows(row) {
-    const { flight } = this, place = flight.at('position', row), turn = flight.at('quaternion', row);
-    const thrust = flight.at('thrust', row), force = this.shown.contact ? flight.at('contact_force', row) : [];
+    const { flight, world: { reach } } = this, place = flight.at('position', row), turn = flight.at('quaternion', row);
+    const thrust = flight.at('thrust', row), force = this.has('contact') ? flight.at('contact_force', row) : [];
     flight.plant.drones.forEach(({ mount }, drone) => {
       const from = add(place, rotate(turn, mount));
-      if (this.shown.thrust) this.arrow(from, rotate(turn, [0, 0, this.reach.thrust * thrust[drone]]), COLOURS.thrust);
-      if (!this.shown.contact) return;
-      const push = times(this.reach.contact, force.slice(3 * drone, 3 * drone + 3));
-      this.arrow(from, rotate(turn, push), COLOURS.contact);
+      if (this.has('thrust')) this.arrow(from, rotate(turn, [0, 0, reach.thrust * thrust[drone]]), 'thrust');
+      if (!this.has('contact')) return;
+      const push = times(reach.contact, force.slice(3 * drone, 3 * drone + 3));
+      this.arrow(from, rotate(turn, push), 'contact');
     });
-    if (!this.shown.weight) return;
+    if (!this.has('weight')) return;
     const weight = flight.plant.gravity * flight.at('object_mass', row)[0];
-    this.arrow(add(place, rotate(turn, this.offset(row))), [0, 0, -this.reach.contact * weight], COLOURS.weight);
+    this.arrow(add(place, rotate(turn, this.offset(row))), [0, 0, -reach.contact * weight], 'weight');
   }
 
-  arrow(from, along, colour) {
-    const c = this.context, [x, y, near] = this.camera.project(from), [u, v, far] = this.camera.project(add(from, along));
-    const size = Math.hypot(u - x, v - y), head = Math.min(11, 0.6 * size);
-    if (near < 0.05 || far < 0.05 || size < 2) return;
+  arrow(from, along, name) {
+    const [x, y, near] = this.lens.project(from), [u, v, far] = this.lens.project(add(from, along));
+    if (near > 0.05 && far > 0.05) this.strokeArrow(x, y, u, v, name);
+  }
+
+  strokeArrow(x, y, u, v, name) {
+    const c = this.context, size = Math.hypot(u - x, v - y), head = Math.min(11, 0.6 * size);
+    if (size < 2) return;
     const [dx, dy] = [(u - x) / size, (v - y) / size];
-    c.strokeStyle = c.fillStyle = colour;
+    c.strokeStyle = c.fillStyle = colour(name);
     c.lineWidth = 3;
     c.beginPath();
     c.moveTo(x, y);
@@ -238,5 +263,39 @@ class Scene {
     c.lineTo(u - head * dx - 0.5 * head * dy, v - head * dy + 0.5 * head * dx);
     c.lineTo(u - head * dx + 0.5 * head * dy, v - head * dy - 0.5 * head * dx);
     c.fill();
+  }
+
+  // For each scale of arrows one arrow of a round force, as long as it would be across the view at the load.
+  bars(row) {
+    const depth = this.lens.project(this.flight.at('position', row))[2], { reach } = this.world;
+    if (depth < 0.05) return [];
+    const bar = (name, metres, text) => {
+      // Round where all scenes look, so that all show the same force.
+      const most = 80 * this.camera.distance / this.lens.focal / metres, power = 10 ** Math.floor(Math.log10(most));
+      const value = [5, 2, 1].map((k) => k * power).find((k) => k <= most);
+      return { name, value, pixels: value * metres * this.lens.focal / depth, text: `${short(value)} ${text}` };
+    };
+    const pushed = ['contact', 'weight'].filter((kind) => this.has(kind));
+    return [
+      ...(this.has('thrust') ? [bar('thrust', reach.thrust, 'N thrust')] : []),
+      ...(pushed.length ? [bar(pushed[0], reach.contact, `N ${pushed.join(', ')}`)] : []),
+      bar('soft', 0.01, 'cm'),
+    ];
+  }
+
+  scales(row, height) {
+    const c = this.context;
+    c.font = '12px system-ui, sans-serif';
+    c.textBaseline = 'middle';
+    this.bars(row).reverse().forEach(({ name, pixels, text }, k) => {
+      const y = height - 14 - 18 * k;
+      if (name === 'soft') {
+        c.fillStyle = colour(name);
+        c.fillRect(10, y - 1, pixels, 2);
+        for (const x of [10, 8 + pixels]) c.fillRect(x, y - 4, 2, 8);
+      } else this.strokeArrow(10, y, 10 + pixels, y, name);
+      c.fillStyle = colour('ink');
+      c.fillText(text, 18 + pixels, y);
+    });
   }
 }

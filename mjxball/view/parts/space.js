@@ -6,6 +6,7 @@ const times = (s, a) => [s * a[0], s * a[1], s * a[2]];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const length = (a) => Math.sqrt(dot(a, a));
+const clamp = (value, low, high) => Math.max(low, Math.min(high, value));
 
 function rotate([w, x, y, z], v) {
   const axis = [x, y, z], t = times(2, cross(axis, v));
@@ -18,32 +19,50 @@ function axes({ azimuth, elevation }) {
   return { back: [ce * ca, ce * sa, se], right: [-sa, ca, 0], up: [-se * ca, -se * sa, ce] };
 }
 
+// How one looks, at whichever scene: it orbits a target, which is moved by `pan`.
 class Camera {
-  constructor(target, distance) {
-    this.home = { target, distance, azimuth: -1.15, elevation: 0.24 };
-    Object.assign(this, this.home);
+  constructor() {
+    this.home = { azimuth: -1.15, elevation: 0.24, distance: 1, pan: [0, 0, 0] };
+    this.follow = false;  // the rig is the target, else the middle of the flight
+    this.reset();
   }
 
   reset() { Object.assign(this, this.home); }
 
   turn(dx, dy) {
     this.azimuth -= 0.008 * dx;
-    this.elevation = Math.max(-0.3, Math.min(1.5, this.elevation + 0.008 * dy));
+    this.elevation = clamp(this.elevation + 0.008 * dy, -0.3, 1.5);
   }
 
-  zoom(factor) { this.distance = Math.max(0.3, Math.min(40, this.distance * factor)); }
+  // By pixels over the focal length: what is at the target's depth goes along with the pointer.
+  slide(dx, dy) { this.pan = add(this.pan, this.across(-dx, -dy, this.distance)); }
 
-  // Distance from which all `points`, given from the target, and what lies flat within `around` of each are seen at home.
+  // What is seen at (dx, dy) from the centre and at the target's depth stays there.
+  zoom(factor, dx = 0, dy = 0) {
+    const before = this.distance;
+    this.distance = clamp(before * factor, 0.3, 40);
+    this.pan = add(this.pan, this.across(dx, dy, before - this.distance));
+  }
+
+  across(dx, dy, depth) {
+    const { right, up } = axes(this);
+    return add(times(dx * depth, right), times(-dy * depth, up));
+  }
+
+  // Distance from which all `points`, given from the target, and what lies flat within `around` of each are seen at
+  // home.
   whole(points, around) {
     const { back, right, up } = axes(this.home);
     return Math.max(...points.map((p) => dot(p, back)
       + Math.max(2.6 * (Math.abs(dot(p, right)) + around), 3.4 * (Math.abs(dot(p, up)) + 0.4 * around))));
   }
+}
 
-  // Call once for each picture of `width` x `height` pixels.
-  aim(width, height) {
-    Object.assign(this, axes(this));
-    this.place = add(this.target, times(this.distance, this.back));
+// What a camera that looks at `target` sees in a picture of `width` x `height` pixels.
+class Lens {
+  constructor(camera, target, width, height) {
+    Object.assign(this, axes(camera));
+    this.place = add(add(target, camera.pan), times(camera.distance, this.back));
     this.focal = 1.25 * Math.min(width, 1.3 * height);
     this.centre = [width / 2, height / 2];
   }
