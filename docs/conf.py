@@ -29,6 +29,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_math_renderer = "mathml"  # the browser's own: no script, no font
 html_copy_source = False
+html_show_search_summary = False  # the search would fetch pages, which browsers refuse for files on disk
 html_last_updated_fmt = None
 
 default_role = "code"

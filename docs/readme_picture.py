@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from mjxball import Scenario, simulate
 from mjxball.baselines import make_baseline
 from mjxball.config import Plant, preset
+from mjxball.plotting import LOOKS
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 from mjxball.scene import Scene
@@ -55,11 +56,12 @@ def main() -> None:
     config = preset("transport")
     scenario = Scenario(omega=OMEGA, amplitude=AMPLITUDE, goal=GOAL, seconds=END)
     followers = []
-    for name, text, colour, law in (
-        ("copy", "PD law alone", (198, 78, 0), make_baseline("copy", config)),
-        ("lqg-offset-free", "classical law", (0, 84, 166), make_baseline("lqg-offset-free", config)),
-        ("balance", "trained network", (0, 146, 108), Policy.load(shipped_policy("balance"))),
+    for name, text, law in (
+        ("copy", "PD law alone", make_baseline("copy", config)),
+        ("lqg-offset-free", "classical law", make_baseline("lqg-offset-free", config)),
+        ("balance", "trained network", Policy.load(shipped_policy("balance"))),
     ):
+        colour = ImageColor.getrgb(LOOKS[name][0])
         flight = simulate(config, law, scenario, "newton-euler")
         rows = np.searchsorted(flight.time, END + SHOWN * (np.arange(FRAMES) / FRAMES - 1))
         error = np.linalg.norm(flight.target - flight.position, axis=-1)

@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from attitude_trials import Body, Trial
+from attitude_trials import simulate as simulate_attitude
 
-from attitude_gains import Body, Trial
-from attitude_gains import simulate as simulate_attitude
 from mjxball.config import Autopilot, Config, preset
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError

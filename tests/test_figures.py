@@ -166,6 +166,7 @@ REFUSED = {
     "seeds": (["--figures", "all", "--seeds", 2], "drop --num-seeds"),
     "check": (["--figures", "all", "--check"], "drop --check"),
     "followers": (["--figures", "all", "--followers", "lqg"], "drop --followers"),
+    "style": (["--suite", "gusts", "--style", "paper"], "--style belongs to figures"),
     "scenario": (["--figures", "all", "--omega", 1], "drop --omega"),
     "mass change": (["--figures", "all", "--mass-change", "1:0.1"], "drop --mass-change"),
     "stiffness": (["--figures", "all", "--wn-pitch", 5], "drop --wn-pitch"),
@@ -192,6 +193,18 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "full" / "figures.html").write_text("kept")
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+def test_figures_of_a_paper_are_pdf_of_a_columns_width(tmp_path: Path) -> None:
+    arrays, card = load_arrays()
+    write_arrays(tmp_path / "curved.npz", arrays, {**card, "curve": CURVE})
+    out = tmp_path / "out"
+    assert call(main, [tmp_path / "curved.npz", "--figures", "reward", "--style", "paper", "--out", out]) == 0
+    assert {path.name for path in out.iterdir()} == {"figures.html", "figure-reward.pdf"}
+    drawn = (out / "figure-reward.pdf").read_bytes()
+    assert b"/FontFile2" in drawn
+    assert b"/MediaBox [ 0 0 252 " in drawn  # 3.5 in
+    assert 'href="figure-reward.pdf"' in (out / "figures.html").read_text()
 
 
 def assert_refused(here: Path, arguments: list[Any], word: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.fly import command, lift
+from mjxball.fly.card import config_of
 from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import STAND_SPARE, Limits, Times
 from mjxball.fly.log_schema import KINDS
@@ -15,6 +16,9 @@ from mjxball.fly.main import make_parser
 from mjxball.fly.mocap_supervision import MocapLimits
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR
 from mjxball.fly.supervisor import TRANSITIONS, Event, State
+from mjxball.fly.twin.conditions import Conditions
+from mjxball.policy import Policy
+from mjxball.policy.file import shipped_policy
 
 
 def log_kinds() -> str:
@@ -78,6 +82,19 @@ def bounds() -> str:
         "no good pose of a drone (motion capture)": f"{MocapLimits().lost:g} s",
     }
     return "\n".join(["| bound | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+
+
+def loads() -> str:
+    """What each shipped policy for two Crazyflies carries on the twin."""
+    lines = ["| policy | object [g] | CG on the twin |", "|---|---|---|"]
+    for name in ("flight", "flight-upgrade", "flight-brushless", "stand"):
+        config = config_of(Policy.load(shipped_policy(name)).card)
+        met = Conditions.of(config)
+        moves = f"a sine of {1000 * met.cg_amplitude:.0f} mm at {met.cg_speed:g} rad/s"
+        if config.motion.kind == "rolling":
+            moves = f"a free ball that starts {100 * met.ball:g} cm from O"
+        lines.append(f"| `{name}` | {1000 * met.object_mass:g} | {moves} |")
+    return "\n".join(lines)
 
 
 FAULTS = Path(__file__).parents[2] / "benchmarks" / "results" / "fly_faults_virtual.json"

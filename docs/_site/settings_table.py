@@ -7,14 +7,7 @@ from typing import Any
 from docutils import nodes
 from sphinx.util.docutils import SphinxDirective
 
-from mjxball.config import Config, leaves
-
-
-def shown(value: Any) -> str:
-    """A default as the command line takes it."""
-    if isinstance(value, tuple):
-        return ",".join(f"{part:g}" for part in value) or "(none)"
-    return f"{value:g}" if isinstance(value, float) else str(value).lower() if isinstance(value, bool) else str(value)
+from mjxball.config import Config, leaves, to_text
 
 
 def row(*cells: list[nodes.Node]) -> nodes.row:
@@ -24,7 +17,7 @@ def row(*cells: list[nodes.Node]) -> nodes.row:
 
 def setting(path: str, value: Any, about: str) -> nodes.row:
     """The line of one setting."""
-    default = nodes.inline("", f"default {shown(value)}", classes=["default"])
+    default = nodes.inline("", f"default {to_text(value) or '(none)'}", classes=["default"])
     return row([nodes.literal("", f"--{path}"), default], [nodes.Text(about)])
 
 

@@ -35,9 +35,11 @@ from mjxball.evaluate.suites import find_suites, list_suites
 from mjxball.evaluate.variants import Suite
 from mjxball.files import write_whole
 from mjxball.physics.step import ENGINES
+from mjxball.plotting import STYLES
 from mjxball.policy import Policy
 from mjxball.policy.file import policy_path, shipped_policies
 from mjxball.sim.scenario import Scenario
+from mjxball.terminal import Status
 from mjxball.train.run_directory import commit, versions
 
 # What `--figures` fixes itself.
@@ -97,6 +99,8 @@ def parser() -> cli.Parser:
     result.add_argument("--num-seeds", "--seeds", type=int, metavar="N", help="of each variant of a suite (default 3)")
     figures = ", ".join(paper_figures.NAMES)
     result.add_argument("--figures", nargs="+", metavar="NAME", help=f"the paper's: {figures}, or all")
+    about = "of figures: screen (default), or paper: PDF of a column's width"
+    result.add_argument("--style", choices=STYLES, default="screen", help=about)
     result.add_argument(
         "--flight", type=Path, metavar="LOG", help="draw a flight log, its commands simulated beside it"
     )
@@ -120,7 +124,13 @@ def main(arguments: list[str] | None = None) -> int:
     """Evaluate; return the exit code."""
     options = parser().parse_args(arguments)
     given = sys.argv[1:] if arguments is None else arguments
-    return cli.run_command(lambda: _evaluate(options, given) if options.flight is None else _flight(options))
+
+    def run() -> int:
+        if options.style != "screen" and (options.out is None or options.suite or options.benchmark):
+            raise InputError("--style belongs to figures of --figures, --flight or a comparison, and needs --out DIR")
+        return _evaluate(options, given) if options.flight is None else _flight(options)
+
+    return cli.run_command(run)
 
 
 def _suites(options: argparse.Namespace) -> list[Suite]:
@@ -189,17 +199,18 @@ def _entry(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.out is None or options.out.suffix != ".json":
         raise InputError("--benchmark needs --out FILE.json, where the entry is written")
     cli.output_file(options.out, ".json")
-    started = time.monotonic()
-
-    def progress(text: str) -> None:
-        print(f"{time.monotonic() - started:6.1f} s  {text}", file=sys.stderr)  # noqa: T201
-
     name, make = entrant(options.benchmark)
-    found = run_entry(name, make, options.tracks or (), options.draw or 0, progress)
+    found = run_entry(name, make, options.tracks or (), options.draw or 0, _clock())
     known = {"command": shlex.join(["python", "eval.py", *arguments]), "commit": commit(), "versions": versions()}
     write_whole(options.out, json.dumps({**found, **known}, indent=1, allow_nan=False) + "\n")
     print(f"{table_of(found)}\nthe entry is {options.out}")  # noqa: T201
     return 0
+
+
+def _clock() -> Callable[[str], None]:
+    """What says on stderr how far it is, and after how long."""
+    started, status = time.monotonic(), Status()
+    return lambda text: status.say(f"{time.monotonic() - started:6.1f} s  {text}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,10 +251,7 @@ def _benchmark(
     baselines = group.baselines(SUITE_BASELINES) if one_plant else []
     followers: list[Follower] = [*baselines, *policies]
     _refuse_same_names([*(follower.name for follower in followers), *(path.stem for path in team)])
-    num_seeds, started = options.num_seeds or 3, time.monotonic()
-
-    def progress(text: str) -> None:
-        print(f"{time.monotonic() - started:6.1f} s  {text}", file=sys.stderr)  # noqa: T201
+    num_seeds = options.num_seeds or 3
 
     def team_followers(known: config.Config) -> list[Follower]:
         """Whoever flies this team: baselines, and policies that were made for such."""
@@ -256,11 +264,11 @@ def _benchmark(
                 found.append(load_policy(path, known))
         return found
 
-    scores = run_benchmark(group.setup, followers, suites, num_seeds, options.physics, progress, team_followers)
+    scores = run_benchmark(group.setup, followers, suites, num_seeds, options.physics, _clock(), team_followers)
     if not scores:
         raise InputError("none of these followers flies the teams of these suites")
     plant = suites[0].variants[0].nominal(group.setup).plant
-    print(text_table(scores))  # noqa: T201
+    print(text_table(scores, suites))  # noqa: T201
     if options.json:
         write_whole(options.json, json.dumps({"scores": [score.record() for score in scores]}, indent=1) + "\n")
     if options.out:
@@ -287,7 +295,7 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
             every += results
         if options.out:
             place = options.out / group.setup.preset if number else options.out
-            write_results(results, place)
+            write_results(results, place, options.style)
             scores, suites = scores_of(results)
             write_report(place, group.setup.plant, scores, suites, policies, command, versions())
             print(f"report.html, figures and cells.json are in {place}")  # noqa: T201
@@ -306,7 +314,7 @@ def _flight(options: argparse.Namespace) -> int:
         raise InputError(f"--flight draws what was flown; drop {what}")
     if options.out is None:
         raise InputError("--flight needs --out DIR, a directory to write to")
-    return evaluate_log(options.flight, options.out)
+    return evaluate_log(options.flight, options.out, options.style)
 
 
 def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
@@ -323,16 +331,22 @@ def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     policies = _load(paths, lambda path: _figure_config(path) or config.preset("paper"), options)
     _refuse_same_names([*LAWS, *(policy.name for policy in policies)])
     paper_figures.check_figures(names, policies)
-    figures, started = [], time.monotonic()
+    figures, say = [], _clock()
     for name in names:
-        figures.append(paper_figures.draw_figure(name, policies, options.physics))
-        print(f"{time.monotonic() - started:6.1f} s  figure {name}", file=sys.stderr)  # noqa: T201
+        figures.append(paper_figures.draw_figure(name, policies, options.physics, options.style))
+        say(f"figure {name}")
     options.out.mkdir(parents=True, exist_ok=True)
+    ending = STYLES[options.style]["savefig.format"]
     for figure in figures:
-        write_whole(options.out / f"figure-{figure.name}.svg", figure.svg)
+        write_whole(options.out / f"figure-{figure.name}.{ending}", figure.picture)
     page = options.out / "figures.html"
     links = [*((figure.name, figure.title) for figure in figures), MADE]
-    context = {"title": "The paper's figures from our flights", "figures": figures, "links": links}
+    context = {
+        "title": "The paper's figures from our flights",
+        "figures": figures,
+        "links": links,
+        "file_format": ending,
+    }
     command = shlex.join(["python", "eval.py", *arguments])
     write_page("figures.html", page, context, policies, command, versions())
     print(f"the figures are in {page}")  # noqa: T201

@@ -15,6 +15,7 @@ from mjxball.evaluate.plots import draw_flights
 from mjxball.evaluate.results import Result, scenario_title
 from mjxball.fly.recording import Recording, fly_again, read_recording
 from mjxball.fly.twin.conditions import Conditions
+from mjxball.plotting import SIMULATED, file_format, style
 from mjxball.sim.rollout import Trajectory
 from mjxball.sim.scenario import Scenario
 
@@ -22,16 +23,17 @@ MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
 DIVERGED = 0.25  # [m] of difference from which on the open-loop simulation is not drawn
 
 
-def evaluate_log(path: Path, out: Path) -> int:
+def evaluate_log(path: Path, out: Path, look: str = "screen") -> int:
     """Draw the log `path` into the new directory `out`, print how far the simulation is from it; the exit code."""
     recording = read_recording(path)
     cli.output_directory(out)
     for remark in recording.remarks:
         print(remark, file=sys.stderr)  # noqa: T201
     recorded = result_of(recording, f"{recording.policy}, flown")
-    simulated = result_of(fly_again(recording), "the same, simulated")
+    simulated = result_of(fly_again(recording), SIMULATED)
     print(differences(recorded, simulated))  # noqa: T201
-    print(f"figure: {draw(recorded, simulated, out)}")  # noqa: T201
+    with style(look):
+        print(f"figure: {draw(recorded, simulated, out)}")  # noqa: T201
     return 0
 
 
@@ -74,9 +76,10 @@ def trajectory_of(recording: Recording) -> Trajectory:
 def draw(recorded: Result, simulated: Result, out: Path) -> Path:
     """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file."""
     out.mkdir(parents=True, exist_ok=True)
-    both = [recorded, _cut(simulated, valid_rows(recorded, simulated))]
-    draw_flights(both, scenario_title(recorded), out / "flight.png")
-    return out / "flight.png"
+    both = [without_goal(recorded), _cut(without_goal(simulated), valid_rows(recorded, simulated))]
+    path = out / f"flight.{'png' if file_format() == 'svg' else file_format()}"
+    draw_flights(both, scenario_title(recorded), path)
+    return path
 
 
 def differences(recorded: Result, simulated: Result) -> str:
@@ -103,6 +106,14 @@ def valid_rows(recorded: Result, simulated: Result) -> int:
     apart = np.linalg.norm(recorded.flight.position - simulated.flight.position, axis=1)
     lost = np.flatnonzero(~(apart < DIVERGED))
     return int(lost[0]) if len(lost) else len(apart)
+
+
+def without_goal(result: Result) -> Result:
+    """`result` without a goal after the last command of a law: what a log holds then was not flown to."""
+    target = np.array(result.flight.target, float)
+    commanded = np.flatnonzero(np.isfinite(result.flight.leader_command).all(axis=-1))
+    target[commanded[-1] + 1 if len(commanded) else len(target) :] = np.nan
+    return dataclasses.replace(result, flight=dataclasses.replace(result.flight, target=target))
 
 
 def _cut(result: Result, rows: int) -> Result:

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 
 from mjxball import config as configs
+from mjxball import terminal
 from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics
-from mjxball.evaluate.results import Result, fly_scenarios, scenario_title
+from mjxball.evaluate.results import COLUMNS, MARK, Result, fly_scenarios, metric_text, scenario_title
 from mjxball.evaluate.variants import Suite, Variant
 
 # What the tables show and rank: less is better in each.
@@ -192,17 +193,21 @@ SHOWN = (  # in the text table
 )
 
 
-def text_table(scores: Sequence[Score]) -> str:
-    """Medians over the seeds, one line for each variant and follower."""
-    heads = ("suite", "variant", "follower")
-    width = [max(len(head), *(len(getattr(score, head)) for score in scores)) for head in heads]
-    lines = [" ".join(f"{head:<{w}}" for head, w in zip(heads, width, strict=True))]
-    lines[0] += "".join(f"{name:>16}" for name in (*SHOWN, "failed"))
+def text_table(scores: Sequence[Score], suites: Sequence[Suite]) -> str:
+    """Medians over the seeds, one line for each variant and follower; `MARK` before those on the reference scenario."""
+    marked = {(suite.name, variant.label) for suite in suites for variant in suite.variants if variant.is_reference}
+    units = {suite.name: suite.axis.partition("[")[2].rstrip("]") for suite in suites}
+    measured = [name for name in SHOWN if any(not np.isnan(score.values(name)).all() for score in scores)]
+    rows = []
     for score in scores:
-        line = " ".join(f"{getattr(score, head):<{w}}" for head, w in zip(heads, width, strict=True))
-        line += "".join(f"{score.summary(name).median:16.4g}" for name in SHOWN)
-        lines.append(line + f"{score.failures:>12}/{len(score.metrics)}")
-    return "\n".join(lines)
+        mark = MARK if (score.suite, score.variant) in marked else ""
+        medians = (metric_text(name, score.summary(name).median) for name in measured)
+        failed = f"{score.failures}/{len(score.metrics)}"
+        variant = f"{score.variant} {units[score.suite]}".strip()
+        rows.append([mark, score.suite, variant, score.follower, failed, *medians])
+    heads = ["", "suite", "variant", "follower", "failed", *(COLUMNS[name][0] for name in measured)]
+    said = f"Medians over the seeds. {MARK} the reference scenario; - there is none; failed: of all seeds, or most do."
+    return f"{terminal.table(heads, rows, names=(1, 2, 3), least=5)}\n{terminal.folded_out(said)}"
 
 
 def scores_of(results: Sequence[Result]) -> tuple[list[Score], list[Suite]]:

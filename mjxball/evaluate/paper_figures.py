@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,16 +13,27 @@ from mjxball import config as configs
 from mjxball.baselines import make_baseline
 from mjxball.control.followers import Follower
 from mjxball.errors import InputError
-from mjxball.evaluate.plots import Figure, as_svg, colours, legend_above, panels, thinned
+from mjxball.evaluate.plots import Figure, distance, panels, thinned
 from mjxball.evaluate.results import Result, fly_scenarios
 from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.evaluate.stand_figure import draw_stand
 from mjxball.evaluate.suites import BY_NAME
-from mjxball.plotting import logarithmic, pyplot
+from mjxball.plotting import (
+    INK,
+    follower_styles,
+    legend_above,
+    line,
+    logarithmic,
+    pyplot,
+    rendered,
+    series_styles,
+    style,
+)
 from mjxball.policy import Policy
 
 NAMES = ("reward", "adaptive", "speeds", "masses", "stand")
-LETTERS = {"font.size": 8, "axes.titlesize": 8.5, "legend.fontsize": 7.5, "legend.handlelength": 1.3}  # [pt]
+LETTERS = {"font.size": 8, "axes.titlesize": 8.5}  # [pt], on a screen
+FOLLOWING = 3.0  # [s], of errors that swing fast
 SWING = 0.01  # [m] on either side of the goal
 LINEAR = 10.0  # returns nearer to 0 are drawn on a linear scale, the others on a logarithmic one
 
@@ -42,8 +53,8 @@ def on_stand(policy: Policy) -> bool:
     return policy.card["plant"].get("stand", "free") != "free"
 
 
-def draw_figure(name: str, policies: Sequence[Policy], physics: str) -> Figure:
-    """Fly and draw the figure `name`; see `check_figures`."""
+def draw_figure(name: str, policies: Sequence[Policy], physics: str, look: str = "screen") -> Figure:
+    """Fly and draw the figure `name` in the style `look`; see `check_figures`."""
     free = [policy for policy in policies if not on_stand(policy)]
     makers: dict[str, Callable[[], Figure]] = {
         "reward": lambda: draw_reward(free or policies),
@@ -52,7 +63,7 @@ def draw_figure(name: str, policies: Sequence[Policy], physics: str) -> Figure:
         "masses": lambda: draw_masses(free, physics),
         "stand": lambda: draw_stand([policy for policy in policies if on_stand(policy)], physics),
     }
-    with pyplot().rc_context(LETTERS):
+    with style(look), pyplot().rc_context(LETTERS if look == "screen" else {}):
         return makers[name]()
 
 
@@ -95,31 +106,30 @@ def draw_reward(policies: Sequence[Policy]) -> Figure:
     from matplotlib.ticker import EngFormatter
 
     curves = [(policy, curve) for policy in policies if (curve := read_curve(policy))]
-    figure, axes = panels([2.0] * max(len(curves), 1))
-    shade, rows = colours([policy.name for policy in policies]), []
+    figure, axes = panels([2.0] * max(len(curves), 1), sharex=False)
+    looks, rows = follower_styles(policy.name for policy in policies), []
     for axis, (policy, curve) in zip(axes[:, 0], curves, strict=False):
         mimics = _reward_kind(policy) == "paper"
-        axis.plot(curve.steps, curve.returns, color="#9a9a9a", linewidth=1, label="exploring")
-        style: dict[str, Any] = {"color": shade[policy.name], "marker": "o", "markersize": 3, "linewidth": 1.1}
-        axis.plot(curve.evaluated_steps, curve.evaluated, label="evaluated, deterministic", **style)
+        axis.plot(curve.steps, curve.returns, color=INK, linewidth=0.8, alpha=0.7, label="exploring")
+        own = {**looks[policy.name], "markersize": 4, "clip_on": False}
+        axis.plot(curve.evaluated_steps, curve.evaluated, label=f"{policy.name}, deterministic", **own)
         if mimics:
-            axis.axhline(0.0, color="black", linestyle=":", linewidth=1, label="optimum: copy the leader")
+            axis.axhline(0.0, color=INK, linestyle=":", linewidth=1, label="optimum: copy the leader")
         logarithmic(axis, "symlog", linthresh=LINEAR)
         axis.set_ylim(top=min(axis.get_ylim()[1], LINEAR / 2))
         axis.xaxis.set_major_formatter(EngFormatter())
-        axis.set(title=policy.name, ylabel="return of an episode")
+        axis.set(title=policy.name, ylabel="return of an episode", xlabel="environment steps")
         last = f"{curve.evaluated[-1]:.4g}" if curve.evaluated else "-"
         ends = (f"{curve.returns[0]:.4g}", f"{curve.returns[-1]:.4g}", last)
         rows.append((policy.name, "paper" if mimics else "task (ours)", f"{curve.steps[-1]:,.0f}", *ends))
     rows += [(p.name, "no training curve in its card", "-", "-", "-", "-") for p in policies if read_curve(p) is None]
-    legend_above(figure, axes[:, 0])
-    axes[-1, 0].set_xlabel("environment steps")
+    legend_above(figure, axes[:, 0], 3)
     caption = (
         "Return of an episode of 1000 steps during training, from the policy files: grey the exploring policy, in "
         "colour the deterministic one. The scale is logarithmic below -10. The optimum of the paper's reward is 0."
     )
     heads = ("follower", "reward", "steps", "first", "last", "last evaluated")
-    return Figure("reward", "Training", 2, as_svg(figure), caption, heads, rows)
+    return Figure("reward", "Training", 2, rendered(figure), caption, heads, rows)
 
 
 def draw_adaptive(policies: Sequence[Policy], physics: str) -> Figure:
@@ -127,9 +137,9 @@ def draw_adaptive(policies: Sequence[Policy], physics: str) -> Figure:
     setup = configs.preset("paper")
     followers: list[Follower] = [make_baseline("copy", setup), make_baseline("adaptive", setup), *policies]
     results = fly_scenarios(setup, followers, [REFERENCE], physics)
-    shade = colours([result.follower for result in results])
-    figure, axes = panels([1.5] * 3)
-    _draw_position(axes[:, 0], results, [{"color": shade[r.follower], "label": r.follower} for r in results])
+    looks = follower_styles(result.follower for result in results)
+    figure, axes = panels([1.3, 1.3, 1.3, 1.7])
+    _draw_flights([*axes[:, 0]], results, [{**line(looks[r.follower]), "label": r.follower} for r in results])
     axes[-1, 0].set_xlabel("time [s]")
     legend_above(figure, axes[:1, 0])
     rows = []
@@ -138,12 +148,13 @@ def draw_adaptive(policies: Sequence[Policy], physics: str) -> Figure:
         percent = "-" if over is None else f"{100 * over:.1f} %"
         rows.append((result.follower, str(swings(result.flight.error)), percent, *_settled(result)))
     caption = (
-        "Position of the object's centre O, goal dotted: CG ±0.05 m at 0.31 rad/s, object of 0.2 kg. The adaptive "
-        "follower is ours; copy is the optimum of the paper's reward. Swings: passages of O from more than 1 cm on one "
-        "side of its goal to more than 1 cm on the other, all axes. Peak: largest error after 20 s."
+        "Position of the object's centre O, goal dotted, and its distance from there: CG ±0.05 m at 0.31 rad/s, "
+        "object of 0.2 kg. The adaptive follower is ours; copy is the optimum of the paper's reward. Swings: passages "
+        "of O from more than 1 cm on one side of its goal to more than 1 cm on the other, all axes. Peak: largest "
+        "error after 20 s."
     )
     heads = ("follower", "swings", "overshoot", "peak", "settles")
-    return Figure("adaptive", "Beside the adaptive controller", 3, as_svg(figure), caption, heads, rows)
+    return Figure("adaptive", "Beside the adaptive controller", 3, rendered(figure), caption, heads, rows)
 
 
 def swings(error: np.ndarray) -> int:
@@ -156,8 +167,11 @@ def draw_speeds(policies: Sequence[Policy], physics: str) -> Figure:
     """Five CG speeds: each policy a column, copying the last one."""
     setup = configs.preset("paper")
     columns = _fly_suite([*policies, make_baseline("copy", setup)], "cg-speed", physics, " rad/s")
-    caption = "Position of O, goal dotted, for five speeds of the CG: ±0.05 m along the rod, object of 0.2 kg."
-    return _variations("speeds", "CG speeds", 4, columns, caption)
+    caption = (
+        "Position of O, goal dotted, and its largest distance from there in the next 3 s, for five speeds of the CG: "
+        "±0.05 m along the rod, object of 0.2 kg."
+    )
+    return _variations("speeds", "CG speeds", 4, columns, caption, FOLLOWING)
 
 
 def draw_masses(policies: Sequence[Policy], physics: str) -> Figure:
@@ -167,8 +181,9 @@ def draw_masses(policies: Sequence[Policy], physics: str) -> Figure:
     titles = ("known mass", "mass changes")
     columns = [(f"{name}, {titles[k % 2]}", results) for k, (name, results) in enumerate(columns)]
     caption = (
-        "Position of O, goal dotted: CG ±0.05 m at 0.31 rad/s. Known: the hover thrust assumes the true mass. Changes: "
-        "mass added to or dropped from 0.2 kg in flight without telling the drones; the leader has no integral term."
+        "Position of O, goal dotted, and its distance from there: CG ±0.05 m at 0.31 rad/s. Known: the hover thrust "
+        "assumes the true mass. Changes: mass added to or dropped from 0.2 kg in flight without telling the drones; "
+        "the leader has no integral term."
     )
     return _variations("masses", "Object masses", 5, columns, caption)
 
@@ -184,32 +199,33 @@ def _fly_suite(followers: Sequence[Any], name: str, physics: str, unit: str = ""
     return [(f.name, list(zip(labels, results[k::count], strict=True))) for k, f in enumerate(followers)]
 
 
-def _variations(name: str, title: str, number: int, columns: Sequence[Column], caption: str) -> Figure:
-    """x, y, z of each column's flights; two columns beside each other, the next ones below."""
+def _variations(
+    name: str, title: str, number: int, columns: Sequence[Column], caption: str, ahead: float = 0.0
+) -> Figure:
+    """x, y, z and error of each column's flights; two columns beside each other, the next ones below."""
     across = min(2, len(columns))
-    figure, axes = panels([0.55, 1.1, 1.1, 1.1] * -(-len(columns) // across), across)
-    shades, rows = pyplot().get_cmap("viridis"), []
-    for k, axis in enumerate(axes.flat):
-        axis.set_visible(k // (4 * across) * across + k % across < len(columns))
-    for k, (head, flown) in enumerate(columns):
-        top = 4 * (k // across)
-        legend_axis, *mine = axes[top : top + 4, k % across]
-        styles = [
-            {"color": shades(0.9 * i / max(len(flown) - 1, 1)), "label": label} for i, (label, _) in enumerate(flown)
-        ]
-        _draw_position(mine, [result for _, result in flown], styles)
-        legend_axis.set_title(head)
-        legend_axis.axis("off")
-        handles = mine[0].get_legend_handles_labels()
-        legend = legend_axis.legend(*handles, loc="center", ncol=1 if len(flown) < 4 else 2, frameon=False)
-        legend.set_in_layout(False)  # it may be wider than its panels
+    figure, axes = panels([0.9, 0.9, 0.9, 1.4] * -(-len(columns) // across), across)
+    looks, rows = series_styles(list(dict.fromkeys(label for _, flown in columns for label, _ in flown))), []
+    places = [axes[4 * (k // across) : 4 * (k // across) + 4, k % across] for k in range(len(columns))]
+    for axis in axes[-4:, 1:].flat if len(columns) % across else []:
+        axis.set_visible(False)
+    for k, (mine, (head, flown)) in enumerate(zip(places, columns, strict=True)):
+        styles = [{**line(looks[label]), "linewidth": 1.0, "label": label} for label, _ in flown]
+        _draw_flights([*mine], [result for _, result in flown], styles, ahead)
+        mine[0].set_title(head)
         for axis in mine if k % across else []:
             axis.set_ylabel("")
         mine[-1].set_xlabel("time [s]")
         mine[-1].tick_params(labelbottom=True)
         rows += [(f"{head}, {label}", *_settled(result), _final(result)) for label, result in flown]
+    errors = [mine[-1] for mine in places]
+    low, high = zip(*(axis.get_ylim() for axis in errors), strict=True)
+    for axis in errors:
+        axis.set_ylim(min(low), max(high))
+        logarithmic(axis)
+    legend_above(figure, [mine[0] for mine in places], 2 if len(looks) > 6 else 3)
     heads = ("flown", "peak after 20 s", "settles", "error at the end")
-    return Figure(name, title, number, as_svg(figure), caption, heads, rows)
+    return Figure(name, title, number, rendered(figure), caption, heads, rows)
 
 
 def _settled(result: Result) -> tuple[str, str]:
@@ -224,15 +240,28 @@ def _final(result: Result) -> str:
     return "-" if result.metrics.failed else f"{np.linalg.norm(result.flight.error[-1]):.3f} m"
 
 
-def _draw_position(axes: Iterable[Any], results: Sequence[Result], styles: Sequence[dict[str, Any]]) -> None:
-    """x, y, z of O over time into three panels, the goal dotted."""
-    for k, axis in enumerate(axes):
+def _draw_flights(
+    axes: Sequence[Any], results: Sequence[Result], styles: Sequence[dict[str, Any]], ahead: float = 0.0
+) -> None:
+    """x, y, z of O over time into three panels, the goal dotted; its distance from there into a fourth."""
+    for k, axis in enumerate(axes[:3]):
         first = results[0].flight
-        axis.plot(first.time, first.target[:, k], color="black", linestyle=":", linewidth=1)
-        for result, style in zip(results, styles, strict=True):
-            rows = thinned(len(result.flight.time))
-            axis.plot(result.flight.time[rows], result.flight.position[rows, k], linewidth=1.1, **style)
+        axis.plot(first.time, first.target[:, k], color=INK, linestyle=":", linewidth=1)
         axis.set_ylabel(f"{'xyz'[k]} [m]")
+    for result, look in zip(results, styles, strict=True):
+        rows = thinned(len(result.flight.time))
+        values = *result.flight.position.T, _following(distance(result.flight), result.flight.time, ahead)
+        for axis, value in zip(axes, values, strict=True):
+            axis.plot(result.flight.time[rows], value[rows], **look)
+    logarithmic(axes[3])
+    axes[3].set_ylabel("error [mm]")
+
+
+def _following(error: np.ndarray, time: np.ndarray, ahead: float) -> np.ndarray:
+    """(T,) the largest of `error` (T,) in the `ahead` [s] from each moment on: no dips where it passes 0."""
+    count = max(round(ahead / (time[1] - time[0])), 1)
+    longer = np.concatenate([error, np.full(count - 1, error[-1])])
+    return np.lib.stride_tricks.sliding_window_view(longer, count).max(axis=1)
 
 
 def _reward_kind(policy: Policy) -> str | None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mjxball import terminal
 from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import Metrics, measure_batch, rotor_limits
@@ -72,49 +73,68 @@ def fly_scenarios(
     return results
 
 
-COLUMNS = (
-    ("rmse", "rmse m", 1.0, 3),
-    ("settling_time", "settle s", 1.0, 2),
-    ("overshoot", "over %", 100.0, 1),
-    ("x_peak", "x-peak m", 1.0, 4),
-    ("y_peak", "y-peak m", 1.0, 4),
-    ("z_peak", "z-peak m", 1.0, 4),
-    ("plane_peak", "plane m", 1.0, 4),
-    ("max_tilt", "tilt deg", 180 / math.pi, 1),
-    ("action_error", "act.err", 1.0, 3),
-    ("rotors_at_limit", "limit %", 100.0, 1),
-    ("rotor_power", "power", 1.0, 3),
-    ("command_spread", "spread deg", 180 / math.pi, 2),
+# Of a table: metric -> its head, factor and digits.
+COLUMNS = {
+    "peak": ("peak\nm", 1.0, 4),
+    "rmse": ("rmse\nm", 1.0, 3),
+    "settling_time": ("settle\ns", 1.0, 2),
+    "overshoot": ("over\n%", 100.0, 1),
+    "x_peak": ("x-peak\nm", 1.0, 4),
+    "y_peak": ("y-peak\nm", 1.0, 4),
+    "z_peak": ("z-peak\nm", 1.0, 4),
+    "plane_peak": ("plane\nm", 1.0, 4),
+    "max_tilt": ("tilt\ndeg", 180 / math.pi, 1),
+    "action_error": ("act.err\n", 1.0, 3),
+    "saturation": ("satur.\n%", 100.0, 1),
+    "rotors_at_limit": ("limit\n%", 100.0, 1),
+    "rotor_power": ("power\nhover=1", 1.0, 3),
+    "command_spread": ("spread\ndeg", 180 / math.pi, 2),
+}
+SHOWN = (
+    *("rmse", "settling_time", "overshoot", "x_peak", "y_peak", "z_peak", "plane_peak", "max_tilt", "action_error"),
+    *("rotors_at_limit", "rotor_power", "command_spread"),
 )
+MARK = "*"  # of what is flown on the reference scenario
+
+
+def metric_text(name: str, value: float | None) -> str:
+    """The metric `name` as tables have it: a dash for none, `never` for a flight that did not settle."""
+    if name == "settling_time" and (value is None or value == math.inf):
+        return "never"
+    if value is None or math.isnan(value):
+        return "-"
+    _, factor, digits = COLUMNS[name]
+    return "failed" if math.isinf(value) else f"{value * factor:.{digits}f}"
 
 
 def table(results: Sequence[Result], reference: Scenario) -> str:
-    """One line per result, a dash where a metric does not exist, and a line that explains them."""
+    """One line per result, and a line that explains them; `MARK` before those on the `reference` scenario."""
     # Where the load moves along a line, the error in the plane is hardly more than along it; a pair has no spread.
     in_plane = any(np.ndim(result.flight.cg_offset) > 1 for result in results)
     several = any(result.metrics.command_spread is not None for result in results)
-    shown = {"plane_peak": in_plane, "command_spread": several}
-    columns = [column for column in COLUMNS if shown.get(column[0], True)]
-    head = ["omega", "ampl.", "mass", "believed", "follower", *(title for _, title, _, _ in columns), ""]
-    rows = [head]
-    for result in results:
-        record = result.record()
-        numbers = (record[key] for key in ("omega", "amplitude", "mass", "believed_mass"))
-        row = [*("-" if number is None else f"{number:g}" for number in numbers), result.follower]
-        for name, _, factor, digits in columns:
-            value = record[name]
-            row.append("-" if value is None else f"{value * factor:.{digits}f}")
-        rows.append([*row, "FAILED" if result.metrics.failed else ""])
-    widths = [max(len(row[i]) for row in rows) for i in range(len(head))]
-    lines = ["  ".join(text.rjust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join([*lines, _legend(reference, results[0].motion)])
+    columns = [name for name in SHOWN if {"plane_peak": in_plane, "command_spread": several}.get(name, True)]
+    conditions = {"omega": "omega\nrad/s", "amplitude": "ampl.\nm", "mass": "mass\nkg", "believed_mass": "believed\nkg"}
+    records = [result.record() for result in results]
+    if all(record["mass"] == record["believed_mass"] for record in records):
+        del conditions["believed_mass"]
+    failed = any(result.metrics.failed for result in results)
+    rows = []
+    for result, record in zip(results, records, strict=True):
+        row = [MARK if result.scenario == reference else ""]
+        row += ["-" if record[name] is None else f"{record[name]:g}" for name in conditions]
+        row += [result.follower, *["FAILED" if result.metrics.failed else ""] * failed]
+        rows.append([*row, *(metric_text(name, record[name]) for name in columns)])
+    words = (1 + len(conditions), 2 + len(conditions))[: 1 + failed]
+    heads = ["", *conditions.values(), "follower", *[""] * failed]
+    shown = terminal.table([*heads, *(COLUMNS[name][0] for name in columns)], rows, names=words, least=len(heads))
+    return f"{shown}\n{terminal.folded_out(_legend(reference, results[0].motion))}"
 
 
 def _legend(reference: Scenario, motion: str) -> str:
     sine = f"omega {reference.omega:g}, ampl. {reference.amplitude:g}, " if motion == "sine" else ""
     return (
-        "x-peak is the largest |error along x| from 20 s on; - says that there is none, or that it never settled; "
-        f"the reference scenario is {sine}mass {reference.mass:g}"
+        "x-peak is the largest |error along x| from 20 s on; - says that there is none; "
+        f"{MARK} the reference scenario, which is {sine}mass {reference.mass:g}"
     )
 
 
@@ -127,13 +147,13 @@ def scenario_title(result: Result) -> str:
     """The scenario in words, as a figure's title."""
     s = result.scenario
     motion = {
-        "sine": f"{s.amplitude:g} m at {s.omega:g} rad/s",
+        "sine": f"{s.amplitude:g} m at {s.omega:g} rad/s" if s.amplitude else "at rest",
         "waveform": "given waveform",
         "rolling": f"rolling ball from {s.ball_start:g} m",
     }
     believed = "" if s.believed_mass is None else f", believed {s.believed_mass:g} kg"
     changes = "".join(f", {mass:+g} kg at {time:g} s" for time, mass in s.mass_changes)
-    return f"CG: {motion[result.motion]}, object {s.mass:g} kg{believed}{changes}"
+    return f"CG {motion[result.motion]}, object {s.mass:g} kg{believed}{changes}"
 
 
 def scenario_stem(result: Result) -> str:

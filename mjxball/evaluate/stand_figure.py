@@ -13,7 +13,8 @@ from mjxball.config import Config, ball_limit
 from mjxball.control import rotations
 from mjxball.control.followers import Follower
 from mjxball.evaluate.metrics import STEADY_AFTER
-from mjxball.evaluate.plots import Figure, as_svg, colours, legend_above, panels, thinned
+from mjxball.evaluate.plots import Figure, panels, thinned
+from mjxball.plotting import INK, follower_styles, legend_above, line, logarithmic, rendered
 from mjxball.policy import Policy
 from mjxball.sim.rollout import Trajectory, check_rate, simulate_batch
 from mjxball.sim.scenario import Scenario
@@ -121,34 +122,33 @@ def draw_stand(policies: Sequence[Policy], physics: str) -> Figure:
         for name, flight in flights.items()
     ]
     caption = (
-        "Height of the leader (goal dotted), roll, the follower's vertical command (its first 2 s may leave the panel) "
+        "Height of the leader (goal dotted), roll, the follower's vertical command (linear within 0.1 m/s²) "
         "and the ball (end stops dotted): two Crazyflies on a stand that frees roll and height, a ball that rolls "
         "freely and is not measured. Left: the leader's gains and thrust law of the paper. Right: a stiffer height "
         "loop and thrust by the motors' curve. copy sees the leader's error, as in the paper, the others the object's."
     )
     heads = ("settings, follower", "roll rms", "ball range", "height off")
-    return Figure("stand", "The experiment on the test stand", 7, _stand_svg(flown), caption, heads, rows)
+    return Figure("stand", "The experiment on the test stand", 7, _picture(flown), caption, heads, rows)
 
 
-def _stand_svg(flown: dict[str, dict[str, StandFlight]]) -> str:
+def _picture(flown: dict[str, dict[str, StandFlight]]) -> bytes:
     figure, axes = panels([1.4] * 4, len(flown))
-    shade = colours([name for flights in flown.values() for name in flights])
+    looks = follower_styles(name for flights in flown.values() for name in flights)
     stop = ball_limit(stand_config().plant)
     for column, (settings, flights) in zip(axes.T, flown.items(), strict=True):
         for axis, lines in zip(column, ((LEVEL,), (0.0,), (), (-stop, stop)), strict=True):
             for value in lines:
-                axis.axhline(value, color="black", linestyle=":", linewidth=1)
+                axis.axhline(value, color=INK, linestyle=":", linewidth=1)
         for name, flight in flights.items():
             rows = thinned(len(flight.time))
             curves = flight.height, np.degrees(flight.roll), flight.vertical, flight.ball
             for axis, curve in zip(column, curves, strict=True):
-                axis.plot(flight.time[rows], curve[rows], color=shade[name], linewidth=1.1, label=name)
-        late = np.concatenate([flight.vertical[flight.time >= 2.0] for flight in flights.values()])
-        column[2].set_ylim(*(1.15 * limit for limit in (min(late.min(), -0.01), max(late.max(), 0.01))))
+                axis.plot(flight.time[rows], curve[rows], label=name, **line(looks[name]))
+        logarithmic(column[2], "symlog", linthresh=0.1)
         column[0].set_title(SETTINGS[settings])
         column[-1].set_xlabel("time [s]")
     labels = ("leader height [m]", "roll [deg]", "follower az [m/s²]", "ball [m]")
     for axis, label in zip(axes[:, 0], labels, strict=True):
         axis.set_ylabel(label)
     legend_above(figure, axes[0])
-    return as_svg(figure)
+    return rendered(figure)

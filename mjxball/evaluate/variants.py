@@ -30,6 +30,12 @@ class Variant:
     known: Mapping[str, Any] = field(default_factory=dict)  # of a team, settings that its followers are made for
     scatter: float = 0.0  # of a team, every drone's numbers are drawn within this share of those that followers know
 
+    @property
+    def is_reference(self) -> bool:
+        """Whether it is the reference scenario itself on the command's plant, which several suites have."""
+        s, changed = self.scenario, bool(self.changes or self.waveform or self.team or self.scatter)
+        return not changed and s.believed_mass in (None, s.mass) and s == Scenario(believed_mass=s.believed_mass)
+
     def nominal(self, base: Config) -> Config:
         """What its followers are made for: `base`, or a team of its own."""
         if not self.team:

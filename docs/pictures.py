@@ -1,0 +1,259 @@
+#!/usr/bin/env python3
+"""Make the still pictures of the pages: `python docs/pictures.py [NAME ...] [--out DIR]`, all without a name.
+
+The pictures `tutorial-*` come from the commands of docs/tutorial.md, run one after the other in a directory of their
+own: some minutes. `viewer` and `tutorial-report` are screenshots and need a Chromium and Playwright.
+docs/readme_picture.py makes the moving picture.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjxball import Policy, Scenario
+from mjxball import config as configs
+from mjxball.baselines import make_baseline
+from mjxball.commands.flight_log import result_of, without_goal
+from mjxball.evaluate.paper_figures import draw_figure
+from mjxball.evaluate.plots import PANELS, draw_flights
+from mjxball.evaluate.results import fly_scenarios, scenario_title
+from mjxball.evaluate.scenarios import REFERENCE
+from mjxball.fly.recording import read_recording
+from mjxball.plotting import INK, legend_above, line, logarithmic, pyplot, save, series_styles
+from mjxball.policy.file import policy_path, shipped_policy
+from mjxball.rig.design import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
+
+REPOSITORY = Path(__file__).parents[1]
+RESULTS = REPOSITORY / "benchmarks" / "results"
+X, Y, Z, ERROR, CG, ROLL, PITCH, VERTICAL = PANELS
+BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
+COLOURS_OF_PNG = 256
+WIDTH = 77  # of quoted lines, which fit the page
+
+
+def flights(names: list[str | Path], scenario: Scenario, path: Path, panels: tuple[Any, ...] = (X, ERROR, CG)) -> None:
+    """Classical followers and policies by their names, or policy files, on one scenario of the preset `transport`."""
+    config = configs.preset("transport")
+    classical = ("copy", "lqg")
+    followers: list[Any] = [
+        make_baseline(str(name), config) if name in classical else Policy.load(policy_path(str(name))) for name in names
+    ]
+    flown = fly_scenarios(config, followers, [scenario], "newton-euler")
+    draw_flights(flown, scenario_title(flown[0]), path, panels)
+
+
+def copying(out: Path) -> None:
+    """Page mimicking: what copying the leader does to the object."""
+    flights(["copy", "lqg", "transport"], REFERENCE, out / "copying.svg")
+
+
+def flight(out: Path) -> None:
+    """Page getting-started: the flight of its program."""
+    flights(["copy", "balance"], Scenario(omega=1.0, amplitude=0.08), out / "flight.svg", (X, ERROR, PITCH))
+
+
+def crazyflie_stand(out: Path) -> None:
+    """Archive, page crazyflie: `python eval.py --figures stand`."""
+    policy = Policy.load(shipped_policy("stand"))
+    (out / "crazyflie-stand.svg").write_bytes(draw_figure("stand", [policy], "newton-euler").picture)
+
+
+def crazyflie_gains(out: Path) -> None:
+    """Page crazyflie: steps, poles and loop gain of the pair, with delivered and with computed gains."""
+    sys.path.append(str(REPOSITORY / "tests"))
+    from attitude_trials import Trial, pair, simulate
+
+    config, delay, lags, ends = configs.preset("flight"), 0.01, (0.03, 0.05, 0.1, 0.15), (-12.0, 28.0)
+    designs = design(config)
+    worst = max(designs, key=lambda one: one.axis.inertia_ratio)
+    axis, number = worst.axis, ("roll", "pitch", "yaw").index(worst.axis.name)
+    delivered = configs.Autopilot(kind="crazyflie", motor_curve=config.autopilot.motor_curve)
+    autopilots = {"delivered": delivered, "computed": apply(config.autopilot, tuple(designs))}
+    gains = {"delivered": delivered_gains(axis), "computed": worst.gains}
+    looks = {name: line(look) for name, look in series_styles([*gains]).items()}
+    figure, named = pyplot().subplot_mosaic("AA;BC", figsize=(7.5, 6.5), layout="constrained")
+    places = [*named.values()]
+    for name, look in looks.items():
+        step = tuple(8.0 * (k == number) for k in range(3))
+        angles = simulate(pair(config), autopilots[name], [Trial(step, lag=lag, delay=delay) for lag in lags])
+        for angle, width in zip(angles[..., number].T, np.linspace(0.6, 2.2, len(lags)), strict=True):
+            outside = np.flatnonzero((angle < ends[0]) | (angle > ends[1]))
+            last = outside[0] if len(outside) else len(angle)
+            time = 0.002 * np.arange(last)
+            places[0].plot(time, angle[:last], **{**look, "linewidth": width}, label=name)
+            if len(outside):
+                places[0].plot(time[-1], angle[last - 1], "x", color=look["color"], clip_on=False)
+        marks = {"color": look["color"], "marker": "o" if name == "delivered" else "s", "linestyle": "none"}
+        for scale in np.geomspace(1 / axis.inertia_ratio, 2.0, 40):
+            poles = closed_poles(gains[name], axis.gain / scale, config.plant.rotor_lag, delay)
+            places[1].plot(poles.real, poles.imag, markersize=1.5, alpha=0.6, **marks)
+        poles = closed_poles(gains[name], axis.gain, config.plant.rotor_lag, delay)
+        places[1].plot(poles.real, poles.imag, markersize=8, markerfacecolor="none", **marks, label=f"{name}, the pair")
+        value = loop_gain(gains[name], axis.gain, config.plant.rotor_lag, delay, FREQUENCIES)
+        angle = np.degrees(np.unwrap(np.angle(value)))
+        angle += -360 * np.round((angle[np.argmin(np.abs(np.abs(value) - 1))] + 180) / 360)
+        places[2].plot(angle, 20 * np.log10(np.abs(value)), **look)
+    places[0].set(xlabel="time [s]", ylabel=f"{axis.name} [degrees]", ylim=ends)
+    places[0].set_title("8 degree step, motor lag 30 to 150 ms (thin to thick); cross: leaves the panel", fontsize=10)
+    places[1].axvline(0, color=INK, linewidth=0.8)
+    places[1].set(xlim=(-25, 8), ylim=(-25, 25), xlabel="real [1/s]", ylabel="imaginary [1/s]")
+    places[1].set_title("Poles, inertia from one drone's\nto twice the pair's", fontsize=10)
+    places[2].plot([-180], [0], "+", color=INK, markersize=12, markeredgewidth=2)
+    places[2].set(xlim=(-280, -80), ylim=(-40, 40), xlabel="phase [degrees]", ylabel="loop gain [dB]")
+    places[2].set_title("Loop gain against phase\nplus: instability", fontsize=10)
+    legend_above(figure, places[:2])
+    save(figure, out / "crazyflie-gains.svg")
+
+
+def learning_curves(out: Path) -> None:
+    """Page results: cost of an episode against seconds, from learning_curves_h200.json."""
+    found = json.loads((RESULTS / "learning_curves_h200.json").read_text())
+    labels = {"sac": "SAC", "ppo": "PPO", "gradient": "first-order gradients", "stock": "Brax's own SAC"}
+    figure, axis = pyplot().subplots(figsize=(7, 4), layout="constrained")
+    looks = series_styles([*labels])
+    for name, rows in found["curves"].items():
+        seconds, cost = np.array([(row["seconds"], -row["return"]) for row in rows]).T
+        axis.plot(seconds, cost, **line(looks[name]), label=labels[name])
+        at = np.array([row["at_bar"] for row in rows])
+        axis.plot(seconds[at], cost[at], "o", color=looks[name]["color"], markersize=5, clip_on=False)
+    axis.plot([], [], "o", color=INK, markersize=5, label="at the bar")
+    axis.set(xscale="log", xlabel="seconds since process start", ylabel="cost of an episode (minus its return)")
+    axis.set_xticks([5, 10, 20, 30, 50], ["5", "10", "20", "30", "50"], minor=False)
+    axis.set_xticks([], minor=True)
+    logarithmic(axis)
+    axis.grid()
+    legend_above(figure, [axis], 3, found["versions"]["where"])
+    save(figure, out / "learning-curves.svg")
+
+
+def viewer(out: Path) -> None:
+    """Page view: `python -m mjxball.view balance`."""
+    with tempfile.TemporaryDirectory() as place:
+        page = Path(place) / "page.html"
+        command = "python -m mjxball.view balance --omega 1 --amplitude 0.1 --out"
+        run([*shlex.split(command), str(page)], Path(place))
+        screenshot(page, out / "viewer.png")
+
+
+def tutorial(out: Path) -> None:
+    """Page tutorial: its commands, and what they leave."""
+    from mjxball.train.curves import draw_training
+
+    text = (REPOSITORY / "docs" / "tutorial.md").read_text()
+    blocks = "".join(re.findall(r"^```bash\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE))
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        commands = [line for line in blocks.replace("\\\n", " ").splitlines() if line.startswith("python ")]
+        excerpts("".join(run(shlex.split(command, comments=True), place) for command in commands), out)
+        first = place / "runs" / "first"
+        draw_training(first, configs.preset("transport"), out / "tutorial-training.svg")
+        flights(["copy", first / "policy.npz"], REFERENCE, out / "tutorial-flight.svg")
+        screenshot(place / "benchmark" / "report.html", out / "tutorial-report.png")
+        screenshot(place / "first.html", out / "tutorial-viewer.png")
+        log = without_goal(result_of(read_recording(place / "first.jsonl"), "first, flown"))
+        draw_flights([log], "Rehearsal on the twin", out / "tutorial-rehearsal.svg", (Z, ERROR, ROLL))
+
+
+def excerpts(printed: str, out: Path) -> None:
+    """What the page quotes of the lines that its commands have `printed`: no times, which are the machine's."""
+    lines = re.split(r"[\r\n]+", printed)
+    final = [line for line in lines if re.search(r"768,000 / 768,000 steps.*eval peak", line)][-1]
+    head = next(k for k, line in enumerate(lines) if line.split()[:3] == ["omega", "ampl.", "mass"])
+    rows = [line for line in lines[head:] if line.startswith("*")][:2]
+    table = [line[:WIDTH].rstrip() for line in [*lines[head : head + 2], *rows]]
+    landed = next(line for line in lines if line.startswith("landed"))
+    checked = [line for line in lines if line.startswith("good")]
+    texts = {
+        "training": [re.sub(r"  +[\d.]+ k/s.*left", "", final).strip(), "policy: runs/first/policy.npz"],
+        "results": [*table, *(line.partition(";")[0] for line in lines if "meets the bounds" in line)],
+        "rehearsal": [
+            checked[0],
+            "...",
+            checked[-1],
+            landed,
+            next(one for one in lines if one.startswith("error rms")),
+        ],
+    }
+    for name, text in texts.items():
+        (out / f"tutorial-{name}.txt").write_text("\n".join(text) + "\n")
+
+
+def run(words: list[str], place: Path) -> str:
+    """What one command of a page prints in the directory `place`."""
+    program = [str(REPOSITORY / words[1]), *words[2:]] if words[1].endswith(".py") else words[1:]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    command: dict[str, Any] = {"cwd": place, "env": environment, "text": True}
+    command: dict[str, Any] = {"cwd": place, "env": environment, "text": True}
+    for _ in range(3 if "--rehearse" in words else 1):  # a busy machine misses the deadlines of a rehearsal
+        done = subprocess.run(
+            [sys.executable, *program], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False, **command
+        )
+        print(done.stdout, flush=True)  # noqa: T201
+        if not done.returncode:
+            return done.stdout
+        (place / "first.jsonl").unlink(missing_ok=True)
+    raise SystemExit(f"{shlex.join(words)} ended with {done.returncode}")
+
+
+def screenshot(page: Path, path: Path, width: int = 1200, height: int = 800) -> None:
+    """`page` as a browser shows it after 8 s of its flight, in few colours."""
+    from PIL import Image
+    from playwright.sync_api import sync_playwright
+
+    program = next(filter(None, map(shutil.which, BROWSERS)))
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        tab = browser.new_page(viewport={"width": width, "height": height})
+        tab.goto(page.as_uri())
+        for _ in range(80):
+            tab.keyboard.press("ArrowRight")
+        tab.wait_for_timeout(500)
+        picture = Image.open(io.BytesIO(tab.screenshot()))
+        browser.close()
+    picture.convert("RGB").quantize(COLOURS_OF_PNG, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+PICTURES: dict[str, Callable[[Path], None]] = {
+    "copying": copying,
+    "flight": flight,
+    "crazyflie-stand": crazyflie_stand,
+    "crazyflie-gains": crazyflie_gains,
+    "learning-curves": learning_curves,
+    "viewer": viewer,
+    "tutorial": tutorial,
+}
+
+
+MADE = (
+    *("copying.svg", "flight.svg", "crazyflie-stand.svg", "crazyflie-gains.svg", "learning-curves.svg", "viewer.png"),
+    *(f"tutorial-{name}" for name in ("training.svg", "flight.svg", "report.png", "viewer.png", "rehearsal.svg")),
+    *(f"tutorial-{name}.txt" for name in ("training", "results", "rehearsal")),
+)
+
+
+def main() -> None:
+    """Make the pictures that are named."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(PICTURES))
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent, metavar="DIR")
+    options = parser.parse_args()
+    for name in options.names or PICTURES:
+        PICTURES[name](options.out)
+
+
+if __name__ == "__main__":
+    main()
