@@ -1,10 +1,16 @@
 """mjxball: two quadrotors carry one object whose centre of gravity moves."""
 
 import os
+import sys
 from typing import TYPE_CHECKING, Any
 
 # XLA writes two lines of 2 kB to stderr for each CPU program that it loads from its cache. What goes wrong is raised.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+if "jax" not in sys.modules:
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+elif os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "1":  # which JAX itself says, to a library that has read it by now
+    _set_level = getattr(sys.modules.get("jaxlib.utils"), "absl_set_min_log_level", None)
+    if _set_level:
+        _set_level(3)
 
 __version__ = "0.2.0"
 __all__ = ["Policy", "Scenario", "Trajectory", "__version__", "simulate"]

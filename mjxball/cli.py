@@ -10,8 +10,10 @@ import os
 import re
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from mjxball import __version__
 from mjxball import config as configs
@@ -20,6 +22,8 @@ from mjxball.xla import explained
 
 FAULT = 3  # exit code after an error of the program, where 1 is a result
 EXTRAS = {"onnx": "onnx", "gymnasium": "gym", "cflib": "fly"}  # packages that another extra than `train` brings
+SHELLS = ("bash", "zsh", "tcsh")
+Describe = Callable[["Parser", argparse.Namespace, Any], set[str] | None]
 
 
 class Parser(argparse.ArgumentParser):
@@ -40,20 +44,110 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> None:  # type: ignore[override]
         """Print `message`, with the flag that is most like an unknown one, and exit with code 2."""
         unknown = re.match(r"unrecognized arguments: (--[^ =]+)", message)
-        known = re.findall(r"--[\w.-]+", self.format_help()) if unknown else []
+        known = [flag for action in self._actions if action.help != argparse.SUPPRESS for flag in action.option_strings]
         similar = difflib.get_close_matches(unknown[1], known, 1, cutoff=0.8) if unknown else []
         self.exit(2, f"{self.prog}: {message}{f'; did you mean {similar[0]}?' if similar else ''}\n")
 
 
-def make_parser(program: str, description: str, usage: str | None = None, epilog: str | None = None) -> Parser:
+class Formatter(argparse.HelpFormatter):
+    """As argparse's, and no line is longer than a terminal of 40 columns or more: a long flag or usage is folded."""
+
+    def __init__(self, prog: str, **given: Any):
+        super().__init__(prog, **{"max_help_position": 32, **given})
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        return self._folded(super()._format_action_invocation(action), self._current_indent)
+
+    def _format_usage(self, *given: Any) -> str:
+        return self._folded(super()._format_usage(*given).strip(), 0) + "\n\n"
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(" ".join(text.split()), width, break_on_hyphens=False)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = self._split_lines(text, width - len(indent))
+        return "\n".join(indent + line for line in lines)
+
+    def _folded(self, text: str, indent: int) -> str:
+        plain = re.sub(r"\x1b\[[\d;]*m", "", text)  # Python 3.14 writes in colours
+        width = self._width - indent
+        if max(map(len, plain.splitlines())) <= width:
+            return text
+        inner = " " * (indent + 4)
+        lines = (
+            textwrap.fill(line, width, subsequent_indent=inner, break_on_hyphens=False) for line in plain.splitlines()
+        )
+        return "\n".join(lines)
+
+
+class Help(argparse.Action):
+    """`--help` prints the common flags, `--help all` every one; `--help TOPIC` is the program's own.
+
+    `describe(parser, namespace, topic)` returns the flags to be printed, None for all, and may change their texts.
+    """
+
+    def __init__(self, option_strings: Sequence[str], dest: str, describe: Describe, **given: Any):
+        super().__init__(option_strings, dest, nargs="?", default=argparse.SUPPRESS, **given)
+        self._describe = describe
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        """Print and exit."""
+        try:
+            flags = self._describe(parser, namespace, values)
+        except InputError as error:
+            parser.error(str(error))
+        for action in parser._actions:
+            if flags is not None and not flags & {*action.option_strings, "" if action.option_strings else action.dest}:
+                action.help = argparse.SUPPRESS
+        for group in parser._action_groups:
+            if any(action.help == argparse.SUPPRESS for action in group._group_actions):
+                group.description = None  # of the whole group
+        parser.print_help()
+        parser.exit()
+
+
+class Completion(argparse.Action):
+    """`--print-completion SHELL`: how the shell completes the command, see `shtab`, which is loaded here alone.
+
+    Of an action with `suggested` words these are offered, of a path files.
+    """
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
+        """Print and exit."""
+        try:
+            import shtab
+        except ModuleNotFoundError:
+            parser.error("shtab is not installed; pip install 'mjxball[train]'")
+        for action in parser._actions:
+            action.choices = getattr(action, "suggested", action.choices)
+            if getattr(action.type, "__name__", "") in ("Path", "policy_path"):
+                action.complete = shtab.FILE
+        print(shtab.complete(parser, values))  # noqa: T201
+        parser.exit()
+
+
+def make_parser(
+    program: str,
+    description: str,
+    usage: str | None = None,
+    epilog: str | None = None,
+    describe: Describe | None = None,
+) -> Parser:
     """The parser of the command `program`, with the `--help` and `--version` of every command; no flag is shortened.
 
-    Installed commands (`mjxball-train`) are called by their own name, whatever `program` says.
+    Installed commands (`mjxball-train`) are called by their own name, whatever `program` says. `describe`: see `Help`.
     """
     called = Path(sys.argv[0]).stem
     name = called if called.startswith("mjxball-") else program
-    parser = Parser(prog=name, description=description, usage=usage, epilog=epilog, allow_abbrev=False)
-    parser.add_argument("--version", action="version", version=f"mjxball {__version__}")
+    given: dict[str, Any] = {"allow_abbrev": False, "formatter_class": Formatter, "add_help": describe is None}
+    parser = Parser(prog=name, description=description, usage=usage, epilog=epilog, **given)
+    if describe is not None:
+        about = "show the common flags, of TOPIC all every flag, and exit"
+        parser.add_argument("-h", "--help", action=Help, describe=describe, metavar="TOPIC", help=about)
+    parser.add_argument("--version", action="version", version=f"mjxball {__version__}", help="show it and exit")
+    if " " not in name:  # what a shell can complete
+        about = f"print what makes {', '.join(SHELLS)} complete this command, and exit"
+        parser.add_argument("--print-completion", action=Completion, choices=SHELLS, metavar="SHELL", help=about)
     return parser
 
 
@@ -131,19 +225,27 @@ def output_file(path: Path, suffix: str) -> Path:
 
 
 def add_config_flags(parser: argparse.ArgumentParser) -> None:
-    """Add `--<path> VALUE` for every leaf of the configuration, with its help text."""
-    group = parser.add_argument_group("configuration", "defaults are the preset's; tuples are comma-separated")
-    names = ", ".join(configs.PLANTS)
-    group.add_argument(
-        "--plant", type=Path, metavar="NAME|FILE", help=f"{names}, or a rig in TOML or JSON (docs/howto/own-rig.md)"
-    )
+    """Add `--<path> VALUE` for every leaf of the configuration, with its help text, a group for each section."""
+    groups: dict[str, Any] = {}
     for path, _, item in configs.leaves(configs.Config()):
+        section = path.partition(".")[0]
+        group = groups.get(section) or parser.add_argument_group(section, configs.about_section(section))
+        groups[section] = group
         about = item.metadata["about"].replace("%", "%%")
         group.add_argument(f"--{path}", metavar="VALUE", dest=f"config:{path}", default=None, help=about)
         for old in configs.old_names(path):
             group.add_argument(f"--{old}", dest=f"config:{path}", default=None, help=argparse.SUPPRESS)
     for path in configs.CONSTANT:
-        group.add_argument(f"--{path}", dest=f"config:{path}", default=None, help=argparse.SUPPRESS)
+        parser.add_argument(f"--{path}", dest=f"config:{path}", default=None, help=argparse.SUPPRESS)
+
+
+def show_defaults(parser: argparse.ArgumentParser, settings: configs.Config) -> None:
+    """Add to the help of every `--<path>` its value in `settings`."""
+    values = {path: configs.to_text(value) or "none" for path, value, _ in configs.leaves(settings)}
+    for action in parser._actions:
+        text = values.get(action.dest.removeprefix("config:"))
+        if text is not None and action.dest.startswith("config:") and action.help != argparse.SUPPRESS:
+            action.help = f"{action.help} (default {text.replace('%', '%%')})"
 
 
 def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> configs.Config:

@@ -1,7 +1,8 @@
-"""Export a follower: `python -m mjxball.export POLICY|RUN OUT`, of a run's newest checkpoint or of a policy file.
+"""Export a follower, `python -m mjxball.export POLICY|RUN OUT`, or a flight log, `python -m mjxball.export LOG OUT`.
 
-OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header); see docs/policy-file.md. With --crazyflie it is a
-new directory of apps for both drones; see docs/onboard.md.
+Of a policy file, or a run's newest checkpoint, OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header);
+see docs/policy-file.md. With --crazyflie it is a new directory of apps for both drones; see docs/onboard.md. Of a
+flight log, .jsonl, it ends in .mcap (ROS 2 messages), .csv or .parquet; see docs/flight-log.md.
 """
 
 from __future__ import annotations
@@ -107,13 +108,24 @@ def export(
     (ROUNDED if int8 else WRITERS)[out.suffix](out, policy())
 
 
+def export_log(log: Path, out: Path) -> list[str]:
+    """Export the flight log `log` to the new file `out`; returns what a reader should know. Raises InputError."""
+    from mjxball.fly.log_export import WRITERS as OF_LOGS
+
+    if out.suffix not in OF_LOGS:
+        raise InputError(
+            f"output file {out} of a flight log must end in {', '.join(OF_LOGS)}, which chooses the format"
+        )
+    return OF_LOGS[out.suffix](output_file(out, out.suffix), log)
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.export`."""
     about, formats = __doc__.split("\n\n")
     parser = make_parser("python -m mjxball.export", about, epilog=formats)
-    about_source = "policy file, name of a shipped one, or run directory of train.py"
-    parser.add_argument("source", metavar="POLICY|RUN", type=policy_path, help=about_source)
-    parser.add_argument("out", metavar="OUT", type=Path, help="file to write, .npz, .onnx or .h; must not exist")
+    about_source = "policy file, name of a shipped one, run directory of train.py, or flight log"
+    parser.add_argument("source", metavar="POLICY|RUN|LOG", type=policy_path, help=about_source)
+    parser.add_argument("out", metavar="OUT", type=Path, help="file to write, whose ending says what; must not exist")
     parser.add_argument("--crazyflie", action="store_true", help="OUT is a directory: apps for a pair of Crazyflies")
     parser.add_argument("--int8", action="store_true", help="weights of 8 bits; .npz: rounded to them")
     about = f"team in which a policy flies that has to be told: {', '.join(configs.PLANTS)}, or a rig in TOML or JSON"
@@ -122,6 +134,13 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def command() -> int:
+        if options.source.suffix == ".jsonl":
+            if options.crazyflie or options.int8 or options.plant or options.drone is not None:
+                raise InputError("a flight log takes no other flag")
+            for remark in export_log(options.source, options.out):
+                print(f"note: {remark}", file=sys.stderr)  # noqa: T201
+            print(options.out)  # noqa: T201
+            return 0
         export(options.source, options.out, options.crazyflie, options.int8, options.plant, options.drone)
         print(options.out)  # noqa: T201
         return 0

@@ -105,13 +105,13 @@ def import_brax_env() -> tuple[type, type]:
     return base.Env, base.State
 
 
-def import_tensorboard_writer() -> type:
-    """tensorboardX's `SummaryWriter`, without PyTorch, which it would load (5 s) where that is installed."""
+def import_tensorboard() -> Any:
+    """tensorboardX, without PyTorch, which it would load (5 s) where that is installed."""
     if "torch" in sys.modules:
-        return importlib.import_module("tensorboardX").SummaryWriter
+        return importlib.import_module("tensorboardX")
     sys.modules["torch"] = None  # type: ignore[assignment]  # what Python raises ImportError for
     try:
-        return importlib.import_module("tensorboardX").SummaryWriter
+        return importlib.import_module("tensorboardX")
     finally:
         del sys.modules["torch"]
 

@@ -104,13 +104,25 @@ def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         cached.cache_clear()
 
 
+class Text(str):
+    """A text that stands in a `repr` as it is."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def in_full(value: Any) -> Text:
+    """What a dataclass's own `repr` says."""
+    fields = ", ".join(f"{field.name}={getattr(value, field.name)!r}" for field in dataclasses.fields(value))
+    return Text(f"{type(value).__qualname__}({fields})")
+
+
 def fingerprint(worlds: list[World]) -> str:
     """Of all plants, laws and flights."""
     parts = []
     for world in worlds:
-        own = [
-            getattr(world.config, part) for part in ("plant", "attitude", "autopilot", "leader", "command", "timing")
-        ]
+        named = ("plant", "attitude", "autopilot", "leader", "command", "timing")
+        own = [in_full(getattr(world.config, name)) for name in named]
         parts.append((own, world.config.scenario.termination_distance, world.scenarios, world.told, world.length))
     # Six digits: a linear program bounds some amplitudes, and its last bits are its own.
     text = re.sub(r"-?\d+\.\d+(e-?\d+)?", lambda number: f"{float(number[0]):.6g}", repr(parts))

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import json
 import math
-import operator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import opened
 
-import timeline
-from balance import FLIGHTS, read_levels
 from mjxball.baselines import make_baseline
 from mjxball.commands.evaluate import main as evaluate
 from mjxball.config import preset
@@ -25,6 +21,7 @@ from mjxball.evaluate.benchmark import Score, bootstrap, by_variant, run_benchma
 from mjxball.evaluate.report import compare, verdict
 from mjxball.evaluate.variants import Suite
 from mjxball.sim.scenario import check_scenario
+from seeds import FLIGHTS, read_levels
 
 CONFIG = preset("paper")
 SHORT = ("delay", "mass-change")
@@ -239,9 +236,3 @@ def test_the_frozen_levels_are_flights_of_the_pair() -> None:
             config = level.config(CONFIG, seed)
             check_scenario(config, level.seeded(seed))
             assert (config.motion.kind == "waveform") == bool(level.waveforms)
-
-
-def test_the_time_line_of_a_training_names_what_there_is() -> None:
-    for module, paths in timeline.FUNCTIONS.items():
-        for path in paths:
-            assert callable(operator.attrgetter(path)(importlib.import_module(module))), path

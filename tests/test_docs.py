@@ -118,19 +118,40 @@ def test_pages_fit_in_a_browser(site: Path, browser: Any) -> None:
     tab.on("pageerror", lambda error: errors.append(str(error)))
     for page in sorted(site.rglob("*.html")):
         tab.goto(page.as_uri())
-        for width in (1280, 390):
+        for width in (1300, 390):
             tab.set_viewport_size({"width": width, "height": 800})
             assert tab.evaluate("document.documentElement.scrollWidth") <= width, page.name
+            wide = (
+                "blocks => blocks.filter(block => block.scrollWidth > block.clientWidth).map(block => block.innerText)"
+            )
+            assert tab.eval_on_selector_all("pre", wide) == [], page.name
+        assert tab.eval_on_selector_all("img", "all => all.every(one => one.naturalWidth > 0)"), page.name
     assert [url for url in requests if not url.startswith(("file:", "data:"))] == []
     assert errors == []
 
 
-def test_the_search_finds_a_name(site: Path, browser: Any) -> None:
+@pytest.mark.parametrize(("words", "page"), [("simulate_batch", "flights"), ("disturbance observer", "followers")])
+def test_the_search_finds_names_and_words(site: Path, browser: Any, words: str, page: str) -> None:
     """From disk, without a server."""
     tab = browser.new_page()
-    tab.goto(f"{(site / 'search.html').as_uri()}?q=simulate_batch")
+    errors: list[str] = []
+    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    tab.goto(f"{(site / 'search.html').as_uri()}?q={words}")
     tab.wait_for_selector("#search-results li a", timeout=20_000)
-    assert "flights" in tab.inner_text("#search-results").lower()
+    assert page in tab.inner_text("#search-results").lower()
+    assert errors == []
+
+
+def test_pictures_are_small_and_still_ones_are_the_scripts() -> None:
+    sys.path.append(str(DOCS))
+    from pictures import MADE
+
+    shown = {Path(name).name for page in PAGES for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page.read_text())}
+    quoted = {name for page in PAGES for name in re.findall(r"\{literalinclude\} (\S+)", page.read_text())}
+    assert set(MADE) <= shown | quoted
+    assert shown - set(MADE) <= {"balance.gif", "architecture.svg", "real-flights.svg"}
+    for name in shown - {"balance.gif"}:
+        assert (DOCS / name).stat().st_size < 150_000, name
 
 
 def test_formulas_are_the_browsers_own(site: Path) -> None:

@@ -194,7 +194,7 @@ def test_a_slow_landing_is_not_over_before_the_pair_rests() -> None:
 
 @pytest.mark.slow
 def test_flights_in_a_row_with_reboots_between_them() -> None:
-    """Six here, 30 with ten reboots in benchmarks/fly_firmware.py."""
+    """Six, a drone reboots before every other one."""
     world = hovering(1.0)
     for number in range(6):
         if number:

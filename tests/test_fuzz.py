@@ -24,11 +24,10 @@ from command_line import REPOSITORY, TRANSPORT, environment
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mjxball import config as configs
 from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFileError, shipped_policies, shipped_policy
 from mjxball.train.checkpoint import Checkpoints
-from mjxball.train.run_directory import read_config, write_config
+from mjxball.train.run_directory import read_config
 
 
 @pytest.fixture(scope="module")
@@ -45,16 +44,9 @@ def fuzz() -> Iterator[ModuleType]:
 
 
 @pytest.fixture(scope="module")
-def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_directory(fuzz: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The records of a run of two members, without its checkpoints."""
-    run = tmp_path_factory.mktemp("run")
-    origin = {"seed": 0, "physics": "mjx", "seeds": 2, "sweep": None, "command": "train"}
-    write_config(run, configs.preset("transport"), origin)
-    header = "steps,seconds,rate,episode_return,eval_return"
-    (run / "metrics.csv").write_text(f"{header}\n1024,0.5,2000.0,-3.5,\n2048,1.0,2000.0,-2.5,-1.25\n")
-    members = "steps,seed,eval_return,eval_steady_error,eval_peak,eval_tilt_error,eval_vertical_error"
-    (run / "members.csv").write_text(f"{members}\n2048,0,-1.5,0.1,0.2,0.01,0.1\n2048,1,-1.0,0.1,0.2,0.01,0.1\n")
-    return run
+    return fuzz.records(tmp_path_factory.mktemp("run"))
 
 
 def test_damaged_policies(fuzz: ModuleType, tmp_path: Path) -> None:
@@ -107,10 +99,8 @@ class TestTheJudge:
         assert fuzz.outcome(hang, tmp_path) == "it hung"
 
     def test_a_pickle_would_be_seen(self, fuzz: ModuleType, tmp_path: Path) -> None:
-        import mutations
-
         path = tmp_path / "pickle.npz"
-        path.write_bytes(mutations.pickled(random.Random(3), TRANSPORT.read_bytes()))
+        path.write_bytes(fuzz.pickled(random.Random(3), TRANSPORT.read_bytes()))
         for name in ("card", "weight_0", "observation_mean", "extra"):
             with np.load(path, allow_pickle=True) as data:
                 try:
@@ -303,14 +293,12 @@ for name in files:
         assert "checkpoint 9 cannot be read" in warnings[0]
 
     def test_every_file_damaged(self, fuzz: ModuleType, written: Path) -> None:
-        import mutations
-
         self.assert_whole(self.restored(written))
         lost = 0
         files = sorted(path for path in (written / "checkpoints").rglob("*") if path.is_file())
         for number, (path, kind) in enumerate(itertools.product(files, ["overwritten", "truncated", "flipped_bits"])):
             content = path.read_bytes()
-            path.write_bytes(getattr(mutations, kind)(random.Random(number), content or b"x"))
+            path.write_bytes(getattr(fuzz, kind)(random.Random(number), content or b"x"))
             found = self.restored(written)
             path.write_bytes(content)
             lost += found is None

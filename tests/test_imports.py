@@ -17,11 +17,11 @@ from command_line import REPOSITORY, environment
 
 # Floor by floor: a part imports itself and what stands on lower floors, never a neighbour or what is above.
 FLOORS = (
-    {"errors", "reading"},
+    {"errors", "reading", "pictures"},
     {"files"},
     {"config"},
     {"xla"},
-    {"cli", "cache", "quiet", "plotting"},
+    {"cli", "cache", "quiet", "plotting", "terminal"},
     {"plant"},
     {"control"},
     {"policy", "baselines"},
@@ -34,7 +34,7 @@ FLOORS = (
     {"evaluate"},
     {"fly", "gym", "bench"},
     {"view"},
-    {"rig"},
+    {"rig", "notebook"},
     {"commands", "export"},
     {"entry"},
 )
@@ -42,13 +42,14 @@ FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}
 GROUND = {
     "errors",
     "reading",
+    "pictures",
     "files",
     "config",
     "plant",
     "control",
 }  # all of our own that `control` and `policy` may import
 # What the base install runs: NumPy alone.
-BASE = ("errors", "reading", "files", "config", "cli", "plant", "control", "policy", "entry")
+BASE = ("errors", "reading", "pictures", "files", "config", "cli", "plant", "control", "policy", "entry")
 OURS = "mjxball"
 
 

@@ -13,7 +13,6 @@ import pytest
 from command_line import call
 from onboard_bench import Bench, cores_of, needs_gcc, policy_of
 
-import cortex
 import onboard as benchmark
 from mjxball.control import rotations
 from mjxball.export import main as export
@@ -22,7 +21,7 @@ from mjxball.fly.app.protocol import Phase
 from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.policy.file import load_file, save_file, shipped_policy
 
-needs_arm = pytest.mark.skipif(bool(cortex.missing()), reason=f"not installed: {cortex.missing()}")
+needs_arm = pytest.mark.skipif(bool(benchmark.missing()), reason=f"not installed: {benchmark.missing()}")
 
 
 INTERFACE = Path(__file__).parent / "firmware" / "interface.h"
@@ -52,7 +51,7 @@ def test_the_app_compiles_against_the_interface(name: str, tmp_path: Path, capsy
     compilers = [
         ["gcc"],
         *([["clang"]] if shutil.which("clang") else []),
-        *([[*cortex.ARM]] if not cortex.missing() else []),
+        *([[*benchmark.ARM]] if not benchmark.missing() else []),
     ]
     for compiler, flags, (number, role) in itertools.product(compilers, (STRICT, FIRMWARE), enumerate(generate.ROLES)):
         kbuild = (tmp_path / "app" / role / "src/Kbuild").read_text()
@@ -137,7 +136,7 @@ def test_a_cortex_m4_flies_the_same_bits(name: str, tmp_path: Path):
         if path != "src/glue.c" and path.startswith("src/"):
             (tmp_path / Path(path).name).write_text(text)
     for number in range(2):
-        cortex.build(tmp_path, REPLAY, [*generate.options(False), f"-DMJXBALL_FOLLOWER={number}"])
-        host, arm = cortex.on_both(tmp_path, b"".join(records[number]))
+        benchmark.build(tmp_path, REPLAY, [*generate.options(False), f"-DMJXBALL_FOLLOWER={number}"])
+        host, arm = benchmark.on_both(tmp_path, b"".join(records[number]))
         assert len(host) == 900 * (13 * 4 + protocol.BEAT_SIZE)
         assert host == arm

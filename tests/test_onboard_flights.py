@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from onboard_bench import cores_of, needs_gcc
 
-import virtual_flight
+import fly_faults_virtual
+from fly_faults_virtual import SETTLE, cause_of, code_of, settings_of
 from mjxball.fly.app.protocol import Phase
 from mjxball.fly.card import Controller
 from mjxball.fly.supervisor import State as Laptop
@@ -17,7 +18,6 @@ from mjxball.fly.twin.conditions import FAULT_KINDS, Conditions, Surroundings, d
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
-from virtual_flight import SETTLE, cause_of, code_of, settings_of
 
 
 def world(seconds: float = 6.0, curve: str = "linear", **around: Any) -> VirtualTwin:
@@ -65,7 +65,7 @@ def test_a_ball_at_either_end_is_lifted_and_kept(ball: float):
     policy = Policy.load(shipped_policy("stand"))
     config = Controller(policy).config
     conditions, most = replace(Conditions.of(config), ball=ball), config.plant.moving_fraction * config.plant.ball_stop
-    cores = virtual_flight.cores_of(shipped_policy("stand"), "float32")
+    cores = fly_faults_virtual.cores_of(shipped_policy("stand"), "float32")
     twin = VirtualTwin(policy, settings_of(policy, 8.0), conditions=conditions, settle=SETTLE, cores=cores)
     twin.run(40.0)
     assert code_of(twin) == 0

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import onboard_fuzz as fuzz
 import pytest
 from onboard_bench import needs_gcc
-
-import onboard_fuzz as fuzz
 
 TICKS = 200_000
 # A fault: file, what is replaced by what, roles in which it must be reported.

@@ -154,7 +154,7 @@ def test_rows_of_a_run_that_do_not_follow_are_left_out_and_told(
     (tmp_path / "other.csv").write_text("steps,seconds,steps\n1,2,3\n")
     with pytest.raises(InputError, match="stands twice"):
         read_rows(tmp_path / "other.csv")
-    progress = Progress(path, names, 1000, resumed_at=250)
+    progress = Progress(path, dict.fromkeys(names, ""), 1000, resumed_at=250)
     progress.close()
     assert progress.before == 2.0
     assert [line.split(",")[0] for line in path.read_text().splitlines()] == ["steps", "100", "200"]

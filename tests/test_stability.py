@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import hover_stability
-from hover_stability import delay_margins, linearised_hovers
+import stability
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, preset
 from mjxball.evaluate.batch import law_of
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.rollout import simulate_batch
 from mjxball.sim.scenario import Scenario
+from stability import delay_margins, linearised_hovers
 
 CASES = [(0.0, 0.2, 0.2), (0.1, 0.2, 0.2), (0.05, 0.4, 0.4)]
 MISTAKEN = (0.0, 0.25, 0.2)  # the hover thrust believes 0.2 kg
@@ -69,18 +69,8 @@ def test_the_margin_of_a_case_is_the_last_delay_before_its_first_unstable_one(
         asked.append(delay)
         return [SimpleNamespace(stable=bool(row[delay])) for row in stable[: len(cases)]]
 
-    monkeypatch.setattr(hover_stability, "linearised_hovers", hovers)
+    monkeypatch.setattr(stability, "linearised_hovers", hovers)
     law = law_of(make_baseline("lqg", paper))
     assert delay_margins(paper, law, [CASES[0]] * 4, longest=3) == [1, -1, 0, 2]
     assert delay_margins(paper, law, CASES[:1], longest=3) == [1]
     assert asked == [0, 1, 2, 3, 0, 1, 2]  # no further than the first delay that nobody bears
-
-
-def test_the_slowest_mode_is_no_memory_that_never_changes() -> None:
-    """Two modes of a known map: one of the load's numbers, one that it cannot see, and a number that is kept."""
-    jacobian = np.diag([0.5] * 12 + [0.99, 1.0])
-    slowest, seen = hover_stability._slowest(jacobian)
-    assert (slowest, seen) == (0.99, 0.0)
-    jacobian[0, 0] = 0.999
-    slowest, seen = hover_stability._slowest(jacobian)
-    assert (slowest, seen) == (0.999, 1.0)

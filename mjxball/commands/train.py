@@ -29,6 +29,7 @@ from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.file import policy_path
 from mjxball.quiet import import_jax
+from mjxball.terminal import folded_out
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
 from mjxball.train.lock import LOCK, check_free
@@ -49,46 +50,76 @@ from mjxball.train.run_directory import (
 )
 from mjxball.xla import compile_small_loops_whole
 
+# What `--help` shows of the settings; `--help all` has the rest.
+COMMON = (
+    *("scenario.cg_speed", "scenario.cg_amplitude", "scenario.object_mass", "scenario.noise", "scenario.delay"),
+    *("follower.action_scale_tilt", "follower.history", "follower.recurrent_units", "reward.kind"),
+    *("sac.total_steps", "sac.num_envs", "sac.learning_rate", "ppo.total_steps", "ppo.num_envs", "ppo.learning_rate"),
+    *("gradient.gradient_steps", "gradient.num_envs", "gradient.learning_rate"),
+)
+SECTIONS = tuple(dict.fromkeys(path.partition(".")[0] for path, _, _ in config.leaves(config.Config())))
+
 
 def parser() -> cli.Parser:
     """The argument parser; configuration flags are generated from `mjxball.config`."""
     result = cli.make_parser(
         "train.py",
-        usage="%(prog)s [PRESET] [--seed N] [--num-seeds K] [--sweep FILE] [--out DIR] [--resume DIR]\n"
-        "                [--start-from POLICY] [--physics ENGINE]\n"
-        "                [--distributed [--coordinator HOST:PORT --processes N --process I]]\n"
-        "                [--<config path> VALUE ...]",
+        usage="%(prog)s [PRESET] [FLAG ...]",
         description="Train a follower, export it to NumPy and compare it with `copy`.",
         epilog="Writes DIR/config.json, metrics.csv, checkpoints/, policy.npz and eval/. Ctrl-C saves and stops.",
+        describe=_describe,
     )
     names = ", ".join(config.PRESETS)
-    result.add_argument("preset", nargs="?", metavar="PRESET", help=f"one of {names} (default transport)")
-    result.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default 0)")
-    result.add_argument(
-        "--num-seeds", "--seeds", type=int, metavar="K", help="train K followers at once, seeds N, N + 1 ..."
-    )
-    result.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
+    preset = result.add_argument("preset", nargs="?", metavar="PRESET", help=f"one of {names} (default transport)")
+    vars(preset)["suggested"] = tuple(config.PRESETS)
+    run = result.add_argument_group("the run")
+    run.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default 0)")
     about = "run directory (default runs/PRESET-<time>, with --env runs/CLASS-<time>)"
-    result.add_argument("--out", type=Path, metavar="DIR", help=about)
-    result.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
-    result.add_argument(
-        "--start-from",
-        type=policy_path,
-        metavar="POLICY",
-        help="begin with the weights of a policy file or shipped policy, or each member with those of a run's",
-    )
-    result.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
-    result.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state), your own")
-    result.add_argument(
-        "--algorithm", metavar="NAME", help=f"one of {', '.join(ALGORITHMS)} (default sac), or MODULE:CLASS, your own"
-    )
-    result.add_argument("--physics", choices=TRAINING_ENGINES, help="engine (default mjx; newton-euler: quicker)")
-    result.add_argument("--distributed", action="store_true", help="train with the other processes of this job")
-    result.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
-    result.add_argument("--processes", type=int, metavar="N", help="how many processes there are, with --coordinator")
-    result.add_argument("--process", type=int, metavar="I", help="this process's number, 0 .. N - 1")
+    run.add_argument("--out", type=Path, metavar="DIR", help=about)
+    run.add_argument("--resume", type=Path, metavar="DIR", help="continue the run in DIR from its newest checkpoint")
+    about = "train K followers at once, seeds N, N + 1 ... (default 1)"
+    run.add_argument("--num-seeds", "--seeds", type=int, metavar="K", help=about)
+    run.add_argument("--sweep", type=Path, metavar="FILE", help="JSON: settings with K numbers each, one a member")
+    about = "begin with the weights of a policy file or shipped policy, or each member with those of a run's"
+    run.add_argument("--start-from", type=policy_path, metavar="POLICY", help=about)
+    about = f"one of {', '.join(ALGORITHMS)} (default sac), or MODULE:CLASS, your own"
+    run.add_argument("--algorithm", metavar="NAME", help=about)
+    about = "engine, mjx (default) or newton-euler, which is quicker"
+    run.add_argument("--physics", choices=TRAINING_ENGINES, metavar="ENGINE", help=about)
+    about = f"{', '.join(config.PLANTS)}, or a rig in TOML or JSON (docs/howto/own-rig.md)"
+    run.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
+    own = result.add_argument_group("in place of ours")
+    own.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
+    own.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state)")
+    several = result.add_argument_group("several processes")
+    several.add_argument("--distributed", action="store_true", help="train with the other processes of this job")
+    several.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
+    several.add_argument("--processes", type=int, metavar="N", help="how many there are, with --coordinator")
+    several.add_argument("--process", type=int, metavar="I", help="this process's number, 0 .. N - 1")
     cli.add_config_flags(result)
     return result
+
+
+def _describe(parser: cli.Parser, given: argparse.Namespace, topic: str | None) -> set[str] | None:
+    """See `cli.Help`: the topic is `all`, a section of the configuration or a preset, whose values are shown."""
+    known = ("all", *SECTIONS, *config.PRESETS)
+    if topic is not None and topic not in known:
+        raise InputError(f"no help on {topic!r}; there is --help {', '.join(known)}")
+    name = topic if topic in config.PRESETS else given.preset
+    plant = cli.read_plant(given.plant) if given.plant else None
+    name = name or (plant.preset if plant else None) or "transport"
+    cli.show_defaults(parser, config.with_plant(config.preset(name), given.plant, {}))
+    flown = f" on the plant {given.plant}" if given.plant else ""
+    parser.epilog = (
+        f"Defaults of settings are those of the preset {name}{flown}; tuples are comma-separated. "
+        f"All settings: --help all, or of one section: --help {', '.join(SECTIONS)}. {parser.epilog}"
+    )
+    if topic == "all":
+        return None
+    flags = {flag for action in parser._actions for flag in action.option_strings if "." not in flag}
+    if topic in SECTIONS:
+        return {f"--{path}" for path, _, _ in config.leaves(config.preset(name)) if path.startswith(f"{topic}.")}
+    return {"preset", *flags, *(f"--{path}" for path in COMMON)}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -388,8 +419,10 @@ def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any])
     save_file(out / POLICY, dataclasses.replace(chosen, card={**chosen.card, "population": {"seed": seeds, **spread}}))
     for name in compared:
         values = sorted(math.inf if value is None else value for value in spread[name])
-        low, middle, high = values[0], statistics.median(values), values[-1]
-        print(f"{name}: median {middle:.4g}, best {low:.4g}, worst {high:.4g} of {len(values)}")
+        numbers = (statistics.median(values), values[0], values[-1])
+        missing = "never" if name == "settling_time" else "failed"
+        middle, low, high = (missing if math.isinf(value) else f"{value:.4g}" for value in numbers)
+        print(f"{name}: median {middle}, best {low}, worst {high} of {len(values)}")
     (out / "eval").mkdir(exist_ok=True)
     draw_members(out, out / "eval" / "members.png")
 
@@ -446,5 +479,5 @@ def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) ->
     )
     misses = check_bounds(trained, reference.metrics)
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
-    print(f"{policy} {verdict}; figures in {out / 'eval'}")
+    print(folded_out(f"{policy} {verdict}; figures in {out / 'eval'}"))
     return 0

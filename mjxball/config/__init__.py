@@ -26,6 +26,7 @@ from mjxball.config._settings import (
     Timing,
 )
 from mjxball.config._tree import (
+    about_section,
     apply_overrides,
     config_hash,
     from_dict,
@@ -35,6 +36,7 @@ from mjxball.config._tree import (
     replace,
     to_dict,
     to_json,
+    to_text,
 )
 from mjxball.config._validate import ball_limit, cg_limit, validate
 
@@ -63,6 +65,7 @@ __all__ = [
     "Sac",
     "ScenarioRanges",
     "Timing",
+    "about_section",
     "apply_overrides",
     "ball_limit",
     "cg_limit",
@@ -81,6 +84,7 @@ __all__ = [
     "thrust_over_weight",
     "to_dict",
     "to_json",
+    "to_text",
     "total_mass",
     "validate",
     "with_current_names",

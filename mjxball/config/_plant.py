@@ -55,6 +55,27 @@ class Plant:
     yaw_per_thrust: float = setting(0.02, "yaw moment of a rotor over its force [m]", above=0)
     gravity: float = setting(9.81, "gravitational acceleration [m/s2]", above=0)
 
+    def __repr__(self) -> str:
+        """Short: `to_json` has all of it."""
+        mass = sum(drone.mass for drone in self.drones) + self.carrier_mass + self.object_mass
+        load = f"object {self.object_mass:g} kg along {self.cg_axis}"
+        return (
+            f"<Plant of {self.count} drones, {mass:.4g} kg, {load}{'' if self.stand == 'free' else f', {self.stand}'}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the rig from above."""
+        from mjxball import pictures
+
+        facts = {
+            "masses": f"{', '.join(f'{drone.mass:g}' for drone in self.drones)} kg, object {self.object_mass:g} kg",
+            "leader": f"drone {self.leader}, filled",
+            "load moves along": self.cg_axis,
+        }
+        mounts = [drone.mount for drone in self.drones]
+        drawn = pictures.plan(mounts, self.leader, self.of_drones("arm"), self.object_size)
+        return pictures.card(f"rig of {self.count} drones, from above", facts, drawn)
+
     @property
     def count(self) -> int:
         """How many drones there are, N."""

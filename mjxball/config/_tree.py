@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 import typing
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -29,6 +30,19 @@ def leaves(config: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasse
                 yield from leaves(record, f"{path}.{number}.")
         elif item.metadata:
             yield path, value, item
+
+
+def to_text(value: Any) -> str:
+    """The value of a leaf as the command line takes it."""
+    if isinstance(value, tuple):
+        return ",".join(f"{part:g}" for part in value)
+    return f"{value:g}" if isinstance(value, float) else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def about_section(name: str) -> str:
+    """What the section `name` of the configuration is: the first sentence of its class."""
+    text = type(getattr(Config(), name)).__doc__ or ""
+    return re.split(r"\.(?=\s+[A-Z`]|\s*$)", text.strip())[0].replace("`", "")
 
 
 def replace(config: Any, path: str, value: Any) -> Any:

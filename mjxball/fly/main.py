@@ -55,67 +55,82 @@ WORSE = {  # once the motors turn: cflib connects over a good link only
 }
 
 
+# What `--help` leaves to `--help all`, besides all of the groups `twin` and `thrust`.
+RARE = {"--upload", "--mocap-rate", "--mocap-std", "--mocap-option"}
+
+
 def make_parser() -> cli.Parser:
     """The flags; what None stands for is the policy card's."""
+    rare = set(RARE)
+
+    def common(parser: cli.Parser, _: argparse.Namespace, topic: str | None) -> set[str] | None:
+        if topic == "all":
+            return None
+        parser.epilog = "Defaults are in brackets. --help all has the twin's faults and surroundings, and rare flags."
+        every = {flag for action in parser._actions for flag in action.option_strings}
+        return {"policy", *every} - rare
+
     about = "Fly a policy with two Crazyflies, or rehearse it with their software twin."
-    parser = cli.make_parser("python -m mjxball.fly", about)
-    add = parser.add_argument
-    add("policy", type=policy_path, metavar="POLICY.npz", help="the follower, a file or a shipped one's name")
+    usage = (
+        "%(prog)s POLICY.npz --leader URI --follower URI [FLAG ...]\n       %(prog)s POLICY.npz --rehearse [FLAG ...]"
+    )
+    parser = cli.make_parser("python -m mjxball.fly", about, usage=usage, describe=common)
+    policy = "the follower, a file or a shipped one's name"
+    parser.add_argument("policy", type=policy_path, metavar="POLICY.npz", help=policy)
+
+    add = parser.add_argument_group("the drones").add_argument
     add("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
     add("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")
     add("--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given")
-    for name, _, high in LINK[1:]:
-        add(f"--{name}", type=float, metavar="X", help=f"--rehearse: {WORSE[name]}, up to {high:g}")
-    kinds = ", ".join(FAULT_KINDS)
-    add(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="KIND:DRONE@S",
-        help=f"--rehearse: after S seconds with motors on; may be repeated: {kinds}",
-    )
-    add_twin_options(parser)
-    about = "the laws run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
-    add("--onboard", nargs="?", const="float32", choices=("float32", "int8"), help=about)
-    add("--upload", action="store_true", help="--onboard int8: put the policy's weights into the follower's app first")
-    add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
     add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
+
+    add = parser.add_argument_group("the flight").add_argument
     add("--seconds", type=float, default=20.0, metavar="S", help="time under both laws before landing (20)")
+    about = "of O from its start, m (0 0 0.4; a stand: 0 0 0.08)"
+    add("--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help=about)
+    add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
     about = "write everything to this new file (flight-DATE.jsonl; none for --rehearse)"
     add("--log", type=Path, metavar="FILE", help=about)
     about = "a live page of the log, for a browser on this machine (a free port)"
     add("--view", type=int, nargs="?", const=0, metavar="PORT", help=about)
-    about = "of O from its start, m (0 0 0.4; a stand: 0 0 0.08)"
-    add("--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help=about)
+    about = "the laws run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
+    add("--onboard", nargs="?", const="float32", choices=("float32", "int8"), help=about)
+    add("--upload", action="store_true", help="--onboard int8: put the policy's weights into the follower's app first")
+
+    _add_mocap(parser.add_argument_group("motion capture"))
+    thrust = parser.add_argument_group("thrust and firmware")
+    add = thrust.add_argument
     about = "JSON of firmware parameters to upload, for both drones or each, over the card's"
     add("--gains", type=Path, metavar="FILE", help=about)
-    add(
-        "--thrust",
-        choices=("calibrated", "paper"),
-        help="m (g + az) through the force curve, or the paper's HOVER + 1000 az (the card's)",
-    )
+    about = "m (g + az) through the force curve, or the paper's HOVER + 1000 az (the card's)"
+    add("--thrust", choices=("calibrated", "paper"), help=about)
     add("--hover", type=float, metavar="UNITS", help="paper law: thrust at hover (the card's)")
     add("--curve", choices=CURVE_NAMES, help="force curve of the firmware (found by itself)")
     add("--mass", type=float, metavar="KG", help="calibrated law: of all that flies (the card's)")
+
+    twin = parser.add_argument_group("faults and surroundings of the twin")
+    kinds = ", ".join(FAULT_KINDS)
+    about = f"--rehearse: after S seconds with motors on; may be repeated: {kinds}"
+    twin.add_argument("--fault", action="append", default=[], metavar="KIND:DRONE@S", help=about)
+    for name, _, high in LINK[1:]:
+        about = f"--rehearse: {WORSE[name]}, up to {high:g}"
+        twin.add_argument(f"--{name}", type=float, metavar="X", help=about)
+    add_twin_options(twin)
+    rare.update(flag for group in (thrust, twin) for action in group._group_actions for flag in action.option_strings)
+    return parser
+
+
+def _add_mocap(group: argparse._ArgumentGroup) -> None:
+    add = group.add_argument
     add("--mocap", choices=KINDS, metavar="KIND", help=f"forward poses from: {', '.join(KINDS)}")
     add("--mocap-host", metavar="HOST", help="--mocap: its server; optitrack: as numbers")
     add("--bodies", nargs=2, metavar=("LEADER", "FOLLOWER"), help="--mocap: names of the rigid bodies")
-    add(
-        "--mocap-rate",
-        type=float,
-        metavar="HZ",
-        help="--mocap: poses a second to each drone, 50 to 100 (100; on a shared dongle 50)",
-    )
-    add(
-        "--mocap-std",
-        type=float,
-        nargs=2,
-        metavar=("M", "RAD"),
-        help="--mocap: deviations of a pose for the estimators (0.01 0.05)",
-    )
+    about = "--mocap: poses a second to each drone, 50 to 100 (100; on a shared dongle 50)"
+    add("--mocap-rate", type=float, metavar="HZ", help=about)
+    about = "--mocap: deviations of a pose for the estimators (0.01 0.05)"
+    add("--mocap-std", type=float, nargs=2, metavar=("M", "RAD"), help=about)
     about = "--mocap: more for this kind, such as port=22222; may be repeated"
     add("--mocap-option", action="append", default=[], metavar="KEY=VALUE", help=about)
-    return parser
 
 
 def mocap_settings(options: argparse.Namespace) -> MocapSettings | None:

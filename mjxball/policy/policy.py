@@ -73,6 +73,28 @@ class Policy:
         self._single: SingleFollower | None = None
         self._ahead = False  # whether `_single` has the memory, newer than `_memory`
 
+    @property
+    def _facts(self) -> dict[str, object]:
+        layers = [len(bias) for bias in self._biases[:-1]]
+        made = {"preset": self.card.get("preset"), "seed": self.card.get("seed"), "steps": self.card["training_steps"]}
+        return {**made, "GRU": self._law.units or None, "layers": layers, "period": f"{1e3 * self.control_period:g} ms"}
+
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name} {value}" for name, value in self._facts.items() if value is not None)
+        return f"<Policy {self.name}: {told}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: what made it, and its returns over training."""
+        from mjxball import pictures
+
+        curve, lines = self.card.get("curve") or {}, []
+        if curve.get("steps"):
+            lines = [pictures.Curve("exploring", curve["steps"], curve["episode_return"])]
+            lines += [pictures.Curve("evaluated", curve["eval_steps"], curve["eval_return"], dots=True)]
+        drawn = pictures.curves(lines, "environment steps", "return of an episode") if lines else ""
+        facts = {name: value for name, value in self._facts.items() if value is not None}
+        return pictures.card(f"policy {self.name}", facts, drawn)
+
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Policy:
         """Load a policy file; raise PolicyFileError with one sentence if it is unsound."""

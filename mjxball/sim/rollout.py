@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from mjxball import pictures
 from mjxball.config import Config, Plant, follow_plant, preset, replace, validate
 from mjxball.control import rotations
 from mjxball.control.followers import Baseline, Follower, PrivilegedInfo
@@ -84,6 +85,27 @@ class Trajectory:
     goal: Float[np.ndarray, "... 3"]  # of O, the last one of a sequence of waypoints [m]
     target: Float[np.ndarray, "T ... 3"]  # goal of O at every step [m]
     diverged: Bool[np.ndarray, "..."]
+
+    @property
+    def _summary(self) -> str:
+        several = f", {self.position.shape[1]} flights" if self.position.ndim > 2 else ""
+        diverged = int(np.sum(self.diverged))
+        lost = f", {diverged} diverged" if diverged else ""
+        return f"{self.time[-1]:g} s, {len(self.time)} steps{several}{lost}"
+
+    def __repr__(self) -> str:
+        return f"<Trajectory {self._summary}>"
+
+    def _repr_html_(self) -> str:
+        """For notebooks: the error over time, of several flights its length."""
+        if self.position.ndim == 2:
+            lines = [pictures.Curve(f"error along {'xyz'[axis]}", self.time, self.error[:, axis]) for axis in range(3)]
+        else:
+            far = np.linalg.norm(self.error, axis=-1)
+            lines = [pictures.Curve(f"flight {number}", self.time, far[:, number]) for number in range(far.shape[1])][
+                :4
+            ]
+        return pictures.card("flight", {"of": self._summary}, pictures.curves(lines, "time [s]", "error [m]"))
 
     @property
     def error(self) -> Float[np.ndarray, "T ... 3"]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.files import MissingFileError
+from mjxball.train.events import Events, Point, Session, tags
 from mjxball.train.run_directory import METRICS, read_metrics, read_rows, write_rows
 
 LOG = "members.csv"
@@ -19,11 +21,17 @@ COLUMNS = ("steps", "seed", "eval_return")  # and what the environment reports o
 
 
 class MemberLog:
-    """`members.csv` of a run: one row for each member and evaluation; without `out` nothing is written."""
+    """`members.csv` of a run: one row for each member and evaluation, which TensorBoard has as well.
 
-    def __init__(self, out: Path | None, seed: int, resumed_at: int = 0):
-        self._out, self._seed = out, seed
+    Without `out` nothing is written.
+    """
+
+    def __init__(self, out: Path | None, sessions: Sequence[Session] = (), seed: int = 0, resumed_at: int = 0):
+        """`sessions`: each member's."""
+        self._out, self._sessions, self._seed = out, sessions, seed
         self._rows = [row for row in read_members(out) if row["steps"] <= resumed_at] if out else []
+        self._at: dict[float, float] = {}  # steps -> when the evaluation was added [s]
+        self._write_events()
 
     def add(self, steps: int, found: Mapping[str, np.ndarray]) -> None:
         """Append one evaluation: every array is (members,)."""
@@ -33,6 +41,18 @@ class MemberLog:
         if self._out is None:
             return
         write_rows(self._out / LOG, list(self._rows[-1]), self._rows)
+        self._at[steps] = time.time()
+        self._write_events()
+
+    def _write_events(self) -> None:
+        """Every member's run in TensorBoard, anew: of some thousand members no file stays open."""
+        if self._out is None:
+            return
+        for member, session in enumerate(self._sessions):
+            own = [row for row in self._rows if row["seed"] == self._seed + member]
+            named = tags((), (), [name.removeprefix("eval_") for name in (own[-1] if own else {}) if "eval_" in name])
+            points = [Point(int(row["steps"]), row, self._at.get(row["steps"], time.time())) for row in own]
+            Events(self._out, session, named, points).close()
 
     def best(self) -> int:
         """The member with the highest return at the last evaluation; 0 before the first."""
@@ -69,7 +89,7 @@ def best_member(rows: list[dict[str, float]]) -> int:
 
 def draw_members(run: Path, path: Path) -> None:
     """Picture of all members over training: steady-state error and return, each one, their median and quartiles."""
-    from mjxball.plotting import logarithmic, pyplot, save
+    from mjxball.plotting import BLUE, INK, legend_above, logarithmic, pyplot, save
 
     rows = read_members(run)
     steps = sorted({row["steps"] for row in rows})
@@ -78,20 +98,18 @@ def draw_members(run: Path, path: Path) -> None:
     labels = (("eval_steady_error", "steady-state error [m]"), ("eval_return", "return of an episode"))
     for axis, (name, label) in zip(axes, labels, strict=True):
         table = np.array([[row[name] for row in rows if row["steps"] == step] for step in steps])
-        axis.plot(steps, table, ".-", color="#9bb7cc", linewidth=0.8)  # one evaluation is a point
+        axis.plot(steps, table, ".-", color=INK, alpha=0.5, linewidth=0.8)  # one evaluation is a point
         if (known := np.isfinite(table).any(axis=1)).any():  # short episodes have no steady state
             at, (low, middle, high) = np.array(steps)[known], np.nanpercentile(table[known], [25, 50, 75], axis=1)
-            axis.fill_between(at, low, high, color="#1b6ca8", alpha=0.2, label="quartiles")
-            axis.plot(at, middle, ".-", color="#1b6ca8", linewidth=2, label="median")
+            axis.fill_between(at, low, high, color=BLUE, alpha=0.25, label="quartiles")
+            axis.plot(at, middle, ".-", color=BLUE, linewidth=2, label="median")
         axis.set_ylabel(label)
-        axis.grid(alpha=0.25)
+        axis.grid()
     if any(row["eval_steady_error"] > 0 for row in rows):
         logarithmic(axes[0])
-    axes[1].legend()
     axes[1].set_xlabel("environment steps of each member")
-    figure.suptitle(f"{table.shape[1]} followers")
+    legend_above(figure, axes, title=f"{table.shape[1]} followers")
     save(figure, path)
-    plt.close(figure)
 
 
 PANELS = {
@@ -101,7 +119,6 @@ PANELS = {
         (None, "eval_vertical_error", "vertical command off the leader's [m/s² rms]"),
     ),
 }
-BLUE, GREY = "#1b6ca8", "#9a9a9a"
 
 
 def training_summary(run: Path, seed: int) -> dict[str, Any]:
@@ -141,7 +158,7 @@ def _rows(run: Path) -> list[dict[str, str]]:
 
 def draw_training(run: Path, config: Config, path: Path) -> None:
     """Draw `metrics.csv` of the directory `run` to `path`, whose directory is made."""
-    from mjxball.plotting import logarithmic, pyplot, save
+    from mjxball.plotting import BLUE, INK, legend_above, logarithmic, pyplot, save
 
     rows = _rows(run)
 
@@ -159,18 +176,18 @@ def draw_training(run: Path, config: Config, path: Path) -> None:
         axes, (("episode_return", "eval_return", "return of an episode"), *below), strict=True
     ):
         if exploring:
-            axis.plot(*column(exploring), color=GREY, linewidth=1, label="exploring")
-        axis.plot(*column(evaluated), color=BLUE, marker="o", markersize=3.5, label="evaluated, deterministic")
+            axis.plot(*column(exploring), color=INK, alpha=0.7, linewidth=1, label="exploring")
+        axis.plot(
+            *column(evaluated), color=BLUE, marker="o", markersize=3.5, clip_on=False, label="evaluated, deterministic"
+        )
         axis.set_ylabel(label, fontsize="small")
-        axis.grid(alpha=0.25)
+        axis.grid()
     for axis in axes[1:]:
         if (column(below[0][1])[1] > 0).any():
             logarithmic(axis)
     if config.reward.kind == "paper":
-        axes[0].axhline(0.0, color="black", linestyle=":", linewidth=1, label="optimum: copy the leader")
-    axes[0].legend(fontsize="small")
+        axes[0].axhline(0.0, color=INK, linestyle=":", linewidth=1, label="optimum: copy the leader")
     axes[-1].set_xlabel("environment steps")
-    figure.suptitle(f"training of preset {config.preset}")
+    legend_above(figure, axes, title=f"training of preset {config.preset}")
     path.parent.mkdir(parents=True, exist_ok=True)
     save(figure, path)
-    plt.close(figure)

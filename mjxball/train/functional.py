@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,9 +13,13 @@ from jax import Array
 
 from mjxball.algorithms.base import Phase, PolicyNetwork
 from mjxball.config import Config
+from mjxball.errors import InputError
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions
+from mjxball.train.live import LiveCurve, Report, in_notebook
 from mjxball.train.program import Mode, Program, TrainState
+
+CHUNKS = 25  # reports of training, at most about
 
 
 def train(
@@ -27,6 +32,7 @@ def train(
     algorithm: Any = None,
     overrides: Mapping[str, Any] | None = None,
     evaluate: bool = True,
+    progress: bool | Report | None = None,
 ) -> tuple[PolicyNetwork, dict[str, Array]]:
     """Train a follower from `key` (`jax.random.PRNGKey(seed)` gives the run of `train.py --seed`) without any file.
 
@@ -37,10 +43,18 @@ def train(
     (`num_evaluations`,): `steps`, `episode_return` (exploring), the algorithm's metrics, `eval_return`, and the
     means of the environment's metrics as `eval_<name>`. Without `evaluate` it trains in one stretch, and what is named
     `eval_` holds nothing. `mjxball.train.compilation.compiler_options()` are the options with which `train.py` compiles
-    sooner. `jax.shard_map` of it needs `check_vma=False`. Raises InputError if one of them does not fit.
+    sooner. `jax.shard_map` of it needs `check_vma=False`. `progress`: True for a live curve in a notebook, which is the
+    default there, or a function that is told how it goes (`live.Report`); then it cannot be traced, and steps in turns.
+    Raises InputError if one of them does not fit.
     """
+    traced = any(isinstance(value, jax.core.Tracer) for value in (key, *(overrides or {}).values()))
+    if traced and progress:
+        raise InputError("train() is traced, by jax.jit or jax.vmap, and cannot show its progress: leave progress out")
+    if progress is None:
+        progress = in_notebook() and not traced
+    report = progress if callable(progress) else LiveCurve(f"training {config.preset}") if progress else None
     with jax.enable_x64(False):  # float32 throughout, also where the user's own program is not
-        return _train(config, key, physics, Extensions(env, reward, algorithm), overrides, evaluate)
+        return _train(config, key, physics, Extensions(env, reward, algorithm), overrides, evaluate, report)
 
 
 def _train(
@@ -50,6 +64,7 @@ def _train(
     extensions: Extensions,
     overrides: Mapping[str, Any] | None,
     evaluate: bool,
+    report: Report | None,
 ) -> tuple[PolicyNetwork, dict[str, Array]]:
     program = Program(config, physics, overrides, extensions=extensions)
     program.algorithm.check_parts(1)
@@ -70,13 +85,38 @@ def _train(
         return kept, {"steps": kept.steps, "return": returned, **metrics, **own}
 
     modes = _phases(program, evaluate)
-    state, seen = jax.lax.scan(phase, state, modes)
+    if report:
+        state, seen = _in_turns(phase, state, modes, program, report)
+    else:
+        state, seen = jax.lax.scan(phase, state, modes)
     # Behind the warm-up.
     trained, evaluated = slice(1, None, 2), slice(2, None, 2)
     metrics = {name: seen[name][trained] for name in ("steps", *program.algorithm.metrics)}
     metrics |= {"episode_return": seen["return"][trained], "eval_return": seen["return"][evaluated]}
     metrics |= {name: value[evaluated] for name, value in seen.items() if name.startswith("eval_")}
     return program.policy(state), metrics
+
+
+def _in_turns(phase: Any, state: TrainState, modes: Mode, program: Program, report: Report) -> tuple[TrainState, Any]:
+    """As `jax.lax.scan` of `phase`, with training in about `CHUNKS` parts, after each of which there is a `report`."""
+    turn, window = jax.jit(phase), program.algorithm.steps_per_collect
+    most = math.ceil(program.total_rounds / CHUNKS / window) * window
+    seen = []
+    for number in range(len(modes.steps)):
+        mode = jax.tree.map(lambda leaf, number=number: leaf[number], modes)
+        left, total, returned = int(mode.steps), int(mode.steps), 0.0
+        while True:
+            part = min(left, most) if mode.phase.learning else left
+            state, found = turn(state, mode._replace(steps=np.int32(part)))
+            left, returned = left - part, returned + found["return"] * part / max(total, 1)
+            name = "eval_return" if mode.phase.evaluate else "episode_return"
+            if total:
+                told = {"steps": float(found["steps"]), name: float(found["return"])}
+                report({**told, "total": float(program.schedule.total_steps)})
+            if left <= 0:
+                break
+        seen.append({**found, "return": returned})
+    return state, jax.tree.map(lambda *values: jnp.stack(values), *seen)
 
 
 def _phases(program: Program, evaluate: bool) -> Mode:

@@ -1,4 +1,4 @@
-"""The live progress line and the rows of `metrics.csv`."""
+"""The live status of a training and the rows of `metrics.csv`."""
 
 from __future__ import annotations
 
@@ -9,28 +9,31 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from mjxball.quiet import import_tensorboard_writer
+from mjxball.terminal import Status
+from mjxball.train.events import Events, Point, Session, tags
 from mjxball.train.run_directory import CONFIG_FILE, read_metrics, write_rows
-
-EVENTS = "tensorboard"  # directory beside metrics.csv
-
 
 # steps: environment steps so far; seconds: of training, compilation included, of a resumed run what came before its
 # checkpoint too; rate: environment steps per second of all members together, updates included; episode_return: mean
 # reward x episode steps, exploring. Then what environment and algorithm report, and episodes that ended before their
 # time limit or left the finite range.
 COMMON = ("steps", "seconds", "rate", "episode_return")
+KEYS = "Ctrl-C saves and stops"
 Row = dict[str, Any]  # by column; the columns of an evaluation are absent between evaluations
 
 
-def columns(exploring: Sequence[str], algorithm: Sequence[str], evaluated: Sequence[str]) -> list[str]:
-    """Columns of `metrics.csv`, from what the environment reports (exploring, evaluated) and the algorithm."""
+def columns(exploring: Sequence[str], algorithm: Sequence[str], evaluated: Sequence[str]) -> dict[str, str]:
+    """Columns of `metrics.csv`, from what the environment reports (exploring, evaluated) and the algorithm.
+
+    Each with its tag in TensorBoard, '' of `steps`.
+    """
     found = [*COMMON, *exploring, *algorithm, "terminated", "diverged", "eval_return"]
-    return [*found, *(f"eval_{name}" for name in evaluated)]
+    known = tags(exploring, algorithm, evaluated)
+    return {name: known.get(name, "") for name in (*found, *(f"eval_{name}" for name in evaluated))}
 
 
 class Progress:
-    """Prints one line that is overwritten on a terminal; appends rows to `metrics.csv` and to TensorBoard's events.
+    """Shows a status at a terminal, else a line a row; appends rows to `metrics.csv` and to TensorBoard's events.
 
     Of a run that is resumed at `resumed_at` steps, rows beyond are dropped: they will come again. Without a `path`
     nothing is printed or written.
@@ -39,39 +42,53 @@ class Progress:
     def __init__(
         self,
         path: Path | None,
-        names: Sequence[str],
+        names: Mapping[str, str],
         total: int,
         resumed_at: int = 0,
         members: int = 1,
         stream: TextIO | None = None,
+        session: Session | None = None,
     ):
-        self._names, self._total, self._members = names, total, members
-        self._stream = stream or sys.stderr
-        self._live = self._stream.isatty()
+        """`names`: see `columns`."""
+        self._names, self._total, self._members = list(names), total, members
+        session = session or Session()
+        self._called = session.name
+        self._status = Status(stream or sys.stderr)
         self._start = time.monotonic()
-        self._width = 0
+        self._doing = "", "", KEYS
+        self._latest: tuple[Row, float] | None = None  # and when it came
         self.before = 0.0  # [s] what the run took before it was resumed
         self._silent = path is None
         if path is None:
             return
-        kept = _rows_until(path, names, resumed_at)
+        kept = _rows_until(path, self._names, resumed_at)
         self.before = float(kept[-1]["seconds"]) if kept else 0.0
-        write_rows(path, names, kept)
+        write_rows(path, self._names, kept)
         self._file = path.open("a", newline="")
-        self._writer = csv.DictWriter(self._file, names)
-        self._events = _events_anew(path, kept)
+        self._writer = csv.DictWriter(self._file, self._names)
+        config = path.with_name(CONFIG_FILE)
+        began = config.stat().st_mtime if config.exists() else time.time()
+        told = {name: tag for name, tag in names.items() if tag}
+        self._events = Events(path.parent, session, told, [_point(row, began) for row in kept])
+        self._events.flush()
 
     def elapsed(self) -> float:
         """Seconds since this object was made."""
         return time.monotonic() - self._start
 
-    def say(self, text: str) -> None:
-        """Print a line of its own."""
+    def begin(self, doing: str, what: str = "", keys: str = KEYS) -> None:
+        """Show what is done until there is a row, and how long it has taken; without a terminal say it, if `what`."""
         if self._silent:
             return
-        clear = "\r" + " " * self._width + "\r" if self._live and self._width else ""
-        self._width = 0
-        print(clear + text, file=self._stream, flush=True)
+        if what and not self._status.live:
+            self.say(f"{doing} {what} ...")
+        self._doing = doing, what, keys
+        self._status.show(self._lines)
+
+    def say(self, text: str) -> None:
+        """Print a line of its own."""
+        if not self._silent:
+            self._status.say(text)
 
     def show(self, row: Row) -> None:
         """Record `row` and show it."""
@@ -82,54 +99,58 @@ class Progress:
             self._file.flush()
         except OSError as error:  # of a full disk it does not say where
             raise OSError(error.errno, error.strerror, self._file.name) from None
-        for name, value in row.items():
-            if value is not None and name != "steps":
-                self._events.add_scalar(name, value, row["steps"])
-        left = max(self._total - row["steps"], 0) * self._members / max(row["rate"], 1e-9)
-        evaluated = "eval_return" in row
-        text = (
-            f"{row['steps']:>9,} / {self._total:,} steps  {row['rate'] / 1e3:6.1f} k/s  "
-            f"{int(left) // 60}:{int(left) % 60:02d} left  {self._summary(row, evaluated)}"
-        )
-        if self._live and not evaluated:
-            self._stream.write("\r" + text.ljust(self._width))
-            self._stream.flush()
-            self._width = len(text)
-        else:
-            self.say(text)
+        self._events.add(Point(row["steps"], row, time.time()))
+        self._events.flush()
+        if not self._status.live or "eval_return" in row:
+            left = self._left(row, 0.0)
+            text = f"{row['steps']:>9,} / {self._total:,} steps  {row['rate'] / 1e3:6.1f} k/s  {left}"
+            self.say("  ".join((text, *self._summary(row))))
+        self._latest = row, time.monotonic()
+        self._status.show(self._lines)
 
-    def _summary(self, row: Row, evaluated: bool) -> str:
+    def _lines(self) -> list[list[str]]:
+        """What a terminal shows now."""
+        if self._latest is None:
+            doing, what, keys = self._doing
+            return [[f"{doing} {self.elapsed():.0f} s", *([what] if what else [])], [keys, self._called]]
+        row, came = self._latest
+        head = [
+            f"{row['steps'] / self._total:.0%}",
+            self._left(row, time.monotonic() - came),
+            f"{row['rate'] / 1e3:.1f} k/s",
+            f"{row['steps']:,} of {self._total:,} steps",
+            self._called,
+        ]
+        return [head, [KEYS, *self._summary(row)]]
+
+    def _left(self, row: Row, since: float) -> str:
+        left = max(self._total - row["steps"], 0) * self._members / max(row["rate"], 1e-9) - since
+        return f"{max(int(left), 0) // 60}:{max(int(left), 0) % 60:02d} left"
+
+    def _summary(self, row: Row) -> list[str]:
         """The return and the first metrics behind it, of the evaluation or exploring."""
+        evaluated = "eval_return" in row
         chosen = [name for name in self._names if name.startswith("eval_") == evaluated and name not in COMMON]
         shown = chosen[:3] if evaluated else ["episode_return", *chosen[:2]]
-        return "  ".join(f"{name.replace('_', ' ')} {_number(row.get(name))}" for name in shown)
+        return [f"{name.replace('_', ' ')} {_number(row.get(name))}" for name in shown]
+
+    def end_status(self) -> None:
+        """Take the status away: what comes is said line by line."""
+        self._status.close()
 
     def close(self) -> None:
-        """End the line and close the file."""
+        """Take the status away and close the files."""
+        self.end_status()
         if self._silent:
             return
-        if self._live and self._width:
-            self._stream.write("\n")
         self._file.close()
         self._events.close()
 
 
-def _events_anew(path: Path, kept: Sequence[Mapping[str, str]]) -> Any:
-    """A writer of TensorBoard's events beside `path`, with the rows `kept`: each point once, whoever reads them.
-
-    What is there besides goes: rows that will come again, and others than an earlier process wrote to metrics.csv.
-    """
-    place = path.with_name(EVENTS)
-    for older in place.glob("events.out.tfevents.*"):
-        older.unlink()
-    events, began = import_tensorboard_writer()(str(place)), path.with_name(CONFIG_FILE)
-    start = began.stat().st_mtime if began.exists() else time.time()
-    for row in kept:
-        numbers = {name: float(text) for name, text in row.items() if text and name != "steps"}
-        for name, value in numbers.items():
-            events.add_scalar(name, value, int(row["steps"]), walltime=start + numbers["seconds"])
-    events.flush()
-    return events
+def _point(row: Mapping[str, str], began: float) -> Point:
+    """A row of `metrics.csv` of a run that began then [s]."""
+    numbers = {name: float(text) for name, text in row.items() if text}
+    return Point(int(row["steps"]), numbers, began + numbers["seconds"])
 
 
 def _number(value: float | None) -> str:

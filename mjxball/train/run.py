@@ -25,6 +25,7 @@ from mjxball.sim.follower import follower_law
 from mjxball.train import lock, processes
 from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
+from mjxball.train.events import session
 from mjxball.train.extensions import Extensions, is_pair, resolve
 from mjxball.train.population import Population
 from mjxball.train.program import Statistics, TrainState
@@ -57,9 +58,11 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
         stop.requested = True
         restore()
         if not stop.begun and jax.process_count() == 1:
+            progress.end_status()
             progress.say("stopped before training began; --resume begins it")
             lock.drop()
             os._exit(130)  # what XLA compiles cannot be cut short
+        progress.end_status()  # a second one leaves no time to
         progress.say("stopping: saving the policy and a checkpoint (Ctrl-C again to quit at once)")
 
     for number in defaults:
@@ -112,10 +115,11 @@ class Run:
                 write_config(out, config, self.origin)
         exploring, evaluated = self.population.metric_names()
         names = columns(exploring, self.population.program.algorithm.metrics, evaluated)
-        self.progress = Progress(
-            out / METRICS if self._writes else None, names, self._schedule.total_steps, done, origin["seeds"]
-        )
-        self.members = MemberLog(out if self._writes else None, origin["seed"], done)
+        place, total, seed, count = out / METRICS, self._schedule.total_steps, origin["seed"], origin["seeds"]
+        whole = session(config, seed, count, origin)
+        self.progress = Progress(place if self._writes else None, names, total, done, count, session=whole)
+        sessions = [session(self.population.member_config(k), seed + k, 1, origin) for k in range(count)]
+        self.members = MemberLog(out if self._writes else None, sessions if count > 1 else (), seed, done)
         self._writer = ThreadPoolExecutor(1)  # writes checkpoints
         self._clock = ThreadPoolExecutor(1)  # sees when the devices are done
         self._checkpoints: Future[Any] | None = None
@@ -171,7 +175,8 @@ class Run:
 
     def _start(self) -> None:
         devices = self.population.devices
-        self.progress.say(f"compiling the training program for {devices} x {jax.devices()[0].device_kind} ...")
+        what = f"the training program for {devices} x {jax.devices()[0].device_kind}"
+        self.progress.begin("compiling", what, "Ctrl-C stops")
         creating = self._state is None
         self._compiled = self.population.compile(creating)
         if creating:
@@ -185,6 +190,7 @@ class Run:
         if self._writes:  # Orbax takes a second to load: while the device trains, not before
             self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
+        self.progress.begin("training")
 
     def _loop(self, stop: Stop) -> None:
         total, first = self.population.program.total_rounds, self.population.program.warmup_rounds

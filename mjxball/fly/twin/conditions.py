@@ -85,7 +85,7 @@ RANGES = {"noise": (0.0, 100.0), "pose_hz": (1.0, 1000.0), "delay": (0.0, 0.5)}
 LOAD_RANGES = ((0.0, 0.1), (-0.15, 0.15), (0.0, 3600.0))  # of `AddedLoad`
 
 
-def add_twin_options(parser: argparse.ArgumentParser) -> None:
+def add_twin_options(parser: argparse._ActionsContainer) -> None:
     """Add --twin-drone and the others to `parser`; None by default."""
     about = "--rehearse: "
     add = parser.add_argument

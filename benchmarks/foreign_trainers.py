@@ -1,0 +1,276 @@
+"""Train a follower with Brax's or Stable-Baselines3's own SAC or PPO on the environment of a preset -> a policy file.
+
+`python benchmarks/foreign_trainers.py brax-sac|brax-ppo|sb3-sac|sb3-ppo OUT.npz [--seed N] [--steps N] ...`
+
+`--help` behind a trainer's name lists its settings. What the networks see, how actions are bounded and what is rewarded
+are the preset's, exactly as in `train.py`. So are the settings, but those of Brax's SAC: the best of 12 on two cores
+(docs/archive/training.md). Where the preset has none a library's own holds. A policy file ends in tanh, and so do all
+four: SB3's PPO acts through one, too. Its `VecNormalize` scales PPO's rewards. Brax has no decay of learning rates. Its
+evaluations are left out, which makes it faster; besides OUT.npz, written at the end, there is OUT-<steps>.npz at each
+of `--snapshots` equal parts of the way; the files' times tell when each was reached. `sb3-*` need stable-baselines3 and
+PyTorch, see docs/gym.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import time
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjxball import config as configs
+from mjxball.algorithms.base import PolicyNetwork
+from mjxball.cache import enable_compilation_cache
+from mjxball.env import TransportEnv
+from mjxball.policy import load_network, save_file
+from mjxball.policy.export import policy_file
+from mjxball.sim.follower import follower_law
+
+LAST_RATE = 0.02  # of SB3's learning rates, at the end over the start: linear, as the preset's own
+SAMPLES = 100  # observations of a flight on which the policy file must answer as SB3's model
+ROUNDING = 1e-4  # of an action, in [-1, 1]: float32 through three layers, whose inputs are tens of deviations at most
+TANH_IS_ONE = 20.0  # where it is so in float32: what PPO's unbounded actions are clipped to
+COMMON = {"layers": "64,64", "discount": 0.97}
+SETTINGS: dict[str, dict[str, Any]] = {
+    "brax-sac": {"steps": 768_000, "num_envs": 128, "updates": 8, "batch": 256, "replay": 768_000, **COMMON}
+    | {"learning_rate": 5e-4, "target_rate": 0.01, "reward_scale": 20.0, "snapshots": 1},
+    "brax-ppo": {"steps": 4_000_000, "num_envs": 512, **COMMON, "learning_rate": 2e-3, "reward_scale": 0.02}
+    | {"snapshots": 1},
+    "sb3-sac": {"steps": 768_000, "num_envs": 512, "updates": 8, "batch": 256, **COMMON, "learning_rate": 4e-3},
+    "sb3-ppo": {"steps": 4_000_000, "num_envs": 512, **COMMON, "learning_rate": 2e-3},
+}
+Export = Callable[[int, Any, Any, Any], None]  # environment steps; layers, means, deviations: see `PolicyNetwork`
+
+
+class Masked:
+    """An environment whose observation has zeros where the preset's networks look away."""
+
+    def __init__(self, env: TransportEnv):
+        self._env, self._mask = env, jnp.asarray(env.input_mask, jnp.float32)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+    def reset(self, key: Any) -> Any:
+        """See `TransportEnv.reset`."""
+        state = self._env.reset(key)
+        return state.replace(obs=state.obs * self._mask)
+
+    def step(self, state: Any, action: Any) -> Any:
+        """See `TransportEnv.step`."""
+        state = self._env.step(state, action)
+        return state.replace(obs=state.obs * self._mask)
+
+
+def train_brax(config: configs.Config, options: argparse.Namespace, export: Export) -> None:
+    """Train with Brax; `export` at every snapshot."""
+    from mjxball.gym.brax_trainers import brax_trainer
+
+    agent = options.trainer.removeprefix("brax-")
+    train = brax_trainer(agent)
+    from brax.envs.wrappers import training as wrappers
+    from brax.training import acting
+    from brax.training.agents.ppo.networks import make_ppo_networks
+    from brax.training.agents.sac.networks import make_sac_networks
+
+    newest: list[Any] = [None]
+
+    def look(self: Any, parameters: Any, training_metrics: dict[str, Any], **_: Any) -> dict[str, Any]:
+        newest[0] = parameters  # Brax hands them out nowhere else before the end
+        return dict(training_metrics)
+
+    def snapshot(steps: int, _: Any) -> None:
+        if steps:
+            export(steps, newest[0][1]["params"], newest[0][0].mean, newest[0][0].std)
+
+    acting.Evaluator.run_evaluation = look
+    sizes, ppo = options.sizes, config.ppo
+    if agent == "sac":
+        networks = functools.partial(make_sac_networks, hidden_layer_sizes=sizes)
+        own: dict[str, Any] = {
+            "batch_size": options.batch,
+            "tau": options.target_rate,
+            "grad_updates_per_step": options.updates,
+        }
+        own |= {"min_replay_size": config.sac.warmup_steps, "max_replay_size": options.replay}
+    else:
+        networks = functools.partial(
+            make_ppo_networks, policy_hidden_layer_sizes=sizes, value_hidden_layer_sizes=ppo.value_layers
+        )
+        own = {"batch_size": options.num_envs // ppo.minibatches, "num_minibatches": ppo.minibatches}
+        own |= {"unroll_length": ppo.unroll_length, "num_updates_per_batch": ppo.epochs}
+        own |= {"gae_lambda": ppo.gae_lambda, "clipping_epsilon": ppo.clipping}
+        own |= {"entropy_cost": ppo.entropy_cost, "max_grad_norm": ppo.max_grad_norm}
+    with jax.default_matmul_precision("highest"):
+        train(
+            environment=Masked(TransportEnv(config, options.physics)),
+            wrap_env_fn=wrappers.wrap,
+            num_timesteps=options.steps,
+            episode_length=config.timing.episode_steps,
+            num_envs=options.num_envs,
+            learning_rate=options.learning_rate,
+            discounting=options.discount,
+            seed=options.seed,
+            num_evals=options.snapshots + 1,
+            progress_fn=snapshot,
+            normalize_observations=True,
+            max_devices_per_host=1,
+            reward_scaling=options.reward_scale,
+            network_factory=functools.partial(networks, activation=jax.nn.relu),
+            **own,
+        )
+
+
+class Worlds:
+    """A `FollowerVectorEnv` with same-step autoreset as what Stable-Baselines3 asks of its `VecEnv`.
+
+    Observations (N, n) have zeros where the preset's networks look away. If `squashed`, actions (N, 3) go through tanh.
+    """
+
+    render_mode = None
+
+    def __init__(self, env: Any, mask: np.ndarray, squashed: bool):
+        import gymnasium
+
+        self._env, self._mask, self._squashed, self._seed = env, mask, squashed, 0
+        self.num_envs, self.observation_space = env.num_envs, env.single_observation_space
+        wide = gymnasium.spaces.Box(-TANH_IS_ONE, TANH_IS_ONE, env.single_action_space.shape, np.float32)
+        self.action_space = wide if squashed else env.single_action_space
+
+    def seed(self, seed: int) -> None:
+        """Of the next `reset`: world i has `seed` + i."""
+        self._seed = seed
+
+    def reset(self) -> np.ndarray:
+        """First observations (N, n)."""
+        return self._env.reset(seed=self._seed)[0] * self._mask
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep `actions` (N, 3) for `step_wait`."""
+        self._actions = np.tanh(actions) if self._squashed else actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Observations, rewards, endings, and what SB3 wants to know of each world that ended."""
+        seen, reward, terminated, truncated, info = self._env.step(self._actions)
+        ended = terminated | truncated
+        told: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for world in np.flatnonzero(ended):
+            told[world] = {
+                "terminal_observation": info["final_obs"][world] * self._mask,
+                "TimeLimit.truncated": bool(truncated[world]),
+            }
+        return seen * self._mask, reward.astype(np.float32), ended, told
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The same for all worlds."""
+        return [getattr(self, attr_name)] * self.num_envs
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """No world has a wrapper of its own."""
+        return [False] * self.num_envs
+
+
+def train_sb3(config: configs.Config, options: argparse.Namespace, export: Export) -> None:
+    """Train with Stable-Baselines3, `export`, and assert that the policy file answers as the model does."""
+    import torch
+    from stable_baselines3 import PPO, SAC
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from mjxball.gym.vector import FollowerVectorEnv
+
+    torch.set_num_threads(1)
+    is_ppo, ppo = options.trainer == "sb3-ppo", config.ppo
+    worlds = FollowerVectorEnv(options.num_envs, config=config, physics=options.physics, autoreset_mode="SameStep")
+    mask = np.array(TransportEnv(config, options.physics).input_mask, np.float32)
+    # A policy file does not clip what its network sees.
+    env = VecNormalize(Worlds(worlds, mask, is_ppo), norm_reward=is_ppo, gamma=options.discount, clip_obs=np.inf)
+    own: dict[str, Any] = {
+        "learning_rate": lambda left: options.learning_rate * max(left, LAST_RATE),
+        "gamma": options.discount,
+        "policy_kwargs": {"net_arch": options.sizes, "activation_fn": torch.nn.ReLU},
+    }
+    if is_ppo:
+        own |= {"n_steps": ppo.unroll_length, "batch_size": options.num_envs * ppo.unroll_length // ppo.minibatches}
+        own |= {"n_epochs": ppo.epochs, "gae_lambda": ppo.gae_lambda, "clip_range": ppo.clipping}
+        own |= {"ent_coef": ppo.entropy_cost, "max_grad_norm": ppo.max_grad_norm}
+    else:
+        own |= {"n_steps": config.sac.n_step, "tau": config.sac.tau, "learning_starts": config.sac.warmup_steps}
+        own |= {"batch_size": options.batch, "train_freq": 1, "gradient_steps": options.updates}
+    model = (PPO if is_ppo else SAC)("MlpPolicy", env, seed=options.seed, device="cpu", **own)
+    model.learn(options.steps)
+    env.training = False
+
+    if is_ppo:
+        hidden, mean, log_std = model.policy.mlp_extractor.policy_net, model.policy.action_net, model.policy.log_std
+    else:
+        hidden, mean, log_std = model.actor.latent_pi, model.actor.mu, model.actor.log_std
+    found = [(array(part.weight).T, array(part.bias)) for part in hidden if isinstance(part, torch.nn.Linear)]
+    kernel, bias = array(mean.weight).T, array(mean.bias)
+    wide = (np.zeros_like(kernel), array(log_std)) if is_ppo else (array(log_std.weight).T, array(log_std.bias))
+    found.append((np.hstack([kernel, wide[0]]), np.hstack([bias, wide[1]])))
+    named = {f"hidden_{k}": {"kernel": weight, "bias": bias} for k, (weight, bias) in enumerate(found)}
+    statistics = env.obs_rms
+    export(model.num_timesteps, named, statistics.mean, np.sqrt(statistics.var + env.epsilon))
+
+    network, seen, flown = load_network(options.out), env.reset(), []
+    for _ in range(SAMPLES):
+        flown.append(env.get_original_obs()[0])
+        seen, *_ = env.step(model.predict(seen, deterministic=True)[0])
+    observations = np.stack(flown)
+    answers = model.predict(env.normalize_obs(observations), deterministic=True)[0]
+    apart = np.abs((np.tanh(answers) if is_ppo else answers) - network(observations)).max()
+    print(f"policy file and model are apart by {apart:.1e} on {SAMPLES} observations", flush=True)
+    assert apart < ROUNDING
+
+
+def array(tensor: Any) -> np.ndarray:
+    """PyTorch's `tensor` as NumPy's."""
+    return tensor.detach().numpy()
+
+
+def main() -> None:
+    """Train and export."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    trainers = parser.add_subparsers(dest="trainer", required=True)
+    for name, settings in SETTINGS.items():
+        own = trainers.add_parser(name, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+        own.add_argument("out", type=Path, metavar="OUT.npz")
+        own.add_argument("--preset", default="transport")
+        own.add_argument("--physics", choices=("mjx", "newton-euler"), default="newton-euler")
+        own.add_argument("--seed", type=int, default=0)
+        for setting, value in settings.items():
+            flags = ["--num-envs", "--worlds"] if setting == "num_envs" else [f"--{setting.replace('_', '-')}"]
+            own.add_argument(*flags, dest=setting, type=type(value), default=value, metavar="X", help=" ")
+    options = parser.parse_args()
+    enable_compilation_cache()
+    config = configs.preset(options.preset)
+    settings = {name: getattr(options, name) for name in SETTINGS[options.trainer]}
+    options.sizes = [int(size) for size in options.layers.split(",")]
+    library = "brax" if options.trainer.startswith("brax") else "stable-baselines3"
+    card = {"trainer": options.trainer, "library": f"{library} {metadata.version(library)}", "settings": settings}
+    card |= {"seed": options.seed, "physics": options.physics}
+    started = time.perf_counter()
+
+    def export(steps: int, found: Any, mean: Any, deviation: Any) -> None:
+        mask = jnp.asarray(TransportEnv(config, options.physics).input_mask)
+        learnt = PolicyNetwork(found, jnp.asarray(mean), jnp.asarray(deviation), mask)
+        exported = policy_file(config, follower_law(config), learnt, steps, card)
+        if library == "brax":
+            save_file(options.out.with_name(f"{options.out.stem}-{steps}.npz"), exported)
+        if steps >= options.steps:
+            save_file(options.out, exported)
+        print(f"{steps} steps in {time.perf_counter() - started:.0f} s", flush=True)
+
+    (train_brax if library == "brax" else train_sb3)(config, options, export)
+    print(f"policy: {options.out}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""What is shown at a terminal, by rich: a status that is redrawn in place, and tables. Elsewhere plain lines.
+
+rich costs 40 ms to import; whoever has imported flax has paid for it.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Sequence
+from typing import Any, TextIO
+
+PERIOD = 0.5  # [s] between two redraws
+GAP = "   "  # between the parts of a line
+Lines = Sequence[Sequence[str]]  # each of parts, the most important first
+
+
+def is_live(stream: TextIO) -> bool:
+    """Whether `stream` is a terminal that can go back on a line."""
+    return stream.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "unknown", "")
+
+
+def columns_of(stream: TextIO) -> int:
+    """Width of the terminal `stream`, whose window may have changed; 80 if it does not say."""
+    try:
+        return os.get_terminal_size(stream.fileno()).columns or 80
+    except (OSError, ValueError):
+        return 80
+
+
+def fitted(parts: Sequence[str], columns: int) -> str:
+    """As many of `parts` from the first on as a line of `columns` holds; of a first one too long its beginning."""
+    line = parts[0][:columns] if parts else ""
+    for part in parts[1:]:
+        if len(line) + len(GAP) + len(part) > columns:
+            break
+        line += GAP + part
+    return line
+
+
+def folded(text: str, columns: int) -> str:
+    """`text` in lines of up to `columns`, which break between words, or if two blanks part something there alone."""
+    if "  " in text.strip():
+        text = re.sub(r"(?<=\S) (?=\S)", "\xa0", text)
+    return textwrap.fill(text, columns, break_on_hyphens=False).replace("\xa0", " ")
+
+
+def folded_out(text: str) -> str:
+    """`text` for stdout: `folded` if that is a terminal."""
+    return folded(text, columns_of(sys.stdout)) if sys.stdout.isatty() else text
+
+
+class Status:
+    """Lines at the bottom of a terminal, redrawn in place and cut to its width, with lines of their own above them.
+
+    Without a terminal, or in one that cannot go back on a line, there are only those of their own.
+    """
+
+    def __init__(self, stream: TextIO | None = None):
+        self._stream = stream or sys.stderr
+        self.live = is_live(self._stream)
+        self._shown: Callable[[], Lines] = list
+        self._display: Any = None
+
+    def show(self, lines: Callable[[], Lines]) -> None:
+        """Show from now on what `lines` returns, which is asked again every `PERIOD`."""
+        self._shown = lines
+        if not self.live:
+            return
+        if self._display is None:
+            self._display = _display(self._stream, self._render)
+            self._display.start()
+        self._display.refresh()
+
+    def say(self, text: str) -> None:
+        """Print `text` on lines of its own; at a terminal they break between words."""
+        if self._stream.isatty():
+            text = folded(text, columns_of(self._stream))
+        if self._display is None:
+            print(text, file=self._stream, flush=True)
+        else:
+            self._display.console.print(text)
+
+    def close(self) -> None:
+        """Take the lines away."""
+        if self._display is not None:
+            self._display.stop()
+        self._display, self.live = None, False
+
+    def _render(self) -> Any:
+        from rich.text import Text
+
+        columns = columns_of(self._stream)
+        return Text("\n".join(fitted(parts, columns) for parts in self._shown()), no_wrap=True)
+
+
+def _display(stream: TextIO, render: Callable[[], Any]) -> Any:
+    from rich.console import Console
+    from rich.live import Live
+
+    class Plain(Console):
+        def show_cursor(self, show: bool = True) -> bool:
+            """The cursor stays: a process that is killed could not bring it back."""
+            return False
+
+    console = Plain(file=stream, force_terminal=True, highlight=False, markup=False, emoji=False)
+    return Live(
+        console=console,
+        get_renderable=render,
+        refresh_per_second=1 / PERIOD,
+        transient=True,
+        redirect_stdout=False,
+        redirect_stderr=stream is sys.stderr,
+    )
+
+
+COMFORTABLE = 16  # width below which words are not folded
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], names: Sequence[int], least: int) -> str:
+    """A table of `rows` below `heads`, in which a line break parts a name from its unit. Columns `names` hold words.
+
+    On a terminal that is too narrow the words are folded, and columns left out from the right, never of the first
+    `least`; a line says which. Elsewhere a row is a line.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    width = columns_of(sys.stdout) if sys.stdout.isatty() else 10_000
+    cells = list(zip(heads, *rows, strict=True))
+
+    def needed(shown: int, words: int) -> int:
+        """Width of the first `shown` columns; those of words need their longest one, or `words` for all."""
+        total = 2 * (shown - 1)
+        for number, column in enumerate(cells[:shown]):
+            whole = max(len(line) for cell in column for line in cell.split("\n"))
+            longest = max((len(word) for cell in column for word in cell.split()), default=0)
+            total += max(longest, min(whole, words)) if number in names else whole
+        return total
+
+    most, some = len(heads), min(least + 3, len(heads))
+    tries = [*((n, COMFORTABLE) for n in range(most, some - 1, -1)), *((n, 0) for n in range(some, least - 1, -1))]
+    shown = next((n for n, words in tries if needed(n, words) <= width), least)
+    made = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    for number, head in enumerate(heads[:shown]):
+        word = number in names
+        made.add_column(_text(head), justify="left" if word else "right", no_wrap=not word, vertical="bottom")
+    for row in rows:
+        made.add_row(*map(_text, row[:shown]))
+    console = Console(file=io.StringIO(), width=width, color_system=None, highlight=False)
+    console.print(made)
+    lines = [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
+    if shown < most:
+        left_out = ", ".join(head.split("\n")[0] for head in heads[shown:])
+        lines += textwrap.wrap(f"left out on this narrow terminal: {left_out}", width)
+    return "\n".join(lines)
+
+
+def _text(text: str) -> Any:
+    from rich.text import Text
+
+    return Text(text)

@@ -1,0 +1,161 @@
+"""What is shown at a terminal: nothing is wrapped, nothing is left over; and elsewhere plain lines."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import REPOSITORY, environment, script, tiny
+from pseudo_terminal import on_terminal
+
+from mjxball.evaluate.benchmark import Score, text_table
+from mjxball.evaluate.metrics import Metrics
+from mjxball.evaluate.results import metric_text
+from mjxball.evaluate.suites import find_suites
+from mjxball.terminal import fitted, folded, table
+
+WIDTHS = (40, 80, 100, 130)
+TRAINING = """
+import sys, time, pathlib
+from mjxball.train.progress import Progress, Session, columns
+names = columns(["steady_error"], ["alpha", "entropy"], ["steady_error", "peak"])
+progress = Progress(pathlib.Path("metrics.csv"), names, 768000, session=Session("transport-seed0"))
+progress.begin("compiling", "the training program for 1 x a device with quite a long name", "Ctrl-C stops")
+progress.say("compiled in 8.1 s")
+for k in range(1, 7):
+    row = {"steps": k * 128000, "seconds": k, "rate": 25222.0, "episode_return": -1.2e4 / k, "steady_error": 0.0123}
+    row |= {"alpha": 0.02, "entropy": 1.0, "terminated": 0, "diverged": 0}
+    if k == 3:
+        row |= {"eval_return": -1e4, "eval_steady_error": 0.01, "eval_peak": 0.5}
+    progress.show(row)
+    time.sleep(0.05)
+    if k == 2:
+        print("a warning of a library", file=sys.stderr)
+progress.close()
+print("the end")
+"""
+LINES = ["compiled in 8.1 s", "a warning of a library", "the end"]
+
+
+@pytest.fixture(scope="module")
+def training(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """A program that shows the progress of a training that there is not."""
+    path = tmp_path_factory.mktemp("program") / "training.py"
+    path.write_text(TRAINING)
+    return [sys.executable, str(path)]
+
+
+@pytest.mark.parametrize("columns", [*WIDTHS, 0])
+def test_progress_fits_and_leaves_nothing_behind(columns: int, training: list[str], tmp_path: Path) -> None:
+    seen = on_terminal(training, columns, tmp_path)
+    assert (seen.code, seen.wrapped) == (0, 0), seen.text
+    live = [state for state in seen.states if "Ctrl-C saves and stops" in state]
+    assert any("17%   0:25 left   25.2 k/s" in state for state in live)
+    assert max(len(re.findall("k/s   ?", state)) + state.count("Ctrl-C") for state in live) <= 3  # one status alone
+    left = seen.text.splitlines()
+    evaluated = [number for number, line in enumerate(left) if "384,000 / 768,000 steps" in line]
+    assert len(evaluated) == 1
+    assert [line for line in left if line in LINES] == LINES
+    rest = " ".join(line for line in left if line not in LINES)
+    assert re.fullmatch(r" *384,000 / .* steps +25.2 k/s +0:15 left +eval return -1e\+04 .* eval peak 0.5 *", rest)
+
+
+def test_a_dumb_terminal_and_a_pipe_have_a_line_a_row(training: list[str], tmp_path: Path) -> None:
+    dumb = on_terminal(training, 80, tmp_path, term="dumb")
+    piped = subprocess.run(training, capture_output=True, text=True, cwd=tmp_path, env=ENVIRONMENT, check=True)
+    for text in (dumb.text, piped.stderr):
+        assert len(re.findall(r"^ +[\d,]+ / 768,000 steps", text, re.MULTILINE)) == 6
+        assert "\x1b" not in text
+    assert dumb.wrapped == 0
+    assert len(piped.stderr.splitlines()) == 6 + 3
+
+
+ENVIRONMENT = {**environment(), "PYTHONPATH": str(REPOSITORY)}
+
+
+@pytest.mark.slow
+def test_a_real_training_fits_and_is_stopped(tmp_path: Path) -> None:
+    columns = 40
+    command = [sys.executable, str(script("train.py")), *tiny(out="run")]
+    whole = on_terminal(command, columns, tmp_path)
+    assert (whole.code, whole.wrapped) == (0, 0), whole.text
+    assert any("Ctrl-C stops" in state for state in whole.states)
+    assert "Ctrl-C" not in whole.text
+    assert re.search(r"^\* ", whole.text, re.MULTILINE)  # the reference scenario
+    again = [sys.executable, str(script("train.py")), *tiny(out="other", sac__total_steps=400_000)]
+    stopped = on_terminal(again, columns, tmp_path, interrupt_at="% ")
+    assert (stopped.code, stopped.wrapped) == (130, 0), stopped.text
+    assert "Ctrl-C saves" not in stopped.text
+
+
+def test_parts_that_do_not_fit_are_left_out() -> None:
+    assert fitted(["0123456789"], 4) == "0123"
+    assert fitted(["ab", "cd", "ef"], 7) == "ab   cd"
+    assert fitted([], 7) == ""
+    assert folded("one two three", 8) == "one two\nthree"
+    assert folded("return 5  steady error 3  alpha", 18) == "return 5\nsteady error 3\nalpha"
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------
+
+
+def flight(**values: float | bool | None) -> Metrics:
+    return Metrics(**{**dict.fromkeys(Metrics.__dataclass_fields__, 0.5), "failed": False, **values})
+
+
+def test_suites_have_units_never_and_a_mark() -> None:
+    suites = find_suites(["cg-speed", "rotor-lag"])
+    flown = {"settled": flight(), "never": flight(settling_time=None), "lost": flight(failed=True)}
+    scores = [
+        Score(suite.name, variant.label, name, (metrics,), None)
+        for suite in suites
+        for variant in suite.variants[:2]
+        for name, metrics in flown.items()
+    ]
+    lines = text_table(scores, suites).splitlines()
+    assert "inf" not in "".join(lines)
+    assert "nan" not in "".join(lines)
+    assert lines[0].split()[:4] == ["peak", "rmse", "settle", "over"]
+    assert lines[1].split()[:8] == ["suite", "variant", "follower", "failed", "m", "m", "s", "%"]
+    marked = [line.split()[1:4] for line in lines if line.startswith("* ")]
+    assert marked == [["cg-speed", "0.31", "rad/s"]] * 3  # the lag of 15 ms is another plant
+    assert "0.50" in lines[2]
+    assert "never" in lines[3]
+    assert "0.8660" in lines[3]
+    assert lines[4].split()[5:8] == ["1/1", "failed", "failed"]
+
+
+def test_numbers_of_a_table() -> None:
+    assert [metric_text("settling_time", value) for value in (None, np.inf, 2.0)] == ["never", "never", "2.00"]
+    assert [metric_text("overshoot", value) for value in (None, np.nan, np.inf, 0.125)] == ["-", "-", "failed", "12.5"]
+
+
+TABLE = """
+from mjxball.terminal import table
+rows = [["*", "cg-speed", "+0.1 kg at 12 s, -0.1 kg at 24 s", "a_follower", *["0.1234"] * 9]] * 3
+print(table(["", "suite", "variant", "follower", *[f"number{k}\\nm" for k in range(9)]], rows, (1, 2, 3), 4))
+"""
+
+
+@pytest.mark.parametrize("columns", WIDTHS)
+def test_a_table_fits(columns: int, tmp_path: Path) -> None:
+    seen = on_terminal([sys.executable, "-c", TABLE], columns, tmp_path)
+    assert (seen.code, seen.wrapped) == (0, 0)
+    assert "…" not in seen.text
+    assert seen.text.count("0.1234") == 3 * sum(f"number{k}" in seen.text.split("left out")[0] for k in range(9))
+    assert ("left out on this narrow terminal" in " ".join(seen.text.split())) == (
+        "number8" not in seen.text.split("l")[0]
+    )
+
+
+def test_a_table_in_a_file_has_a_line_a_row() -> None:
+    found = table(["name", "value\nm"], [["with several words", "1"]] * 3, (0,), 1)
+    assert found.splitlines() == [
+        "                    value",
+        "name                    m",
+        *["with several words      1"] * 3,
+    ]
