@@ -1,12 +1,8 @@
 """Every cell of CG speed x amplitude x object mass: does a policy beat the best classical follower there?
 
-`python benchmarks/cells.py FOLLOWER ... [--robust FOLLOWER ...] [--seeds N] [--json FILE]`; a follower is a policy
-file or the name of a classical one.
-
 A cell is flown from the origin to (1, 1, 1) m for 45 s from several CG phases, with the mass known to the hover thrust
-or believed to be 0.2 kg (then adaptive adapts its mass), undisturbed and with noise at level 1 and 40 ms of delay. All
-policies fly where the mass is known, the robust ones where it is not; of several, as of the seeds of one run, the
-distribution is printed as well. Wanted, of medians over the phases; who fails in any of them loses the cell:
+or believed to be 0.2 kg (then adaptive adapts its mass), undisturbed and with noise at level 1 and 40 ms of delay.
+Wanted, of medians over the phases; who fails in any of them loses the cell:
 
 - peak: the largest |e| of any axis after 20 s at most the adaptive follower's in the same flights plus 3 mm
 - overshoot: at most the adaptive follower's in the same flights
@@ -22,14 +18,16 @@ are counted apart as well.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import statistics
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from harness import Row, arguments, say, shown, write
 from mjxball.baselines import make_baseline
+from mjxball.cli import run_command
 from mjxball.config import Config, preset
 from mjxball.control.constants import trim_limit
 from mjxball.control.followers import Follower
@@ -67,7 +65,7 @@ def scenarios_of(cells: list[Any], common: dict[str, Any], disturbed: bool, seed
     return scenarios
 
 
-def medians(flown: list[Any], cells: int) -> list[dict[str, Any]]:
+def medians(flown: list[Any], cells: int) -> list[Row]:
     """Over the seeds for every one of the cells, all infinite where any of its flights failed."""
     found = []
     for i in range(cells):
@@ -109,58 +107,35 @@ def wins_of(mine: dict[str, float], bar: dict[str, float]) -> list[str]:
     return [name for name in WANTED if math.isfinite(mine[name]) and mine[name] <= bar[name]]
 
 
-def show(where: str, name: str, rows: list[dict[str, Any]]) -> dict[str, Any]:
+def condition(known: bool, disturbed: bool) -> str:
+    """One of the four in words."""
+    return f"mass {'known' if known else 'unknown'}, {'noise and 40 ms' if disturbed else 'undisturbed'}"
+
+
+def show(where: str, name: str, rows: list[Row]) -> Row:
     """Print and return how often each of the four is reached in `rows`."""
-    won = {key: sum(key in row["wins"] for row in rows) for key in WANTED}
-    whole = sum(len(row["wins"]) == len(WANTED) for row in rows)
-    failed = sum(row["failed"] for row in rows)
-    peaks = {who: statistics.median(row["peaks"][who] for row in rows) for who in rows[0]["peaks"]}
     flown = [row for row in rows if not row["failed"]]
+    found = {"where": where, "policy": name, "cells": len(rows)}
+    found["all four"] = sum(len(row["wins"]) == len(WANTED) for row in rows)
+    found |= {key: sum(key in row["wins"] for row in rows) for key in WANTED}
+    found["failed"] = sum(row["failed"] for row in rows)
+    peaks = {who: statistics.median(row["peaks"][who] for row in rows) for who in rows[0]["peaks"]}
     effort = {key: statistics.median(row[key] for row in flown) if flown else None for key in EFFORT}
-    counts = ", ".join(f"{key} {count}" for key, count in won.items())
-    medians = ", ".join(f"{who} {1e3 * value:.1f}" for who, value in peaks.items())
-    print(
-        f"{where} ({name}): all four in {whole} of {len(rows)}; {counts}; {failed} flights failed; "
-        f"peaks [mm] {medians}; "
-        + ", ".join(f"{key} {'-' if value is None else f'{value:.3f}'}" for key, value in effort.items()),
-        flush=True,
-    )
-    return {
-        "where": where,
-        "policy": name,
-        "cells": len(rows),
-        "all four": whole,
-        **won,
-        "failed": failed,
-        "median peaks": peaks,
-        "median effort": effort,
-    }
-
-
-def distribution(summaries: list[dict[str, Any]]) -> None:
-    """Print least, median and most cells won by the policies of each condition that several flew."""
-    for where in dict.fromkeys(row["where"] for row in summaries):
-        rows = [row for row in summaries if row["where"] == where]
-        if len(rows) > 1:
-            shown = "; ".join(
-                f"{key} {min(row[key] for row in rows)} - {statistics.median(row[key] for row in rows):g} - "
-                f"{max(row[key] for row in rows)}"
-                for key in ("all four", *WANTED)
-            )
-            print(f"{where}: least - median - most of {len(rows)} policies, of {rows[0]['cells']} cells: {shown}")
+    say(found | {f"peak of {who} [mm]": 1e3 * peak for who, peak in peaks.items()} | effort)
+    return found | {"median peaks": peaks, "median effort": effort}
 
 
 def evaluate(
-    config: Config, policies: list[Follower], robust: list[Follower], reference: str, cells: list[Any], seeds: int
-) -> Any:
-    """(summaries, what is missed) of all policies where the mass is known, of the robust ones where it is not."""
+    config: Config, policies: list[Follower], reference: str, cells: list[Cell], seeds: int
+) -> tuple[list[Row], list[str]]:
+    """(summaries, what is missed) of all policies in all four conditions."""
     calm, summaries, missed = fly(make_baseline(reference, config), cells, {}, False, seeds), [], []
     for known, disturbed in ((True, False), (True, True), (False, False), (False, True)):
         rival = "adaptive" if known else "adaptive-mass"
         common = {} if known else {"believed_mass": BELIEVED}
-        where = f"mass {'known' if known else 'unknown'}, {'noise and 40 ms' if disturbed else 'undisturbed'}"
+        where = condition(known, disturbed)
         other = fly(make_baseline(rival, config), cells, common, disturbed, seeds)
-        for policy in dict.fromkeys([*policies, *robust]) if known else robust:
+        for policy in policies:
             rows = []
             mine = fly(policy, cells, common, disturbed, seeds)
             for cell, own, theirs, best in zip(cells, mine, other, calm, strict=True):
@@ -180,38 +155,31 @@ def follower_of(name: str, config: Config) -> Follower:
     return load_policy(Path(name), config) if name.endswith(".npz") else make_baseline(name, config)
 
 
-def shortfall(where: str, name: str, row: dict[str, Any]) -> str:
+def shortfall(where: str, name: str, row: Row) -> str:
     """What a cell misses, in words."""
     names = [key for key in WANTED if key not in row["wins"]]
-    shown = ", ".join(f"{key} {row[key]:.4g} (wanted {row['bar'][key]:.4g})" for key in names)
-    return f"{where}, {name}: {row['cell']} misses {shown}" if names else ""
+    missed = ", ".join(f"{key} {shown(row[key])} (wanted {shown(row['bar'][key])})" for key in names)
+    return f"{where}, {name}: {row['cell']} misses {missed}" if names else ""
 
 
-def main() -> None:
+def main(given: Sequence[str] | None = None) -> int:
     """Fly, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policies", nargs="*", metavar="FOLLOWER")
-    parser.add_argument(
-        "--robust", nargs="+", metavar="FOLLOWER", help="policies for unknown masses (default: the same)"
-    )
-    parser.add_argument("--seeds", type=int, default=3)
+    parser = arguments(__file__, __doc__)
+    parser.add_argument("policies", nargs="*", metavar="FOLLOWER", help="a policy file, or a classical one's name")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="CG phases")
     parser.add_argument("--reference", choices=("lqg", "lqg-slow"), default="lqg", help="LQG of settling and rmse")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    options = parser.parse_args()
+    options = parser.parse_args(given)
     config = preset("paper")
     cells = feasible(config)
     lost = ", ".join(f"{a:g} m with {m:g} kg" for a, m in sorted({c[1:] for c in EVERY} - {c[1:] for c in cells}))
     print(f"{len(cells)} of {len(EVERY)} cells are feasible, not at any speed: {lost}")
     policies = [follower_of(name, config) for name in options.policies]
-    robust = [follower_of(name, config) for name in options.robust] if options.robust else policies
-    summaries, missed = evaluate(config, policies, robust, options.reference, cells, options.seeds)
-    distribution(summaries)
-    if len(policies) + len(robust) <= 4:
+    summaries, missed = evaluate(config, policies, options.reference, cells, options.seeds)
+    if len(policies) <= 2:
         print("\n".join(missed))
-    if options.json:
-        found = {"cells": len(cells), "summaries": summaries, "missed": missed}
-        options.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
+    write(options.json, {"cells": len(cells), "summaries": summaries})
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_command(main))

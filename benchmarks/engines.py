@@ -3,23 +3,21 @@
 No two rigs are alike: masses, inertias, mounts, yaw angles, carrier. Closed form and MJX run once with numbers that are
 traced, every world with the rig of its own, and the closed form once more with constants. A difference is that of a
 state's accelerations, over the largest of them, the load's included.
-
-    python benchmarks/engines.py --json benchmarks/results/engines.json
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from harness import Row, arguments, say, write
+from mjxball.cli import run_command
 from mjxball.config import Attitude, Drone, Motion, Plant, preset
 from mjxball.physics import mjx, motion, mujoco, newton_euler
 from mjxball.physics.engine import Load, PathShape, PlantState, Wrench, total_wrench
@@ -154,7 +152,7 @@ def stacked(trees: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
-def measure(count: int, paths: tuple[str, ...], stand: str, states: int, rigs: int) -> Iterator[dict[str, Any]]:
+def measure(count: int, paths: tuple[str, ...], stand: str, states: int, rigs: int) -> Iterator[Row]:
     """Rows of all `paths` for teams of `count` on `stand`, `states` in all on `rigs` different rigs."""
     axis = "y" if paths is LINE else "xy"
     plants = [
@@ -171,7 +169,7 @@ def measure(count: int, paths: tuple[str, ...], stand: str, states: int, rigs: i
             [getattr(make(plant, Attitude()), name)(*case[1:]) for plant, case in zip(plants, cases, strict=True)]
             for make in (mujoco.make_engine, newton_euler.make_engine)
         )
-        row: dict[str, Any] = {"drones": count, "load": f"{path} ({axis})", "stand": stand, "states": states}
+        row: Row = {"drones": count, "load": f"{path} ({axis})", "stand": stand, "states": states}
         row["closed form"] = max(map(difference, constant, expected, cases))
         together = stacked([case[1:] for case in cases])
         for engine, law in functions.items():
@@ -181,31 +179,26 @@ def measure(count: int, paths: tuple[str, ...], stand: str, states: int, rigs: i
         yield row
 
 
-def main() -> None:
-    """Print the table and write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(given: Sequence[str] | None = None) -> int:
+    """Measure, print, write."""
+    parser = arguments(__file__, __doc__)
     parser.add_argument("--drones", type=int, nargs="+", default=[2, 3, 4, 6])
     parser.add_argument("--stands", nargs="+", choices=("free", "pivot", "heave"), default=["free", "pivot", "heave"])
     parser.add_argument("--states", type=int, default=10_000, help="for every number of drones, load and stand")
     parser.add_argument("--rigs", type=int, default=10, help="different rigs among them")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
+    options = parser.parse_args(given)
     rows, started = [], time.process_time()
-    names = ("closed form", "closed form, traced", "MJX, traced")
-    print(f"{'drones':>6} {'load':>22} {'stand':>6}  " + "  ".join(f"{name:>20}" for name in names), flush=True)
     for count in options.drones:
         for stand in options.stands:
             for paths in (LINE, PLANE):
                 for row in measure(count, paths, stand, options.states, options.rigs):
                     rows.append(row)
-                    figures = "  ".join(f"{row[name]:20.1e}" for name in names)
-                    print(f"{count:>6} {row['load']:>22} {stand:>6}  {figures}", flush=True)
-    worst = {name: max(row[name] for row in rows) for name in names}
-    print("worst:", ", ".join(f"{name} {value:.1e}" for name, value in worst.items()))
-    print(f"{time.process_time() - started:.0f} CPU s")
-    if options.json:
-        options.json.write_text(json.dumps({"worst": worst, "rows": rows}, indent=1) + "\n")
+                    say(row, ".1e")
+    worst = {name: max(row[name] for row in rows) for name in ("closed form", "closed form, traced", "MJX, traced")}
+    say({"worst:": "", **worst, "CPU s": round(time.process_time() - started)}, ".1e")
+    write(options.json, {"worst": worst, "rows": rows})
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_command(main))

@@ -1,16 +1,15 @@
 """Faults of the twin in virtual time: hover at 0.4 m, a fault at a random moment, at the leader and at the follower.
 
-`python benchmarks/fly_faults_virtual.py [--policy FILE] [--trials 1] [--jobs 2] [--only FAULT ...] [--json FILE]`
-
-Measured are the seconds until each drone's motors are off, speed at the first contact, largest tilt and drift between
-the fault and then. The table in docs/flying.md is made from benchmarks/results/fly_faults_virtual.json.
-`fly_faults.py` is the same by the clock, with sockets.
+Without sockets or clock. Measured are the seconds until each drone's motors are off, speed at the first contact,
+largest tilt and drift between the fault and then. The table in docs/flying.md is made from
+benchmarks/results/fly_faults_virtual.json. `--onboard float32` (or `int8`) has the laws on the drones, in the apps' own
+C, compiled by gcc: a dead laptop and a lost heartbeat are faults as well then.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import functools
 import math
 import multiprocessing
 import statistics
@@ -21,12 +20,19 @@ from typing import Any
 
 import numpy as np
 
+from harness import Row, arguments, table, write
+from mjxball.cli import run_command
+from mjxball.fly.app.host import Library, compile_pair
+from mjxball.fly.card import Controller, goal_of, limits_of, times_of
+from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import FAULT_KINDS
-from mjxball.fly.twin.virtual import Moment, VirtualTwin
+from mjxball.fly.twin.conditions import FAULT_KINDS, Surroundings, drone_kind
+from mjxball.fly.twin.virtual import MemoryLog, Moment, VirtualTwin
+from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
-from virtual_flight import Row, code_of, world_of
 
+SETTLE = 1.0  # [s] that estimators get before a flight, as the check before a real one gives them
+SETTLED, HOVER = 3.0, 6.0  # [s] under both laws, until a fault may come and until the flight lands
 Injection = Callable[[VirtualTwin, int], None]
 
 
@@ -57,7 +63,7 @@ def gap(seconds: float) -> Injection:
         for number in range(2):
             world.fault_link(number, silent_down=True)
         world.flight.note("gap", world.now)
-        world.later = (world.now + seconds, lambda: [world.fault_link(n, silent_down=False) for n in range(2)])  # type: ignore[attr-defined]
+        world.later = (world.now + seconds, lambda: [world.fault_link(n, silent_down=False) for n in range(2)])
 
     return inject
 
@@ -74,7 +80,7 @@ def asked(**how: Any) -> Injection:
 
 def laptop_killed(world: VirtualTwin, drone: int) -> None:
     """The laptop sends nothing any more; its watchdog process is not part of the virtual twin."""
-    world.killed = True  # type: ignore[attr-defined]
+    world.killed = True
 
 
 ONBOARD: dict[str, Injection] = {"laptop killed": laptop_killed, "heartbeat lost": injected("peer")}  # with apps only
@@ -117,14 +123,47 @@ FAULTS: dict[str, Injection] = {
 }
 
 
-SETTLED, HOVER = 3.0, 6.0  # [s] under both laws, until a fault may come and until the flight lands
+def settings_of(policy: Policy, seconds: float) -> FlightSettings:
+    """What the command line would make of `policy`'s card."""
+    config = Controller(policy).config
+    goal, stand = goal_of(config), config.plant.stand != "free"
+    return FlightSettings(seconds, goal, stand=stand, limits=limits_of(config, goal), times=times_of(config))
 
 
-def fault(path: Path, kind: str, drone: int, number: int, onboard: str = "") -> list[Row]:
-    """One flight with one fault; `onboard` as for `world_of`."""
-    world = hovering(path, number, onboard)
-    world.fly_for(moment_of(kind, drone, number))
-    return finish(world, path, kind, drone)
+@functools.cache
+def cores_of(path: Path, weights: str) -> tuple[Library, Library]:
+    """The apps of the policy in `path`, `weights` float32 or int8."""
+    return compile_pair(load_file(path), path.stem, weights == "int8")
+
+
+def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
+    """The pair `SETTLED` [s] under both laws, which are `onboard` (float32, int8) or on the laptop."""
+    policy = Policy.load(path)
+    world = VirtualTwin(
+        policy,
+        settings_of(policy, HOVER),
+        kind=drone_kind(Controller(policy).config.autopilot.drone.removesuffix("-legacy") or "2.1", "linear"),
+        surroundings=Surroundings(seed=number),
+        log=MemoryLog(True),
+        settle=SETTLE,
+        cores=cores_of(path, onboard) if onboard else None,
+    )
+    world.killed, world.later = False, (math.inf, None)
+    world.fly_until(State.FLY)
+    world.fly_for(SETTLED)
+    return world
+
+
+def code_of(world: VirtualTwin) -> int:
+    """The exit code that the runner's command would have."""
+    flight = world.flight
+    return 0 if flight.supervisor.cause is None and flight.lifted and flight.supervisor.state is State.DONE else 1
+
+
+def cause_of(world: VirtualTwin) -> str:
+    """What ended the flight early, empty if nothing did."""
+    cause = world.flight.supervisor.cause
+    return "" if cause is None else f"{cause.event.name} {cause.detail}"
 
 
 def moment_of(kind: str, drone: int, number: int) -> float:
@@ -133,25 +172,15 @@ def moment_of(kind: str, drone: int, number: int) -> float:
     return float(random.uniform(0.0, HOVER - SETTLED - 1.0))
 
 
-def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
-    """The pair `SETTLED` [s] under both laws."""
-    world = world_of(path, HOVER, onboard=onboard, seed=number)
-    world.killed = False  # type: ignore[attr-defined]
-    world.later = (math.inf, None)  # type: ignore[attr-defined]
-    world.fly_until(State.FLY)
-    world.fly_for(SETTLED)
-    return world
-
-
-def finish(world: VirtualTwin, path: Path, kind: str, drone: int) -> list[Row]:
+def finish(world: VirtualTwin, path: Path, kind: str, drone: int) -> Row:
     """The rest of the flight, with the fault now."""
     at = world.now
     FAULTS[kind](world, drone)
     while world.now < at + 15.0:
-        if world.now >= world.later[0]:  # type: ignore[attr-defined]
-            world.later[1]()  # type: ignore[attr-defined]
-            world.later = (math.inf, None)  # type: ignore[attr-defined]
-        if world.killed:  # type: ignore[attr-defined]
+        if world.now >= world.later[0]:
+            world.later[1]()
+            world.later = (math.inf, None)
+        if world.killed:
             world.advance(0.02)
             world.track.append(world.moment())
         elif not world.tick():
@@ -160,23 +189,22 @@ def finish(world: VirtualTwin, path: Path, kind: str, drone: int) -> list[Row]:
         world.advance(0.02)
         world.track.append(world.moment())
     after = [moment for moment in world.track if moment.time >= at]
-    return [{"policy": path.stem, "fault": kind, "drone": ("leader", "follower")[drone], **evaluated(world, after, at)}]
+    return {"policy": path.stem, "fault": kind, "drone": ("leader", "follower")[drone], **evaluated(world, after, at)}
 
 
 def all_of(options: argparse.Namespace) -> list[Row]:
-    """Every fault at each drone, in processes that branch off one hover for each trial; written as far as it came."""
+    """Every fault at each drone, in processes that branch off one hover for each trial."""
     context, rows = multiprocessing.get_context("fork"), []
     for number in range(options.trials):
         flown = sorted((moment_of(kind, drone, number), kind, drone) for kind in options.only for drone in range(2))
-        world, passed = hovering(options.policy, number), 0.0
+        world, passed = hovering(options.policy, number, options.onboard), 0.0
         running: list[Any] = []
         for moment, kind, drone in [*flown, (math.inf, "", 0)]:
             while running and (len(running) >= options.jobs or math.isinf(moment)):
                 child, end = running.pop(0)
-                rows += end.recv()
+                rows.append(end.recv())
                 child.join()
                 print(f"\r{len(rows)} of {len(flown) * options.trials}", end="", file=sys.stderr, flush=True)
-                write(options.json, sorted(rows, key=lambda row: list(FAULTS).index(row["fault"])))
             if math.isfinite(moment):
                 world.fly_for(moment - passed)
                 passed = moment
@@ -185,18 +213,11 @@ def all_of(options: argparse.Namespace) -> list[Row]:
                 child.start()
                 theirs.close()
                 running.append((child, ours))
-    return rows
+    return sorted(rows, key=lambda row: list(FAULTS).index(row["fault"]))
 
 
 def _send(end: Any, *arguments: Any) -> None:
     end.send(finish(*arguments))
-
-
-def write(path: Path | None, rows: Sequence[Row]) -> None:
-    """Put `rows` into the file at `path`, if one is wanted."""
-    if path is not None:
-        command = f"python benchmarks/fly_faults_virtual.py {' '.join(sys.argv[1:])}"
-        path.write_text(json.dumps({"command": command, "faults": rows}, indent=1) + "\n", encoding="utf-8")
 
 
 def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
@@ -222,33 +243,37 @@ def evaluated(world: VirtualTwin, after: Sequence[Moment], at: float) -> Row:
     return {name: round(value, 4) if isinstance(value, float) else value for name, value in found.items()}
 
 
-def table(rows: Sequence[Row]) -> None:
-    """Print median and worst of each fault, of leader and follower."""
-    print(f"{'fault':42} {'off L / F s':>12} {'speed m/s':>12} {'tilt deg':>12} {'drift m':>12}  median, worst")
-    for name in dict.fromkeys((row["fault"], row["drone"]) for row in rows):
-        own = [row for row in rows if (row["fault"], row["drone"]) == name]
-        off = [statistics.median(row["off"][n] for row in own) for n in range(2)]
-        parts = [
-            f"{statistics.median(row[key] for row in own):5.2f} {max(row[key] for row in own):6.2f}"
-            for key in ("speed", "tilt", "drift")
-        ]
-        bad = "" if all(row["stopped"] for row in own) else "  A MOTOR STILL TURNS"
-        print(f"{' '.join((name[1], name[0])):32} {off[0]:6.2f} / {off[1]:5.2f} {parts[0]} {parts[1]} {parts[2]}{bad}")
+def show(rows: Sequence[Row]) -> None:
+    """Print medians and worst of each fault, of leader and follower."""
+    shown = []
+    for name, drone in dict.fromkeys((row["fault"], row["drone"]) for row in rows):
+        own = [row for row in rows if (row["fault"], row["drone"]) == (name, drone)]
+        line = {"fault": name, "of": drone}
+        line |= {f"off {who} s": statistics.median(row["off"][n] for row in own) for n, who in enumerate("LF")}
+        for key, unit in (("speed", "m/s"), ("tilt", "deg"), ("drift", "m")):
+            line |= {
+                f"{key} {unit}": statistics.median(row[key] for row in own),
+                "worst " + key: max(r[key] for r in own),
+            }
+        shown.append(line | {"": "" if all(row["stopped"] for row in own) else "A MOTOR STILL TURNS"})
+    table(shown, form=".2f")
 
 
-def main() -> int:
+def main(given: Sequence[str] | None = None) -> int:
     """Run the campaign; returns 1 if a motor still turned."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = arguments(__file__, __doc__)
     parser.add_argument("--policy", type=Path, default=shipped_policy("flight"), metavar="FILE")
     parser.add_argument("--trials", type=int, default=1, help="flights of each fault at each drone")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--only", nargs="+", choices=FAULTS, default=[one for one in FAULTS if one not in ONBOARD])
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    options = parser.parse_args()
+    parser.add_argument("--only", nargs="+", choices=FAULTS, metavar="FAULT", help="these faults alone")
+    parser.add_argument("--onboard", choices=("float32", "int8"), default="", help="the laws' weights on the drones")
+    options = parser.parse_args(given)
+    options.only = options.only or [one for one in FAULTS if options.onboard or one not in ONBOARD]
     rows = all_of(options)
-    table(sorted(rows, key=lambda row: list(FAULTS).index(row["fault"])))
+    show(rows)
+    write(options.json, {"faults": rows})
     return 0 if all(row["stopped"] for row in rows) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(main))

@@ -1,51 +1,296 @@
-"""Mutated policy files, run records and checkpoints: each must load right or be refused in one sentence.
+"""Damaged policy files and run records: each must load right or be refused in one sentence.
 
-`python benchmarks/fuzz_loaders.py [--files 10000] [--records 1000] [--checkpoints 100] [--seed 0] [--json FILE]`
-
-Counts for every kind of mutation what loaded, what was refused, and what went wrong: another exception than the
-one-line refusal, code run from the file, too much memory, too much time. Exit code 1 if anything did. Checkpoints
-are damaged files of a small run that is trained first (half a minute); they are read in a process of their own,
-whose death would count as a fault.
+Counts for every kind of damage what loaded, what was refused, and what went wrong: another exception than the one-line
+refusal, code run from the file, too much memory, too much time. Exit code 1 if anything did. Files of checkpoints:
+`tests/test_fuzz.py`.
 """
 
 from __future__ import annotations
 
-import argparse
+import io
 import json
 import os
-import random
+import pickle
 import resource
-import shutil
 import signal
-import subprocess
+import struct
 import sys
 import tempfile
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator
+import warnings
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 
+from harness import arguments, table, write
 from mjxball import config as configs
+from mjxball.cli import run_command
 from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy, shipped_policies
 from mjxball.train.curves import read_members, training_summary
-from mjxball.train.run_directory import read_config
-from mutations import ANY, CSV, JSON, POLICY, WITNESS
+from mjxball.train.run_directory import read_config, write_config
 
-TRAIN = Path(__file__).parents[1] / "train.py"
+Mutation = Callable[[Random, bytes], bytes]  # of a sound file's bytes
 MEMORY = 256 * 2**20  # [B] that reading one file may take: a few times the largest file that is read
 PATIENCE = 10.0  # [s] for one file
 ROOM = 8 * 2**30  # [B] of address space for the whole process
 SEEN = np.random.default_rng(0).normal(size=(5, OBSERVATION_SIZE))
 FORBIDDEN = ("pickle.find_class", "subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "socket.connect")
+WITNESS = "MJXBALL_FUZZ_WITNESS"  # environment variable that unpickled code would set
+ODD_VALUES: tuple[Any, ...] = (
+    *(None, True, False, 0, -1, 1, 2**31, 2**63, -(2**64), 10**400, 1e308, -1e308, 1e-320, 0.1),
+    *(float("nan"), float("inf"), "", "x", "a\nb", "\x1b[31m", "\u202e", "\ud800", "é" * 50, [], {}, [[]], {"": {}}),
+    *([1, 2], [None, None], ["a", "b"], {"a": [1]}, [float("nan")] * 3, "x" * 10_000),
+)
+
+
+FIELDS = {  # of a zip: where numbers stand behind each signature
+    **{b"PK\x01\x02": (8, 10, 20, 24, 28, 30, 42), b"PK\x05\x06": (8, 10, 12, 16, 20)},
+    **{b"PK\x03\x04": (6, 8, 18, 22, 26, 28)},
+}
+NAMES = ("../../x.npy", "/etc/x.npy", "é\u202e.npy", "a\nb.npy", "a\0b.npy", "card", "weight_0.npy.npy", ".npy", "a/")
 events: list[str] = []  # forbidden ones, as Python's audit hook tells them
+
+
+class Explosive:
+    """Sets an environment variable when unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return exec, (f"import os; os.environ[{WITNESS!r}] = 'executed'",)
+
+
+def flipped_bits(draw: Random, content: bytes) -> bytes:
+    """1 to 8 bits flipped, half the time in the last 1500 bytes: a zip's directory."""
+    changed = bytearray(content)
+    low = max(0, len(changed) - 1500) if draw.random() < 0.5 else 0
+    for _ in range(draw.randint(1, 8)):
+        changed[draw.randrange(low, len(changed))] ^= 1 << draw.randrange(8)
+    return bytes(changed)
+
+
+def truncated(draw: Random, content: bytes) -> bytes:
+    """Cut short, or without its beginning."""
+    place = draw.randrange(len(content))
+    return content[:place] if draw.random() < 0.7 else content[place:]
+
+
+def inserted(draw: Random, content: bytes) -> bytes:
+    """Random bytes, zeros or a copy of a part put in somewhere."""
+    place, length = draw.randrange(len(content)), draw.choice((1, 2, 7, 64, 4096))
+    start = draw.randrange(len(content))
+    part = draw.choice((draw.randbytes(length), bytes(length), content[start : start + length]))
+    return content[:place] + part + content[place:]
+
+
+def overwritten(draw: Random, content: bytes) -> bytes:
+    """A stretch replaced by random bytes, 0xff or bytes that formats know."""
+    place = draw.randrange(len(content))
+    known = (b"PK\x01\x02", b"PK\x03\x04", b"PK\x05\x06", b"PK\x06\x06", b"PK\x06\x07", b"\x93NUMPY", b"(dp0")
+    new = draw.choice((draw.randbytes(draw.randint(1, 64)), b"\xff" * draw.randint(1, 16), draw.choice(known)))
+    return content[:place] + new + content[place + len(new) :]
+
+
+def removed(draw: Random, content: bytes) -> bytes:
+    """A stretch taken out."""
+    place = draw.randrange(len(content))
+    return content[:place] + content[place + draw.choice((1, 2, 8, 500)) :]
+
+
+def _entries(content: bytes) -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _zipped(entries: list[tuple[str, bytes]], method: int = zipfile.ZIP_STORED) -> bytes:
+    stream = io.BytesIO()
+    with warnings.catch_warnings(action="ignore"), zipfile.ZipFile(stream, "w", method) as archive:  # of names twice
+        for name, content in entries:
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def _replaced(content: bytes, name: str, new: bytes, method: int = zipfile.ZIP_STORED) -> bytes:
+    return _zipped([*{**_entries(content), name: new}.items()], method)
+
+
+def _relabelled(content: bytes, size: int) -> bytes:
+    """The sizes unpacked that the last entry of a zip claims, in its header and in the directory."""
+    changed, local, central = bytearray(content), content.rfind(b"PK\x03\x04"), content.rfind(b"PK\x01\x02")
+    struct.pack_into("<I", changed, local + 22, size)
+    struct.pack_into("<I", changed, central + 24, size)
+    return bytes(changed)
+
+
+def bomb(draw: Random, content: bytes) -> bytes:
+    """Tens of megabytes of zeros packed small: told truly, or as less or more than they are."""
+    name = draw.choice(("weight_0.npy", "card.npy", "bias_9.npy"))
+    others = [(key, value) for key, value in _entries(content).items() if key != name]
+    packed = _zipped([*others, (name, bytes(draw.choice((20, 70)) * 2**20))], zipfile.ZIP_DEFLATED)
+    return packed if draw.random() < 0.5 else _relabelled(packed, draw.choice((0, 100, 10_000, 2**31, 2**32 - 2)))
+
+
+def false_sizes(draw: Random, content: bytes) -> bytes:
+    """A field of the directory or of the end record set to an extreme number."""
+    changed = bytearray(content)
+    signature = draw.choice([*FIELDS])
+    places = [k for k in range(len(content)) if content.startswith(signature, k)]
+    value = draw.choice((0, 1, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0xFFFFFFFF))
+    place = draw.choice(places) + draw.choice(FIELDS[signature])
+    struct.pack_into("<H" if value <= 0xFFFF else "<I", changed, min(place, len(changed) - 4), value)
+    return bytes(changed)
+
+
+def many_entries(draw: Random, content: bytes) -> bytes:
+    """A directory of thousands of entries."""
+    count = draw.choice((70, 500, 3000))
+    return _zipped([*_entries(content).items(), *((f"weight_{k}.npy", b"") for k in range(3, count))])
+
+
+def odd_entries(draw: Random, content: bytes) -> bytes:
+    """Entries twice, renamed, missing, with names of any kind or packed by another method."""
+    entries = [*_entries(content).items()]
+    place = draw.randrange(len(entries))
+    change = draw.randrange(4)
+    if change == 0:
+        entries.append((entries[place][0], draw.choice((entries[place][1], b"", b"x"))))
+    elif change == 1:
+        entries[place] = (draw.choice(NAMES), entries[place][1])
+    elif change == 2:
+        del entries[place]
+    else:
+        return _zipped(entries, draw.choice((zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA, zipfile.ZIP_DEFLATED)))
+    return _zipped(entries)
+
+
+def pickled(draw: Random, content: bytes) -> bytes:
+    """An array of objects, or a bare pickle in the place of an array."""
+    stream = io.BytesIO()
+    array = np.empty(draw.choice(((), (1,), (3, 2))), object)
+    array[...] = Explosive()
+    np.save(stream, array, allow_pickle=True)
+    new = stream.getvalue() if draw.random() < 0.7 else pickle.dumps(Explosive())
+    return _replaced(content, draw.choice(("card.npy", "weight_0.npy", "observation_mean.npy", "extra.npy")), new)
+
+
+def array_headers(draw: Random, content: bytes) -> bytes:
+    """The header of one array says something else: dtype, shape, order, version, or no literal at all."""
+    name = draw.choice([*_entries(content)])
+    shapes = ("(2**40,)", f"({2**40},)", "(-1,)", "(0,)", "()", f"({2**31}, {2**31})", "(1.5,)", "'x'", "(True,)")
+    types = ("'<f4'", "'>f4'", "'|O'", "'<U0'", "'V0'", "'<U2000000000'", "[('a','<f4')]", "'<m8'", "'f'", "[" * 60)
+    shape = draw.choice(shapes) if draw.random() < 0.6 else f"({draw.randrange(200)}, {draw.randrange(200)})"
+    text = (
+        f"{{'descr': {draw.choice(types)}, 'fortran_order': {draw.choice(('True', 'False', '1'))}, 'shape': {shape}}}"
+    )
+    if draw.random() < 0.2:
+        text = draw.choice(("", "{}", "(" * 9000, "__import__('os')", "{'descr': 1}", "\0" * 100, "1" * 9000))
+    body = text.encode() + b"\n"
+    version = draw.choice(((1, 0), (1, 0), (2, 0), (3, 0), (9, 9)))
+    length = len(body) if draw.random() < 0.8 else draw.choice((0, 0xFFFF))
+    packed = struct.pack("<H" if version == (1, 0) else "<I", length)
+    data = _entries(content)[name][128:]
+    return _replaced(content, name, b"\x93NUMPY" + bytes(version) + packed + body + data)
+
+
+def array_values(draw: Random, content: bytes) -> bytes:
+    """NaN, infinities, huge and tiny numbers among the weights; the zip itself is sound."""
+    entries = {key: value for key, value in _entries(content).items() if key != "card.npy"}
+    name = draw.choice([*entries])
+    changed = bytearray(entries[name])
+    value = draw.choice((np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, -1.0, 0.0))
+    struct.pack_into("<f", changed, 128 + 4 * draw.randrange((len(changed) - 128) // 4), value)
+    return _replaced(content, name, bytes(changed))
+
+
+def _with_card(content: bytes, text: str) -> bytes:
+    stream = io.BytesIO()
+    try:
+        np.save(stream, np.array(text))
+    except (UnicodeEncodeError, ValueError):
+        np.save(stream, np.array(text.encode("utf-8", "replace")))
+    return _replaced(content, "card.npy", stream.getvalue())
+
+
+def hostile_text(draw: Random) -> str:
+    """JSON that is deep, long, huge in its numbers, or no JSON."""
+    deep, wide = draw.choice((100, 10_000, 200_000)), draw.choice((1000, 400_000))
+    choices = (
+        lambda: "[" * deep + "]" * deep,
+        lambda: '{"a":' * deep + "1" + "}" * deep,
+        lambda: "[" + "[]," * wide + "[]]",
+        lambda: '{"format_version":' + "9" * draw.choice((400, 4000, 5000, 300_000)) + "}",
+        lambda: '{"gravity":1e999999999}',
+        lambda: draw.choice(("", "null", "NaN", "[1]", "{", '"', "\0", "{}", '{"a":1,"a":2}', "\ufeff{}", "'a'")),
+    )
+    return draw.choice(choices)()
+
+
+def card_text(draw: Random, content: bytes) -> bytes:
+    """The whole card replaced."""
+    return _with_card(content, hostile_text(draw))
+
+
+def damaged(draw: Random, tree: Any) -> Any:
+    """A JSON tree with one to three of its values replaced, removed, renamed or doubled, at any depth."""
+    for _ in range(draw.randint(1, 3)):
+        spot = tree
+        while isinstance(spot, dict) and spot:
+            key = draw.choice([*spot])
+            if isinstance(spot[key], dict) and spot[key] and draw.random() < 0.6:
+                spot = spot[key]
+                continue
+            action = draw.randrange(6)
+            if action == 0:
+                del spot[key]
+            elif action == 1:
+                spot[draw.choice(("x", "", "é", key + "_", "a\nb"))] = spot.pop(key)
+            elif action == 2 and isinstance(spot[key], list):
+                spot[key] = [*spot[key], draw.choice(ODD_VALUES)]
+            else:
+                spot[key] = draw.choice(ODD_VALUES)
+            break
+    return tree
+
+
+def card_values(draw: Random, content: bytes) -> bytes:
+    """Fields of the card replaced, removed, renamed."""
+    card = json.loads(str(np.load(io.BytesIO(_entries(content)["card.npy"]))))
+    return _with_card(content, json.dumps(damaged(draw, card)))
+
+
+def json_values(draw: Random, content: bytes) -> bytes:
+    """Values of a JSON file replaced, removed, renamed."""
+    return json.dumps(damaged(draw, json.loads(content))).encode("utf-8", "replace")
+
+
+def json_text(draw: Random, content: bytes) -> bytes:
+    """A JSON file replaced."""
+    return hostile_text(draw).encode("utf-8", "replace")
+
+
+def csv_cells(draw: Random, content: bytes) -> bytes:
+    """Cells, rows and the header of a CSV file damaged."""
+    rows = [line.split(b",") for line in content.splitlines()]
+    row = draw.choice(rows)
+    odd = (b"", b"x", b"nan", b"inf", b"1e400", b"-1", b"9" * 5000, b'"', b"\xff", b"\0", "²".encode(), b"1\n2", b"1,2")
+    row[draw.randrange(len(row))] = draw.choice(odd)
+    if draw.random() < 0.2:
+        rows = rows[draw.randrange(len(rows)) :] + rows[: draw.randrange(3)]
+    return b"\n".join(b",".join(row) for row in rows)
+
+
+ANY: tuple[Mutation, ...] = (flipped_bits, truncated, inserted, overwritten, removed)
+POLICY = (*ANY, false_sizes, bomb, odd_entries, many_entries, pickled)
+POLICY += (array_headers, array_values, card_values, card_text)
+JSON, CSV = (*ANY, json_values, json_text), (*ANY, csv_cells)
 
 
 class HangError(BaseException):
@@ -141,155 +386,66 @@ def read_records(run: Path) -> None:
     training_summary(run, 0)
 
 
+def records(run: Path) -> Path:
+    """The records of a run of two members, without its checkpoints."""
+    origin = {"seed": 0, "physics": "mjx", "seeds": 2, "sweep": None, "command": "train"}
+    write_config(run, configs.preset("transport"), origin)
+    header = "steps,seconds,rate,episode_return,eval_return"
+    (run / "metrics.csv").write_text(f"{header}\n1024,0.5,2000.0,-3.5,\n2048,1.0,2000.0,-2.5,-1.25\n")
+    members = "steps,seed,eval_return,eval_steady_error,eval_peak,eval_tilt_error,eval_vertical_error"
+    (run / "members.csv").write_text(f"{members}\n2048,0,-1.5,0.1,0.2,0.01,0.1\n2048,1,-1.0,0.1,0.2,0.01,0.1\n")
+    return run
+
+
 def fuzz_policies(files: int, seed: int, place: Path) -> list[Count]:
-    """Mutated copies of the shipped policies."""
-    originals = [path.read_bytes() for path in shipped_policies()]
-    counts = [Count(f"policy, {kind}") for kind in POLICY]
-    path = place / "mutated.npz"
-    for number in range(files):
-        draw = random.Random(f"{seed} {number}")
-        mutate = [*POLICY.values()][number % len(POLICY)]
-        path.write_bytes(mutate(draw, draw.choice(originals)))
-        measured(load_and_fly, path, counts[number % len(POLICY)])
-    return counts
+    """Damaged copies of the shipped policies."""
+    originals, path = [path.read_bytes() for path in shipped_policies()], place / "policy.npz"
+    return _fuzz(load_and_fly, path, [(path, originals, mutate) for mutate in POLICY], files, seed)
 
 
 def fuzz_records(run: Path, files: int, seed: int) -> list[Count]:
     """A run directory of which one text file is damaged."""
-    kinds = [("config.json", kind, JSON[kind]) for kind in JSON]
-    kinds += [(name, kind, CSV[kind]) for name in ("metrics.csv", "members.csv") for kind in CSV]
-    counts = [Count(f"{name}, {kind}") for name, kind, _ in kinds]
-    originals = {name: (run / name).read_bytes() for name in ("config.json", "metrics.csv", "members.csv")}
+    places = {run / "config.json": JSON, run / "metrics.csv": CSV, run / "members.csv": CSV}
+    kinds = [(path, [path.read_bytes()], mutate) for path, mutations in places.items() for mutate in mutations]
+    return _fuzz(read_records, run, kinds, files, seed)
+
+
+def _fuzz(
+    load: Callable[[Path], object],
+    read: Path,
+    kinds: Sequence[tuple[Path, list[bytes], Mutation]],
+    files: int,
+    seed: int,
+) -> list[Count]:
+    """Of every kind (file, what it held, damage) in turn, `files` in all, what `load` makes of `read`."""
+    counts = [Count(f"{path.name}, {mutate.__name__.replace('_', ' ')}") for path, _, mutate in kinds]
     for number in range(files):
-        name, _, mutate = kinds[number % len(kinds)]
-        (run / name).write_bytes(mutate(random.Random(f"{seed} {number}"), originals[name]))
-        measured(read_records, run, counts[number % len(kinds)])
-        (run / name).write_bytes(originals[name])
+        draw, (path, sound, mutate) = Random(f"{seed} {number}"), kinds[number % len(kinds)]
+        path.write_bytes(mutate(draw, draw.choice(sound)))
+        measured(load, read, counts[number % len(kinds)])
+        path.write_bytes(sound[0])
     return counts
 
 
-def fuzz_checkpoints(run: Path, files: int, seed: int) -> list[Count]:
-    """A run directory of which one file of one checkpoint is damaged or gone."""
-    import jax
-
-    from mjxball.train.checkpoint import Checkpoints
-    from mjxball.train.population import Population
-
-    config, origin = read_config(run)
-    template = Population(config, origin["physics"], origin["seeds"], origin["sweep"]).template()
-    kinds = {**ANY, "emptied": lambda draw, content: b"", "gone": None, "json: text": JSON["json: text"]}
-    counts = [Count(f"checkpoint, {kind}") for kind in kinds]
-
-    def restored(directory: Path) -> Any:
-        checkpoints = Checkpoints(directory)
-        try:
-            return checkpoints.restore(template, lambda text: None, discard=False)
-        finally:
-            checkpoints.close()
-
-    def load(directory: Path) -> None:
-        state = restored(directory)
-        if state is None:
-            raise InputError("no checkpoint can be read")
-        leaves = [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(state)]
-        if leaves not in sound:
-            raise ArithmeticError("a damaged checkpoint was restored as if it were sound")
-
-    sound = []  # the states of both checkpoints, the newest first; every damaged one must give one of them or none
-    for step in sorted((run / "checkpoints").iterdir(), key=lambda path: -int(path.name)):
-        sound.append([np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(restored(run))])
-        step.rename(run / f"aside-{step.name}")
-    (run / "checkpoints").mkdir(exist_ok=True)
-    for aside in run.glob("aside-*"):
-        aside.rename(run / "checkpoints" / aside.name.removeprefix("aside-"))
-    load(run)
-    for number in range(files):
-        draw, mutate = random.Random(f"{seed} {number}"), [*kinds.values()][number % len(kinds)]
-        copy = run.with_name("damaged")
-        shutil.copytree(run, copy)
-        path = draw.choice(sorted(path for path in (copy / "checkpoints").rglob("*") if path.is_file()))
-        content = path.read_bytes()
-        path.write_bytes(mutate(draw, content or b"\0")) if mutate else path.unlink()
-        measured(load, copy, counts[number % len(kinds)])
-        shutil.rmtree(copy)
-    return counts
-
-
-def small_run(place: Path) -> Path:
-    """A run directory with checkpoints, of two followers with networks so small that damage hits everything."""
-    flags = {
-        "--physics": "newton-euler",
-        "--seeds": 2,
-        "--out": place / "run",
-        "--sac.total_steps": 4096,
-        "--sac.num_envs": 32,
-        "--sac.replay_size": 3200,
-        "--sac.warmup_steps": 1024,
-        "--sac.updates_per_step": 1,
-        "--timing.episode_steps": 100,
-        "--sac.policy_layers": "8,8",
-        "--sac.critic_layers": "8,8",
-    }
-    command = [sys.executable, str(TRAIN), *(str(word) for pair in flags.items() for word in pair)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ})
-    if not (place / "run" / "checkpoints").is_dir():
-        raise SystemExit(f"the small run failed:\n{done.stderr}")
-    return place / "run"
-
-
-def in_child(run: Path, files: int, seed: int) -> list[Count]:
-    """`fuzz_checkpoints` in a process of its own."""
-    command = [sys.executable, __file__, "--run", str(run), "--checkpoints", str(files), "--seed", str(seed)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        print(f"FAULT checkpoint: the reader died with code {done.returncode}", file=sys.stderr)
-        return [Count("checkpoint, all", files, faults=1)]
-    return [Count(**count) for count in json.loads(done.stdout.splitlines()[-1])]
-
-
-def table(counts: list[Count]) -> str:
-    """One line for each kind, and their sum."""
-    total = Count("all", *(sum(getattr(c, name) for c in counts) for name in ("files", "loaded", "refused", "faults")))
-    total.longest, total.memory = max(c.longest for c in counts), max(c.memory for c in counts)
-    lines = [
-        f"{'mutation':34s} {'files':>6s} {'loaded':>6s} {'refused':>7s} {'faults':>6s} {'slowest':>8s} {'most':>9s}"
-    ]
-    for c in (*counts, total):
-        numbers = (
-            f"{c.files:6d} {c.loaded:6d} {c.refused:7d} {c.faults:6d} {1e3 * c.longest:5.0f} ms {c.memory:5.1f} MiB"
-        )
-        lines.append(f"{c.kind:34s} {numbers}")
-    return "\n".join(lines)
-
-
-def main() -> int:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--files", type=int, default=10_000, help="mutated policy files")
-    parser.add_argument("--records", type=int, default=1000, help="mutated config.json, metrics.csv and members.csv")
-    parser.add_argument("--checkpoints", type=int, default=100, help="runs with a damaged checkpoint")
+def main(given: Sequence[str] | None = None) -> int:
+    """Damage, load, print, write."""
+    parser = arguments(__file__, __doc__)
+    parser.add_argument("--files", type=int, default=10_000, help="damaged policy files")
+    parser.add_argument("--records", type=int, default=1000, help="damaged config.json, metrics.csv and members.csv")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    parser.add_argument("--run", type=Path, help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.run:
-        watch()
-        print(json.dumps([asdict(count) for count in fuzz_checkpoints(options.run, options.checkpoints, options.seed)]))
-        return 0
+    options = parser.parse_args(given)
     with tempfile.TemporaryDirectory() as name:
-        place = Path(name)
-        run = small_run(place) if options.records or options.checkpoints else place
+        run = records(Path(name))
         watch()
-        counts = fuzz_policies(options.files, options.seed, place)
-        counts += fuzz_records(run, options.records, options.seed) if options.records else []
-        counts += in_child(run, options.checkpoints, options.seed) if options.checkpoints else []
-    print(table(counts))
-    if options.json:
-        options.json.write_text(
-            json.dumps({"seed": options.seed, "kinds": [asdict(c) for c in counts]}, indent=1) + "\n"
-        )
-    return 1 if any(count.faults for count in counts) else 0
+        counts = fuzz_policies(options.files, options.seed, Path(name))
+        counts += fuzz_records(run, options.records, options.seed)
+    rows = [asdict(count) for count in counts]
+    total = {key: sum(row[key] for row in rows) for key in ("files", "loaded", "refused", "faults")}
+    most = {key: max(row[key] for row in rows) for key in ("longest", "memory")}
+    table([*rows, {"kind": "all", **total, **most}], form=".3f")
+    write(options.json, {"seed": options.seed, "kinds": rows})
+    return 1 if total["faults"] else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(main))

@@ -1,14 +1,15 @@
-"""Bad and hostile command lines and files (`hostile.py`), each in a process and a directory of its own.
+"""Bad and hostile command lines and files, each in a process and a directory of its own.
 
-    python benchmarks/hardening.py [--lines 250] [--jobs 2] [--only TEXT] [--json FILE]
-
-Of each it asserts: exit code 2, one sentence on stderr, no traceback, less than 20 s and 3 GB, nothing overwritten and
-nothing left behind. Prints what of that does not hold; exit code 1 if anything does not.
+A case is a command line that is sound but for one flaw, generated from the programs' own parsers, with the files that
+it is given. Of each it asserts: exit code 2, one sentence on stderr, no traceback, less than 20 s and 3 GB, nothing
+overwritten and nothing left behind. Prints what of that does not hold; exit code 1 if anything does not.
 """
 
 from __future__ import annotations
 
+import argparse
 import concurrent.futures
+import io
 import json
 import os
 import signal
@@ -17,57 +18,340 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from random import Random
 from typing import Any
 
-from hostile import Case, every_case, prepare, spread
-from hostile_files import ROOT
-from mjxball import cli
+import numpy as np
+
+from harness import ROOT, Row, arguments, table, write
+from mjxball import cli, export
+from mjxball import config as configs
+from mjxball.commands import evaluate, train
+from mjxball.fly import main as fly
+from mjxball.policy.file import shipped_policy
+from mjxball.rig import gains, identify
+from mjxball.view import command as view
 
 LINES, SECONDS, MEMORY = 250, 20.0, 3.0e9  # [s] of a line, [bytes] resident at most
 POLL = 0.05  # [s]
 LONGEST = 1000  # characters of a sentence, paths included
+SPARSE = 6 * 10**9  # bytes of a file that takes no room on the disk
+Content = bytes | Callable[[Path], None]  # of a file, or what makes it
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run, print, write."""
-    parser = cli.make_parser("python benchmarks/hardening.py", __doc__.split("\n\n")[0])
-    parser.add_argument("--lines", type=int, default=LINES, metavar="N", help="how many of the cases, evenly chosen")
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes at a time (2)")
-    parser.add_argument("--only", default="", metavar="TEXT", help="of cases whose program and flaw have TEXT")
-    parser.add_argument("--seconds", type=float, default=SECONDS, metavar="S", help="of a line; more on a busy machine")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    options = parser.parse_args(arguments)
-    cases = [case for case in every_case() if options.only in f"{case.program}: {case.flaw}"]
-    chosen = spread(cases, options.lines)
-    rows = []
-    with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-        for row in pool.map(lambda case: run(case, options.seconds), chosen):
-            rows.append(row)
-            if row["wrong"]:
-                print(f"{row['program']:9} {row['flaw']:44} {'; '.join(row['wrong'])}", flush=True)
-    bad = [row for row in rows if row["wrong"]]
-    for name in dict.fromkeys(row["program"] for row in rows):
-        mine = [row for row in rows if row["program"] == name]
-        refused, slowest = sum(not row["wrong"] for row in mine), max(row["seconds"] for row in mine)
-        most = max(row["bytes"] for row in mine) / 1e9
-        print(f"{name:9} {refused:3} of {len(mine):3} refused well, at most {slowest:.1f} s and {most:.2f} GB")
-    causes = Counter(cause.split(":")[0] for row in bad for cause in row["wrong"])
-    print(f"{len(rows) - len(bad)} of {len(rows)} of {len(cases)} lines; {dict(causes)}")
-    if options.json:
-        lines = ",\n".join(json.dumps(row) for row in rows)
-        options.json.write_text(f'{{"lines": [\n{lines}\n]}}\n')
-    return 1 if bad else 0
+def _sparse(path: Path) -> None:
+    with path.open("wb") as stream:
+        stream.truncate(SPARSE)
 
 
-def run(case: Case, longest: float) -> dict[str, Any]:
+ODD_FILES: dict[str, Content] = {
+    "missing": lambda path: None,
+    "a directory": lambda path: path.mkdir(),
+    "/dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "a pipe": os.mkfifo,
+    "a loop of links": lambda path: path.symlink_to(path.name),
+    "6 GB of nothing": _sparse,
+    "empty": b"",
+    "noise": Random(0).randbytes(5000),
+    "other UTF": "\ufeff{}".encode("utf-16"),
+}
+
+
+def _changed(card: Callable[[str], str] = str, weight: float | None = None) -> bytes:
+    """A shipped policy file with another text as its card, or one weight of another value."""
+    with np.load(shipped_policy("balance")) as arrays:
+        found = {name: array.copy() for name, array in arrays.items()}
+    found["card"] = np.array(card(str(found["card"])))
+    if weight is not None:
+        found["weight_0"][0, 0] = weight
+    stream = io.BytesIO()
+    np.savez(stream, **found)
+    return stream.getvalue()
+
+
+def _edited(field: str, value: Any) -> bytes:
+    return _changed(lambda text: json.dumps({**json.loads(text), field: value}))
+
+
+def policies() -> dict[str, Content]:
+    """Damaged policy files."""
+    sound = shipped_policy("balance").read_bytes()
+    return {
+        "half of one": sound[: len(sound) // 2],
+        "a flipped byte": bytes(sound[:900] + bytes([sound[900] ^ 255]) + sound[901:]),
+        "a NaN weight": _changed(weight=float("nan")),
+        "a weight of 1e30": _changed(weight=1e30),
+        "format 99": _edited("format_version", 99),
+        "control period 0": _edited("control_period", 0),
+        "limits of NaN": _edited("command_limits", [float("nan"), 6.0]),
+        "a twice given key": _changed(lambda text: '{"gravity": 1.62, ' + text[1:]),
+        "flown by one drone": _edited("flown", {"drones": [1], "seconds": 60}),
+        "a card of 100 000 brackets": _changed(lambda text: "[" * 100_000),
+    }
+
+
+RIG = (ROOT / "mjxball" / "config" / "plants" / "team3.toml").read_text()
+
+
+def rigs() -> dict[str, tuple[str, Content]]:
+    """Damaged plant files: flaw -> (name, content)."""
+    toml = {
+        "no TOML": "plant = [",
+        "a key given twice": "[plant]\nobject_mass = 0.3\nobject_mass = 0.4\n",
+        "an unknown key": RIG.replace("carrier_mass", "carrier_weight"),
+        "a word for a number": RIG.replace("object_mass = 0.3\n", 'object_mass = "0.3"\n'),
+        "a mass of NaN": RIG.replace("object_mass = 0.3\n", "object_mass = nan\n"),
+        "a mass of inf": RIG.replace("object_mass = 0.3\n", "object_mass = inf\n"),
+        "a negative mass": RIG.replace("object_mass = 0.3\n", "object_mass = -0.3\n"),
+        "drones of 1000 kg": RIG.replace("[[plant.drones]]\n", "[[plant.drones]]\nmass = 1000.0\n"),
+        "arms of 46 m": RIG.replace("[plant]\n", "[plant]\narm = 46.0\n"),
+        "a lag of 30 s": RIG.replace("[plant]\n", "[plant]\nrotor_lag = 30.0\n"),
+        "rotors of 5.5 mN": RIG.replace("rotor_force_max = 8.0", "rotor_force_max = 0.0055"),
+        "one drone": RIG[: RIG.index("[[plant.drones]]\nmount = [-")],
+        "10 000 drones": RIG + "[[plant.drones]]\nmount = [0.1, 0.1, 0.0]\n" * 10_000,
+        "drones in one place": RIG.replace("-0.09815, -0.17", "-0.09815, 0.17"),
+        "drones that are a number": RIG.split("# The leader")[0].replace("[plant]", "[plant]\ndrones = 3"),
+    }
+    text = json.dumps({"plant": {"object_mass": 0.3}})
+    other = {
+        "JSON: a key given twice": '{"plant": {"object_mass": 0.3, "object_mass": 0.4}}',
+        "JSON: NaN": '{"plant": {"object_mass": NaN}}',
+        "JSON: 1e400": text.replace("0.3", "1e400"),
+        "JSON: a list": "[1, 2]",
+        "JSON: brackets": '{"plant":' * 50_000,
+    }
+    found: dict[str, tuple[str, Content]] = {flaw: ("rig.toml", content.encode()) for flaw, content in toml.items()}
+    return {**found, **{flaw: ("rig.json", content.encode()) for flaw, content in other.items()}}
+
+
+def logs() -> dict[str, Content]:
+    """What is no flight log."""
+    return {
+        "text": b"hello\n" * 100,
+        "half a line": b'{"kind": "flight", "time": 0.',
+        "numbers": b"1\n2\n3\n",
+        "NaN": b'{"time": NaN, "record": "tick"}\n' * 50,
+        "brackets": b"[" * 100_000,
+    }
+
+
+def series() -> dict[str, Content]:
+    """Bad `--waveform` files."""
+    rows = {
+        "words": "time,offset\nnow,here\n",
+        "NaN": "0,0\n1,nan\n2,0\n",
+        "backwards": "0,0\n2,0.01\n1,0.02\n",
+        "a time twice": "0,0\n1,0.01\n1,0.02\n",
+        "one column": "0\n1\n2\n",
+        "one sample": "0,0\n",
+        "out of the object": "0,0\n1,17\n",
+        "too many": "0,0\n" * 200_000,
+    }
+    return {flaw: text.encode() for flaw, text in rows.items()}
+
+
+def sweeps() -> dict[str, Content]:
+    """Bad `--sweep` files."""
+    rows = {
+        "no JSON": "{",
+        "a key given twice": '{"leader.kp": [0.5, 0.6], "leader.kp": [0.1, 0.2]}',
+        "an unknown setting": '{"leader.gain": [0.5, 0.6]}',
+        "unlike lengths": '{"sac.learning_rate": [1e-3, 2e-3], "sac.tau": [0.1]}',
+        "NaN": '{"sac.learning_rate": [NaN, 1e-3]}',
+        "words": '{"sac.learning_rate": ["a", "b"]}',
+        "a list": "[1, 2]",
+    }
+    return {flaw: text.encode() for flaw, text in rows.items()}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One command line."""
+
+    program: str
+    flaw: str
+    arguments: tuple[str, ...]
+    files: dict[str, Content] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Program:
+    """A command with a sound line; `{}` in `line` is where a flag may be put."""
+
+    name: str
+    start: tuple[str, ...]  # python arguments
+    line: tuple[str, ...]
+    parser: argparse.ArgumentParser
+    skip: frozenset[str] = frozenset()  # flags that take any text, or that are outputs
+
+
+class _FoundError(Exception):
+    """Carries a parser out of the `main` that makes it."""
+
+
+def parser_in(main: Callable[[list[str]], Any]) -> argparse.ArgumentParser:
+    """The parser that `main` makes for itself."""
+
+    def stop(self: Any, *_: Any, **__: Any) -> Any:
+        raise _FoundError(self)
+
+    kept, cli.Parser.parse_args = cli.Parser.parse_args, stop
+    try:
+        main([])
+    except _FoundError as found:
+        parser: argparse.ArgumentParser = found.args[0]
+        return parser
+    finally:
+        cli.Parser.parse_args = kept
+    raise RuntimeError(f"{main} made no parser")
+
+
+def programs() -> list[Program]:
+    """Every command of the project that a user calls."""
+    module, flight = (lambda name: ("-m", f"mjxball.{name}")), str(shipped_policy("flight"))
+    balance = str(shipped_policy("balance"))
+    text = frozenset(
+        {"--env", "--reward", "--twin-load", "--mocap-option", "--bodies", "--mocap-host", "--coordinator"}
+    )
+    learning = ("paper", "--physics", "newton-euler", "--out", "run")
+    short = ("copy", "--seconds", "1", "--physics", "newton-euler")
+    return [
+        Program("train", (str(ROOT / "train.py"),), learning, train.parser(), text),
+        Program("eval", (str(ROOT / "eval.py"),), ("--followers", *short), evaluate.parser(), text),
+        Program("view", module("view"), (*short, "--out", "page.html"), view.parser(), text),
+        Program("fly", module("fly"), (flight, "--rehearse", "--seconds", "2"), fly.make_parser(), text),
+        Program("export", module("export"), (balance, "out.npz"), parser_in(export.main), text),
+        Program("gains", module("rig.gains"), ("--out", "gains.json"), gains.parser(), text),
+        Program("identify", module("rig.identify"), ("flight.jsonl", "--out", "plant.json"), identify.parser(), text),
+    ]
+
+
+WORDS: dict[Any, tuple[str, ...]] = {float: ("nan", "inf", "1e999", "abc", ""), int: ("abc", "1.5", "1e30", "nan", "")}
+OUTPUTS = ("--out", "--json", "--log", "--save")
+
+
+def words(program: Program, random: Random) -> Iterator[Case]:
+    """Every flag of a parser but the configuration's with values that its type does not take."""
+    for action in program.parser._actions:
+        flag = next((name for name in action.option_strings if name.startswith("--")), None)
+        if flag is None or action.dest in ("help", "version") or action.dest.startswith("config:"):
+            continue
+        if flag in program.skip or flag in OUTPUTS or (action.type is Path and flag != "--plant"):
+            continue
+        if action.nargs == 0:
+            yield _with(program, f"{flag}=yes", f"{flag}=yes")
+            continue
+        count = action.nargs if isinstance(action.nargs, int) else 1
+        if action.choices is not None:
+            wrong = ("", "nonsense")
+        elif action.type in WORDS:
+            wrong = tuple(random.sample(WORDS[action.type], 2))
+        else:
+            wrong = ("",)
+        for word in wrong:
+            yield _with(program, f"{flag} {word!r}", flag, *[word] * count)
+        if action.nargs != "?":
+            yield _with(program, f"{flag} alone", flag)
+
+
+def settings(program: Program, random: Random, count: int) -> Iterator[Case]:
+    """Some of the configuration's flags with what no setting is."""
+    leaves = random.sample([path for path, _, _ in configs.leaves(configs.Config())], count)
+    for number, path in enumerate(leaves):
+        word = ("nan", "1e999", "-1e30", "abc", "1,2,3,4,5,6,7,8,9")[number % 5]
+        yield _with(program, f"--{path}={word}", f"--{path}={word}")
+
+
+def _with(program: Program, flaw: str, *flag: str, files: dict[str, Content] | None = None) -> Case:
+    return Case(program.name, flaw, (*program.start, *program.line, *flag), files or {})
+
+
+PLACES = {"train": "run", "eval": "out", "view": "page.html", "export": "out.npz", "gains": "gains.json"}
+
+
+def files(every: dict[str, Program]) -> Iterator[Case]:
+    """A bad file in the place of every one that a command reads, and something where it writes."""
+    for flaw, content in {**ODD_FILES, **policies()}.items():
+        bad, made = "bad.npz", {"bad.npz": content}
+        for name, line in {
+            "eval": (bad, "--seconds", "1", "--physics", "newton-euler"),
+            "view": (bad, "--seconds", "1", "--out", "page.html"),
+            "fly": (bad, "--rehearse", "--seconds", "2"),
+            "export": (bad, "out.onnx"),
+            "train": ("balance", "--start-from", bad, "--out", "run"),
+        }.items():
+            if name in ("eval", "fly") or flaw in ODD_FILES or flaw == "a twice given key":
+                yield Case(name, f"policy: {flaw}", (*every[name].start, *line), made)
+    for flaw, (file, content) in {**{f: ("rig.toml", c) for f, c in ODD_FILES.items()}, **rigs()}.items():
+        yield _with(every["train"], f"--plant {flaw}", "--plant", file, files={file: content})
+        if flaw in ODD_FILES or len(flaw) % 2:
+            yield _with(every["eval"], f"--plant {flaw}", "--plant", file, files={file: content})
+    for flaw, content in {**ODD_FILES, **logs()}.items():
+        made = {"flight.jsonl": content}
+        for name, line in {
+            "eval": ("--flight", "flight.jsonl", "--out", "out"),
+            "view": ("flight.jsonl", "--out", "page.html"),
+            "identify": ("flight.jsonl", "--out", "plant.json"),
+        }.items():
+            yield Case(name, f"log: {flaw}", (*every[name].start, *line), made)
+    for flaw, content in {**ODD_FILES, **series()}.items():
+        yield _with(every["eval"], f"--waveform {flaw}", "--waveform", "wave.csv", files={"wave.csv": content})
+    for flaw, content in {**ODD_FILES, **sweeps()}.items():
+        yield _with(every["train"], f"--sweep {flaw}", "--sweep", "sweep.json", files={"sweep.json": content})
+    for flaw, content in ODD_FILES.items():
+        yield _with(every["fly"], f"--gains {flaw}", "--gains", "own.json", files={"own.json": content})
+    yield from outputs(every)
+
+
+def outputs(every: dict[str, Program]) -> Iterator[Case]:
+    """Where a command writes there is something already, or no directory."""
+    for name, place in PLACES.items():
+        line = every[name] if name != "eval" else None
+        flags = () if line else ("--out", place)
+        made: Content = _full if name in ("train", "eval") else b"mine"
+        yield _with(every[name], f"{place} exists", *flags, files={place: made})
+        if name in ("train", "eval"):
+            yield _with(every[name], f"{place} is a file", *flags, files={place: b"mine"})
+    for flag, file in (("--json", "cells.json"), ("--json", "nowhere/cells.json"), ("--json", "cells.txt")):
+        yield _with(every["eval"], f"{flag} {file}", flag, file, files={"cells.json": b"mine"})
+    yield _with(every["view"], "--save exists", "--save", "f.npz", files={"f.npz": b"mine"})
+    yield _with(every["fly"], "--log exists", "--log", "f.jsonl", files={"f.jsonl": b"mine"})
+
+
+def _full(path: Path) -> None:
+    path.mkdir()
+    (path / "mine").write_text("mine")
+
+
+def every_case(seed: int = 0, config_flags: int = 40) -> list[Case]:
+    """All of them, in a fixed order."""
+    random, named = Random(seed), {program.name: program for program in programs()}
+    found: list[Case] = []
+    for program in named.values():
+        found += words(program, random)
+    return [*found, *settings(named["train"], random, config_flags), *files(named)]
+
+
+def spread(cases: Sequence[Case], count: int) -> list[Case]:
+    """`count` of the cases, evenly from their order; all of them if there are fewer."""
+    step = max(len(cases) / count, 1.0)
+    return [cases[int(number * step)] for number in range(min(count, len(cases)))]
+
+
+def run(case: Case, longest: float) -> Row:
     """What a case's process did, `wrong` being what it should not have."""
     with tempfile.TemporaryDirectory(prefix="hardening-") as folder:
         place, temporary, errors = Path(folder) / "work", Path(folder) / "tmp", Path(folder) / "stderr"
         place.mkdir()
         temporary.mkdir()
-        prepare(case, place)
+        for name, content in case.files.items():
+            if isinstance(content, bytes):
+                (place / name).write_bytes(content)
+            else:
+                content(place / name)
         before = listing(place)
         code, seconds, memory, why = watched(case, place, temporary, errors, longest)
         stderr = errors.read_text(errors="replace")[:20_000]
@@ -141,5 +425,34 @@ def listing(place: Path) -> dict[str, tuple[int, int]]:
     return found
 
 
+def main(given: Sequence[str] | None = None) -> int:
+    """Run, print, write."""
+    parser = arguments(__file__, __doc__)
+    parser.add_argument("--lines", type=int, default=LINES, metavar="N", help="how many of the cases, evenly chosen")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes at a time (2)")
+    parser.add_argument("--only", default="", metavar="TEXT", help="of cases whose program and flaw have TEXT")
+    parser.add_argument("--seconds", type=float, default=SECONDS, metavar="S", help="of a line; more on a busy machine")
+    options = parser.parse_args(given)
+    cases = [case for case in every_case() if options.only in f"{case.program}: {case.flaw}"]
+    rows = []
+    with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
+        for row in pool.map(lambda case: run(case, options.seconds), spread(cases, options.lines)):
+            rows.append(row)
+            if row["wrong"]:
+                print(f"{row['program']:9} {row['flaw']:44} {'; '.join(row['wrong'])}", flush=True)
+    found = []
+    for name in dict.fromkeys(row["program"] for row in rows):
+        mine = [row for row in rows if row["program"] == name]
+        line = {"program": name, "lines": len(mine), "refused well": sum(not row["wrong"] for row in mine)}
+        most = max(row["bytes"] for row in mine) / 1e9
+        found.append(line | {"slowest s": max(row["seconds"] for row in mine), "most GB": most})
+    table(found)
+    bad = [row for row in rows if row["wrong"]]
+    causes = Counter(cause.split(":")[0] for row in bad for cause in row["wrong"])
+    print(f"{len(rows) - len(bad)} of {len(rows)} of {len(cases)} lines; {dict(causes)}")
+    write(options.json, {"lines": rows})
+    return 1 if bad else 0
+
+
 if __name__ == "__main__":
-    raise SystemExit(cli.run_command(main))
+    sys.exit(cli.run_command(main))

@@ -1,7 +1,5 @@
 """Flights of ten minutes: each policy on its own plants, its load at rest and moving, beside the same of one minute.
 
-    python benchmarks/horizon.py [POLICY.npz ...] [--seconds 60 600] [--json FILE]
-
 A row is steady if the flight does not fail, no peak later than 20 s is more than 1.5 times that of the shortest flight
 and 5 mm, and a rotor is at its limit in less than a fifth of the time. A policy for any rig flies a pair and rings of
 three, four and six; one for teams rings of every number of drones between its smallest and its largest. Numbers are
@@ -11,11 +9,10 @@ those of docs/metrics.md, computed in float32; ideal sensors.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
+from harness import Row, arguments, say, write
 from mjxball import cli
 from mjxball import config as configs
 from mjxball.config import Config
@@ -36,19 +33,17 @@ SHOWN = ("rotors_at_limit", "rotor_power", "command_spread")
 RIGS = ("pair", "team3", "team4", "team6")  # plants of a policy for any rig
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(given: Sequence[str] | None = None) -> int:
     """Fly, print, write."""
-    parser = cli.make_parser("python benchmarks/horizon.py", __doc__.split("\n\n")[0])
+    parser = arguments(__file__, __doc__)
     parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz", help="default: every shipped one")
     parser.add_argument("--seconds", nargs="+", type=float, default=[MINUTE, TEN], metavar="S")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    options = parser.parse_args(arguments)
-    rows: list[dict[str, Any]] = []
+    options = parser.parse_args(given)
+    rows: list[Row] = []
     for path in options.policies or shipped_policies():
         for label, setup in own_plants(path):
             rows += flown(path, label, setup, sorted(options.seconds))
-    if options.json:
-        options.json.write_text(json.dumps({"rows": rows}, indent=1, allow_nan=False) + "\n")
+    write(options.json, {"rows": rows})
     return 0
 
 
@@ -78,7 +73,7 @@ def own_scenarios(setup: Config, seconds: float) -> list[Scenario]:
     ]
 
 
-def flown(path: Path, label: str, setup: Config, horizons: Sequence[float]) -> list[dict[str, Any]]:
+def flown(path: Path, label: str, setup: Config, horizons: Sequence[float]) -> list[Row]:
     """One row for each scenario and horizon [s], the shortest first."""
     batch, rows, first = Batch(setup, load_policy(path, setup)), [], []
     for seconds in horizons:
@@ -90,7 +85,7 @@ def flown(path: Path, label: str, setup: Config, horizons: Sequence[float]) -> l
             motion = f"{scenario.omega:g} rad/s" if scenario.amplitude else "ball" if scenario.ball_start else "rest"
             row = {"policy": path.stem, "plant": label, "drones": setup.plant.count, "motion": motion}
             rows.append({**row, "seconds": seconds, **numbers, "steady": is_steady(metrics, start)})
-            show(rows[-1])
+            say(rows[-1])
     return rows
 
 
@@ -101,17 +96,6 @@ def is_steady(metrics: Metrics, start: Metrics) -> bool:
         return False
     pairs = [(getattr(metrics, name), getattr(start, name)) for name in PEAKS]
     return all(None not in (late, early) and late <= GROWTH * early + SLACK for late, early in pairs)
-
-
-def show(row: dict[str, Any]) -> None:
-    """Print a row."""
-    peaks = " ".join("      -" if row[name] is None else f"{1e3 * row[name]:7.1f}" for name in PEAKS)
-    rest = " ".join("     -" if row[name] is None else f"{row[name]:6.3f}" for name in SHOWN)
-    where = f"{row['policy']:16} {row['plant']:16} {row['motion']:10} {row['seconds']:5g} s"
-    print(
-        f"{where}  peaks {peaks} mm  limit, power, spread {rest}  {'steady' if row['steady'] else 'NOT STEADY'}",
-        flush=True,
-    )
 
 
 if __name__ == "__main__":

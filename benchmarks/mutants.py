@@ -1,10 +1,8 @@
 """Do the tests notice what they should? A copy of the tree gets one small fault of `mutants.toml` at a time.
 
-    python benchmarks/mutants.py --json benchmarks/results/mutants.json      # against the first tier
-    python benchmarks/mutants.py --suite full                                # survivors against the second tier, too
-
 A fault is killed if a test fails. First the tests that are likely to notice it run, then, if none of them does, the
-whole tier. `--likely` stops before that: then "not by the likely tests" says nothing about the others.
+whole tier. `--likely` stops before that: then "not by the likely tests" says nothing about the others. Nothing of
+mjxball is imported here, `harness.py` included: tests run in forks of this process, and must find the copy's.
 """
 
 from __future__ import annotations
@@ -21,10 +19,11 @@ import sys
 import tempfile
 import time
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-REPOSITORY = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[1]
 TABLE = Path(__file__).with_suffix(".toml")
 TIERS = {"quick": "not slow and not release", "full": "slow"}  # marker expressions; full: quick, then this one
 LIMIT, TIER_LIMIT = 900.0, 3600.0  # [s] for the likely tests and for a tier, after which a fault counts as noticed
@@ -157,50 +156,46 @@ def row_of(number: int, mutant: Mutant, verdict: Verdict | None) -> dict[str, An
     found = {"number": number, "file": mutant.file, "old": mutant.old, "new": mutant.new}
     if verdict is None:
         return {**found, "killed": None, "by": "the text is not in this tree"}
-    return {
-        **found,
-        "killed": bool(verdict.tier),
-        "tier": verdict.tier,
-        "by": verdict.test,
-        "seconds": round(verdict.seconds, 1),
-    }
+    killed = {"killed": bool(verdict.tier), "tier": verdict.tier, "by": verdict.test}
+    return found | killed | {"seconds": round(verdict.seconds, 1)}
 
 
-def report(rows: list[dict[str, Any]], suite: str, likely_only: bool) -> dict[str, Any]:
+def report(rows: list[dict[str, Any]], suite: str) -> dict[str, Any]:
     """All rows with their counts."""
     asked = [row for row in rows if row["killed"] is not None]
-    killed = [row for row in asked if row["killed"]]
-    return {
-        "suite": "likely tests alone" if likely_only else suite,
+    found = {
+        "suite": suite,
         "mutants": len(rows),
         "evaluated": len(asked),
-        "killed": len(killed),
-        "survivors": [row for row in asked if not row["killed"]],
-        "rows": rows,
+        "killed": sum(row["killed"] for row in asked),
     }
+    return found | {"survivors": [row["number"] for row in asked if not row["killed"]], "rows": rows}
 
 
-def main() -> int:
+def numbers_of(text: str, count: int) -> set[int]:
+    """`N,N-N` as numbers, all of them if it says nothing."""
+    parts = [part.split("-") for part in filter(None, text.split(","))]
+    return {n for part in parts for n in range(int(part[0]), int(part[-1]) + 1)} or set(range(count))
+
+
+def main(given: Sequence[str] | None = None) -> int:
     """Command line; exit code 1 if a fault survives."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="written after every fault")
     parser.add_argument("--suite", choices=TIERS, default="quick", help="quick: the first tier; full: both")
     parser.add_argument("--likely", action="store_true", help="only the tests that are likely to notice")
     parser.add_argument("--numbers", default="", metavar="N,N-N", help="of the faults in the table, from 0; all")
     parser.add_argument("--file", default="", metavar="TEXT", help="only faults in files whose path holds TEXT")
-    parser.add_argument("--tree", type=Path, default=REPOSITORY, help="checkout whose tests are asked")
+    parser.add_argument("--tree", type=Path, default=ROOT, help="checkout whose tests are asked")
     parser.add_argument("--unchecked", action="store_true", help="do not first run the likely tests without a fault")
-    parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="written after every fault")
-    options = parser.parse_args()
+    options = parser.parse_args(given)
     table = list(enumerate(read_table()))
-    wanted = {
-        n
-        for part in filter(None, options.numbers.split(","))
-        for n in range(int(part.split("-")[0]), int(part.split("-")[-1]) + 1)
-    }
-    table = [(n, one) for n, one in table if (not wanted or n in wanted) and options.file in one.file]
+    wanted = numbers_of(options.numbers, len(table))
+    table = [(n, one) for n, one in table if n in wanted and options.file in one.file]
     for name in PRELOADED:
         __import__(name)
     rows: list[dict[str, Any]] = []
+    suite = "likely tests alone" if options.likely else options.suite
     with tempfile.TemporaryDirectory() as place:
         scratch = copied(options.tree.resolve(), Path(place) / "tree")
         if not options.unchecked and not sound(scratch, [one for _, one in table], options.suite):
@@ -216,9 +211,9 @@ def main() -> int:
             said = "-" if verdict is None else "killed" if verdict.tier else "SURVIVED"
             print(f"{number:3} {said:8} {mutant.file}: {mutant.new.strip()[:60]}  {row['by']}", flush=True)
             if options.json:
-                options.json.write_text(json.dumps(report(rows, options.suite, options.likely), indent=1) + "\n")
-    done = report(rows, options.suite, options.likely)
-    print(f"{done['killed']} of {done['evaluated']} killed by the {done['suite']}")
+                options.json.write_text(json.dumps(report(rows, suite), indent=1) + "\n")
+    done = report(rows, suite)
+    print(f"{done['killed']} of {done['evaluated']} killed by the {suite}")
     return 1 if done["survivors"] else 0
 
 

@@ -1,6 +1,6 @@
 """The gains of `observer`, `pid` or `mpc`: a search on flights that no table reports.
 
-`python benchmarks/observer_tuning.py [observer|pid|mpc] [--rounds N] [--sets N] [--width W] [--json FILE]`
+`python benchmarks/observer_tuning.py [observer|pid|mpc|mpc-team] [--rounds N] [--sets N] [--width W] [--json FILE]`
 
 Covariance matrix adaptation (CMA-ES, Hansen) over the logarithms of the gains. It goes on from those that the law has,
 so it says whether better ones are near; how these were found stands beside the law. All flights are
@@ -10,16 +10,18 @@ flown undisturbed and with noise at level 1 and 40 ms of delay; what is made sma
   5 mm, at most 20
 - `pid`, `mpc`: flights from rest of known mass and, for three in ten, of one that is believed to be 0.2 kg, 25 s each;
   besides 30 times the overshoot (of `pid` beyond 4 %) and 5 times the RMSE; 20 flights
+- `mpc-team`: likewise on rings of 3 to 6 whose loads move in the plane, four flights each, the mass unknown in one
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import math
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -28,16 +30,21 @@ import numpy as np
 
 from mjxball.baselines import Mpc, Observer, Pid
 from mjxball.baselines.mpc_design import MpcTuning
-from mjxball.config import Config, preset
+from mjxball.config import Config, cg_limit, preset, with_plant
 from mjxball.control.followers import Baseline
 from mjxball.evaluate.batch import Batch
+from mjxball.evaluate.metrics import Metrics, measure_batch, rotor_limits
+from mjxball.plant.teams import ring_config
+from mjxball.plant.trim import largest_amplitude
 from mjxball.sim.disturbances import Disturbance
-from mjxball.sim.scenario import Scenario
-from stability import peak, random_scenarios
+from mjxball.sim.rollout import simulate_batch
+from mjxball.sim.scenario import CgPath, Scenario
+from stability import MARGIN, peak, random_scenarios
 
 FLIGHTS, SETS, ROUNDS, SEED, WIDTH = 48, 24, 80, 1007, 0.3
 CONDITIONS = (Disturbance(), Disturbance(noise=1.0, delay=0.04, seed=SEED))
-TUNED: dict[str, Any] = {"observer": Observer, "pid": Pid, "mpc": Mpc}
+TUNED: dict[str, Any] = {"observer": Observer, "pid": Pid, "mpc": Mpc, "mpc-team": Mpc}
+TEAMS, TEAM_FLIGHTS = (3, 4, 5, 6), 4
 KNOWN, UNKNOWN, SECONDS, CORES = 14, 6, 25.0, 2  # flights of `pid` and `mpc`
 ALLOWED = {"pid": 0.04, "mpc": 0.0}  # overshoot that costs nothing
 
@@ -50,10 +57,57 @@ def from_rest(config: Config) -> list[Scenario]:
     ]
     still, random, found = Scenario(), np.random.default_rng(SEED), []
     for one in drawn:
-        goal = random.uniform(0.7, 1.1, 3) * random.choice([-1.0, 1.0], 3)
         start = {name: getattr(still, name) for name in ("start_position", "start_velocity", "start_tilt")}
-        found.append(dataclasses.replace(one, goal=tuple(map(float, goal)), seconds=SECONDS, **start))
+        found.append(dataclasses.replace(one, goal=far_goal(random), seconds=SECONDS, **start))
     return found
+
+
+def far_goal(random: np.random.Generator) -> tuple[float, float, float]:
+    """0.7 to 1.1 m away along every axis."""
+    x, y, z = map(float, random.uniform(0.7, 1.1, 3) * random.choice([-1.0, 1.0], 3))
+    return x, y, z
+
+
+def of_teams() -> list[tuple[Config, list[Scenario]]]:
+    """The flights of `mpc-team`, feasible with 15 % of the rotors left."""
+    random, found = np.random.default_rng(SEED), []
+    ways = [(math.cos(angle), math.sin(angle)) for angle in np.pi * np.arange(8) / 8]
+    for size in TEAMS:
+        config, flights = ring_config(with_plant(preset("paper"), "team6"), size), list[Scenario]()
+        while len(flights) < TEAM_FLIGHTS:
+            mass = config.plant.object_mass * float(random.uniform(0.5, 1.5))
+            width, turn, lead, phase = map(float, random.uniform(0, (1.0, *[2 * math.pi] * 3)))
+            reach = min(largest_amplitude(config, mass, MARGIN, way) for way in ways)
+            scenario = Scenario(
+                omega=float(random.uniform(0.0, 3.1)),
+                amplitude=float(random.uniform()) * min(reach, cg_limit(config.plant)) / math.hypot(1, width),
+                phase=phase,
+                path=CgPath(turn, width, float(random.choice([1.0, 1.5, 2.0])), lead),
+                mass=mass,
+                believed_mass=None if flights else config.plant.object_mass,
+                goal=far_goal(random),
+                seconds=SECONDS,
+            )
+            if reach > 0:
+                flights.append(scenario)
+        found.append((config, flights))
+    return found
+
+
+def cost_of(runs: Sequence[Metrics], allowed: float | None) -> np.ndarray:
+    """(n,) what each flight costs; overshoot and RMSE count where some overshoot is `allowed`."""
+    settling = np.array([run.settling_time or math.inf for run in runs])
+    parts = np.minimum(settling, 30.0) + np.minimum(1e3 * np.array([peak(run) for run in runs]) / 5, 20.0)
+    if allowed is None:
+        return parts
+    over = np.array([1.0 if run.failed else min(max(run.overshoot - allowed, 0.0), 1.0) for run in runs])
+    return parts + 30.0 * over + 5.0 * np.array([3.0 if run.failed else min(run.rmse, 3.0) for run in runs])
+
+
+def medians(runs: Sequence[Metrics], sets: int) -> dict[str, np.ndarray]:
+    """Medians (S,) of the settling time [s] and of the peak [mm]."""
+    numbers = {"settling": [run.settling_time or math.inf for run in runs], "peak": [1e3 * peak(run) for run in runs]}
+    return {name: np.median(np.reshape(values, (sets, -1)), axis=1) for name, values in numbers.items()}
 
 
 def costs_of(
@@ -65,16 +119,25 @@ def costs_of(
     flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn * sets]
     flown = batch.fly(flights)
     for runs in (flown[: len(flights) // 2], flown[len(flights) // 2 :]):
-        settling = np.array([run.settling_time or math.inf for run in runs]).reshape(sets, -1)
-        high = 1e3 * np.array([peak(run) for run in runs]).reshape(sets, -1)
-        parts = np.minimum(settling, 30.0) + np.minimum(high / 5, 20.0)
-        if allowed is not None:
-            over = np.array([1.0 if run.failed else min(max(run.overshoot - allowed, 0.0), 1.0) for run in runs])
-            rmse = np.array([3.0 if run.failed else min(run.rmse, 3.0) for run in runs])
-            parts = parts + (30.0 * over + 5.0 * rmse).reshape(sets, -1)
-        total += parts.mean(axis=1)
-        shown.append({"settling": np.median(settling, axis=1), "peak": np.median(high, axis=1)})
+        total += cost_of(runs, allowed).reshape(sets, -1).mean(axis=1)
+        shown.append(medians(runs, sets))
     return total, shown
+
+
+def costs_of_team(sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
+    """`costs_of` `mpc` with the tunings `sets` (S, k), on teams."""
+    runs: tuple[list[list[Metrics]], ...] = tuple([[] for _ in sets] for _ in CONDITIONS)
+    for config, drawn in of_teams():
+        flights = [dataclasses.replace(one, disturbance=condition) for condition in CONDITIONS for one in drawn]
+        laws = [type("Tuned", (Mpc,), {"team_tuning": MpcTuning(*map(float, values))})(config) for values in sets]
+        flown = simulate_batch(config, [(Baseline(law, config), flights) for law in laws], "newton-euler")
+        limit, most = config.scenario.termination_distance, rotor_limits(config.plant, flights * len(sets))
+        found = iter(measure_batch(flown, limit, most, config.plant.leader))
+        for number in range(len(sets)):
+            for of_condition in runs:
+                of_condition[number] += itertools.islice(found, TEAM_FLIGHTS)
+    total = sum(np.array([cost_of(one, ALLOWED["mpc"]).mean() for one in of_condition]) for of_condition in runs)
+    return np.asarray(total), [medians([*itertools.chain(*one)], len(sets)) for one in runs]
 
 
 def costs(law: Any, sets: np.ndarray) -> tuple[np.ndarray, list[dict[str, np.ndarray]]]:
@@ -139,9 +202,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
     law = TUNED[options.law]
-    given = law.tuning if law is Mpc else law.gains
+    team = options.law == "mpc-team"
+    given = law.team_tuning if team else law.tuning if law is Mpc else law.gains
     start = np.log(np.array(given, float))
-    if law is Mpc:
+    if team:
+        best, least = minimise(
+            lambda sets: costs_of_team(np.exp(sets))[0], start, options.width, options.sets, options.rounds
+        )
+        shown = costs_of_team(np.exp([best]))[1]
+    elif law is Mpc:
         with ProcessPoolExecutor(CORES, multiprocessing.get_context("spawn")) as pool:
             each = lambda sets: np.array([cost[0] for cost, _ in pool.map(costs_of_mpc, np.exp(sets))])  # noqa: E731
             best, least = minimise(each, start, options.width, options.sets, options.rounds)
@@ -152,8 +221,8 @@ def main() -> None:
         )
         shown = costs(law, np.exp([best]))[1]
     gains = dict(zip(given._fields, np.exp(best).tolist(), strict=True))
-    medians = [{key: round(float(np.ravel(value)[0]), 3) for key, value in one.items()} for one in shown]
-    found = {"law": options.law, "gains": gains, "cost": least, "medians": medians}
+    rounded = [{key: round(float(np.ravel(value)[0]), 3) for key, value in one.items()} for one in shown]
+    found = {"law": options.law, "gains": gains, "cost": least, "medians": rounded}
     print(json.dumps(found))
     if options.json:
         options.json.write_text(json.dumps(found, indent=1) + "\n")

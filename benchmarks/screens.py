@@ -32,14 +32,14 @@ BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
 WIDTHS, SCHEMES = (400, 1300), ("light", "dark")
 ROWS, LONGEST = 50, 240.0  # of a terminal; seconds that a program may take
 FLY = ("-m", "mjxball.fly", "flight", "--rehearse", "--seconds", "2")
-TRAIN = ("train.py", "paper", "--physics", "newton-euler", "--sac.total_steps", "60000", "--sac.warmup_steps", "10000")
+TRAIN = ("train.py", "paper", "--physics", "newton-euler", "--sac.total_steps", "12000", "--sac.warmup_steps", "2000")
 PROGRAMS = {  # name: arguments of Python, in a folder of its own
     "train-help": ("train.py", "--help"),
     "train-preset-help": ("train.py", "balance", "--help"),
     "eval-help": ("eval.py", "--help"),
     "fly-help": ("-m", "mjxball.fly", "--help"),
     "view-help": ("-m", "mjxball.view", "--help"),
-    "train": (*TRAIN, "--sac.replay_size", "60000", "--out", "run"),
+    "train": (*TRAIN, "--sac.replay_size", "12000", "--out", "run"),
     "eval": ("eval.py", "balance", "--physics", "newton-euler", "--seconds", "10"),
     "suite": (
         "eval.py",

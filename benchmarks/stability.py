@@ -1,71 +1,226 @@
 """How stable a policy is: eigenvalues and delay margins about hover, and thousands of random flights.
 
-`python benchmarks/stability.py POLICY.npz [--flights N] [--seed N] [--unknown] [--json FILE] [--picture FILE.png]`
+With the CG at rest at an offset, the loop over one control step is a smooth map of everything that it remembers: the
+object's position, attitude, velocity and rates, the rotors, the follower's memory, and the observations under way if
+its measurements are late. Its fixed point is found by flying and by Newton's method, its Jacobian there by JAX, in
+float64. A network with ReLU units is linear around almost every point, so the eigenvalues say what a small error
+does, no more. A recurrent follower may have several fixed points, and circle about one with millimetres: the one
+nearest to the flight's mean is taken.
 
 - For a grid of CG offsets and object masses that one drone can trim: the spectral radius of leader, policy and plant
   over one control step about hover (below 1: small errors die out), the time constant that goes with it, and the
   largest delay of the follower's measurements, in whole control steps, that keeps it below 1. LQG, adaptive beside it.
 - Random feasible flights: CG speed, amplitude, phase, mass, goal, start position, velocity and tilt, all uniform. None
-  may fail. The ten with the largest steady-state peak are listed and drawn.
+  may fail. The ten with the largest steady-state peak are listed.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
-from hover_stability import delay_margins, linearised_hovers
+from harness import Row, arguments, say, table, write
 from mjxball.baselines import make_baseline
+from mjxball.cli import run_command
 from mjxball.config import Config, preset
+from mjxball.control import rotations
 from mjxball.control.constants import trim_limit
-from mjxball.control.followers import Follower
+from mjxball.control.followers import Follower, Law
 from mjxball.evaluate.batch import Batch, law_of
 from mjxball.evaluate.policies import load_policy
-from mjxball.plotting import pyplot
-from mjxball.sim.rollout import simulate_batch
+from mjxball.physics import newton_euler
+from mjxball.physics.engine import Load, PlantState
+from mjxball.physics.step import jax_repeat, make_control_step, start_state
+from mjxball.sim import rollout
+from mjxball.sim.closed_loop import ClosedLoop, LoopState
+from mjxball.sim.disturbances import Sample, SensorModel, SensorState
 from mjxball.sim.scenario import Scenario
 
-OFFSETS = (-0.17, -0.1, -0.05, 0.0, 0.05, 0.1, 0.17)
-MASSES = (0.1, 0.2, 0.4, 0.6)
-MARGIN = 0.15
+Array = Any
+SETTLE, WATCHED = 3000, 1000  # control steps flown towards the fixed point, and those whose mean is taken
+NEWTON, HALVINGS = 40, 12  # then steps of Newton's method, each as short as makes the residual smallest
+SOUND = 1e-8  # largest change over a control step, in SI units, of what counts as a fixed point
+NEUTRAL = 1e-6  # a memory that the loop does not use keeps its value: eigenvalue 1
+CG_OFFSETS, MASSES = (-0.17, -0.1, -0.05, 0.0, 0.05, 0.1, 0.17), (0.1, 0.2, 0.4, 0.6)  # of the pair's hovers
+MARGIN, BELIEVED = 0.15, 0.2  # of what can be trimmed; mass that is believed if it is unknown [kg]
 LONGEST = 10  # control steps of delay that are tried
+
+
+@dataclass(frozen=True)
+class Hover:
+    """The closed loop about hover with the CG at rest."""
+
+    offset: float  # of the CG [m]
+    mass: float  # of the object [kg]
+    delay: int  # control steps by which the follower's measurements are late
+    residual: float  # change over a control step at the fixed point; above `SOUND` there is none
+    error: float  # |e_o| at the fixed point [m]
+    tilt: float  # hypot(roll, pitch) there [rad]
+    radius: float  # largest |eigenvalue| of the map over one control step
+    swing: float  # half of what the position still moves after `SETTLE` steps, of the axis that moves most [m]
+
+    @property
+    def stable(self) -> bool:
+        """True if there is a hover in which small errors do not grow."""
+        return bool(self.residual < SOUND and self.radius < 1 + NEUTRAL)
+
+
+def linearised_hovers(
+    config: Config, law: Law, cases: Sequence[tuple[float, float, float]], delay: int = 0
+) -> list[Hover]:
+    """The hover of every case: (CG offset [m], object mass [kg], believed mass [kg])."""
+    return linearised(config, lambda _: law, np.zeros(1), cases, delay)[0]
+
+
+def linearised(
+    config: Config, law: Callable[[Any], Law], numbers: Any, cases: Sequence[tuple[float, float, float]], delay: int
+) -> list[list[Hover]]:
+    """`linearised_hovers` of every one of k laws, `law` of traced numbers: a tree of arrays (k, ...)."""
+    with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
+        scenarios = [
+            Scenario(omega=0.0, phase=np.pi / 2, amplitude=offset, mass=mass, believed_mass=believed)
+            for offset, mass, believed in cases
+        ]
+        loads = jax.tree.map(jnp.asarray, rollout.load_of(config, scenarios))
+
+        def of_one(own: Any) -> tuple[Array, Array, Array, Array]:
+            start, step = closed_loop(config, law(own), delay)
+            return jax.vmap(lambda load: _linearise(start(load), lambda z: step(z, load)))(loads)
+
+        found = map(np.asarray, jax.jit(jax.vmap(of_one))(jax.tree.map(jnp.asarray, numbers)))
+    return [
+        [
+            Hover(
+                *(offset, mass, delay, float(left), float(np.linalg.norm(z[:3])), float(np.hypot(z[3], z[4]))),
+                *(_radius(jacobian), float(swing)),
+            )
+            for (offset, mass, _), z, left, jacobian, swing in zip(cases, *one, strict=True)
+        ]
+        for one in zip(*found, strict=True)
+    ]
+
+
+def _radius(jacobian: np.ndarray) -> float:
+    """Largest |eigenvalue|, infinite where the flight towards the fixed point ran away."""
+    return float(np.abs(np.linalg.eigvals(jacobian)).max()) if np.isfinite(jacobian).all() else np.inf
+
+
+def delay_margins(
+    config: Config, law: Law, cases: Sequence[tuple[float, float, float]], longest: int = 15
+) -> list[int]:
+    """For every case the control steps of delay up to which its hover stays stable; -1 if it never is."""
+    margins = [-1] * len(cases)
+    for delay in range(longest + 1):
+        for number, hover in enumerate(linearised_hovers(config, law, cases, delay)):
+            if hover.stable and margins[number] == delay - 1:
+                margins[number] = delay
+        if max(margins) < delay:
+            break
+    return margins
+
+
+def closed_loop(config: Config, law: Law, delay: int) -> tuple[Callable[[Load], Array], Callable[[Array, Load], Array]]:
+    """(`start(load)` -> z, `step(z, load)` -> z one control period on) for a goal at the origin, on vectors z (k,).
+
+    z holds position, Euler angles, velocity, rates, rotor forces, the follower's memory, older observations.
+    """
+    period = config.timing.control_period
+    physics = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude), jax_repeat)
+    privileged, loop = rollout.make_privileged_info(config), ClosedLoop(config, physics, SensorModel(delay))
+    goal, still, zero = jnp.zeros(3), jnp.zeros(3), jnp.zeros(())
+
+    def flat(plant: PlantState, memory: Any, past: Array) -> tuple[Array, Any]:
+        euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(plant.quaternion))
+        return ravel_pytree((plant.position, euler, plant.velocity, plant.rates, plant.rotor_force, memory, past))
+
+    def first(load: Load) -> tuple[PlantState, Any, Array]:
+        plant = start_state(config, still, still, still, load.believed_mass, zero)
+        observation = loop.observe(plant, goal)
+        return plant, law.start(observation), jnp.broadcast_to(observation, (delay, *observation.shape))
+
+    def start(load: Load) -> Array:
+        return flat(*first(load))[0]
+
+    def step(z: Array, load: Load) -> Array:
+        unflatten = flat(*first(load))[1]
+        position, euler, velocity, rates, rotors, memory, older = unflatten(z)
+        plant = PlantState(position, rotations.quaternion_from_euler(euler), velocity, rates, rotors, zero, zero, zero)
+        past = jnp.concatenate([loop.observe(plant, goal)[None], older])
+        sensors = SensorState(delay, (), past) if delay else SensorState()
+        state = LoopState(plant, loop.zero_integral(still), sensors, jnp.zeros((), bool))
+        memory, answer = law.step(memory, past[-1], privileged(plant, load))
+        moved, _, _ = loop.step(state, past[-1], answer, load, (goal, goal), Sample(), 0.0)
+        older = moved.sensors.past[1:] if delay else older
+        # A flight that diverged stays where it was, which is no hover.
+        return jnp.where(moved.diverged, jnp.nan, flat(moved.plant._replace(time=zero), memory, older)[0])
+
+    if config.autopilot.kind != "ideal":
+        raise ValueError("a firmware's whole numbers have no derivative: only the ideal autopilot is linearised")
+    if config.leader.ki != (0.0, 0.0, 0.0):
+        raise ValueError(f"the leader's integral term {config.leader.ki} has no place in this loop of {period:g} s")
+    return start, step
+
+
+def _linearise(start: Array, step: Callable[[Array], Array]) -> tuple[Array, Array, Array, Array]:
+    """(fixed point, its residual, Jacobian there, swing flown [m]) of `step`, found from `start`.
+
+    A flight that never comes to rest circles about its fixed point: its mean is nearer to it than any of its states.
+    """
+    z = jax.lax.fori_loop(0, SETTLE, lambda _, z: step(z), start)
+
+    def watch(_: Array, seen: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        z, total, low, high = seen
+        return step(z), total + z, jnp.minimum(low, z), jnp.maximum(high, z)
+
+    _, total, low, high = jax.lax.fori_loop(0, WATCHED, watch, (z, jnp.zeros_like(z), z, z))
+    still = jnp.eye(len(z))
+    slopes = jax.jacfwd(lambda z: (step(z) - z,) * 2, has_aux=True)
+    shares = jnp.append(0.5 ** jnp.arange(HALVINGS), 0.0)  # of Newton's step
+
+    def polish(_: Array, found: tuple[Array, ...]) -> tuple[Array, ...]:
+        point = found[0]
+        slope, change = slopes(point)
+        # A memory that the loop does not use has no slope, and no change either.
+        tried = point - shares[:, None] * jnp.linalg.solve(slope - NEUTRAL**2 * still, change)
+        left = jax.vmap(lambda z: jnp.linalg.norm(step(z) - z))(tried)
+        return tried[jnp.nanargmin(left)], point, change, slope
+
+    mean = total / WATCHED
+    _, z, change, slope = jax.lax.fori_loop(0, NEWTON, polish, (mean, mean, mean, still))
+    return z, jnp.abs(change).max(), slope + still, (high - low)[:3].max() / 2
 
 
 def grid(config: Config, unknown: bool) -> list[tuple[float, float, float]]:
     """(CG offset, mass, believed mass) of every hover that one drone can trim."""
-    return [
-        (offset, mass, 0.2 if unknown else mass)
-        for mass in MASSES
-        for offset in OFFSETS
-        if abs(offset) <= trim_limit(config.plant, mass, MARGIN, 0.2 if unknown else mass)
-    ]
+    every = [(offset, mass, BELIEVED if unknown else mass) for mass in MASSES for offset in CG_OFFSETS]
+    return [case for case in every if abs(case[0]) <= trim_limit(config.plant, case[1], MARGIN, case[2])]
 
 
-def about_hover(config: Config, follower: Follower, cases: list[Any]) -> list[dict[str, Any]]:
+def about_hover(config: Config, follower: Follower, cases: list[Any]) -> list[Row]:
     """One row for each case."""
-    found, margins = (
-        linearised_hovers(config, law_of(follower), cases),
-        delay_margins(config, law_of(follower), cases, LONGEST),
-    )
-    period = config.timing.control_period
-    return [
-        {
-            "follower": follower.name,
-            "offset": hover.offset,
-            "mass": hover.mass,
-            "radius": hover.radius,
-            "time_constant": -period / math.log(hover.radius) if 0 < hover.radius < 1 else None,
-            "stable": hover.stable,
-            "error": hover.error,
-            "delay_margin": margin * period if margin >= 0 else None,
-        }
-        for hover, margin in zip(found, margins, strict=True)
-    ]
+    law, period = law_of(follower), config.timing.control_period
+    found, margins = linearised_hovers(config, law, cases), delay_margins(config, law, cases, LONGEST)
+    rows = []
+    for hover, margin in zip(found, margins, strict=True):
+        row = {"follower": follower.name, "offset": hover.offset, "mass": hover.mass, "radius": hover.radius}
+        row["time_constant"] = -period / math.log(hover.radius) if 0 < hover.radius < 1 else None
+        row |= {"stable": hover.stable, "error": hover.error}
+        rows.append(row | {"delay_margin": margin * period if margin >= 0 else None})
+    return rows
+
+
+def _vector(random: np.random.Generator, size: float) -> tuple[float, float, float]:
+    x, y, z = map(float, random.uniform(-size, size, 3))
+    return x, y, z
 
 
 def random_scenarios(config: Config, count: int, unknown: bool, seed: int = 0) -> list[Scenario]:
@@ -73,19 +228,18 @@ def random_scenarios(config: Config, count: int, unknown: bool, seed: int = 0) -
     random, scenarios = np.random.default_rng(seed), []
     for _ in range(count):
         mass = float(random.uniform(0.1, 0.35 if unknown else 0.6))
-        reach = min(0.17, trim_limit(config.plant, mass, MARGIN, 0.2 if unknown else mass))
-        vector = lambda size: tuple(map(float, random.uniform(-size, size, 3)))  # noqa: E731
+        reach = min(0.17, trim_limit(config.plant, mass, MARGIN, BELIEVED if unknown else mass))
         scenarios.append(
             Scenario(
                 omega=float(random.uniform(0.0, 3.1)),
                 amplitude=float(random.uniform(0.0, reach)),
                 phase=float(random.uniform(0, 2 * math.pi)),
                 mass=mass,
-                believed_mass=0.2 if unknown else None,
-                goal=vector(1.0),
-                start_position=vector(0.3),
-                start_velocity=vector(0.3),
-                start_tilt=tuple(map(float, random.uniform(-0.15, 0.15, 2))),
+                believed_mass=BELIEVED if unknown else None,
+                goal=_vector(random, 1.0),
+                start_position=_vector(random, 0.3),
+                start_velocity=_vector(random, 0.3),
+                start_tilt=(float(random.uniform(-0.15, 0.15)), float(random.uniform(-0.15, 0.15))),
             )
         )
     return scenarios
@@ -96,84 +250,44 @@ def peak(metrics: Any) -> float:
     return math.inf if metrics.failed else max(metrics.x_peak, metrics.y_peak, metrics.z_peak)
 
 
-def draw(config: Config, follower: Follower, worst: list[Scenario], path: Path) -> None:
-    """The errors of the worst flights over time, one panel each."""
-    flown = simulate_batch(config, [(follower, worst)], "newton-euler")
-    plt = pyplot()
-    figure, axes = plt.subplots(5, 2, sharex=True, figsize=(11, 13), constrained_layout=True)
-    for number, (axis, scenario) in enumerate(zip(axes.flat, worst, strict=True)):
-        axis.plot(flown.time, 1e3 * flown.error[:, number], linewidth=0.9, label=["x", "y", "z"])
-        axis.set_ylim(-150, 150)
-        axis.set_title(
-            f"{scenario.mass:.2f} kg, CG ±{100 * scenario.amplitude:.1f} cm at {scenario.omega:.2f} rad/s", fontsize=9
-        )
-        axis.grid(alpha=0.25)
-    axes[0, 0].legend(fontsize=8, ncol=3)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("error [mm]", fontsize=8)
-    for axis in axes[-1]:
-        axis.set_xlabel("time [s]")
-    figure.savefig(path, dpi=90)
-    plt.close(figure)
-
-
-def main() -> None:
+def main(given: Sequence[str] | None = None) -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policy", type=Path)
+    parser = arguments(__file__, __doc__)
+    parser.add_argument("policy", type=Path, metavar="POLICY.npz")
     parser.add_argument("--flights", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0, help="of the random flights")
     parser.add_argument("--unknown", action="store_true", help="the hover thrust believes 0.2 kg, whatever the mass")
-    parser.add_argument("--json", type=Path, metavar="FILE")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png")
-    options = parser.parse_args()
+    options = parser.parse_args(given)
     config = preset("paper")
     policy = load_policy(options.policy, config)
     cases = grid(config, options.unknown)
-    rows = []
-    for follower in (
-        policy,
-        make_baseline("adaptive-mass" if options.unknown else "adaptive", config),
-        make_baseline("lqg", config),
-    ):
+    classical = "adaptive-mass" if options.unknown else "adaptive", "lqg"
+    rows, shown = [], []
+    followers: list[Follower] = [policy, *(make_baseline(name, config) for name in classical)]
+    for follower in followers:
         mine = about_hover(config, follower, cases)
         rows += mine
-        stable = [row for row in mine if row["stable"]]
         margins = [1e3 * row["delay_margin"] for row in mine if row["delay_margin"] is not None]
-        radius, error = max(row["radius"] for row in mine), 1e3 * max(row["error"] for row in mine)
-        print(
-            f"{follower.name}: stable in {len(stable)} of {len(mine)} hovers, worst radius {radius:.4f}, delay "
-            f"margin of the stable {min(margins, default=0):.0f} - {max(margins, default=0):.0f} ms, "
-            f"largest standing error {error:.1f} mm"
-        )
-        for row in mine:
-            if not row["stable"]:
-                print(f"    not stable: CG {row['offset']:g} m, {row['mass']:g} kg, radius {row['radius']:.4f}")
+        row = {"follower": follower.name, "hovers": len(mine), "stable": sum(row["stable"] for row in mine)}
+        row |= {"radius": max(row["radius"] for row in mine), "error mm": 1e3 * max(row["error"] for row in mine)}
+        shown.append(row | {"margin ms": f"{min(margins, default=0):.0f} - {max(margins, default=0):.0f}"})
+    table(shown)
+    table([row for row in rows if not row["stable"]], ("follower", "offset", "mass", "radius"))
     scenarios = random_scenarios(config, options.flights, options.unknown, options.seed)
     flown = Batch(config, policy).fly(scenarios)
-    failed = sum(metrics.failed for metrics in flown)
-    order = sorted(range(len(flown)), key=lambda k: -peak(flown[k]))[:10]
     peaks = [peak(metrics) for metrics in flown]
-    middle, high, most = 1e3 * np.quantile(peaks, [0.5, 0.99, 1.0])
-    print(
-        f"{len(flown)} random flights of {policy.name}: {failed} failed; peak median {middle:.1f}, 99 % {high:.1f}, "
-        f"largest {most:.1f} mm"
-    )
-    worst = [scenarios[k] for k in order]
-    for k, scenario in zip(order, worst, strict=True):
-        print(
-            f"    {1e3 * peaks[k]:7.1f} mm: {scenario.mass:.3f} kg, CG {scenario.amplitude:.3f} m at "
-            f"{scenario.omega:.2f} rad/s, goal {', '.join(f'{axis:.2f}' for axis in scenario.goal)}"
-        )
-    if options.picture:
-        draw(config, policy, worst, options.picture)
-    if options.json:
-        sound = sorted(peak for peak in peaks if math.isfinite(peak))
-        quantiles = {"median": middle / 1e3, "99 %": high / 1e3, "largest": most / 1e3}
-        found = {"hovers": rows, "flights": len(flown), "failed": failed, "peaks [m]": quantiles}
-        found["largest peaks"] = sound[-100:]
-        options.json.write_text(json.dumps(found, indent=1, default=str) + "\n")
+    failed = sum(metrics.failed for metrics in flown)
+    middle, high, most = map(float, np.quantile(peaks, [0.5, 0.99, 1.0]))
+    quantiles = {"median": middle, "99 %": high, "largest": most}
+    say({"random flights": len(flown), "failed": failed, "peaks": ""} | {k: 1e3 * v for k, v in quantiles.items()})
+    worst = sorted(zip(peaks, scenarios, strict=True), key=lambda one: -one[0])[:10]
+    fields = ("mass", "amplitude", "omega", "goal")
+    table([{"peak": most, **{name: getattr(scenario, name) for name in fields}} for most, scenario in worst])
+    sound = sorted(value for value in peaks if math.isfinite(value))
+    found = {"hovers": rows, "flights": len(flown), "failed": failed, "peaks [m]": quantiles}
+    write(options.json, found | {"largest peaks": sound[-100:]})
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_command(main))

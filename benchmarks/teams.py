@@ -1,13 +1,9 @@
 """Followers of teams: the load on paths in the plane on rings of 2 to 6 drones, and a free ball on a plate.
 
-    python benchmarks/teams.py policies/universal.npz --followers copy adaptive lqg --json benchmarks/results/teams.json
-    python benchmarks/teams.py policies/universal.npz --random --json benchmarks/results/teams_random.json
-    python benchmarks/teams.py --plate --followers copy adaptive lqg --json benchmarks/results/plate.json
-
 Teams: N x path (circle, Lissajous) x CG speed x amplitude x mass, 30 s from the origin to (1, 1, 1), undisturbed. A
 case counts where `mjxball.plant.trim` finds 15 % margin in every direction and the followers' tilt commands reach it.
 The bar: peak in the plane at most that of `adaptive` + 3 mm, settling at most that of `lqg` + 10 %. 5 drones are in no
-training. With --random: random loads, starts and goals that can be trimmed. All with their effort (`effort_of`).
+training. With their effort (`effort_of`).
 
 Plate: random starts, the ball within 60 % of the rim with up to 0.1 m/s, both uniform in radius, 60 s, noise level 1.
 Beside them the share of these starts from which friction alone stops the ball before the rim of a level plate. No
@@ -18,15 +14,14 @@ it only slings the ball outwards.
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from harness import Row, arguments, say, write
 from mjxball import cli
 from mjxball.baselines import make_baseline
 from mjxball.config import Config, ball_limit, preset
@@ -46,37 +41,26 @@ SIZES, SPEEDS, AMPLITUDES, MASSES = (2, 3, 4, 5, 6), (0.31, 1.0, 2.0, 3.1), (0.1
 EIGHT = CgPath(direction=0.7, width=0.5, ratio=2.0, lead=0.3)
 REACH = {CIRCLE: 1.0, EIGHT: math.hypot(1.0, EIGHT.width)}  # farthest CG over the amplitude
 REFERENCES, MORE_PEAK, LATER = ("adaptive", "lqg"), 0.003, 1.1  # the bar: peak of the first [m], settling of the second
-RANDOM = 10_000
 STARTS, SECONDS, INNER, FASTEST = 100, 60.0, 0.6, 0.1
 ENGINE = "newton-euler"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(given: Sequence[str] | None = None) -> int:
     """Fly, print, write."""
-    parser = cli.make_parser("python benchmarks/teams.py", __doc__.split("\n\n")[0])
+    parser = arguments(__file__, __doc__)
     parser.add_argument("policies", nargs="*", type=Path, metavar="POLICY.npz")
     parser.add_argument("--followers", nargs="+", default=["copy"], metavar="NAME", help="baselines (default copy)")
     parser.add_argument("--plate", action="store_true", help="the free ball instead of the paths")
-    parser.add_argument("--random", action="store_true", help=f"{RANDOM:,} random flights instead of the paths")
-    parser.add_argument(
-        "--sizes", nargs="+", type=int, choices=SIZES, default=SIZES, help="numbers of drones (default all)"
-    )
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args(arguments)
-    if options.plate and options.random:
-        raise InputError("--plate and --random are two benchmarks; run one after the other")
-    if tuple(options.sizes) != SIZES and (options.plate or options.random):
-        raise InputError("--sizes is for the paths; drop it, or --plate or --random")
+    parser.add_argument("--sizes", nargs="+", type=int, choices=SIZES, default=SIZES, help="numbers of drones")
+    options = parser.parse_args(given)
+    if tuple(options.sizes) != SIZES and options.plate:
+        raise InputError("--sizes is for the paths; drop it, or --plate")
     flown = options.policies, options.followers
-    rows = (
-        plate(*flown) if options.plate else random_flights(*flown) if options.random else teams(*flown, options.sizes)
-    )
-    if options.json:
-        options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+    write(options.json, {"rows": plate(*flown) if options.plate else teams(*flown, options.sizes)})
     return 0
 
 
-def teams(paths: Sequence[Path], named: Sequence[str], sizes: Sequence[int]) -> list[dict[str, Any]]:
+def teams(paths: Sequence[Path], named: Sequence[str], sizes: Sequence[int]) -> list[Row]:
     """Medians and worst cases for every number of drones and every follower, and shares of cases at the bar."""
     rows, base = [], preset("team")
     for count in sizes:
@@ -92,12 +76,11 @@ def teams(paths: Sequence[Path], named: Sequence[str], sizes: Sequence[int]) -> 
         for follower in _followers(config, paths, named):
             found = references.get(follower.name) or Batch(config, follower).fly(held)
             rows.append({"drones": count, "follower": follower.name, "cases": len(held), **_row(found, references)})
-            print(json.dumps(rows[-1]))
-            sys.stdout.flush()
+            say(rows[-1])
     return rows
 
 
-def _row(found: Sequence[Metrics], references: dict[str, list[Metrics]]) -> dict[str, Any]:
+def _row(found: Sequence[Metrics], references: dict[str, list[Metrics]]) -> Row:
     """Of one follower: failures, medians, and the shares of cases at the bar, by 2 and by 10 % settling times."""
 
     def of(name: str, runs: Sequence[Metrics] = found) -> np.ndarray:
@@ -119,7 +102,7 @@ def _row(found: Sequence[Metrics], references: dict[str, list[Metrics]]) -> dict
         told = of(name, references["lqg"])
         soon = np.where(np.isfinite(told), of(name) <= LATER * told, True)
         row |= {f"soon{label}": float(soon.mean()), f"both{label}": float((small & soon).mean())}
-    return {name: None if value == math.inf else value for name, value in row.items()}
+    return row
 
 
 def effort_of(found: Sequence[Metrics]) -> dict[str, float | None]:
@@ -133,51 +116,6 @@ def effort_of(found: Sequence[Metrics]) -> dict[str, float | None]:
         values = [getattr(run, name) for run in found if not run.failed and getattr(run, name) is not None]
         effort[name] = float(middle(values)) if values else None
     return effort
-
-
-def random_flights(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
-    """Failures and peaks of random loads, starts and goals that can be trimmed, as many with each number of drones."""
-    rows, base = [], preset("team")
-    for count in base.scenario.team_sizes:
-        config, random = ring_config(base, count), np.random.default_rng(count)
-        low, high = config.scenario.object_mass
-        edges = np.linspace(low, high, 9)
-        farthest = [_trimmed(config, mass) for mass in edges[1:]]  # of the heaviest in each part
-        flights = []
-        for _ in range(RANDOM // len(base.scenario.team_sizes)):
-            mass = random.uniform(low, high)
-            path = CgPath(
-                *random.uniform([0, 0], [2 * math.pi, 1]), float(random.integers(1, 3)), random.uniform(0, 6.28)
-            )
-            limit = min(farthest[min(int((mass - low) / (high - low) * 8), 7)], config.plant.object_size[0] / 2)
-            flights.append(
-                Scenario(
-                    omega=random.uniform(*config.scenario.cg_speed),
-                    amplitude=random.uniform(0, limit) / math.hypot(1.0, path.width),
-                    mass=mass,
-                    path=path,
-                    phase=random.uniform(0, 6.28),
-                    goal=_three(random.uniform(-1, 1, 3)),
-                    start_velocity=_three(random.uniform(-0.2, 0.2, 3)),
-                    start_tilt=(random.uniform(-0.05, 0.05), random.uniform(-0.05, 0.05)),
-                    seconds=25.0,
-                )
-            )
-        for follower in _followers(config, paths, named):
-            found = Batch(config, follower).fly(flights)
-            peaks = np.array([math.inf if run.failed else run.plane_peak for run in found])
-            row = {"drones": count, "follower": follower.name, "flights": len(flights)}
-            for label, share in (("median", 0.5), ("99", 0.99), ("largest", 1.0)):
-                peak = float(np.quantile(peaks, share, method="higher"))
-                row[f"plane_peak_{label}"] = peak if math.isfinite(peak) else None
-            rows.append({**row, "failed": sum(run.failed for run in found), **effort_of(found)})
-            print(json.dumps(rows[-1]))
-            sys.stdout.flush()
-    return rows
-
-
-def _three(values: np.ndarray) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
 
 
 def _followers(config: Config, paths: Sequence[Path], named: Sequence[str]) -> list[Follower]:
@@ -196,7 +134,7 @@ def _trimmed(config: Config, mass: float) -> float:
     return min(reach, *(largest_amplitude(config.plant, mass, margin, (math.cos(a), math.sin(a))) for a in angles))
 
 
-def plate(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
+def plate(paths: Sequence[Path], named: Sequence[str]) -> list[Row]:
     """Flights in which the ball stays off the rim, and what friction alone allows."""
     config, random = preset("plate"), np.random.default_rng(1)
     rim, cells, alone = ball_limit(config.plant), [], 0
@@ -219,7 +157,7 @@ def plate(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
                 disturbance=Disturbance(noise=1.0, seed=number),
             )
         )
-    rows: list[dict[str, Any]] = [{"follower": "friction alone, level", "off_the_rim": alone}]
+    rows: list[Row] = [{"follower": "friction alone, level", "off_the_rim": alone}]
     for follower in _followers(config, paths, named):
         flown = Batch(config, follower, ENGINE).course(cells)
         distance = np.hypot(flown.cg_offset[..., 0], flown.cg_offset[..., 1]).max(axis=0)
@@ -234,8 +172,7 @@ def plate(paths: Sequence[Path], named: Sequence[str]) -> list[dict[str, Any]]:
                 "error_worst": float(error.max()),
             }
         )
-    for row in rows:
-        print(json.dumps(row))
+        say(rows[-1])
     return rows
 
 

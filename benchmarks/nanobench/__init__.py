@@ -1,1 +1,0 @@
-"""The comparison with real flights of NanoBench; `benchmarks/real_flights.py` runs it."""
