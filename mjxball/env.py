@@ -421,8 +421,6 @@ class TransportEnv:
         return found
 
 
-
-
 def _made_when_called(make: Callable[[], ControlStep]) -> ControlStep:
     """What `make` returns, made at the first call: programs that only reset worlds need no engine.
 

@@ -1,4 +1,4 @@
-"""Two Crazyflies on a stick with a ball: the presets `stand` and `flight`; their rig is `config/plants/crazyflie.toml`."""
+"""Two Crazyflies on a stick with a ball: presets `stand` and `flight`. Their rig is `config/plants/crazyflie.toml`."""
 
 from __future__ import annotations
 
