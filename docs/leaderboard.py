@@ -42,7 +42,8 @@ of seed 0, in the same environment for as many steps: `python benchmarks/foreign
 117 CPU seconds for 768 000 steps, `brax-sac` 81 s; `sb3-ppo` takes 160 s for 4 million, `brax-ppo` 98 s.
 `balance-memoryless` is `balance` without its GRU and its last action, with layers of 64 and 64, after 500 gradients of
 64 environments (219 CPU seconds); `memoryless` is a [classical law](followers.md). RAPTOR's policies have no place in
-this interface: they command rotors, not attitudes.
+this interface: they command rotors, not attitudes. On random pairs, told the true state,
+[two of them meet 9 %](archive/rigs.md#raptor-on-these-pairs).
 
 Columns: share met and its 95 % interval, flights that failed, median settling time, 90 % quantile of the peaks, time
 with a rotor at its limit, rms change of commands from step to step. A dash: never, or nothing to measure.
