@@ -54,7 +54,7 @@ PROGRAMS = {  # name: arguments of Python, in a folder of its own
         "1",
     ),
     "fly": FLY,
-    "fly-fault": (*FLY, "--fault", "silent:0@4"),
+    "fly-fault": (*FLY, "--fault", "silent:leader@4"),
     "refused": ("eval.py", "nothing.npz"),
 }
 TERMINALS = {"40": (40, "xterm"), "80": (80, "xterm"), "130": (130, "xterm"), "dumb": (80, "dumb"), "none": (0, "")}
@@ -173,7 +173,7 @@ def pages(place: Path, site: Path | None, only: list[str]) -> dict[str, Path]:
         if only and name not in only and "pages" not in only:
             continue
         if name == "viewer-log":
-            asked = [*FLY, "--fault", "silent:0@4", "--log", "flight.jsonl"]
+            asked = [*FLY, "--fault", "silent:leader@4", "--log", "flight.jsonl"]
             subprocess.run(
                 [sys.executable, *asked], cwd=place, env=environment(""), check=False, stdout=subprocess.DEVNULL
             )
@@ -181,7 +181,7 @@ def pages(place: Path, site: Path | None, only: list[str]) -> dict[str, Path]:
         more = () if name == "report" else ("--physics", "newton-euler", "--out", str(page))
         more = ("--out", str(page)) if name == "viewer-log" else more
         command = [sys.executable, *words, *more]
-        subprocess.run(command, cwd=place, env=environment(""), check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(command, cwd=place, env=environment(""), check=False, stdout=subprocess.DEVNULL)
         made[name] = page
     if site:
         made |= {f"site-{path.stem}": path for path in sorted(site.glob("*.html")) if not only or "site" in only}
@@ -199,6 +199,9 @@ def browsed(out: Path, made: dict[str, Path]) -> Iterator[str]:
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=program, args=["--no-sandbox"])
         for name, page in made.items():
+            if not page.exists():
+                yield f"{name}: there is no page"
+                continue
             for width in WIDTHS:
                 for scheme in SCHEMES:
                     picture = out / f"{name}-{width}-{scheme}.png"

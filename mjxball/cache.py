@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
+from mjxball.terminal import warn
 from mjxball.xla import check_address_space
 
 VARIABLE = "MJXBALL_CACHE"
@@ -52,7 +52,7 @@ def enable_compilation_cache() -> Path | None:
         usable = False
     if not usable:
         text = f"warning: {place} cannot be written: nothing compiled is kept; set {VARIABLE} to another directory"
-        print(text, file=sys.stderr)  # noqa: T201
+        warn(text)
         return None
     jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)

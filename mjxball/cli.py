@@ -18,6 +18,7 @@ from typing import Any
 from mjxball import __version__
 from mjxball import config as configs
 from mjxball.errors import InputError
+from mjxball.terminal import warn
 from mjxball.xla import explained
 
 FAULT = 3  # exit code after an error of the program, where 1 is a result
@@ -46,7 +47,8 @@ class Parser(argparse.ArgumentParser):
         unknown = re.match(r"unrecognized arguments: (--[^ =]+)", message)
         known = [flag for action in self._actions if action.help != argparse.SUPPRESS for flag in action.option_strings]
         similar = difflib.get_close_matches(unknown[1], known, 1, cutoff=0.8) if unknown else []
-        self.exit(2, f"{self.prog}: {message}{f'; did you mean {similar[0]}?' if similar else ''}\n")
+        warn(f"{self.prog}: {message}{f'; did you mean {similar[0]}?' if similar else ''}")
+        self.exit(2)
 
 
 class Formatter(argparse.HelpFormatter):
@@ -175,22 +177,22 @@ def run_command(command: Callable[[], int]) -> int:
     try:
         return command()
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)  # noqa: T201
+        warn(f"error: {error}")
         return 2
     except OSError as error:
-        print(f"error: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)  # noqa: T201
+        warn(f"error: {error.filename or 'a file'}: {error.strerror or error}")
         return 2
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("mjxball"):
             raise
         extra = EXTRAS.get(error.name or "", "train")
-        print(f"error: {error.name} is not installed; pip install 'mjxball[{extra}]'", file=sys.stderr)  # noqa: T201
+        warn(f"error: {error.name} is not installed; pip install 'mjxball[{extra}]'")
         return 2
     except (MemoryError, RuntimeError, AssertionError) as error:
         why = explained(error)
         if why is None:
             raise
-        print(f"error: {why}", file=sys.stderr)  # noqa: T201
+        warn(f"error: {why}")
         return 2
 
 

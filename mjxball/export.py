@@ -18,6 +18,7 @@ from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.policy import team
 from mjxball.policy.file import PolicyFile, load_file, policy_path, save_file
+from mjxball.terminal import warn
 
 
 def policy_of_run(run: Path) -> PolicyFile:
@@ -138,7 +139,7 @@ def main(arguments: list[str] | None = None) -> int:
             if options.crazyflie or options.int8 or options.plant or options.drone is not None:
                 raise InputError("a flight log takes no other flag")
             for remark in export_log(options.source, options.out):
-                print(f"note: {remark}", file=sys.stderr)  # noqa: T201
+                warn(f"note: {remark}")
             print(options.out)  # noqa: T201
             return 0
         export(options.source, options.out, options.crazyflie, options.int8, options.plant, options.drone)

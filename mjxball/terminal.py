@@ -48,9 +48,19 @@ def folded(text: str, columns: int) -> str:
     return textwrap.fill(text, columns, break_on_hyphens=False).replace("\xa0", " ")
 
 
-def folded_out(text: str) -> str:
-    """`text` for stdout: `folded` if that is a terminal."""
-    return folded(text, columns_of(sys.stdout)) if sys.stdout.isatty() else text
+def fitted_to(stream: TextIO, text: str) -> str:
+    """`text` for `stream`: `folded` if that is a terminal."""
+    return folded(text, columns_of(stream)) if stream.isatty() else text
+
+
+def say(text: str) -> None:
+    """Print a sentence on stdout, now; at a terminal it breaks between words."""
+    print(fitted_to(sys.stdout, text), flush=True)  # noqa: T201
+
+
+def warn(text: str) -> None:
+    """The same on stderr."""
+    print(fitted_to(sys.stderr, text), file=sys.stderr, flush=True)  # noqa: T201
 
 
 class Status:
@@ -77,8 +87,7 @@ class Status:
 
     def say(self, text: str) -> None:
         """Print `text` on lines of its own; at a terminal they break between words."""
-        if self._stream.isatty():
-            text = folded(text, columns_of(self._stream))
+        text = fitted_to(self._stream, text)
         if self._display is None:
             print(text, file=self._stream, flush=True)
         else:

@@ -17,11 +17,11 @@ from command_line import REPOSITORY, environment
 
 # Floor by floor: a part imports itself and what stands on lower floors, never a neighbour or what is above.
 FLOORS = (
-    {"errors", "reading", "pictures"},
+    {"errors", "reading", "pictures", "terminal"},
     {"files"},
     {"config"},
     {"xla"},
-    {"cli", "cache", "quiet", "plotting", "terminal"},
+    {"cli", "cache", "quiet", "plotting"},
     {"plant"},
     {"control"},
     {"policy", "baselines"},

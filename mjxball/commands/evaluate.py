@@ -39,7 +39,7 @@ from mjxball.plotting import STYLES
 from mjxball.policy import Policy
 from mjxball.policy.file import policy_path, shipped_policies
 from mjxball.sim.scenario import Scenario
-from mjxball.terminal import Status
+from mjxball.terminal import Status, warn
 from mjxball.train.run_directory import commit, versions
 
 # What `--figures` fixes itself.
@@ -376,7 +376,7 @@ def _load(
         except InputError as error:
             if not options.force:
                 raise InputError(f"{error}; --force flies it all the same") from None
-            print(f"warning: FORCED: {error}", file=sys.stderr)  # noqa: T201
+            warn(f"warning: FORCED: {error}")
             policy.name += " (FORCED)"
         policies.append(policy)
     stems = [policy.name for policy in policies]

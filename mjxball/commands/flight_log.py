@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from mjxball.fly.twin.conditions import Conditions
 from mjxball.plotting import SIMULATED, file_format, style
 from mjxball.sim.rollout import Trajectory
 from mjxball.sim.scenario import Scenario
+from mjxball.terminal import warn
 
 MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
 DIVERGED = 0.25  # [m] of difference from which on the open-loop simulation is not drawn
@@ -28,7 +28,7 @@ def evaluate_log(path: Path, out: Path, look: str = "screen") -> int:
     recording = read_recording(path)
     cli.output_directory(out)
     for remark in recording.remarks:
-        print(remark, file=sys.stderr)  # noqa: T201
+        warn(remark)
     recorded = result_of(recording, f"{recording.policy}, flown")
     simulated = result_of(fly_again(recording), SIMULATED)
     print(differences(recorded, simulated))  # noqa: T201

@@ -29,7 +29,7 @@ from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.file import policy_path
 from mjxball.quiet import import_jax
-from mjxball.terminal import folded_out
+from mjxball.terminal import say, warn
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
 from mjxball.train.lock import LOCK, check_free
@@ -155,7 +155,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
 
                 def prepare() -> None:
                     if writes and options.plant:
-                        print(rig_line(settings), file=sys.stderr)
+                        warn(rig_line(settings))
                     if writes and _is_evaluated(origin):
                         beside.submit(_prepare_evaluation, settings, origin["physics"])
 
@@ -215,7 +215,7 @@ def _run(
         state, total = restore_state(out, settings, origin)
         steps = 0 if state is None else int(np.ravel(state.steps)[0])
         if processes.is_writer():
-            print(f"continuing {out} after {steps:,} of {total:,} steps", file=sys.stderr)
+            warn(f"continuing {out} after {steps:,} of {total:,} steps")
         if steps >= total:
             return None
     try:
@@ -224,7 +224,7 @@ def _run(
         if processes.is_writer():
             kept = any(path.name.isdigit() for path in (out / CHECKPOINTS).glob("*"))
             where = f"the last good policy and checkpoint are in {out}" if kept else "no checkpoint came before"
-            print(f"training diverged: {error}; {where}", file=sys.stderr)
+            warn(f"training diverged: {error}; {where}")
         return 1
 
 
@@ -479,5 +479,5 @@ def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) ->
     )
     misses = check_bounds(trained, reference.metrics)
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
-    print(folded_out(f"{policy} {verdict}; figures in {out / 'eval'}"))
+    say(f"{policy} {verdict}; figures in {out / 'eval'}")
     return 0

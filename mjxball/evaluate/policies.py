@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from mjxball.evaluate.metrics import Metrics
 from mjxball.policy import Policy
 from mjxball.policy.file import law_of
 from mjxball.sim.outside import outside
+from mjxball.terminal import warn
 
 
 def load_policy(path: Path, config: Config, compare_laws: bool = True, seconds: float = 0.0) -> Policy:
@@ -23,7 +23,7 @@ def load_policy(path: Path, config: Config, compare_laws: bool = True, seconds: 
     """
     policy = _fitting(path, config, compare_laws)
     for text in beyond_card(policy.card, config.plant.count, seconds):
-        print(f"warning: {path} {text}", file=sys.stderr)  # noqa: T201
+        warn(f"warning: {path} {text}")
     return policy
 
 
@@ -56,7 +56,7 @@ def _fitting(path: Path, config: Config, compare_laws: bool) -> Policy:
                 f"{path} sees and commands along its mount, which plant.cg_axis xy does for a pair along y"
             )
         for text in outside(config, trained_rigs(policy)):
-            print(f"warning: {path} was not trained for this rig: {text}", file=sys.stderr)  # noqa: T201
+            warn(f"warning: {path} was not trained for this rig: {text}")
         return policy
     if sizes := team_sizes(policy):
         _refuse_other_teams(path, sizes, config)

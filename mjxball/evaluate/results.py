@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -127,7 +128,7 @@ def table(results: Sequence[Result], reference: Scenario) -> str:
     words = (1 + len(conditions), 2 + len(conditions))[: 1 + failed]
     heads = ["", *conditions.values(), "follower", *[""] * failed]
     shown = terminal.table([*heads, *(COLUMNS[name][0] for name in columns)], rows, names=words, least=len(heads))
-    return f"{shown}\n{terminal.folded_out(_legend(reference, results[0].motion))}"
+    return f"{shown}\n{terminal.fitted_to(sys.stdout, _legend(reference, results[0].motion))}"
 
 
 def _legend(reference: Scenario, motion: str) -> str:

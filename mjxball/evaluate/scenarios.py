@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from mjxball.files import read_text
 from mjxball.plant.trim import largest_amplitude
 from mjxball.reading import check_times
 from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario, of_plant
+from mjxball.terminal import warn
 
 REFERENCE = of_plant(preset("paper"), Scenario())
 # Copy without CG motion, then five speeds of the CG.
@@ -107,7 +107,7 @@ def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     if len(times) > 1:
         try:
             for remark in check_times(times, longest=SLOWEST):
-                print(f"waveform {path}: {remark}; the CG moves on a spline there", file=sys.stderr)  # noqa: T201
+                warn(f"waveform {path}: {remark}; the CG moves on a spline there")
         except ValueError as error:
             raise InputError(f"waveform {path}: {error}, a header not counted") from None
     return times, offsets

@@ -22,6 +22,7 @@ from mjxball.fly.limits import NAMES, Limits
 from mjxball.fly.packets import DroneState, Setpoint
 from mjxball.fly.process import Child
 from mjxball.fly.supervisor import ENDED, GUIDED, State, Supervisor
+from mjxball.terminal import columns_of, fitted_to, is_live
 
 RED, YELLOW, GREEN, PLAIN = "\x1b[1;37;41m", "\x1b[33m", "\x1b[32m", "\x1b[0m"
 PERIOD = 0.2  # [s]
@@ -104,9 +105,8 @@ class Display:
     def __init__(self, view: Callable[[], View | None], bounds: Limits, stream: TextIO = sys.stdout):
         self._view, self._bounds, self._stream = view, bounds, stream
         self._done = threading.Event()
-        rich = stream.isatty() and os.environ.get("TERM") != "dumb"
         self._colour = "NO_COLOR" not in os.environ
-        self._draw = self._redraw if rich else self._print
+        self._draw = self._redraw if is_live(stream) else self._print
         self._thread = threading.Thread(target=self._draw_all, name="display", daemon=True)
         self._drawn = 0
         self._phase: object = None
@@ -121,10 +121,7 @@ class Display:
 
     def _columns(self) -> int:
         """Of the terminal, whose window may have changed."""
-        try:
-            return max(os.get_terminal_size(self._stream.fileno()).columns, 20)
-        except (OSError, ValueError):
-            return 80
+        return max(columns_of(self._stream), 20)
 
     def _draw_all(self) -> None:
         while not self._done.wait(PERIOD):
@@ -146,7 +143,7 @@ class Display:
     def _print(self, view: View) -> None:
         phase = view.supervisor.state, view.supervisor.cause
         if phase != self._phase:
-            print(plain(view), file=self._stream, flush=True)
+            print(fitted_to(self._stream, plain(view)), file=self._stream, flush=True)
         self._phase = phase
 
 

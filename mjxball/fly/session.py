@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mjxball import __version__
+from mjxball import __version__, terminal
 from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.errors import InputError
@@ -191,4 +191,4 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, captured: bool) -> 
 
 def _say(text: str) -> None:
     with contextlib.suppress(OSError, ValueError):  # a closed terminal must not end a flight
-        print(text, flush=True)  # noqa: T201
+        terminal.say(text)

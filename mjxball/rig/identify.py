@@ -26,6 +26,7 @@ from mjxball.fly.recording import one_curve, own_curve
 from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify, pair_mass
 from mjxball.rig.log import Log, read_log
+from mjxball.terminal import warn
 
 LEAST_INERTIA = 1e-6  # of a drone about its own centre [kg m2]
 DELAY_EITHER_WAY = 0.01  # [s] by which training varies the delay that was found
@@ -66,7 +67,7 @@ def _identify(options: argparse.Namespace) -> int:
     found = [identify(one, log) for one, log in zip(flown, logs, strict=True)]
     for path, log, one in zip(options.logs, logs, found, strict=True):
         for remark in log.remarks:
-            print(remark, file=sys.stderr)  # noqa: T201
+            warn(remark)
         print(f"{path.name}: {one.windows} s of flight, {curve} force curve\n{report(converted, one)}")  # noqa: T201
     mean = average(found)
     if len(found) > 1:

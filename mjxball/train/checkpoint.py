@@ -16,6 +16,7 @@ import orbax.checkpoint as ocp
 
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.terminal import warn
 from mjxball.train.curves import best_member, read_members
 from mjxball.train.extensions import Extensions, is_pair, resolve
 from mjxball.train.population import Population
@@ -189,7 +190,7 @@ def _restore(run: Path, population: Population, discard: bool) -> TrainState | N
     with contextlib.closing(Checkpoints(run, reading=not discard)) as checkpoints:
         if not checkpoints.steps():
             return None
-        say = lambda text: print(f"warning: {text}", file=sys.stderr)  # noqa: E731, T201
+        say = lambda text: warn(f"warning: {text}")  # noqa: E731
         state = checkpoints.restore(population.template(), say, discard)
     if state is None:
         raise InputError(f"{run} has no checkpoint that can be read")

@@ -13,7 +13,6 @@ import fcntl
 import json
 import os
 import socket
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from typing import Any
 
 from mjxball.errors import InputError
 from mjxball.reading import parse_json
+from mjxball.terminal import warn
 
 LOCK = ".lock"  # in the run directory
 RENEWED = 10.0  # [s] between two renewals
@@ -110,7 +110,7 @@ def _lock(handle: int, path: Path) -> bool:
         if _age(handle, path) < STALE and _holder(handle).get("pid") is not None:
             raise _in_use(path, _holder(handle), f"; if that has ended, wait {STALE:.0f} s") from None
         text = f"warning: the file system of {path.parent} has no locks: start no other training there"
-        print(text, file=sys.stderr)  # noqa: T201
+        warn(text)
     try:
         return os.path.samestat(os.fstat(handle), path.stat())
     except FileNotFoundError:  # its holder has just ended

@@ -17,6 +17,7 @@ import numpy as np
 
 from mjxball.cli import FAULT
 from mjxball.errors import InputError, TrainingDivergedError
+from mjxball.terminal import warn
 from mjxball.train import lock
 
 HEARTBEAT = 20  # [s] after which a process that does not answer counts as dead
@@ -153,11 +154,7 @@ def exit_when_a_process_is_lost(resume: str) -> Iterator[None]:
             traceback.print_exc()
         _dismiss(watcher)
         why = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-        print(  # noqa: T201
-            f"process {jax.process_index()} cannot go on, because it or another one failed: {why}. {advice}",
-            file=sys.stderr,
-            flush=True,
-        )
+        warn(f"process {jax.process_index()} cannot go on, because it or another one failed: {why}. {advice}")
         os._exit(FAULT)  # the runtime's own farewell would wait for the lost process
     finally:
         _dismiss(watcher)

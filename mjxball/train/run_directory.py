@@ -12,7 +12,6 @@ import json
 import os
 import platform
 import subprocess
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.container import MAX_BYTES
 from mjxball.policy.file import PolicyFile, load_file
 from mjxball.reading import parse_json
+from mjxball.terminal import warn
 
 LONGEST_COUNT = 20  # digits of a number of steps
 SINCE = {"recurrent_units": 0}  # settings of followers that older policies do not name, and what these have
@@ -72,7 +72,7 @@ def read_metrics(path: Path) -> list[dict[str, str]]:
             kept.append(row)
     if len(kept) < len(rows):
         left = f"{len(rows) - len(kept)} of {len(rows)} rows do not follow the one before"
-        print(f"warning: {path}: {left} in steps and are left out", file=sys.stderr)  # noqa: T201
+        warn(f"warning: {path}: {left} in steps and are left out")
     return kept
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import sys
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from mjxball.files import write_whole
 from mjxball.policy.container import read_arrays
 from mjxball.policy.file import policy_path
 from mjxball.reading import check_times, parse_json
+from mjxball.terminal import warn
 from mjxball.view.marks import Mark, marks_of_log, read_marks
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def check_flight(flight: Flight, name: str) -> Flight:
     except ValueError as error:
         raise InputError(f"{name}: time must increase from row to row: {error}") from None
     for phrase in told:
-        print(f"warning: {name}: {phrase}", file=sys.stderr)  # noqa: T201
+        warn(f"warning: {name}: {phrase}")
     return dataclasses.replace(flight, arrays={field: flight[field] for field in wanted})
 
 
@@ -173,7 +173,7 @@ def read_log(path: Path) -> Flight:
         raise InputError(f"{path} is no flight (.npz), flight log (.jsonl), policy (.npz) or run directory")
     recording = read_recording(path)
     for remark in recording.remarks:
-        print(remark, file=sys.stderr)  # noqa: T201
+        warn(remark)
     rows = len(recording.time)
     euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(recording.quaternion))
     arrays = {
