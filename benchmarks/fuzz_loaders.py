@@ -2,7 +2,7 @@
 
 Counts for every kind of damage what loaded, what was refused, and what went wrong: another exception than the one-line
 refusal, code run from the file, too much memory, too much time. Exit code 1 if anything did. Files of checkpoints:
-`tests/test_fuzz.py`.
+`tests/policy/test_fuzz.py`.
 """
 
 from __future__ import annotations

@@ -76,13 +76,14 @@ def by_the_clock(item: pytest.Item) -> bool:
     return any(item.get_closest_marker(name) for name in ("alone", "clock"))
 
 
+TESTS = Path(__file__).parent
 # Files that take longest, which begin first, so that no worker is left with one of them at the end.
 LONGEST = (
-    *("test_fly_link", "test_fly_mocap_flight", "test_fly_main", "test_fly_watchdog", "test_fly_rehearsal"),
-    *("test_rig_rehearsal", "test_population", "test_distributed", "test_cli_eval"),
-    *("test_docs", "test_team_env", "test_cli_train", "test_rigs"),
-    *("test_algorithms", "test_extensions", "test_figures", "test_stability", "test_fly_defects", "test_resume"),
-    *("test_engines", "test_program", "test_gym"),
+    *("fly/test_link", "fly/test_mocap_flight", "fly/test_main", "fly/test_watchdog", "fly/test_rehearsal"),
+    *("rig/test_rehearsal", "train/test_population", "train/test_distributed", "commands/test_evaluate"),
+    *("test_docs", "test_team_env", "commands/test_train", "sim/test_rigs", "algorithms/test_algorithms"),
+    *("train/test_extensions", "evaluate/test_figures", "evaluate/test_stability", "fly/test_defects"),
+    *("train/test_resume", "physics/test_engines", "train/test_program", "gym/test_gym"),
 )
 
 
@@ -108,7 +109,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(
         key=lambda item: (
             item.path not in clocked,
-            places.get(item.path.stem, len(places)),
+            places.get(str(item.path.relative_to(TESTS).with_suffix("")), len(places)),
         )
     )
 

@@ -317,7 +317,7 @@ def test_a_policy_that_was_told_its_team_flies_as_one_that_joined(tmp_path: Path
 
 def test_a_missing_package_is_named_with_its_extra(saved: Path):
     script = "import sys; sys.modules['onnx'] = None; from mjxball.export import main; sys.exit(main(sys.argv[1:]))"
-    done = run(["-c", script, saved, "out.onnx"], Path(__file__).parents[1])
+    done = run(["-c", script, saved, "out.onnx"], Path(__file__).parents[2])
     assert done.returncode == 2
     assert "mjxball[onnx]" in done.stderr
     assert done.stderr.count("\n") == 1

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from physics.test_engines import TOLERANCE, jitted, relative_difference
 from plants import paper_with, random_motion, team
 from tables import rows
-from test_engines import TOLERANCE, jitted, relative_difference
 
 from engines import random_states
 from mjxball import config as configs

@@ -15,8 +15,8 @@ import pytest
 import toys
 from conftest import Recurrent, with_settings
 from tables import rows
-from test_algorithms import TRAIN, A, B, LinearQuadratic, Q, R, gradient_of
 
+from algorithms.test_algorithms import TRAIN, A, B, LinearQuadratic, Q, R, gradient_of
 from mjxball.algorithms.base import Phase, Shards
 from mjxball.algorithms.gradient import FirstOrderGradient
 from mjxball.algorithms.ppo import ProximalPolicyOptimization

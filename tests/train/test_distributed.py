@@ -21,7 +21,7 @@ from mjxball.train.population import grid
 from mjxball.train.processes import Rendezvous
 from mjxball.train.program import Program
 
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 SMALL = [
     *("--physics", "newton-euler", "--sac.num_envs", "8", "--sac.replay_size", "800", "--sac.batch_size", "16"),
     *("--sac.warmup_steps", "100", "--sac.updates_per_step", "1", "--timing.episode_steps", "60"),

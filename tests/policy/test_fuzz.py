@@ -253,8 +253,8 @@ class TestCheckpoints:
         script = f"""
 import contextlib, shutil, sys
 from pathlib import Path
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-from test_fuzz import TestCheckpoints
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
+from policy.test_fuzz import TestCheckpoints
 from mjxball.train.checkpoint import Checkpoints
 run = Path({str(written)!r})
 files = [path.relative_to(run) for path in run.rglob("*") if path.is_file()]

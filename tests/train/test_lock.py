@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 from command_line import assert_one_line, environment, listing, script, tiny
 from command_line import run as command
-from test_distributed import SMALL, finish, launch
 
 from mjxball.errors import InputError
 from mjxball.train import lock
+from train.test_distributed import SMALL, finish, launch
 
 HOLD = """
 import sys
@@ -29,7 +29,7 @@ with held(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 
 
 @pytest.fixture

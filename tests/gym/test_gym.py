@@ -151,7 +151,7 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 def test_a_process_forked_after_any_use_of_jax_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     (tmp_path / "forked.py").write_text(FORKED)
     done = run(["forked.py"], tmp_path)
     assert "this process was forked from one in which JAX runs" in done.stderr
@@ -183,7 +183,7 @@ NO_ACTIONS = {
 
 
 def test_actions_are_clipped_to_the_box_and_refused_unless_they_are_finite(short: Config):
-    """Alike in one world and in a vector, which stay as they were; tests/test_parallel.py of followers."""
+    """Alike in one world and in a vector, which stay as they were; tests/gym/test_parallel.py of followers."""
     single = FollowerEnv(config=short, physics="newton-euler")
     vector = FollowerVectorEnv(2, config=short, physics="newton-euler")
     for env, shape in ((single, (3,)), (vector, (2, 3))):
@@ -303,7 +303,7 @@ if __name__ == "__main__":
 @pytest.mark.slow
 def test_workers_are_spawned_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Forked ones waited for ever at their first reset."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     (tmp_path / "workers.py").write_text(ASYNC)
     done = run(["workers.py", "fork"], tmp_path)
     assert (done.returncode, "refused: " in done.stderr) == (1, True), done.stderr
@@ -333,7 +333,7 @@ np.savez("pictures.npz", first=first, last=last)
 
 @pytest.mark.slow
 def test_without_a_display_the_variable_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
     done = run(["-c", RENDER], tmp_path)
@@ -345,7 +345,7 @@ def test_without_a_display_the_variable_is_named(tmp_path: Path, monkeypatch: py
 def test_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """In a process of its own, which a failing GL library may end."""
     monkeypatch.setenv("MUJOCO_GL", "egl")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     done = run(["-c", RENDER], tmp_path)
     if done.returncode and re.search("EGL|OpenGL|gl_context|libGL|GLError", done.stderr):
         pytest.skip("MuJoCo's renderer finds no GL library")
@@ -422,8 +422,8 @@ def test_playgrounds_wrappers_take_the_adapter():
 def test_stable_baselines3_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trainer: str, steps: int):
     """Its policy file answers as its model does, which the script asserts, and sways less than the copying follower."""
     pytest.importorskip("stable_baselines3")
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
-    script = Path(__file__).parents[1] / "benchmarks" / "foreign_trainers.py"
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
+    script = Path(__file__).parents[2] / "benchmarks" / "foreign_trainers.py"
     done = run([script, trainer, "out.npz", "--steps", steps], tmp_path, timeout=1800)
     assert done.returncode == 0, done.stderr
     config = preset("transport")

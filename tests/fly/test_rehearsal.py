@@ -107,7 +107,7 @@ def test_it_flies_and_its_commands_simulated_begin_the_same(name: str, flown: Pa
     assert least < heights.max() < most
     assert abs(recording.position[-1, 2]) < 0.01
     # Open loop: setpoints took effect up to a tick or two later than they were noted, which grows with the flight's
-    # time (tests/test_fly_recording.py compares a whole flight, in virtual time). So: until one second in the air.
+    # time (tests/fly/test_recording.py compares a whole flight, in virtual time). So: until one second in the air.
     begun = recording.time[recording.phase.index("fly")]
     early = recording.time < begun + 1.0
     apart = fly_again(recording).position[early] - recording.position[early]

@@ -20,7 +20,7 @@ from mjxball.commands.train import main as train
 from mjxball.train.checkpoint import CHECKPOINTS, Checkpoints
 from mjxball.train.run_directory import PACKAGE, SOURCES
 
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

@@ -205,7 +205,7 @@ def test_mistakes_are_one_sentence(
 def test_a_mistake_ends_the_process_with_one_sentence(tmp_path: Path) -> None:
     """Also while the device's runtime, which a thread starts, is not there yet."""
     command = [sys.executable, REPOSITORY / "train.py", "--env", "toys:Needy", "--physics", "newton-euler"]
-    child = {**environment(), "PYTHONPATH": f"{REPOSITORY}:{Path(__file__).parent}"}
+    child = {**environment(), "PYTHONPATH": f"{REPOSITORY}:{Path(__file__).parents[1]}"}
     for _ in range(3):
         done = subprocess.run(command, cwd=tmp_path, env=child, capture_output=True, text=True, check=False)
         assert done.returncode == 2

@@ -27,7 +27,7 @@ from mjxball.train.curves import best_member, read_members
 from mjxball.train.population import Population, partitioned_by_gspmd
 from mjxball.train.run_directory import read_sweep
 
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 SMALL = {
     "num_envs": 8,
     "replay_size": 800,

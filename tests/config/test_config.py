@@ -345,7 +345,7 @@ class TestOldNames:
         with pytest.raises(InputError, match=r"follower\.base is no setting any more"):
             configs.from_record(recorded)
 
-    @rows("path", sorted(Path(__file__).parents[1].glob("policies/**/*.npz")))
+    @rows("path", sorted(Path(__file__).parents[2].glob("policies/**/*.npz")))
     def test_the_card_of_every_shipped_policy(self, path):
         card = load_file(path).card
         config = configs.validate(configs.from_record(card["config"]))

@@ -24,7 +24,7 @@ from mjxball.policy.file import load_file, save_file, shipped_policy
 needs_arm = pytest.mark.skipif(bool(benchmark.missing()), reason=f"not installed: {benchmark.missing()}")
 
 
-INTERFACE = Path(__file__).parent / "firmware" / "interface.h"
+INTERFACE = Path(__file__).parents[2] / "firmware" / "interface.h"
 STRICT = (
     *("-std=c11", "-Wall", "-Wextra", "-Werror"),
     *("-Wdouble-promotion", "-Wconversion", "-Wshadow", "-pedantic"),
