@@ -21,7 +21,6 @@ import numpy as np
 
 from harness import Row, arguments, table, write
 from mjxball.baselines import make_baseline
-from mjxball.cache import enable_compilation_cache
 from mjxball.cli import run_command
 from mjxball.config import Config, ball_limit, preset
 from mjxball.control import rotations
@@ -33,6 +32,7 @@ from mjxball.policy.file import shipped_policy
 from mjxball.policy.policy import NetworkLaw, Policy
 from mjxball.sim.rollout import make_privileged_info, simulate_batch
 from mjxball.sim.scenario import Scenario
+from mjxball.xla import enable_compilation_cache
 
 SECONDS, SETTLED = 20.0, 5.0
 CLASSICAL = ("copy", "adaptive", "lqg")

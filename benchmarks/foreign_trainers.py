@@ -27,11 +27,11 @@ import numpy as np
 
 from mjxball import config as configs
 from mjxball.algorithms.base import PolicyNetwork
-from mjxball.cache import enable_compilation_cache
 from mjxball.env import TransportEnv
 from mjxball.policy import load_network, save_file
 from mjxball.policy.export import policy_file
 from mjxball.sim.follower import follower_law
+from mjxball.xla import enable_compilation_cache
 
 LAST_RATE = 0.02  # of SB3's learning rates, at the end over the start: linear, as the preset's own
 SAMPLES = 100  # observations of a flight on which the policy file must answer as SB3's model

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.metadata
 import importlib.util
 import io
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
-
-from mjxball.xla import check_address_space
 
 FOR_MESHES = ("trimesh", "scipy.spatial")  # what MJX imports for meshes alone: that takes as long as JAX
 
@@ -76,22 +72,6 @@ def _initialised_when_used(name: str) -> None:
 
     package.__dict__["__getattr__"] = find  # PEP 562
     sys.modules[name] = package
-
-
-def import_jax() -> ModuleType:
-    """JAX, which reads the description of every installed package in search of a plugin of ROCm's: 0.1 to 0.4 s.
-
-    It need not where no directory of that name is there.
-    """
-    check_address_space()
-    if any(place.is_dir() and any(place.glob("jax_rocm*")) for place in map(Path, sys.path)):
-        return importlib.import_module("jax")
-    search = importlib.metadata.distributions
-    importlib.metadata.distributions = lambda **_: iter(())
-    try:
-        return importlib.import_module("jax")
-    finally:
-        importlib.metadata.distributions = search
 
 
 def import_mjx() -> ModuleType:

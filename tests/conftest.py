@@ -23,7 +23,7 @@ import pytest
 import short_train
 from command_line import HASTY
 
-from mjxball import cache, cli
+from mjxball import cli, xla
 from mjxball import config as configs
 from mjxball.algorithms import sac
 from mjxball.algorithms.base import PolicyNetwork, RecurrentNetwork
@@ -38,10 +38,10 @@ from mjxball.train.program import Environments
 # The same as in `command_line.environment`: a cached program is found by the flags that it was compiled with.
 if HASTY not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = f"{HASTY} {os.environ.get('XLA_FLAGS', '')}".strip()
-if cache.VARIABLE not in os.environ:  # one compilation cache a run: of its workers and of the processes they start
-    os.environ[cache.VARIABLE] = tempfile.mkdtemp(prefix="mjxball-cache-")
-    atexit.register(shutil.rmtree, os.environ[cache.VARIABLE], ignore_errors=True)
-cache.enable_compilation_cache()
+if xla.VARIABLE not in os.environ:  # one compilation cache a run: of its workers and of the processes they start
+    os.environ[xla.VARIABLE] = tempfile.mkdtemp(prefix="mjxball-cache-")
+    atexit.register(shutil.rmtree, os.environ[xla.VARIABLE], ignore_errors=True)
+xla.enable_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # tests share hundreds of tiny programs
 cli.collect_seldom()  # as the commands do
 

@@ -21,7 +21,7 @@ FLOORS = (
     {"files"},
     {"config"},
     {"xla"},
-    {"cli", "cache", "quiet", "plotting"},
+    {"cli", "quiet", "plotting"},
     {"plant"},
     {"control"},
     {"policy", "baselines"},

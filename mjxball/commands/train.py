@@ -22,13 +22,11 @@ import numpy as np
 
 from mjxball import __version__, cli, config
 from mjxball.algorithms import ALGORITHMS
-from mjxball.cache import enable_compilation_cache
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
 from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.file import policy_path
-from mjxball.quiet import import_jax
 from mjxball.terminal import say, warn
 from mjxball.train import processes
 from mjxball.train.curves import draw_training
@@ -48,7 +46,7 @@ from mjxball.train.run_directory import (
     start_policy,
     versions,
 )
-from mjxball.xla import compile_small_loops_whole
+from mjxball.xla import check_address_space, compile_small_loops_whole, enable_compilation_cache
 
 # What `--help` shows of the settings; `--help all` has the rest.
 COMMON = (
@@ -131,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _train(options: argparse.Namespace, command: str) -> int:
     meeting, started = _meeting(options), time.monotonic()
-    import_jax()
+    check_address_space()
     # To take three quarters of a large GPU's memory at once takes 1.6 s; taken as it is needed it is as fast.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if options.resume is not None:

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import Baseline, Follower, Law
@@ -25,6 +24,7 @@ from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.disturbances import Sample, SensorModel, followers_axis, record, sensors_of
 from mjxball.sim.scenario import Scenario, check_scenario
+from mjxball.xla import enable_compilation_cache
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 from gymnasium.utils.seeding import np_random
 
-from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.gym import common
 from mjxball.gym.single import PICTURE
 from mjxball.physics.step import make_cg_offset, on_the_host
 from mjxball.plant.teams import ring
+from mjxball.xla import enable_compilation_cache
 
 try:
     import pettingzoo

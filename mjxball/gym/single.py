@@ -9,13 +9,13 @@ import gymnasium
 import jax
 import numpy as np
 
-from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.gym import common
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_cg_offset, make_stepper, on_the_host
+from mjxball.xla import enable_compilation_cache
 
 Array = Any
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from mjxball.cache import enable_compilation_cache
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.gym import common
+from mjxball.xla import enable_compilation_cache
 
 Array = Any
 METADATA: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}

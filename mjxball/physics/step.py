@@ -226,8 +226,8 @@ def make_stepper(config: Config, physics: str) -> ControlStep:
 def _jax_stepper(config: Config, physics: str) -> ControlStep:
     import jax
 
-    from mjxball.cache import enable_compilation_cache
     from mjxball.physics import mjx, newton_euler
+    from mjxball.xla import enable_compilation_cache
 
     enable_compilation_cache()
     make = mjx.make_engine if physics == "mjx" else newton_euler.make_engine

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.sharding import Mesh
 
-from mjxball.cache import traced_directory
 from mjxball.files import write_whole
 from mjxball.reading import parse_json
+from mjxball.xla import traced_directory
 
 OPTIONS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
 # One follower's kernels gain nothing from being tuned and optimised further, and it costs a third of the compile time.

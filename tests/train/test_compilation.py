@@ -100,11 +100,7 @@ def test_a_size_is_known_without_computing_a_reset(looks: bool, size: int, compu
 def test_a_state_is_known_without_the_physics_engine_or_brax_physics() -> None:
     """In a process of its own; Brax is whole for whoever asks for more of it."""
     code = """
-import importlib.metadata, sys
-search = importlib.metadata.distributions
-from mjxball.quiet import import_jax
-import_jax()
-assert importlib.metadata.distributions is search
+import sys
 from mjxball.config import preset
 from mjxball.train.population import Population
 population = Population(preset("transport"), "mjx")

@@ -17,9 +17,9 @@ from jax.sharding import AxisType, PartitionSpec
 
 from mjxball import cli, entry
 from mjxball import config as configs
-from mjxball.cache import cache_directory, enable_compilation_cache
 from mjxball.config import Config
 from mjxball.train import compilation, train
+from mjxball.xla import cache_directory, enable_compilation_cache
 
 SMALL = {
     "timing.episode_steps": 100,

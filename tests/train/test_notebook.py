@@ -153,7 +153,7 @@ jnp.zeros(3).block_until_ready()
 import mjxball
 from mjxball import Scenario, config, simulate
 from mjxball.baselines import make_baseline
-from mjxball.cache import enable_compilation_cache
+from mjxball.xla import enable_compilation_cache
 enable_compilation_cache()
 plant = config.preset("transport")
 simulate(plant, make_baseline("copy", plant), Scenario(seconds=0.1))

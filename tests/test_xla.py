@@ -1,8 +1,9 @@
-"""XLA's flag for small loops on CPUs."""
+"""XLA's flag for small loops on CPUs, and the place of what it compiled."""
 
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -34,3 +35,13 @@ def test_a_loop_becomes_one_function() -> None:
 
     text = jax.jit(loop).lower(jnp.zeros(1000)).compile().as_text()
     assert "xla_cpu_small_call" in (text or "")
+
+
+def test_cache_directory_can_be_chosen_or_switched_off(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("MJXBALL_CACHE", str(tmp_path / "here"))
+    assert xla.cache_directory() == tmp_path / "here"
+    monkeypatch.setenv("MJXBALL_CACHE", "off")
+    assert xla.cache_directory() is None
+    monkeypatch.delenv("MJXBALL_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert xla.cache_directory() == tmp_path / "mjxball" / "jax"
