@@ -89,6 +89,8 @@ def parser() -> cli.Parser:
     own = result.add_argument_group("in place of ours")
     own.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")
     own.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state)")
+    about = "start(name, settings), which returns log(row) for every row of metrics.csv: docs/howto/trackers.md"
+    own.add_argument("--tracker", metavar="MODULE:FUNCTION", help=about)
     several = result.add_argument_group("several processes")
     several.add_argument("--distributed", action="store_true", help="train with the other processes of this job")
     several.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
@@ -157,7 +159,7 @@ def _train(options: argparse.Namespace, command: str) -> int:
                     if writes and _is_evaluated(origin):
                         beside.submit(_prepare_evaluation, settings, origin["physics"])
 
-                code = _run(settings, origin, out, resume, prepare)
+                code = _run(settings, origin, out, resume, prepare, options.tracker)
             if meeting:
                 processes.leave()
         return _finish(settings, origin, out, code, started) if writes else code or 0
@@ -190,7 +192,12 @@ def _output_directory(out: Path) -> Path:
 
 
 def _run(
-    settings: config.Config, origin: dict[str, Any], out: Path, resume: bool, beside: Callable[[], None]
+    settings: config.Config,
+    origin: dict[str, Any],
+    out: Path,
+    resume: bool,
+    beside: Callable[[], None],
+    tracker: str | None = None,
 ) -> int | None:
     """Train; return 0, 1 if training diverged, 130 if it was interrupted, None if nothing was left to train.
 
@@ -204,6 +211,7 @@ def _run(
 
     algorithm = (origin.get("extensions") or {}).get("algorithm") or "sac"
     find(algorithm, "--algorithm")
+    told = None if tracker is None else find(tracker, "--tracker")
     if algorithm in ALGORITHMS:  # of others nobody knows what they take
         requirements.check(settings, algorithm, origin["seeds"])
     state = None
@@ -217,7 +225,7 @@ def _run(
         if steps >= total:
             return None
     try:
-        return 0 if Run(settings, out, origin, state).train(beside) else 130
+        return 0 if Run(settings, out, origin, state, told).train(beside) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
             kept = any(path.name.isdigit() for path in (out / CHECKPOINTS).glob("*"))

@@ -61,8 +61,8 @@ def find(name: str, flag: str) -> Any:
     if not hasattr(found, attribute):
         raise InputError(f"{flag} {name}: {module} has no {attribute}; check the name behind the colon")
     named = getattr(found, attribute)
-    if flag == "--reward":
-        _check_callable(f"{flag} {name}", named)
+    if flag in ARGUMENTS:
+        _check_callable(flag, f"{flag} {name}", named)
     return named
 
 
@@ -256,7 +256,7 @@ def _takes(flag: str, what: str, function: Callable[..., Any], names: tuple[str,
 
 def _check_reward(env: Any, reward: Any) -> None:
     flag = f"--reward {name_of(reward)}"
-    _check_callable(flag, reward)
+    _check_callable("--reward", flag, reward)
     try:
         inspect.signature(reward).bind(None, None, None)
     except (TypeError, ValueError):
@@ -270,9 +270,12 @@ def _check_reward(env: Any, reward: Any) -> None:
         raise InputError(f"{flag} must return one number{each}, not shape {shape} of {kind}; sum it and use floats")
 
 
-def _check_callable(what: str, reward: Any) -> None:
-    if not callable(reward):
-        raise InputError(f"{what} is no function of (state, action, next state)")
+ARGUMENTS = {"--reward": "state, action, next state", "--tracker": "name, settings"}  # of a user's functions
+
+
+def _check_callable(flag: str, what: str, function: Any) -> None:
+    if not callable(function):
+        raise InputError(f"{what} is no function of ({ARGUMENTS[flag]})")
 
 
 def _traced(flag: str, what: str, function: Callable[..., Any], *arguments: Any) -> Any:

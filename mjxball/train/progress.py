@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from mjxball.errors import InputError
 from mjxball.terminal import Status
 from mjxball.train.events import Events, Point, Session, tags
 from mjxball.train.run_directory import CONFIG_FILE, read_metrics, write_rows
@@ -20,6 +21,8 @@ from mjxball.train.run_directory import CONFIG_FILE, read_metrics, write_rows
 COMMON = ("steps", "seconds", "rate", "episode_return")
 KEYS = "Ctrl-C saves and stops"
 Row = dict[str, Any]  # by column; the columns of an evaluation are absent between evaluations
+Log = Callable[[Row], Any]
+Start = Callable[[str, dict[str, Any]], Log]  # of a user's tracker: (the run's name, its settings by name)
 
 
 def columns(exploring: Sequence[str], algorithm: Sequence[str], evaluated: Sequence[str]) -> dict[str, str]:
@@ -30,6 +33,17 @@ def columns(exploring: Sequence[str], algorithm: Sequence[str], evaluated: Seque
     found = [*COMMON, *exploring, *algorithm, "terminated", "diverged", "eval_return"]
     known = tags(exploring, algorithm, evaluated)
     return {name: known.get(name, "") for name in (*found, *(f"eval_{name}" for name in evaluated))}
+
+
+def started(tracker: Start, session: Session) -> Log:
+    """What is called with every row. Raises InputError if there is none."""
+    try:
+        log = tracker(session.name, dict(session.settings))
+    except Exception as error:  # whatever another's program raises
+        raise InputError(f"--tracker raised {type(error).__name__}: {error}") from error
+    if not callable(log):
+        raise InputError(f"--tracker must return what is called with every row, not {type(log).__name__}")
+    return log
 
 
 class Progress:
@@ -48,8 +62,9 @@ class Progress:
         members: int = 1,
         stream: TextIO | None = None,
         session: Session | None = None,
+        tracker: Log | None = None,
     ):
-        """`names`: see `columns`."""
+        """`names`: see `columns`. `tracker` is called with every row."""
         self._names, self._total, self._members = list(names), total, members
         session = session or Session()
         self._called = session.name
@@ -58,7 +73,7 @@ class Progress:
         self._doing = "", "", KEYS
         self._latest: tuple[Row, float] | None = None  # and when it came
         self.before = 0.0  # [s] what the run took before it was resumed
-        self._silent = path is None
+        self._silent, self._log = path is None, tracker
         if path is None:
             return
         kept = _rows_until(path, self._names, resumed_at)
@@ -101,12 +116,23 @@ class Progress:
             raise OSError(error.errno, error.strerror, self._file.name) from None
         self._events.add(Point(row["steps"], row, time.time()))
         self._events.flush()
+        self._track(row)
         if not self._status.live or "eval_return" in row:
             left = self._left(row, 0.0)
             text = f"{row['steps']:>9,} / {self._total:,} steps  {row['rate'] / 1e3:6.1f} k/s  {left}"
             self.say("  ".join((text, *self._summary(row))))
         self._latest = row, time.monotonic()
         self._status.show(self._lines)
+
+    def _track(self, row: Row) -> None:
+        """Tell the tracker; one that fails is told no more, and the training goes on."""
+        if self._log is None:
+            return
+        try:
+            self._log({name: value for name, value in row.items() if value is not None})
+        except Exception as error:  # whatever another's program raises
+            self._log = None
+            self.say(f"warning: --tracker raised {type(error).__name__}: {error}; it is told no more rows")
 
     def _lines(self) -> list[list[str]]:
         """What a terminal shows now."""

@@ -29,7 +29,7 @@ from mjxball.train.events import session
 from mjxball.train.extensions import Extensions, is_pair, resolve
 from mjxball.train.population import Population
 from mjxball.train.program import Statistics, TrainState
-from mjxball.train.progress import Progress, Row, columns
+from mjxball.train.progress import Progress, Row, Start, columns, started
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
 
 CHUNKS = 25  # rows of metrics.csv in a run, at most
@@ -91,8 +91,15 @@ class Run:
     Of several processes each makes the same `Run`; only the first writes and prints.
     """
 
-    def __init__(self, config: Config, out: Path, origin: dict[str, Any], resumed: TrainState | None):
-        """`resumed` is None for a run that starts.
+    def __init__(
+        self,
+        config: Config,
+        out: Path,
+        origin: dict[str, Any],
+        resumed: TrainState | None,
+        tracker: Start | None = None,
+    ):
+        """`resumed` is None for a run that starts. `tracker`: see `mjxball.train.progress.Start`.
 
         `origin` holds seed, physics, seeds (members) and sweep, and whatever else the card should name. A run that
         starts takes the network of the policy `origin["start_from"]`, if that is there; each member its own of a list.
@@ -109,6 +116,8 @@ class Run:
         self.origin = {**origin, "parts": self.population.parts, "hardware": hardware}
         self._writes = processes.is_writer()
         done = _count(resumed) if resumed else 0
+        whole = session(config, origin["seed"], origin["seeds"], origin)
+        log = started(tracker, whole) if tracker is not None and self._writes else None
         if self._writes:
             out.mkdir(parents=True, exist_ok=True)
             if not (out / CONFIG_FILE).exists():
@@ -116,8 +125,7 @@ class Run:
         exploring, evaluated = self.population.metric_names()
         names = columns(exploring, self.population.program.algorithm.metrics, evaluated)
         place, total, seed, count = out / METRICS, self._schedule.total_steps, origin["seed"], origin["seeds"]
-        whole = session(config, seed, count, origin)
-        self.progress = Progress(place if self._writes else None, names, total, done, count, session=whole)
+        self.progress = Progress(place if self._writes else None, names, total, done, count, session=whole, tracker=log)
         sessions = [session(self.population.member_config(k), seed + k, 1, origin) for k in range(count)]
         self.members = MemberLog(out if self._writes else None, sessions if count > 1 else (), seed, done)
         self._writer = ThreadPoolExecutor(1)  # writes checkpoints
