@@ -20,6 +20,7 @@ RECIPES = dict(
         r"`tracker_(\w+)\.py`\n\n```python\n(.*?)```", (REPOSITORY / "docs/howto/trackers.md").read_text(), re.DOTALL
     )
 )
+MLFLOW = {"MLFLOW_TRACKING_URI": "mlruns", "MLFLOW_ALLOW_FILE_STORE": "true"}  # `mlflow-skinny` has no database
 OWN = """
 told = []
 
@@ -84,7 +85,10 @@ def test_refusals(here: Path, capsys: pytest.CaptureFixture[str], name: str, sai
 
 
 @pytest.mark.release
-@pytest.mark.parametrize(("package", "variables"), [("wandb", {"WANDB_MODE": "offline"}), ("mlflow", {}), ("aim", {})])
+@pytest.mark.parametrize(
+    ("package", "variables"),
+    [("wandb", {"WANDB_MODE": "offline"}), ("mlflow", MLFLOW), ("aim", {})],
+)
 def test_recipes_log_offline(package: str, variables: dict[str, str], tmp_path: Path) -> None:
     """As the page has them, in a directory of their own."""
     pytest.importorskip(package)
