@@ -44,7 +44,7 @@ PROGRAMS = {  # name: arguments of Python, in a folder of its own
     "suite": (
         "eval.py",
         "--suite",
-        "speed",
+        "cg-speed",
         "--followers",
         "copy",
         "lqg",
@@ -135,6 +135,8 @@ def terminals(out: Path, only: list[str]) -> Iterator[str]:
                         yield f"{name}, no terminal: it is sent escapes"
             (out / f"{name}-{label}.txt").write_text(text, encoding="utf-8")
             print(f"{name} in {label}: {len(text.splitlines())} lines")
+            if "error: " in text and name != "refused":
+                yield f"{name}, {label}: {text[text.index('error: ') :].splitlines()[0]}"
             if broken:
                 yield f"{name}, {label} columns: {broken} lines are broken"
 
@@ -215,7 +217,7 @@ def browsed(out: Path, made: dict[str, Path]) -> Iterator[str]:
 
 def looked_at(browser: Any, page: Path, width: int, scheme: Any, picture: Path) -> list[str]:
     """What is wrong with `page`; its picture is written."""
-    tab = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    tab = browser.new_page(viewport={"width": width, "height": 2400}, color_scheme=scheme)
     wrong: list[str] = []
     tab.on("pageerror", lambda error: wrong.append(str(error)))
     tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
@@ -227,7 +229,7 @@ def looked_at(browser: Any, page: Path, width: int, scheme: Any, picture: Path) 
     )
     tab.goto(page.as_uri())
     tab.wait_for_timeout(800)
-    tab.screenshot(path=picture, full_page=True)
+    tab.screenshot(path=picture)
     beyond = tab.evaluate("document.documentElement.scrollWidth") - width
     if beyond > 0:
         wrong.append(f"hangs out at the side by {beyond} px")

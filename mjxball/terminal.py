@@ -42,8 +42,9 @@ def fitted(parts: Sequence[str], columns: int) -> str:
 
 
 def folded(text: str, columns: int) -> str:
-    """`text` in lines of up to `columns`, which break between words, or if two blanks part something there alone."""
-    if "  " in text.strip():
+    """`text` in lines of up to `columns`, which break between words; where two blanks part what fits, there alone."""
+    parts = re.split(r"  +", text.strip())
+    if len(parts) > 1 and max(map(len, parts)) <= columns:
         text = re.sub(r"(?<=\S) (?=\S)", "\xa0", text)
     return textwrap.fill(text, columns, break_on_hyphens=False).replace("\xa0", " ")
 

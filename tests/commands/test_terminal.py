@@ -159,3 +159,16 @@ def test_a_table_in_a_file_has_a_line_a_row() -> None:
         "name                    m",
         *["with several words      1"] * 3,
     ]
+
+
+def test_a_sentence_breaks_between_words_behind_columns_too() -> None:
+    """Two blanks part columns, which stay whole if they fit; a long sentence behind them breaks between its words."""
+    sentence = "good  headings: leader +0.0 degrees from the follower; each one costs 6 mm of hover error"
+    lines = folded(sentence, 60).splitlines()
+    assert max(map(len, lines)) <= 60
+    assert " ".join(lines).split() == sentence.split()
+    assert folded("steps 12 of 20  eval return -3  eval peak 0.1", 24).splitlines() == [
+        "steps 12 of 20",
+        "eval return -3",
+        "eval peak 0.1",
+    ]
