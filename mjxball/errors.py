@@ -7,3 +7,12 @@ class InputError(ValueError):
 
 class TrainingDivergedError(RuntimeError):
     """A loss or a weight is not finite any more."""
+
+
+FOREIGN = (Exception, SystemExit)  # what a user's own module may raise: to leave the program is not its to say
+
+
+def said(error: BaseException) -> str:
+    """`error` of a user's own module in one line of printable text."""
+    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    return f"{type(error).__name__}: {' '.join(text.split())[:160]}"

@@ -13,8 +13,8 @@ from mjxball.baselines import LAWS
 from mjxball.config import Config
 from mjxball.control.followers import Follower
 from mjxball.control.observation import OBSERVATION_SIZE
-from mjxball.errors import InputError
-from mjxball.evaluate.followers import Make, answered, find_follower, said
+from mjxball.errors import InputError, said
+from mjxball.evaluate.followers import Make, answered, find_follower
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy import Policy, policy_path
 

@@ -10,7 +10,7 @@ import numpy as np
 from mjxball.baselines import LAWS, make_baseline
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Follower
-from mjxball.errors import InputError
+from mjxball.errors import FOREIGN, InputError, said
 from mjxball.train.extensions import find
 
 Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
@@ -80,7 +80,7 @@ def _guarded(name: str, function: Any, *arguments: Any) -> Any:
         return function(*arguments)
     except InputError:
         raise
-    except Exception as error:  # whatever somebody else's code raises
+    except FOREIGN as error:  # whatever somebody else's code raises
         raise InputError(f"follower {name} raised {said(error)}") from None
 
 
@@ -96,8 +96,3 @@ def answered(name: str, command: Any, observation: Any) -> np.ndarray:
     if not np.isfinite(command).all():
         raise InputError(f"follower {name} answered a number that is not finite")
     return command
-
-
-def said(error: Exception) -> str:
-    """`error` in one line."""
-    return f"{type(error).__name__}: {error}".splitlines()[0]

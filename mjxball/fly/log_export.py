@@ -115,7 +115,10 @@ def write_mcap(path: Path, log: Path) -> list[str]:
     remarks: list[str] = []
     header, *records = flight_log.read(log, remarks.append)
     # Nanoseconds since 1970, or since the log's own clock began.
-    shift = header.get("wall", header["t"]) - header["t"] if "wall" in header else 0.0
+    shift = header["wall"] - header["t"] if "wall" in header else 0.0
+    ends = [one["t"] + shift for one in (header, *records)]
+    if min(ends) < 0 or max(ends) >= 2**31:
+        raise InputError(f"flight log {log}: its wall clock, {header.get('wall', 0):g} s, is none that a bag can hold")
     rig = Rig.of_plant(header["config"].plant)
     about = {name: str(header[name]) for name in ABOUT if name in header}
     stream, schemas, newest = io.BytesIO(), dict[str, Any](), dict[str, DroneState]()

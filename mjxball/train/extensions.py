@@ -18,7 +18,7 @@ import numpy as np
 from mjxball.algorithms import ALGORITHMS
 from mjxball.config import Config
 from mjxball.env import TransportEnv
-from mjxball.errors import InputError
+from mjxball.errors import FOREIGN, InputError, said
 from mjxball.quiet import import_brax_env
 
 
@@ -56,8 +56,8 @@ def find(name: str, flag: str) -> Any:
             f"{flag} {name}: there is no module {error.name} here or among the installed packages; "
             "install it or run from its directory"
         ) from None
-    except Exception as error:
-        raise InputError(f"{flag} {name}: importing {module} raised {_said(error)}; mend that module") from None
+    except FOREIGN as error:
+        raise InputError(f"{flag} {name}: importing {module} raised {said(error)}; mend that module") from None
     if not hasattr(found, attribute):
         raise InputError(f"{flag} {name}: {module} has no {attribute}; check the name behind the colon")
     named = getattr(found, attribute)
@@ -185,8 +185,8 @@ def _made(kind: Any, config: Config, physics: str) -> Any:
         return kind(**{p.name: given[p.name] for p in fixed if p.name in given})
     except InputError:
         raise
-    except Exception as error:
-        raise InputError(f"{flag} could not be made: {_said(error)}; mend its constructor") from None
+    except FOREIGN as error:
+        raise InputError(f"{flag} could not be made: {said(error)}; mend its constructor") from None
 
 
 def _checked_env(env: Any, name: str, config: Config) -> Any:
@@ -243,8 +243,8 @@ def _has(env: Any, part: str) -> bool:
 def _read(flag: str, env: Any, part: str) -> Any:
     try:
         return getattr(env, part)
-    except Exception as error:
-        raise InputError(f"{flag}: {part} raised {_said(error)}; mend it") from None
+    except FOREIGN as error:
+        raise InputError(f"{flag}: {part} raised {said(error)}; mend it") from None
 
 
 def _takes(flag: str, what: str, function: Callable[..., Any], names: tuple[str, ...]) -> None:
@@ -281,10 +281,6 @@ def _check_callable(flag: str, what: str, function: Any) -> None:
 def _traced(flag: str, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return jax.eval_shape(function, *arguments)
-    except Exception as error:
+    except FOREIGN as error:
         mend = "it must be made of JAX operations" if isinstance(error, jax.errors.JAXTypeError) else "mend it"
-        raise InputError(f"{flag}: {what} raised {_said(error)}; {mend}") from None
-
-
-def _said(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
+        raise InputError(f"{flag}: {what} raised {said(error)}; {mend}") from None

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from mjxball.errors import InputError
+from mjxball.errors import FOREIGN, InputError, said
 from mjxball.terminal import Status
 from mjxball.train.events import Events, Point, Session, tags
 from mjxball.train.run_directory import CONFIG_FILE, read_metrics, write_rows
@@ -39,8 +39,8 @@ def started(tracker: Start, session: Session) -> Log:
     """What is called with every row. Raises InputError if there is none."""
     try:
         log = tracker(session.name, dict(session.settings))
-    except Exception as error:  # whatever another's program raises
-        raise InputError(f"--tracker raised {type(error).__name__}: {error}") from error
+    except FOREIGN as error:  # whatever another's program raises
+        raise InputError(f"--tracker raised {said(error)}") from error
     if not callable(log):
         raise InputError(f"--tracker must return what is called with every row, not {type(log).__name__}")
     return log
@@ -130,9 +130,9 @@ class Progress:
             return
         try:
             self._log({name: value for name, value in row.items() if value is not None})
-        except Exception as error:  # whatever another's program raises
+        except FOREIGN as error:  # whatever another's program raises
             self._log = None
-            self.say(f"warning: --tracker raised {type(error).__name__}: {error}; it is told no more rows")
+            self.say(f"warning: --tracker raised {said(error)}; it is told no more rows")
 
     def _lines(self) -> list[list[str]]:
         """What a terminal shows now."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,12 @@ def test_csv_and_parquet_hold_the_flight(log: Path, flight: Recording, tmp_path:
     assert list(columns) == list(rows[0])
 
 
+def clock(log: Path, other: Path, wall: str) -> Path:
+    """`log` with another wall clock."""
+    other.write_text(re.sub(r'"wall": [\d.e+]+', f'"wall": {wall}', log.read_text(), count=1))
+    return other
+
+
 def test_refusals(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "there.csv").write_text("mine")
     (tmp_path / "noise.jsonl").write_bytes(b"\x00\x01")
@@ -113,6 +120,8 @@ def test_refusals(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ([log, tmp_path / "new.csv", "--int8"], "takes no other flag"),
         ([tmp_path / "noise.jsonl", tmp_path / "new.mcap"], "noise.jsonl"),
         ([tmp_path / "none.jsonl", tmp_path / "new.mcap"], "none.jsonl"),
+        ([clock(log, tmp_path / "late.jsonl", "1e300"), tmp_path / "new.mcap"], "none that a bag can hold"),
+        ([clock(log, tmp_path / "early.jsonl", "-1e9"), tmp_path / "new.mcap"], "none that a bag can hold"),
     ]
     for arguments, reason in cases:
         assert call(main, arguments) == 2, arguments

@@ -37,6 +37,9 @@ def failing(name, settings):
 def broken(name, settings):
     raise KeyError("a key")
 
+def leaves(name, settings):
+    raise SystemExit("two\\nlines \\x1b[31m")
+
 def nothing(name, settings):
     pass
 """
@@ -47,6 +50,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, short_verdict: None) -
     """A directory with a module of trackers."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my_tracker.py").write_text(OWN)
+    (tmp_path / "leaving.py").write_text("raise SystemExit(0)")
     monkeypatch.delitem(sys.modules, "my_tracker", raising=False)
     return tmp_path
 
@@ -73,6 +77,8 @@ def test_every_row_is_told_and_a_failing_tracker_ends_nothing(here: Path, capsys
     ("name", "said"),
     [
         ("my_tracker:broken", "--tracker raised KeyError"),
+        ("my_tracker:leaves", "--tracker raised SystemExit: two lines [31m"),
+        ("leaving:start", "importing leaving raised SystemExit"),
         ("my_tracker:nothing", "must return what is called with every row"),
         ("my_tracker:told", "is no function of (name, settings)"),
         ("my_tracker:none", "has no none"),
