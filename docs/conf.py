@@ -36,6 +36,7 @@ default_role = "code"
 myst_enable_extensions = ["dollarmath", "fieldlist"]
 myst_heading_anchors = 4
 myst_dmath_double_inline = True
+smartquotes = False  # which makes a dash of the two before a flag
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
