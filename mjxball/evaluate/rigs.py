@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
 SECONDS = 30.0  # of a flight
-Change = Callable[[PipelineState], PipelineState]
 
 
 class Effort(NamedTuple):
@@ -61,12 +60,10 @@ def fly(
     flights: int = 3,
     seconds: float = SECONDS,
     seed: int = 0,
-    change: tuple[float, Change] | None = None,
 ) -> Flown:
     """Fly `flights` random flights of every rig (R) of one size, the same ones for every follower.
 
-    `laws`: one for all rigs, or R of one class, each made for its rig. `change`: (when [s], what then happens to the
-    world). In float32 on JAX's default device.
+    `laws`: one for all rigs, or R of one class, each made for its rig. In float32 on JAX's default device.
     """
     size, one_rig = int(rigs.size[0]), dataclasses.replace(config.rigs, number=1)
     # Of its plant only the number of drones counts, and its attitude loops are those of the preset's own law.
@@ -79,21 +76,12 @@ def fly(
         alike: Law = laws
         rebuild = lambda _: alike  # noqa: E731
     steps = round(seconds / env.dt)
-    at = -1 if change is None else round(change[0] / env.dt)
 
     def flight(key: Any, rig: RigTable, law: Law) -> Any:
         state = env.reset(key, 1.0, None, rig)
-        if change is not None:  # nothing of its own before
-            later = state.pipeline_state.load
-            later = later._replace(mass_change_time=later.mass_change_time + jnp.inf)
-            state = state.replace(pipeline_state=state.pipeline_state._replace(load=later))
 
-        def step(carry: tuple[State, Any, Any, Any], number: Any) -> Any:
+        def step(carry: tuple[State, Any, Any, Any], _: Any) -> Any:
             state, memory, far, effort = carry
-            if change is not None:
-                world = change[1](state.pipeline_state)
-                world = jax.tree.map(lambda new, old: jnp.where(number == at, new, old), world, state.pipeline_state)
-                state = state.replace(pipeline_state=world)
             world = state.pipeline_state
             error = jnp.linalg.norm(world.goal - world.loop.plant.position)
             far = far | (error > config.scenario.termination_distance) | world.loop.diverged
@@ -106,7 +94,7 @@ def fly(
             law = law.on(rig, own.plant)
         nothing = Effort(*(jnp.zeros(()) for _ in Effort._fields))
         start = (state, law.start(state.obs[..., :18]), jnp.zeros((), bool), nothing)
-        (_, _, far, effort), error = jax.lax.scan(step, start, jnp.arange(steps + 1))
+        (_, _, far, effort), error = jax.lax.scan(step, start, None, steps + 1)
         mean = jax.tree.map(lambda total: total / (steps + 1), effort)
         return error, far, mean._replace(tilt_spread=jnp.sqrt(mean.tilt_spread), lift_spread=jnp.sqrt(mean.lift_spread))
 
@@ -146,17 +134,6 @@ class AnyRigLaw(NetworkLaw):
         found = copy.copy(self)
         found._geometry = team_geometry(plant, rig.numbers.mounts, rig.size)
         return found
-
-
-def mass_changes(world: PipelineState) -> PipelineState:
-    """The change of the object's mass that was drawn (`rigs.mass_step`) happens now."""
-    load = world.load
-    return world._replace(load=load._replace(mass_change_time=jnp.zeros_like(load.mass_change_time)))
-
-
-def cg_jumps(world: PipelineState) -> PipelineState:
-    """The CG is where it would be half a period later, from one moment to the next."""
-    return world._replace(load=world.load._replace(cg_phase=world.load.cg_phase + jnp.pi))
 
 
 def rig_laws(config: Config, rigs: RigTable, make: Callable[[Config], Law]) -> list[Law]:

@@ -235,7 +235,7 @@ def _has(env: Any, part: str) -> bool:
         getattr(env, part)
     except AttributeError:
         return False
-    except Exception:
+    except FOREIGN:
         return True
     return True
 
