@@ -40,10 +40,10 @@ are in `policies/archive/`.
 two cores, the latter with `--algorithm ppo`. `brax-*` and `sb3-*` are Brax's and Stable-Baselines3's own SAC and PPO,
 of seed 0, in the same environment for as many steps: `python benchmarks/foreign_trainers.py sb3-sac sb3-sac.npz` takes
 117 CPU seconds for 768 000 steps, `brax-sac` 81 s; `sb3-ppo` takes 160 s for 4 million, `brax-ppo` 98 s.
-`balance-memoryless` is `balance` without its GRU and its last action: `python train.py balance --algorithm gradient
---follower.recurrent_units 0 --follower.previous_action false --gradient.policy_layers 64,64 --gradient.gradient_steps 500
---gradient.num_envs 64`, 219 CPU seconds. `memoryless` is a [classical law](followers.md). `raptor` is two policies of
-[RAPTOR](https://arxiv.org/abs/2509.11481), which command the rotors of leader and follower; `python
+`balance-memoryless` is `balance` without its GRU and its last action, 219 CPU seconds of `python train.py balance
+--algorithm gradient --follower.recurrent_units 0 --follower.previous_action false --gradient.policy_layers 64,64
+--gradient.gradient_steps 500 --gradient.num_envs 64`. `memoryless` is a [classical law](followers.md). `raptor` is two
+policies of [RAPTOR](https://arxiv.org/abs/2509.11481), which command the rotors of leader and follower; `python
 benchmarks/raptor.py` flies them.
 
 Columns: share met and its 95 % interval, flights that failed, median settling time, 90 % quantile of the peaks, time
