@@ -27,16 +27,17 @@ from mjxball.train.compilation import (
     partitioned_by_gspmd,
 )
 from mjxball.train.extensions import DEFAULTS, Extensions
-from mjxball.train.program import Mode, Program, Statistics, TrainState, report, train, warmup
+from mjxball.train.program import Program, Statistics, TrainState, report, train, warmup
 from mjxball.train.run_directory import Sweep, source_hash, versions
 
 
-class Executables(NamedTuple):
-    """A population's compiled functions."""
+class Compiled(NamedTuple):
+    """`Program`'s functions for all members of a population. What they return replaces their arguments' arrays."""
 
     begin: Callable[[Any, Any], TrainState]  # (swept values, keys) -> `Program.begin`
     episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `Program.episodes`
-    advance: Callable[..., tuple[TrainState, Statistics, Any, int]]  # (state, mode[, pause]), see `Population._advance`
+    collect: Callable[[TrainState, Statistics, Phase], tuple[TrainState, Statistics, Array]]
+    update: Callable[[TrainState, Array], tuple[TrainState, Any]]
     wait: Callable[[], Any]  # until all of them are compiled; raises what went wrong
 
 
@@ -108,7 +109,7 @@ class Population:
                     options = compiler_options(self.program.algorithm, self.members)
                     self._ahead = ThreadPoolExecutor(1).submit(self._collection.lower_carrying().compile, options)
 
-    def compile(self, creating: bool) -> Executables:
+    def compile(self, creating: bool) -> Compiled:
         """Compile everything a run needs, side by side; `begin` only if `creating`.
 
         On one device what is compiled already can be called while the rest still is.
@@ -129,35 +130,17 @@ class Population:
             finally:
                 pool.shutdown(wait=self.mesh is not None)
         collect, update, episodes, *begin = map(_when_ready, pending)
-        advance = functools.partial(self._advance, collect, update)
-        return Executables(
-            begin[0] if begin else self._begin, episodes, advance, lambda: [*map(Future.result, pending)]
+        return Compiled(
+            begin[0] if begin else self._begin,
+            episodes,
+            _of_trees(collect, 2),
+            lambda state, keys: self._named(_of_trees(update, 1)(state, keys)),
+            lambda: [*map(Future.result, pending)],
         )
 
-    def _advance(
-        self,
-        collect: Callable[..., Any],
-        update: Callable[..., Any],
-        state: TrainState,
-        mode: Mode,
-        pause: Callable[[], bool] = lambda: False,
-    ) -> tuple[TrainState, Statistics, dict[str, Any], int]:
-        """See `Program.advance`; also how many steps were taken before `pause` said to stop.
-
-        Results are there before the devices are done with them, unless they are CPUs.
-        """
-        phase, window = self.place(mode.phase, PartitionSpec()), self.program.algorithm.steps_per_collect
-        carried, structure = jax.tree.flatten((state, self._no_statistics()))
-        metrics, taken = jax.tree.leaves(self._no_metrics()), 0
-        while taken < int(mode.steps):
-            (keys,) = collect(carried, *phase)
-            if mode.phase.learning:
-                metrics = update(carried, keys)
-            taken += window
-            if pause():
-                break
-        state, statistics = jax.tree.unflatten(structure, carried)
-        return state, statistics, dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True)), taken
+    def _named(self, updated: Any) -> tuple[TrainState, dict[str, Array]]:
+        state, *metrics = updated
+        return state, dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True))
 
     def _lower_here(self, creating: bool) -> Iterator[Any]:
         """collect, update, episodes and, if `creating`, begin on one device; `read_ahead` may have had the first."""
@@ -176,7 +159,7 @@ class Population:
     @functools.cached_property
     def _collection(self) -> TracedProgram:
         def shapes() -> Any:
-            return self.template(), *jax.tree.map(_shape, (self._no_statistics(), warmup(1).phase))
+            return self.template(), *jax.tree.map(_shape, (self.no_statistics(), warmup(1).phase))
 
         return TracedProgram("collect", self._key, self._collect, shapes, others=len(warmup(1).phase))
 
@@ -198,7 +181,7 @@ class Population:
     def _lower_on_mesh(self, creating: bool) -> Iterator[Any]:
         """The same on several devices."""
         values, keys = self._starts(0)
-        state, statistics = self._placed_shapes(self.template(), self._state_spec), self._no_statistics()
+        state, statistics = self._placed_shapes(self.template(), self._state_spec), self.no_statistics()
         phase, drawn = (
             self._as_argument(warmup(1).phase, PartitionSpec()),
             self._as_argument(self._drawn(), self._whole),
@@ -224,11 +207,11 @@ class Population:
         compiled = jax.jit(flat, donate_argnums=range(count), out_shardings=[place.sharding for place in places])
         return Carrying(compiled.lower(*leaves), count, range(len(leaves)), range(count))
 
-    def start(self, executables: Executables, seed: int) -> TrainState:
+    def start(self, compiled: Compiled, seed: int) -> TrainState:
         """Fresh training states."""
         values, keys = self._starts(seed)
         training = self._as_argument(np.asarray(True), PartitionSpec())
-        return executables.begin(values, keys)._replace(envs=executables.episodes(values, keys, training))
+        return compiled.begin(values, keys)._replace(envs=compiled.episodes(values, keys, training))
 
     def start_from(self, state: TrainState, policies: Sequence[PolicyFile]) -> TrainState:
         """`state` with the network of one of `policies` in every member; see `FirstOrderGradient.start_from`."""
@@ -241,11 +224,11 @@ class Population:
         known = begun[0] if self._single else jax.tree.map(lambda *leaves: np.stack(leaves), *begun)
         return state._replace(algorithm=self.place(known, self._whole))
 
-    def evaluation_envs(self, executables: Executables) -> Any:
+    def evaluation_envs(self, compiled: Compiled) -> Any:
         """Newly reset environments, the same for every member and every evaluation."""
         values, keys = self._starts(0)
         first = self._as_argument(np.broadcast_to(_first_key(), keys.shape), self._whole)
-        return executables.episodes(values, first, self._as_argument(np.asarray(False), PartitionSpec()))
+        return compiled.episodes(values, first, self._as_argument(np.asarray(False), PartitionSpec()))
 
     def policy(self, state: TrainState, member: int) -> PolicyNetwork:
         """The policy of one member of a state of NumPy arrays."""
@@ -271,6 +254,10 @@ class Population:
     def _placed(self, tree: Any, specs: Any) -> Any:
         """`_as_argument` of the parts of a tree."""
         return jax.tree.map(lambda spec, part: self._as_argument(part, spec), specs, tree, is_leaf=_is_spec)
+
+    def place_phase(self, phase: Phase) -> Phase:
+        """A phase as `Compiled.collect` takes it."""
+        return self.place(phase, PartitionSpec())
 
     def place_keys(self, keys: np.ndarray) -> Array:
         """The members' keys, the same in every process, on their devices."""
@@ -323,7 +310,7 @@ class Population:
         specs = self._state_spec, self._whole
         return self._on_mesh(update, specs, specs, (0, 0))(self._values, state, keys)
 
-    def _no_statistics(self) -> Statistics:
+    def no_statistics(self) -> Statistics:
         """Of no steps."""
         each = () if self._single else (self.members,)
         zero: Any = np.zeros(each, np.float32)
@@ -332,9 +319,9 @@ class Population:
         statistics = Statistics(zero, zero, dict.fromkeys(names, zero), dict.fromkeys(names, peak))
         return self._placed(statistics, self._statistics_spec)
 
-    def _no_metrics(self) -> dict[str, Any]:
+    def no_metrics(self) -> dict[str, Any]:
         """Of no update."""
-        return dict.fromkeys(self.program.algorithm.metrics, self._no_statistics().reward)
+        return dict.fromkeys(self.program.algorithm.metrics, self.no_statistics().reward)
 
     def _drawn(self) -> np.ndarray:
         """Something like the keys that a collection leaves for the update."""
@@ -389,6 +376,17 @@ class Population:
 def _when_ready(pending: Future[Callable[..., Any]]) -> Callable[..., Any]:
     def call(*arguments: Any) -> Any:
         return pending.result()(*arguments)
+
+    return call
+
+
+def _of_trees(run: Callable[..., list[Array]], carried: int) -> Callable[..., Any]:
+    """`run` of `Carrying.compile` as a function of trees, of which it replaces the first `carried`."""
+
+    def call(*arguments: Any) -> Any:
+        leaves, structure = jax.tree.flatten(arguments[:carried])
+        others = run(leaves, *jax.tree.leaves(arguments[carried:]))
+        return *jax.tree.unflatten(structure, leaves), *others
 
     return call
 

@@ -27,12 +27,12 @@ from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
 from mjxball.train.events import session
 from mjxball.train.extensions import Extensions, is_pair, resolve
+from mjxball.train.loop import advance, learn
 from mjxball.train.population import Population
-from mjxball.train.program import Statistics, TrainState
+from mjxball.train.program import Mode, Statistics, TrainState
 from mjxball.train.progress import Progress, Row, Start, columns, started
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
 
-CHUNKS = 25  # rows of metrics.csv in a run, at most
 SAVE_EVERY = 60.0  # [s] after which the next row brings a checkpoint, besides those of evaluations
 
 
@@ -115,7 +115,7 @@ class Run:
         hardware = f"{os.cpu_count()} CPU cores" if kind == "cpu" else f"{self.population.devices} x {kind}"
         self.origin = {**origin, "parts": self.population.parts, "hardware": hardware}
         self._writes = processes.is_writer()
-        done = _count(resumed) if resumed else 0
+        self._reached = done = _count(resumed) if resumed else 0  # environment steps, the same for every member
         whole = session(config, origin["seed"], origin["seeds"], origin)
         log = started(tracker, whole) if tracker is not None and self._writes else None
         if self._writes:
@@ -157,12 +157,12 @@ class Run:
                 self._start()
                 stop.begun = True
                 beside()
-                self._loop(stop)
-                self._save()
-                if self._pending and not self._ended:
+                finished = learn(self, stop)
+                self.save()
+                if self._pending and finished:
                     self._pending = self._writer.submit(_keep_newest, self._pending, self._checkpoints)
                 self.progress.say(self._cost())
-            return not self._ended
+            return finished
 
     def close(self) -> None:
         """Wait until every checkpoint is on disk."""
@@ -200,56 +200,28 @@ class Run:
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
         self.progress.begin("training")
 
-    def _loop(self, stop: Stop) -> None:
-        total, first = self.population.program.total_rounds, self.population.program.warmup_rounds
-        evaluations = self._schedule.num_evaluations
-        done = self._steps() // self._schedule.num_envs
-        (ended,) = processes.any_of((stop.requested,))
-        if done < first and not ended:
-            self.state, *_ = self._compiled.advance(self.state, programs.warmup(first - done))
-            done = first
-        window = self.population.program.algorithm.steps_per_collect
-        chunk = math.ceil(total / CHUNKS / window) * window
-        chunks = math.ceil(total / chunk)
-        # Several processes must stop at the same step, and agree on that between chunks alone.
-        pause = (lambda: stop.requested) if jax.process_count() == 1 else lambda: False
-        flying: Chunk | None = None  # the devices are at it, or done with it
-        while done < total and not ended:
-            number = done // chunk + 1
-            goal = min(number * chunk, total)
-            begun = self._begin_chunk(goal - done, flying, pause)
-            done = min(done + begun.steps, goal)
-            if flying:  # looked at while the devices are at the next one, so that they need not wait
-                self.progress.show(self._row(flying))
-            # One that is cut short has no row: who resumes has one of the rest.
-            flying = begun if done == goal else None
-            late = self.progress.elapsed() - self._saved_at > SAVE_EVERY
-            # All processes act on what they agreed on here, whenever a signal reaches one of them.
-            ended, late = processes.any_of((stop.requested, late))
-            due = done == goal and number * evaluations // chunks > (number - 1) * evaluations // chunks
-            due = due or done >= total
-            if not (due or late or ended):
-                continue
-            if flying:
-                row, flying = self._row(flying), None
-                if due:
-                    row |= self._evaluated()
-                self.progress.show(row)
-            if due or late:
-                self._save()
-        self._ended = ended
+    @property
+    def done(self) -> int:
+        """Steps that every environment has taken, the warm-up with them."""
+        return self._reached // self._schedule.num_envs
 
-    def _steps(self) -> int:
-        return _count(self.state)
-
-    def _begin_chunk(self, steps: int, before: Chunk | None, pause: Callable[[], bool]) -> Chunk:
-        """Give the devices a chunk of training, behind that `before` it, or part of it if there is to be a `pause`."""
-        reached, began = before.reached if before else self._steps(), self.progress.elapsed()
-        self.state, statistics, metrics, taken = self._compiled.advance(self.state, programs.train(steps), pause)
+    def advance(self, mode: Mode, pause: Callable[[], bool] = lambda: False) -> Chunk:
+        """Give the devices a stretch of work, behind that they are at, or part of it if there is to be a `pause`."""
+        began = self.progress.elapsed()
+        self.state, statistics, metrics, taken = advance(self.population, self._compiled, self.state, mode, pause)
         ended = self._clock.submit(lambda: (jax.block_until_ready(statistics), self.progress.elapsed())[1])
-        return Chunk(taken, reached + taken * self._schedule.num_envs, began, ended, statistics, metrics)
+        self._reached += taken * self._schedule.num_envs
+        return Chunk(taken, self._reached, began, ended, statistics, metrics)
 
-    def _row(self, chunk: Chunk) -> Row:
+    def saved_long_ago(self) -> bool:
+        """Whether a checkpoint is due for time alone."""
+        return self.progress.elapsed() - self._saved_at > SAVE_EVERY
+
+    def show(self, row: Row) -> None:
+        """Print a row, and write it to metrics.csv and to what else keeps rows."""
+        self.progress.show(row)
+
+    def row(self, chunk: Chunk) -> Row:
         """What there is to say of a chunk, once the devices are done with it."""
         statistics, metrics = processes.gather((chunk.statistics, chunk.metrics))
         ended = chunk.ended.result()
@@ -273,28 +245,29 @@ class Run:
             "diverged": int(each(statistics.totals["diverged"]).sum()) if "diverged" in statistics.totals else 0,
         }
 
-    def _evaluated(self) -> Row:
+    def evaluate(self) -> Row:
         """Evaluate the policies, on the same fresh environments every time."""
         population, kept = self.population, self.state
         steps = population.program.evaluation_steps
         keys = processes.gather(kept.key)
         envs = population.evaluation_envs(self._compiled)
         lent = kept._replace(envs=envs, key=population.place_keys(keys))
-        after, statistics, *_ = self._compiled.advance(lent, programs.evaluate(steps))
+        after, statistics, *_ = advance(population, self._compiled, lent, programs.evaluate(steps))
         statistics = processes.gather(statistics)
         self.state = after._replace(envs=kept.envs, key=population.place_keys(keys))
         reward, ended = population.each(statistics.reward), population.each(statistics.ended)
         found = {"eval_return": population.program.evaluated_return(reward, ended)}
         found |= {f"eval_{name}": values for name, values in population.report(statistics, steps, True).items()}
         if population.members > 1:
-            self.members.add(self._steps(), found)
+            self.members.add(self._reached, found)
         return {name: _median_or_none(values) for name, values in found.items()}
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write policy and checkpoint, if there is anything new; the checkpoint in a thread of its own."""
         began = self.progress.elapsed()
-        if self._state is None or self._saved_steps == self._steps():
+        if self._state is None or self._saved_steps == self._reached:
             return
-        self._saved_steps = self._steps()
+        self._saved_steps = self._reached
         exported = self._export()
         kept = self._snapshot()
         if exported and self._checkpoints:
@@ -321,7 +294,7 @@ class Run:
 
     def _export(self) -> bool:
         """Write the policy file, of a population every member's and the best one's; False if none is sound."""
-        steps, exported = self._steps(), False
+        steps, exported = self._reached, False
         best = self.members.best()
         state = processes.gather(self.state._replace(envs=()))
         if not self._writes:

@@ -18,6 +18,7 @@ from mjxball.algorithms.ppo import ProximalPolicyOptimization
 from mjxball.train import program as programs
 from mjxball.train.compilation import TracedProgram, compiler_options
 from mjxball.train.extensions import Extensions, TracedOnce
+from mjxball.train.loop import advance
 from mjxball.train.population import Population
 
 
@@ -131,10 +132,10 @@ def test_the_longest_program_is_loaded_ahead_if_it_was_traced_before(
         population = Population(config, "newton-euler", extensions=Extensions(None, None, FirstOrderGradient))
         population.read_ahead()
         ahead.append(population._ahead is not None)
-        executables = population.compile(creating=True)
-        state = population.start(executables, 0)
+        compiled = population.compile(creating=True)
+        state = population.start(compiled, 0)
         for mode in (programs.warmup(2), programs.train(4)):
-            state, statistics, *_ = executables.advance(state, mode)
+            state, statistics, *_ = advance(population, compiled, state, mode)
         rewards.append(float(statistics.reward))
         assert int(state.steps) == 12
     assert ahead == [False, True]
