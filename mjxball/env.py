@@ -163,12 +163,11 @@ class TransportEnv:
     def reset(
         self,
         rng: Array,
-        difficulty: Float[Array, ""] | float = 1.0,
         number: Int[Array, ""] | None = None,
         rig: RigTable | None = None,
     ) -> State:
-        """A fresh world at rest or nearly so; `difficulty`, its `number` and `rig` as in `ResetDistribution.draw`."""
-        world, observation = self._fresh_world(rng, difficulty, number, rig)
+        """A fresh world at rest or nearly so; its `number` and `rig` as in `ResetDistribution.draw`."""
+        world, observation = self._fresh_world(rng, number, rig)
         zero = jnp.zeros(())
         names = ("error", "steady_error", "steady", "diverged", "tilt_error", "vertical_error")
         metrics = dict.fromkeys(names, zero)
@@ -275,12 +274,11 @@ class TransportEnv:
     def _fresh_world(
         self,
         rng: Array,
-        difficulty: Float[Array, ""] | float,
         number: Int[Array, ""] | None = None,
         chosen: RigTable | None = None,
     ) -> tuple[PipelineState, Float[Array, "... 18"]]:
         """(world, observation at its start)."""
-        load, plant, goal, rig = self._resets.draw(rng, difficulty, number, chosen)
+        load, plant, goal, rig = self._resets.draw(rng, number, chosen)
         numbers = () if rig is None else rig.numbers if rig.drawn is None else rig.drawn.numbers
         disturbances, sample = self._disturbances.start(jax.random.fold_in(rng, 1))
         delay = disturbances.delay if self._disturbances.present else 0

@@ -242,7 +242,7 @@ def trained(transport: Config) -> Trained:
 @pytest.fixture(scope="session")
 def remembering(transport: Config) -> Trained:
     """A follower with everything that it can remember; its critics are told more than it."""
-    follower = {"history": 3, "previous_action": True, "observation_averages": (0.1, 0.5), "privileged_critic": True}
+    follower = {"previous_action": True, "observation_averages": (0.1, 0.5), "privileged_critic": True}
     return make_trained(with_settings(transport, follower=follower))
 
 

@@ -16,7 +16,6 @@ from mjxball.config import Autopilot, Config, preset
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
-from mjxball.physics.autopilot import make_autopilot
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import hover_rotor_force, make_control_step, make_stepper, start_state
 from mjxball.policy import Policy
@@ -118,20 +117,6 @@ class TestPair:
         paper = dataclasses.replace(PAIR, autopilot=preset("stand").autopilot)
         state = flown(paper, (0.0, 0.0, 1.0), 1.0)
         assert 0.2 < state.velocity[0, 2] / 0.95 < 0.35
-
-    def test_empty_hands_fall_as_the_battery_sags(self) -> None:
-        """Force is lost at 2 % a second: after 2 s the climb is -g 0.02 t^2 / 2, with a motor lag's delay."""
-        sagging = dataclasses.replace(PAIR, autopilot=dataclasses.replace(PAIR.autopilot, sag=0.02, motor_curve=OLDER))
-        state = flown(sagging, (0.0, 0.0, 0.0), 2.0)
-        lag, t = PAIR.plant.rotor_lag, 2.0
-        # A ramp through the lag: t^2 / 2 - lag t + lag^2; the quantised hover thrust costs up to 1e-3 m/s.
-        assert state.velocity[0, 2] == pytest.approx(-9.81 * 0.02 * (t * t / 2 - lag * t + lag * lag), rel=0.01)
-
-    def test_empty_battery_gives_nothing_rather_than_less(self) -> None:
-        sagging = dataclasses.replace(PAIR, autopilot=dataclasses.replace(PAIR.autopilot, sag=0.5, motor_curve=OLDER))
-        state = flown(PAIR, (0.0, 0.0, 0.0), 0.01)._replace(time=np.array([5.0]))
-        _, force = make_autopilot(sagging)(state, np.zeros((1, 2, 3)), still_load())
-        assert not force.any()
 
     def test_hover_is_the_same_in_both_units(self) -> None:
         """The force at which the rotors start is what the first setpoint asks for."""

@@ -214,13 +214,14 @@ def test_memory_of_the_environment_follows_the_layout(remembering_pair: Compiled
     actions = jax.random.uniform(jax.random.key(14), (4, 3), minval=-1, maxval=1)
     states = remembering_pair.roll(first, actions)
     seen = [first.obs[:18], *states.obs[:, :18]]
-    # Behind three observations two averages of 21 numbers, the last action, and what critics are told.
-    history, last, told = slice(0, 54), slice(54 + 42, 57 + 42), 57 + 42
+    # Behind the observation two averages of 21 numbers, the last action, and what critics are told.
+    last, told = slice(18 + 42, 21 + 42), 21 + 42
     assert first.obs.shape == (told + 4,)
-    np.testing.assert_array_equal(first.obs[history], [*seen[0], *seen[0], *seen[0]])
-    np.testing.assert_array_equal(first.obs[54:told], np.zeros(45))
-    for number, older in ((0, (1, 0, 0)), (3, (4, 3, 2))):
-        np.testing.assert_array_equal(states.obs[number][history], np.concatenate([seen[k] for k in older]))
+    np.testing.assert_array_equal(first.obs[18:told], np.zeros(45))
+    average, share = seen[0], 1 - np.exp(-0.02 / 0.1)
+    for number in range(4):
+        average = average + share * (seen[number] - average)
+        np.testing.assert_allclose(states.obs[number][18:36], average - seen[number + 1], rtol=0, atol=1e-5)
         np.testing.assert_array_equal(states.obs[number][last], actions[number])
 
 

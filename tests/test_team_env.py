@@ -72,7 +72,7 @@ class TestRings:
         """The same commands to three drones, alone and with three that pad: the same accelerations."""
         config = settings(scenario__team_sizes=SIZES, scenario__cg_amplitude=(0.1, 0.1), scenario__start_tilt=0.3)
         env = TransportEnv(config, "newton-euler")
-        state = jax.jit(env.reset)(jax.random.key(1), 1.0, 1)
+        state = jax.jit(env.reset)(jax.random.key(1), 1)
         world = state.pipeline_state
         own = ring_config(config, 3)
         alone = TransportEnv(own, "newton-euler")
@@ -198,7 +198,7 @@ class TestWorlds:
 
     def test_every_follower_sees_its_own_errors_and_the_reward_is_its_own(self) -> None:
         env = TransportEnv(settings(scenario__noise=(1.0, 1.0)), "newton-euler")
-        state = jax.jit(env.reset)(jax.random.key(0), 1.0, 3)
+        state = jax.jit(env.reset)(jax.random.key(0), 3)
         angles = mount_angles(env.config.plant)
         seen = rotations.turned_about_z(np.asarray(state.obs[:, ERROR], float), angles)
         assert np.abs(seen - seen[0]).max() < 0.03  # ten deviations of 3 mm
@@ -250,7 +250,7 @@ class TestAgents:
         assert states.obs.shape == (11, env.observation_size)
         action = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (11, 3)), jnp.float32)
         step = jax.jit(environments.step)
-        envs, transition = step(environments.begin(states, 1.0), action, jax.random.PRNGKey(1))
+        envs, transition = step(environments.begin(states), action, jax.random.PRNGKey(1))
         world = jax.tree.map(lambda leaf: leaf[3], states.pipeline_state)
         one = blank(env, 1.0, 3).replace(pipeline_state=world, obs=states.obs[6:])
         alone = jax.jit(env.step)(one, action[6:])
@@ -336,7 +336,7 @@ def test_padded_worlds_move_alike_on_mjx_and_in_closed_form() -> None:
     """One world of each size, rigs of their own, 20 control steps in float32."""
     plants, keys = [], jax.random.split(jax.random.key(0), len(SIZES))
     envs = [TransportEnv(preset("team"), engine) for engine in ("mjx", "newton-euler")]
-    start = jax.jit(jax.vmap(envs[0].reset, in_axes=(0, None, 0)))(keys, 1.0, jnp.arange(len(SIZES)))
+    start = jax.jit(jax.vmap(envs[0].reset, in_axes=(0, 0)))(keys, jnp.arange(len(SIZES)))
     for env in envs:
         state, step = start, jax.jit(jax.vmap(env.step))
         answer = jnp.zeros((len(SIZES), 5, env.action_size)).at[..., :3].set(0.3)

@@ -41,7 +41,6 @@ class Schedule(NamedTuple):
     num_envs: int
     warmup_steps: int  # with random actions
     num_evaluations: int
-    curriculum: float  # share of the training over which the environment's difficulty grows to the whole, 0: none
 
 
 class PolicyNetwork(NamedTuple):

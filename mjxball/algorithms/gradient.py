@@ -77,7 +77,7 @@ class FirstOrderGradient:
         self._adam = optax.scale_by_adam(*own.adam_betas)
         self.steps_per_collect = own.horizon
         window = own.num_envs * own.horizon
-        self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations, 0.0)
+        self.schedule = Schedule((own.gradient_steps + 1) * window, own.num_envs, window, own.num_evaluations)
         self._slots = environments.recurrent_slots
         self._units = self._slots.stop - self._slots.start
         self._actions = environments.action_size - self._units

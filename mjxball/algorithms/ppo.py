@@ -58,7 +58,7 @@ class ProximalPolicyOptimization:
         self._config, self._environments, self._shards = ppo, environments, environments.shards
         self.steps_per_collect = ppo.unrolls * ppo.unroll_length
         self._count = environments.count * ppo.unrolls
-        self.schedule = Schedule(ppo.total_steps, ppo.num_envs, 0, ppo.num_evaluations, 0.0)
+        self.schedule = Schedule(ppo.total_steps, ppo.num_envs, 0, ppo.num_evaluations)
         self._mask = environments.policy_mask
         self._sizes = (environments.observation_size, environments.action_size - self._units)
         self.networks = make_networks(ppo, self._mask, self._sizes[1], environments.critic_mask)

@@ -239,9 +239,7 @@ class SoftActorCritic:
         self._steps = sac.recurrent_steps if self._units else 0
         needed = max(sac.n_step, self._steps)
         first = max(math.ceil(sac.warmup_steps / sac.num_envs), math.ceil(sac.batch_size / sac.num_envs), needed)
-        self.schedule = Schedule(
-            sac.total_steps, sac.num_envs, first * sac.num_envs, sac.num_evaluations, sac.curriculum
-        )
+        self.schedule = Schedule(sac.total_steps, sac.num_envs, first * sac.num_envs, sac.num_evaluations)
         self._sizes = (environments.observation_size, environments.action_size - self._units)
         self._mask = environments.policy_mask
         recurrent = slots if self._units else None

@@ -32,12 +32,6 @@ class Sac:
     alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
     n_step: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
-    curriculum: float = setting(
-        0.0,
-        "share of training over which the CG's amplitude and speed grow to the scenario's, 0: all from the start",
-        low=0,
-        high=1,
-    )
     tau: float = setting(0.02, "rate of the slow copies that give the targets", above=0, high=1)
     alpha: float = setting(0.02, "temperature at the start", above=0)
     alpha_fixed: bool = setting(False, "keep the temperature at its start")

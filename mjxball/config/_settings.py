@@ -63,7 +63,6 @@ class Autopilot:
     )
     hover_thrust: float = setting(46000.0, "thr_hov of the paper's law, calibrated for each rig", low=0, high=60000)
     thrust_per_acceleration: float = setting(1000.0, "k_pz of the paper's law [1/(m/s2)]", low=0)
-    sag: float = setting(0.0, "share of the thrust lost in a second of flight as the battery empties [1/s]", low=0)
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,6 @@ class Follower:
     error: Literal["object", "leader"] = setting(
         "object", "what the slots of the object's error carry: e_o, or the leader's e_l"
     )
-    history: int = setting(1, "observations that the network sees, the newest included", low=1, high=100)
     ignore_position: bool = setting(True, "the network does not see the absolute position")
     previous_action: bool = setting(False, "the network also sees its last action, scaled to [-1, 1]")
     observation_averages: tuple[float, ...] = setting(
@@ -181,11 +179,6 @@ class ScenarioRanges:
         0.0, "probability of a firmware that does not compensate for the battery", low=0, high=1
     )
     gust: Range = drawn((0.0, 0.0), "rms of a gust's force on each axis of the world [N]", low=0)
-    relay_probability: float = setting(
-        0.0, "probability that the object's error reaches the follower by messages, held in between", low=0, high=1
-    )
-    relay_rate: Range = drawn((5.0, 10.0), "messages a second in these flights [Hz]", above=0)
-    relay_loss: Range = drawn((0.0, 0.0), "share of their messages that is lost", low=0, high=0.9)
     rotor_lag_scale: Range = drawn((1.0, 1.0), "factor on the rotors' time constant", above=0)
     thrust_scale: Range = drawn((1.0, 1.0), "factor on each drone's rotor forces, drawn apart", above=0)
     thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", above=0)

@@ -103,13 +103,11 @@ def scale_action(scaled: Array, tilt_limit: float, vertical_limit: float) -> Arr
 class ObservationHistory(NamedTuple):
     """What the network sees besides the newest observation. By default nothing.
 
-    The memory (..., m) holds, in this order: `length` - 1 older observations, newest first; for each time constant
-    of `filters` an exponential average of the observations (18) and one of the network's actions (3); the last
-    action (3) if `previous_action`. Averages are what a linear observer of disturbances needs of the past, in a
-    tenth of the numbers of a history.
+    The memory (..., m) holds, in this order: for each time constant of `filters` an exponential average of the
+    observations (18) and one of the network's actions (3), which is what a linear observer of disturbances needs of
+    the past; the last action (3) if `previous_action`.
     """
 
-    length: int = 1  # observations, the newest included
     previous_action: bool = False
     filters: tuple[float, ...] = ()  # time constants [s]
     period: float = 0.02  # between two observations [s]
@@ -118,18 +116,13 @@ class ObservationHistory(NamedTuple):
     def size(self) -> int:
         """Length m of the memory, and what `network_input` is longer than an observation."""
         averages = len(self.filters) * (OBSERVATION_SIZE + ACTION_SIZE)
-        return self._older + averages + (ACTION_SIZE if self.previous_action else 0)
-
-    @property
-    def _older(self) -> int:
-        return (self.length - 1) * OBSERVATION_SIZE
+        return averages + (ACTION_SIZE if self.previous_action else 0)
 
     def start(self, observation: Array) -> Array:
         """Memory (..., m) at the start of an episode: always this `observation` (..., 18), and zero actions."""
         xp = observation.__array_namespace__()
         still = xp.zeros_like(observation[..., :ACTION_SIZE])
-        parts = [observation] * (self.length - 1) + [observation, still] * len(self.filters)
-        parts += [still] * self.previous_action
+        parts = [observation, still] * len(self.filters) + [still] * self.previous_action
         return xp.concat(parts, axis=-1) if parts else observation[..., :0]
 
     def next(self, memory: Array, observation: Array, scaled_action: Array) -> Array:
@@ -137,7 +130,7 @@ class ObservationHistory(NamedTuple):
         xp = observation.__array_namespace__()
         if not self.size:
             return memory
-        parts = [xp.concat([observation, memory[..., : self._older]], axis=-1)[..., : self._older]]
+        parts = []
         for average, tau in zip(self._averages(memory), self.filters, strict=True):
             new = xp.concat([observation, scaled_action], axis=-1)
             parts.append(average - math.expm1(-self.period / tau) * (new - average))
@@ -152,7 +145,7 @@ class ObservationHistory(NamedTuple):
         xp = observation.__array_namespace__()
         if not self.filters:
             return xp.concat([observation, memory], axis=-1)
-        parts = [observation, memory[..., : self._older]]
+        parts = [observation]
         for average in self._averages(memory):
             parts += [average[..., :OBSERVATION_SIZE] - observation, average[..., OBSERVATION_SIZE:]]
         return xp.concat([*parts, memory[..., self.size - ACTION_SIZE * self.previous_action :]], axis=-1)
@@ -161,8 +154,7 @@ class ObservationHistory(NamedTuple):
         """1 for each number of `network_input` that the network uses, 0 for absolute positions if it ignores them."""
         shown = [0.0 if ignore_position else 1.0] * 3 + [1.0] * (OBSERVATION_SIZE - 3)
         # How an absolute position differs from its average does not depend on where that is.
-        filtered = [1.0] * (OBSERVATION_SIZE + ACTION_SIZE)
-        return shown * self.length + filtered * len(self.filters) + [1.0] * (ACTION_SIZE * self.previous_action)
+        return shown + [1.0] * self.size
 
     def slowest_action(self, memory: Array) -> Array:
         """(..., 3) the network's own action in [-1, 1], averaged over the longest of `filters`."""
@@ -171,11 +163,10 @@ class ObservationHistory(NamedTuple):
 
     def _averages(self, memory: Array) -> list[Array]:
         width = OBSERVATION_SIZE + ACTION_SIZE
-        first = [self._older + k * width for k in range(len(self.filters))]
-        return [memory[..., k : k + width] for k in first]
+        return [memory[..., k * width : (k + 1) * width] for k in range(len(self.filters))]
 
 
 def observation_history(config: Config) -> ObservationHistory:
     """That of the follower of `config`."""
     follower, period = config.follower, config.timing.control_period
-    return ObservationHistory(follower.history, follower.previous_action, follower.observation_averages, period)
+    return ObservationHistory(follower.previous_action, follower.observation_averages, period)

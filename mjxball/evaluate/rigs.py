@@ -78,7 +78,7 @@ def fly(
     steps = round(seconds / env.dt)
 
     def flight(key: Any, rig: RigTable, law: Law) -> Any:
-        state = env.reset(key, 1.0, None, rig)
+        state = env.reset(key, None, rig)
 
         def step(carry: tuple[State, Any, Any, Any], _: Any) -> Any:
             state, memory, far, effort = carry

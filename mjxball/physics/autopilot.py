@@ -79,8 +79,7 @@ def make_autopilot(config: Config, parameters: PlantParameters | None = None) ->
         euler, rates = (xp.broadcast_to(vector[..., None, :], commands.shape) for vector in (euler, state.rates))
         integrals = crazyflie.integral_shares(xp, law, state.rates.dtype, config.plant.count, config.plant.leader)
         loops, duty = crazyflie.cascade(law, state.loops, sent, euler, rates, integrals)
-        left = xp.maximum(1.0 - law.sag * state.time, xp.zeros_like(state.time))[..., None, None]
-        return loops, left * crazyflie.motor_force(law.motor_curve, duty)
+        return loops, crazyflie.motor_force(law.motor_curve, duty)
 
     return firmware
 

@@ -36,7 +36,7 @@ def policy_file(
     card = {
         "format_version": 5 if law.units else 1,
         "observation": [list(slot) for slot in OBSERVATION],
-        "history": follower.history,
+        "history": 1,  # observations; more were possible until 0.1.0
         "previous_action": follower.previous_action,
         "filters": list(follower.observation_averages),
         **({"recurrent_units": law.units} if law.units else {}),

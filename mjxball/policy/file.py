@@ -77,7 +77,7 @@ def law_of(card: dict[str, Any]) -> FollowerLaw:
     """What is around the network of a policy file; `filters` is absent from the first files."""
     filters = tuple(card.get("filters", ()))
     return FollowerLaw(
-        history=ObservationHistory(card["history"], card["previous_action"], filters, float(card["control_period"])),
+        history=ObservationHistory(card["previous_action"], filters, float(card["control_period"])),
         action_scale=tuple(card["action_reach"]),
         limits=tuple(card["command_limits"]),
         kp=tuple(card["leader_kp"]),
@@ -266,8 +266,8 @@ def _check_card(card: dict[str, Any], name: str) -> None:
 def _check_card_numbers(card: dict[str, Any], name: str) -> None:
     if card["action_mode"] not in ("residual", "direct"):
         raise PolicyFileError(f"{name}: action_mode must be residual or direct, not {card['action_mode']!r}")
-    if not 1 <= card["history"] <= 100:
-        raise PolicyFileError(f"{name}: history must be 1 to 100, not {card['history']}")
+    if card["history"] != 1:
+        raise PolicyFileError(f"{name}: history must be 1, not {card['history']}; more of it mjxball 0.1.0 flies")
     filters = card.get("filters", [])
     if not isinstance(filters, list) or len(filters) > 10 or not all(is_finite(t) and t >= 1e-3 for t in filters):
         raise PolicyFileError(f"{name}: filters must be up to 10 time constants of at least 1 ms")

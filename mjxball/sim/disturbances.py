@@ -254,7 +254,6 @@ class RandomState(NamedTuple):
     force: Float[Array, "3"]  # external force on O in the world, now [N]
     drift: Any = ()  # (..., 18) slow error, now, in units of `DRIFT`; () if there is none
     drift_level: Any = ()  # () in units of `DRIFT`
-    relay: Any = ()  # (3,) messages a second, 0: at once; share lost; share of the next one that is over; or ()
 
 
 class RandomDisturbances:
@@ -264,9 +263,7 @@ class RandomDisturbances:
         scenario, self._period = config.scenario, config.timing.control_period
         self._ranges = (scenario.noise, scenario.delay, scenario.gust)
         self._drift, self._calm = scenario.estimator_drift, scenario.calm_probability
-        self._relay = (scenario.relay_probability, scenario.relay_rate, scenario.relay_loss)
-        self._relays = scenario.relay_probability > 0
-        self.present = any(high > 0 for _, high in (*self._ranges, self._drift)) or scenario.quantize or self._relays
+        self.present = any(high > 0 for _, high in (*self._ranges, self._drift)) or scenario.quantize
         self.sensors = SensorModel(math.floor(scenario.delay[1] / self._period + 0.5), None, scenario.quantize)
         self._shape = (*followers_axis(config), OBSERVATION_SIZE)
 
@@ -290,18 +287,11 @@ class RandomDisturbances:
             level = jnp.where(calm, 0.0, low + (high - low) * random.uniform(random.fold_in(noise_key, 2)))
             drift = level * random.normal(random.fold_in(noise_key, 3), self._shape)
         steps = jnp.round(delay / self._period).astype(jnp.int32)
-        relay: Any = ()
-        if self._relays:
-            probability, (slow, fast), (least, most) = self._relay
-            drawn = random.uniform(random.fold_in(noise_key, 4), (3,))
-            rate = jnp.where(drawn[0] < probability, slow + (fast - slow) * drawn[1], 0.0)
-            relay = jnp.stack([rate, least + (most - least) * drawn[2], jnp.zeros(())])
-        state = RandomState(key, noise, steps, gust, gust * random.normal(force_key, (3,)), drift, level, relay)
-        return state, self._sample(state, noise_key, jnp.ones((), bool) if self._relays else None)
+        state = RandomState(key, noise, steps, gust, gust * random.normal(force_key, (3,)), drift, level)
+        return state, self._sample(state, noise_key)
 
     def step(self, state: Any) -> tuple[Any, Sample]:
         """(state, sample) one control period on."""
-        from jax import numpy as jnp
         from jax import random
 
         if not self.present:
@@ -312,18 +302,12 @@ class RandomDisturbances:
             fresh = random.normal(random.fold_in(noise_key, 1), self._shape)
             drift = gauss_markov(drift, fresh, self._period / DRIFT_TIME, state.drift_level)
         force = gauss_markov(state.force, random.normal(force_key, (3,)), self._period / GUST_TIME, state.gust)
-        relay, received = state.relay, None
-        if self._relays:
-            rate, lost, sent = relay[0], relay[1], relay[2] + self._period * relay[0]
-            arrives = (sent >= 1.0) & (random.uniform(random.fold_in(noise_key, 5)) >= lost)
-            received = arrives | (rate == 0)
-            relay = jnp.stack([rate, lost, sent - jnp.floor(sent)])
-        state = state._replace(key=key, force=force, drift=drift, relay=relay)
-        return state, self._sample(state, noise_key, received)
+        state = state._replace(key=key, force=force, drift=drift)
+        return state, self._sample(state, noise_key)
 
-    def _sample(self, state: RandomState, key: Array, received: Array | None) -> Sample:
+    def _sample(self, state: RandomState, key: Array) -> Sample:
         from jax import random
 
         white = random.normal(key, self._shape)
         drift = state.drift if self._drift[1] > 0 else None
-        return Sample(measurement_errors(state.noise, white, drift), received, state.force)
+        return Sample(measurement_errors(state.noise, white, drift), force=state.force)

@@ -80,13 +80,11 @@ class ResetDistribution:
     def draw(
         self,
         rng: Array,
-        difficulty: Scalar | float = 1.0,
         number: Int[Array, ""] | None = None,
         chosen: rigs.RigTable | None = None,
     ) -> tuple[Load, PlantState, Vector, Rig | None]:
         """(load, plant at rest or nearly so, goal (3,) of O [m], the world's own rig if it has one).
 
-        `difficulty` () in [0, 1]: the lower share of the ranges of the CG's amplitude and speed, which is drawn from.
         `number` of the world, of which its team's size follows; None: any of `scenario.team_sizes`. `chosen`: its rig.
         """
         scenario = self.config.scenario
@@ -116,8 +114,8 @@ class ResetDistribution:
         load = Load(
             object_mass=mass,
             believed_mass=believed,
-            cg_amplitude=between(*lower_part(scenario.cg_amplitude, difficulty)),
-            cg_speed=between(*lower_part(scenario.cg_speed, difficulty)),
+            cg_amplitude=between(*scenario.cg_amplitude),
+            cg_speed=between(*scenario.cg_speed),
             cg_phase=between(0.0, 2 * jnp.pi),
             mass_change=between(*scenario.mass_change)[None],
             mass_change_time=between(*MASS_CHANGE_TIME)[None],
@@ -388,9 +386,3 @@ class ResetDistribution:
             places = radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
         visits = jax.random.uniform(key) < self.config.scenario.cg_waypoint_probability
         return load._replace(cg_path=places, follows_path=visits.astype(jnp.float32))
-
-
-def lower_part(ends: tuple[float, float], share: Scalar | float) -> tuple[float, Scalar | float]:
-    """The lower `share` () of the range between `ends`."""
-    low, high = ends
-    return low, high if isinstance(share, float) and share == 1.0 else low + share * (high - low)

@@ -151,11 +151,6 @@ class Rewarded:
             raise AttributeError(name)
         return getattr(self.env, name)
 
-    def reset(self, rng: Any, *difficulty: Any) -> Any:
-        """See the environment's own."""
-        graded = len(inspect.signature(self.env.reset).parameters) > 1
-        return self.env.reset(rng, *difficulty) if graded else self.env.reset(rng)
-
     def step(self, state: Any, action: Any) -> Any:
         """The environment's own, but for the reward."""
         after = self.env.step(state, action)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -52,7 +51,6 @@ class Envs(NamedTuple):
 
     states: Any  # brax State of all environments
     statistics: Statistics
-    difficulty: Float[Array, ""] | float  # of what is drawn at a reset, 0 to 1: see `Schedule.curriculum`
 
 
 def report(env: Any, totals: Mapping[str, Any], peaks: Mapping[str, Any], count: float, evaluation: bool) -> Any:
@@ -109,11 +107,10 @@ SHARED = ("done", "metrics", "info")  # fields of a state that all followers of 
 class Environments:
     """`count` environments on each shard; see `mjxball.algorithms.base.Environments`.
 
-    Beyond Brax's `Env` an environment may have `input_mask` and `critic_mask` (n,), `report` (above), and a second
-    argument of `reset`, the difficulty of what is drawn. One with `team_sizes` is of several followers (see
-    `mjxball.env`): each of them counts as one of `count`, and states hold (count, ...) but for their `pipeline_state`,
-    which holds worlds; a world starts anew as its first follower does. Its `reset` has a third argument, the world's
-    number.
+    Beyond Brax's `Env` an environment may have `input_mask` and `critic_mask` (n,), and `report` (above). One with
+    `team_sizes` is of several followers (see `mjxball.env`): each of them counts as one of `count`, and states hold
+    (count, ...) but for their `pipeline_state`, which holds worlds; a world starts anew as its first follower does. Its
+    `reset` has a second argument, the world's number.
     """
 
     def __init__(self, env: Any, count: int, shards: Shards | None = None):
@@ -123,7 +120,6 @@ class Environments:
         self.policy_mask = getattr(env, "input_mask", None) or [1.0] * self.observation_size
         self.critic_mask = getattr(env, "critic_mask", None) or self.policy_mask
         self.smooth = is_pair(env)
-        self._graded = len(inspect.signature(env.reset).parameters) > 1
         self._step = jax.vmap(env.step)
         sizes = getattr(env, "team_sizes", None)
         self._agents = Agents(sizes, env.config.plant.count - 1, count) if sizes else None
@@ -133,16 +129,14 @@ class Environments:
     def _worlds(self) -> int:
         return self._agents.worlds if self._agents else self.count
 
-    def reset(self, key: Array, difficulty: Float[Array, ""] | float = 1.0) -> Any:
+    def reset(self, key: Array) -> Any:
         """New states of all environments."""
         keys = jax.random.split(self.shards.own(key), self._worlds)
         if self._agents:
             numbers = jnp.arange(self._worlds)
-            fresh = jax.vmap(lambda one, number: self.env.reset(one, difficulty, number))(keys, numbers)
+            fresh = jax.vmap(self.env.reset)(keys, numbers)
             return self._agents.shown(fresh)
-        if not self._graded:
-            return jax.vmap(self.env.reset)(keys)
-        return jax.vmap(lambda one: self.env.reset(one, difficulty))(keys)
+        return jax.vmap(self.env.reset)(keys)
 
     def staggered(self, states: Any, key: Array, episode_steps: int) -> Any:
         """`states` with part of their episodes behind them, so that they do not end together."""
@@ -155,12 +149,12 @@ class Environments:
             return states.replace(pipeline_state=world._replace(steps=steps))
         return states
 
-    def begin(self, states: Any, difficulty: Float[Array, ""] | float) -> Envs:
+    def begin(self, states: Any) -> Envs:
         """`states` with empty statistics."""
         zero = jnp.zeros(())
         totals = dict.fromkeys(states.metrics, zero)
         peaks = dict.fromkeys(states.metrics, jnp.zeros(self.count))
-        return Envs(states, Statistics(zero, zero, totals, peaks), difficulty)
+        return Envs(states, Statistics(zero, zero, totals, peaks))
 
     def rewritten(self, transform: Callable[[Callable[..., Any]], Callable[..., Any]]) -> Environments:
         """See `mjxball.algorithms.base.Environments`."""
@@ -170,7 +164,7 @@ class Environments:
 
     def drawn(self, envs: Envs, key: Array) -> Any:
         """See `mjxball.algorithms.base.Environments`."""
-        return self.reset(key, envs.difficulty)
+        return self.reset(key)
 
     def restart(self, envs: Envs, key: Array, others: Bool[Array, " envs"] | None = None) -> Envs:
         """See `mjxball.algorithms.base.Environments`."""
@@ -213,7 +207,7 @@ class Environments:
         totals = {name: values.sum() for name, values in after.metrics.items()}
         statistics = joined(envs.statistics, Statistics(after.reward.mean(), terminated.sum(), totals, after.metrics))
         transition = Transition(before.obs, action, after.reward, terminated, after.obs, after.done)
-        stepped = Envs(after, statistics, envs.difficulty)
+        stepped = Envs(after, statistics)
         if fresh is not None:
             return stepped._replace(states=self._mixed(after.done.astype(bool), fresh, after)), transition
         return stepped if key is None else self.restart(stepped, key), transition
@@ -307,17 +301,9 @@ class Program:
         """
         _, env_key, stagger_key, _ = jax.random.split(key, 4)
         own_key = jnp.where(training, env_key, jax.random.fold_in(key, EVALUATION_DRAW))
-        envs = self.environments.reset(own_key, self._difficulty(jnp.zeros((), jnp.int32), training))
+        envs = self.environments.reset(own_key)
         staggered = self.environments.staggered(envs, stagger_key, self.config.timing.episode_steps)
         return jax.tree.map(lambda new, old: jnp.where(training, new, old), staggered, envs)
-
-    def _difficulty(self, steps: Int[Array, ""], recording: Bool[Array | np.ndarray, ""]) -> Float[Array, ""] | float:
-        """How hard the drawn environments are after so many `steps`, 0 to 1; in evaluation as hard as can be."""
-        share = self.schedule.curriculum
-        if share == 0:
-            return 1.0
-        grown = jnp.clip(steps / (share * self.schedule.total_steps), 0.0, 1.0)
-        return jnp.where(recording, grown, 1.0)
 
     def advance(self, state: TrainState, mode: Mode) -> tuple[TrainState, Statistics, dict[str, Float[Array, ""]]]:
         """Step all environments `mode.steps` times (rounded up to whole collections), and learn.
@@ -333,7 +319,7 @@ class Program:
             return state, statistics, metrics
 
         metrics = dict.fromkeys(self.algorithm.metrics, jnp.zeros(()))
-        start = (state, self.environments.begin(state.envs, 1.0).statistics, metrics)
+        start = (state, self.environments.begin(state.envs).statistics, metrics)
         rounds = -(-mode.steps // self.algorithm.steps_per_collect)
         return jax.lax.fori_loop(0, rounds, body, start)
 
@@ -342,7 +328,7 @@ class Program:
         algorithm = self.algorithm
         # One draw for many keys: each draw is kernels to compile and to launch.
         keys = jax.random.split(state.key, algorithm.collect_keys + algorithm.update_keys + 1)
-        envs = self.environments.begin(state.envs, self._difficulty(state.steps, phase.recording))
+        envs = self.environments.begin(state.envs)
         with jax.default_matmul_precision(MATMUL_PRECISION):
             known, envs = algorithm.collect(state.algorithm, envs, list(keys[: algorithm.collect_keys]), phase)
         taken = self.schedule.num_envs * algorithm.steps_per_collect

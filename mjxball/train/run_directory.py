@@ -233,7 +233,7 @@ def differences(recorded: Mapping[str, Any]) -> list[str]:
     return found
 
 
-UNSWEPT = ("sac.curriculum", "gradient.impulse_response_from")  # the program branches on them
+UNSWEPT = ("gradient.impulse_response_from",)  # the program branches on it
 # Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
 SWEEPABLE = (
     *(

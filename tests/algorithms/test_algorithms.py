@@ -76,7 +76,7 @@ def gradient_of(
         state = algorithm.init(jax.random.PRNGKey(1))._replace(
             layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=jnp.ones((), jnp.int32)
         )
-        after, _ = algorithm.collect(state, environments.begin(states, 1.0), [jax.random.PRNGKey(2)], TRAIN)
+        after, _ = algorithm.collect(state, environments.begin(states), [jax.random.PRNGKey(2)], TRAIN)
         return after.loss, after.slope["hidden_0"]["kernel"]
 
     loss, slope = jax.jit(collected)(swept or {})
@@ -164,7 +164,7 @@ def test_an_impulse_response_begins_to_count_late_in_one_branch_for_all_members(
         state = algorithm.init(jax.random.PRNGKey(1))._replace(
             layers={"hidden_0": {"kernel": kernel, "bias": jnp.zeros(2)}}, windows=windows
         )
-        after, _ = algorithm.collect(state, environments.begin(states, 1.0), [jax.random.PRNGKey(2)], TRAIN)
+        after, _ = algorithm.collect(state, environments.begin(states), [jax.random.PRNGKey(2)], TRAIN)
         return after.loss
 
     both = jax.vmap(loss)
@@ -200,7 +200,7 @@ def test_what_no_action_reaches_needs_no_gradient(transport: Config) -> None:
     environments = Environments(Pursuing(), 32, Shards())
     algorithm = FirstOrderGradient(transport, environments)
     states = environments.reset(jax.random.PRNGKey(0))
-    begun = environments.begin(states, 1.0)
+    begun = environments.begin(states)
     known, _ = algorithm.collect(algorithm.init(jax.random.PRNGKey(1)), begun, [jax.random.PRNGKey(2)], TRAIN)
     assert all(np.abs(slope["bias"]).max() > 0 for slope in known.slope.values())
 
@@ -211,7 +211,7 @@ def test_the_first_window_normalises_the_observations(transport: Config) -> None
     states = environments.reset(jax.random.PRNGKey(0))
     first = Phase(jnp.asarray(True), jnp.asarray(False))
     known, _ = algorithm.collect(
-        algorithm.init(jax.random.PRNGKey(1)), environments.begin(states, 1.0), [jax.random.PRNGKey(2)], first
+        algorithm.init(jax.random.PRNGKey(1)), environments.begin(states), [jax.random.PRNGKey(2)], first
     )
     policy = algorithm.policy(known)
     # Some of the environments begin anew with the window, at states of the same distribution.

@@ -142,7 +142,7 @@ def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent)
     key = jax.random.PRNGKey(2)
     with jax.default_matmul_precision("highest"):
         environments = Environments(env, worlds)
-        envs = environments.begin(environments.reset(jax.random.key(0)), 1.0)
+        envs = environments.begin(environments.reset(jax.random.key(0)))
         losses = []
         for response in (0.0, weight):
             config = with_settings(recurrent.config, gradient={**own, "impulse_response": response})
@@ -188,7 +188,7 @@ def test_what_was_seen_once_is_remembered(name: str, transport: Config) -> None:
         return parts[: algorithm.collect_keys], parts[algorithm.collect_keys :], phases
 
     states = environments.reset(jax.random.key(0))
-    carry = algorithm.init(jax.random.key(1)), environments.begin(states, 1.0)
+    carry = algorithm.init(jax.random.key(1)), environments.begin(states)
     warm = algorithm.schedule.warmup_steps // (64 * algorithm.steps_per_collect)
     scan = jax.jit(lambda carry, keys: jax.lax.scan(one, carry, keys)[0])
     if warm:
@@ -213,7 +213,7 @@ def test_sequences_are_answered_as_their_steps_were(transport: Config) -> None:
     """Also where an episode ends among them; and a state that another policy left is not believed."""
     algorithm, environments = algorithm_of("sac", transport)
     state = algorithm.init(jax.random.key(1))
-    envs = environments.begin(environments.reset(jax.random.key(0)), 1.0)
+    envs = environments.begin(environments.reset(jax.random.key(0)))
     policy, statistics, network = state.learner.policy, state.learner.normaliser, algorithm.networks.policy_network
     seen, found = [], []
     for _ in range(EPISODE + 4):

@@ -123,7 +123,7 @@ DAMAGES: dict[str, tuple[Callable[[dict, dict], None], str]] = {
     "another slot": (_in_card("observation", lambda slots: [*slots, "battery"]), "observation"),
     "fewer observations": (_in_card("observation", lambda slots: slots[:-1]), "observation"),
     "another action": (_in_card("action", lambda slots: slots[::-1]), "action"),
-    "longer history": (_in_card("history", lambda _: 2), "shape"),
+    "longer history": (_in_card("history", lambda _: 2), "history"),
     "another rate": (_in_card("control_period", lambda _: 0.01), "control period"),
     "another plant": (_in_card("plant", lambda plant: {**plant, "arm": 0.2}), "plant"),
     "number beyond any float": (_in_card("gravity", lambda _: 10**400), "gravity"),

@@ -209,7 +209,6 @@ class TestValidate:
             ("command.tilt_limit", 1.3),
             ("leader.kp", (0.5, -0.5, 0.5)),
             ("follower.action", "indirect"),
-            ("follower.history", 0),
             ("timing.control_period", 0.0),
             ("timing.episode_steps", 0),
             ("scenario.object_mass", (0.3, 0.1)),

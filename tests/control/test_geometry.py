@@ -59,7 +59,7 @@ def test_turning_a_team_changes_nothing() -> None:
 
 def test_worlds_of_training_are_told_what_a_flight_is_told() -> None:
     env = TransportEnv(configs.replace(TEAM, "scenario.mount_scale", (1.0, 1.0)), ENGINE)
-    world = jax.jit(env.reset)(jax.random.key(0), 1.0, 1).pipeline_state  # of three drones
+    world = jax.jit(env.reset)(jax.random.key(0), 1).pipeline_state  # of three drones
     np.testing.assert_allclose(world.history[:2, -4:], geometry_of(ring(3).plant), rtol=1e-5, atol=1e-6)
 
 

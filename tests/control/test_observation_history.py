@@ -9,7 +9,7 @@ import pytest
 
 from mjxball.control.observation import OBSERVATION, ObservationHistory
 
-FULL = ObservationHistory(length=3, previous_action=True, filters=(0.1, 0.5), period=0.02)
+FULL = ObservationHistory(previous_action=True, filters=(0.1, 0.5), period=0.02)
 
 
 @pytest.mark.parametrize(
@@ -17,10 +17,8 @@ FULL = ObservationHistory(length=3, previous_action=True, filters=(0.1, 0.5), pe
     [
         (ObservationHistory(), 0),
         (ObservationHistory(previous_action=True), 3),
-        (ObservationHistory(length=3), 36),
-        (ObservationHistory(length=3, previous_action=True), 39),
         (ObservationHistory(filters=(0.1,)), 21),
-        (FULL, 36 + 42 + 3),
+        (FULL, 42 + 3),
     ],
 )
 def test_size_is_what_the_memory_holds(history: ObservationHistory, size: int) -> None:
@@ -36,21 +34,15 @@ def test_size_is_what_the_memory_holds(history: ObservationHistory, size: int) -
 def test_memory_starts_as_if_the_first_observation_had_always_been() -> None:
     seen = np.arange(18.0)
     memory = FULL.start(seen)
-    np.testing.assert_array_equal(memory, [*seen, *seen, *seen, 0, 0, 0, *seen, 0, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(memory, [*seen, 0, 0, 0, *seen, 0, 0, 0, 0, 0, 0])
     shown = FULL.network_input(seen, memory)
-    np.testing.assert_array_equal(shown, [*seen, *seen, *seen, *[0] * 42, 0, 0, 0])
+    np.testing.assert_array_equal(shown, [*seen, *[0] * 42, 0, 0, 0])
 
 
-def test_history_keeps_the_newest_first() -> None:
-    history = ObservationHistory(length=3, previous_action=True)
-    observations = [np.full(18, float(k)) for k in range(5)]
-    actions = [np.full(3, 0.1 * k) for k in range(5)]
-    memory = history.start(observations[0])
-    for seen, action in zip(observations, actions, strict=True):
-        memory = history.next(memory, seen, action)
-    np.testing.assert_array_equal(memory, [*observations[4], *observations[3], *actions[4]])
-    seen = history.network_input(np.full(18, 5.0), memory)
-    np.testing.assert_array_equal(seen, [*[5.0] * 18, *[4.0] * 18, *[3.0] * 18, *actions[4]])
+def test_the_last_action_stands_at_the_end() -> None:
+    memory = FULL.next(FULL.start(np.zeros(18)), np.zeros(18), np.array([0.1, 0.2, 0.3]))
+    np.testing.assert_array_equal(memory[-3:], [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(FULL.network_input(np.zeros(18), memory)[-3:], [0.1, 0.2, 0.3])
 
 
 def test_the_slowest_action_is_that_of_the_longest_average() -> None:

@@ -206,7 +206,7 @@ def moved():
             changes[f"scenario.{name}_scale"] = (1.3, 1.3)
         base = configs.apply_overrides(preset("team"), changes)
         env = TransportEnv(base, "newton-euler")
-        state = env.reset(jax.random.key(3), 1.0, 0)
+        state = env.reset(jax.random.key(3), 0)
         if not steps:
             steps.append(jax.jit(env.step_with_command))
         for _ in range(3):

@@ -156,7 +156,7 @@ def test_of_what_is_huge(value: float) -> None:
     [
         {},
         {"context": ["share"]},
-        {"history": 2, "filters": [0.1]},
+        {"filters": [0.1]},
         {"action_mode": "direct"},
         {"leader_kp": [0.5, 0.7, 0.9], "leader_kd": [1, 1.2, 1.4]},
     ],
@@ -165,7 +165,7 @@ def test_of_what_is_huge(value: float) -> None:
 def test_of_a_recurrent_network(
     heads: tuple[int, ...], fields: dict[str, Any], dtype: type, recurrent: Recurrent
 ) -> None:
-    """Also told its team, with another history, without a law, other gains; one layer is left to the law of arrays."""
+    """Also told its team, with averages, without a law, other gains; one layer is left to the law of arrays."""
     random, card = np.random.default_rng(6), {**recurrent.contents.card, **fields, "command_limits": [0.3, 0.6]}
     card["team"] = {"drone": 1, "mount_angle": 0.0, "context": [2.0, 3.0, -4.0, 5.0]}
     law, draw = law_of(card), lambda *shape: (random.normal(size=shape) / np.sqrt(shape[0])).astype(np.float32)

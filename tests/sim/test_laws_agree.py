@@ -41,7 +41,7 @@ LIMITS, REACH, G = (0.6, 6.0), (0.2, 2.0), 9.81
 RECURRENT = follower_law(preset("team"))
 TOLD, STATE = random.uniform(1, 3, (WORLDS, 4)), random.uniform(-1, 1, (WORLDS, RECURRENT.units))
 KEPT = 0.1 * normal(RECURRENT.size)
-HISTORY = ObservationHistory(length=3, previous_action=True, filters=(0.1, 0.5))
+HISTORY = ObservationHistory(previous_action=True, filters=(0.1, 0.5))
 SEEN, MEMORY, ACTION = normal(18), normal(HISTORY.size), random.uniform(-1, 1, (WORLDS, 3))
 MASSES = random.uniform(0.1, 0.3, WORLDS)
 TOTAL, THRUST = random.uniform(2.1, 2.3, WORLDS), np.linspace(0.8, 1.0, 2 * WORLDS).reshape(WORLDS, 2)

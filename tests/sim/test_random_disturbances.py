@@ -12,7 +12,6 @@ import pytest
 from conftest import CompiledEnv, compile_env, with_settings
 
 from mjxball.config import Config, preset, replace
-from mjxball.control.observation import ERROR
 from mjxball.env import TransportEnv
 from mjxball.physics import motion, newton_euler
 from mjxball.physics.step import jax_repeat, make_control_step
@@ -88,32 +87,6 @@ def test_gusts_have_their_rms_and_correlation(transport: Config) -> None:
     assert float(force[:, -1].std()) == pytest.approx(0.3, rel=0.05)
     last, before = np.asarray(force[:, -1]).ravel(), np.asarray(force[:, -26]).ravel()
     assert np.corrcoef(last, before)[0, 1] == pytest.approx(math.exp(-25 * 0.02 / GUST_TIME), abs=0.05)
-
-
-def test_messages_hold_the_objects_error(transport: Config) -> None:
-    relay = {"relay_probability": 1.0, "relay_rate": (4.0, 4.0), "relay_loss": (0.0, 0.0)}
-    truth = jnp.arange(500.0)[:, None] * jnp.ones(18)
-    _, seen = rolled(with_settings(transport, scenario=relay), truth)
-    np.testing.assert_array_equal(seen[:, : ERROR.start], truth[:, : ERROR.start])
-    sent = np.flatnonzero(np.diff(np.asarray(seen[:, ERROR.start]), prepend=-1.0))
-    np.testing.assert_array_equal(
-        seen[:, ERROR.start :], np.repeat(sent, np.diff(sent, append=500))[:, None] * np.ones(6)
-    )
-    # Every 12.5 control steps.
-    assert {*np.diff(sent)} <= {12, 13}
-    assert sent[-1] == pytest.approx(12.5 * (len(sent) - 1), abs=1)
-
-
-def test_messages_are_lost_and_some_worlds_have_none(transport: Config) -> None:
-    relay = {"relay_probability": 0.4, "relay_rate": (10.0, 10.0), "relay_loss": (0.5, 0.5)}
-    truth = jnp.arange(101.0)[:, None] * jnp.ones(18)
-    config = with_settings(transport, scenario=relay)
-    seen = np.asarray(jax.vmap(lambda seed: rolled(config, truth, seed)[1])(jnp.arange(1000)))
-    arrived = (np.diff(seen[:, :, -1], axis=1) > 0).sum(axis=1)
-    at_once = arrived == 100
-    assert at_once.mean() == pytest.approx(0.6, abs=0.06)  # four deviations
-    # Of 20 messages half.
-    assert arrived[~at_once].mean() == pytest.approx(10.0, abs=0.5)
 
 
 def test_every_world_draws_its_own_within_the_ranges(transport: Config) -> None:

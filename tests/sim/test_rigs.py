@@ -127,7 +127,7 @@ def test_a_padded_rig_flies_as_it_does_alone() -> None:
         simple = dataclasses.replace(config.follower, recurrent_units=0)
         env = TransportEnv(dataclasses.replace(config, scenario=still, follower=simple), "newton-euler")
         own = jax.tree.map(lambda part: jnp.asarray(part[1], jnp.float32), table)
-        state, step = jax.jit(env.reset)(jax.random.key(3), 1.0, None, own), jax.jit(env.step)
+        state, step = jax.jit(env.reset)(jax.random.key(3), None, own), jax.jit(env.step)
         for _ in range(25):
             state = step(state, jnp.zeros((len(env.config.plant.followers), 3)))
         flown.append(state)

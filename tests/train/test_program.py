@@ -92,28 +92,6 @@ def test_prefill_records_every_step_and_learns_nothing(compiled, prefilled):
     np.testing.assert_array_equal(rows[20 * WORLDS :], 0)
 
 
-def test_a_curriculum_widens_the_motion_until_its_share_of_training_is_over(transport) -> None:
-    changed = {
-        "total_steps": 4 * WORLDS * 100,
-        "replay_size": 4 * WORLDS * 100,
-        "num_envs": WORLDS,
-        "updates_per_step": 4,
-        "curriculum": 0.5,
-    }
-    program = Program(with_settings(transport, sac=changed), "newton-euler")
-    reset = jax.jit(program.environments.reset)
-    low, high = transport.scenario.cg_amplitude
-    largest = {}
-    for steps in (0, 100 * WORLDS, 200 * WORLDS, 400 * WORLDS):
-        for record in (True, False):
-            reach = program._difficulty(jnp.asarray(steps), jnp.asarray(record))
-            load = reset(jax.random.key(1), reach).pipeline_state.load
-            largest[steps, record] = float(load.cg_amplitude.max())
-    assert largest[0, True] == pytest.approx(low)
-    assert largest[100 * WORLDS, True] == pytest.approx(low + (largest[0, False] - low) / 2)
-    assert largest[200 * WORLDS, True] == largest[400 * WORLDS, True] == largest[0, False] <= high
-
-
 def test_normaliser_holds_the_statistics_of_what_was_seen(compiled, prefilled):
     seen = recorded(prefilled)[: 20 * WORLDS, : compiled.program.environments.observation_size].astype(np.float64)
     # Float32 sums over 2560 rows, against float64.

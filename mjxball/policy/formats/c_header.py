@@ -196,20 +196,18 @@ def _history(law: FollowerLaw) -> str:
     history = law.history
     if not law.size:
         return "    (void)follower;"
-    older, width = (history.length - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
+    width = OBSERVATION_SIZE + ACTION_SIZE
     lines = ["    if (!follower->running) {"]
     lines += [f"        for (i = 0; i < {law.size}; i++) memory[i] = 0;"]
-    for k in range(history.length - 1):
-        lines += [f"        mjxball_copy(memory + {k * OBSERVATION_SIZE}, observation, {OBSERVATION_SIZE});"]
     for k in range(len(history.filters)):
-        lines += [f"        mjxball_copy(memory + {older + k * width}, observation, {OBSERVATION_SIZE});"]
+        lines += [f"        mjxball_copy(memory + {k * width}, observation, {OBSERVATION_SIZE});"]
     if law.geometry:
         kept = f"memory[{history.size + law.units} + i]"
         lines += [f"        for (i = 0; i < {GEOMETRY_SIZE}; i++) {kept} = mjxball_geometry[i];"]
     lines += ["        follower->running = 1;", "    }"]
     lines += [f"    mjxball_copy(input + {OBSERVATION_SIZE}, memory, {history.size});"]
     for k in range(len(history.filters)):
-        place = OBSERVATION_SIZE + older + k * width
+        place = OBSERVATION_SIZE + k * width
         lines += [f"    for (i = 0; i < {OBSERVATION_SIZE}; i++) input[{place} + i] -= observation[i];"]
     if law.units:
         lines += _saturated(law, OBSERVATION_SIZE + history.size)
@@ -230,15 +228,9 @@ def _saturated(law: FollowerLaw, place: int) -> list[str]:
 
 def _history_update(law: FollowerLaw) -> str:
     """Lines that move the memory on by one step."""
-    lines, history = [], law.history
-    older, width = (history.length - 1) * OBSERVATION_SIZE, OBSERVATION_SIZE + ACTION_SIZE
-    if older:
-        lines += [
-            f"    for (i = {older - 1}; i >= {OBSERVATION_SIZE}; i--) memory[i] = memory[i - {OBSERVATION_SIZE}];"
-        ]
-        lines += [f"    mjxball_copy(memory, observation, {OBSERVATION_SIZE});"]
+    lines, history, width = [], law.history, OBSERVATION_SIZE + ACTION_SIZE
     for k, tau in enumerate(history.filters):
-        place, share = older + k * width, _number(-math.expm1(-history.period / tau))
+        place, share = k * width, _number(-math.expm1(-history.period / tau))
         lines += [f"    mjxball_approach(memory + {place}, observation, {OBSERVATION_SIZE}, {share});"]
         lines += [f"    mjxball_approach(memory + {place + OBSERVATION_SIZE}, action, {ACTION_SIZE}, {share});"]
     if history.previous_action:
