@@ -13,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball import rewards
+from mjxball.arrays import Array
 from mjxball.config import Config, ball_limit
 from mjxball.control import crazyflie, rotations
 from mjxball.control import observation as layout
 from mjxball.control.geometry import GEOMETRY_SIZE, team_geometry
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
-from mjxball.physics.engine import Array, Load, PlantState
+from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.motion import object_mass
 from mjxball.physics.step import TRAINING_ENGINES, ControlStep, jax_repeat, make_cg_offset, make_control_step
 from mjxball.plant import PlantParameters, plant_parameters

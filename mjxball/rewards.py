@@ -9,7 +9,8 @@ from mjxball.config import Reward
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-    from mjxball.physics.engine import Array, Scalar, Vector
+    from mjxball.arrays import Array
+    from mjxball.physics.engine import Scalar, Vector
 
 
 class Transition(NamedTuple):

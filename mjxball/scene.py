@@ -6,16 +6,15 @@ import dataclasses
 import itertools
 import os
 import warnings
-from typing import Any
 
 import mujoco
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.assembly import BALL_JOINTS, build_spec
 from mjxball.config import Plant
 from mjxball.errors import InputError
 
-Array = Any
 GOAL_COLOUR = (0.18, 0.62, 0.27, 0.55)
 TRAIL_COLOUR = np.array([0.15, 0.35, 0.55, 0.35], np.float32)
 AZIMUTH, ELEVATION = 112.0, -24.0  # of the camera [degrees]

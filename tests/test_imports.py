@@ -17,7 +17,7 @@ from command_line import REPOSITORY, environment
 
 # Floor by floor: a part imports itself and what stands on lower floors, never a neighbour or what is above.
 FLOORS = (
-    {"errors", "reading", "pictures", "terminal"},
+    {"arrays", "errors", "reading", "pictures", "terminal"},
     {"files"},
     {"config"},
     {"xla"},
@@ -40,6 +40,7 @@ FLOORS = (
 )
 FLOOR = {part: height for height, parts in enumerate(FLOORS) for part in parts}
 GROUND = {
+    "arrays",
     "errors",
     "reading",
     "pictures",
@@ -49,7 +50,7 @@ GROUND = {
     "control",
 }  # all of our own that `control` and `policy` may import
 # What the base install runs: NumPy alone.
-BASE = ("errors", "reading", "pictures", "files", "config", "cli", "plant", "control", "policy", "entry")
+BASE = ("arrays", "errors", "reading", "pictures", "files", "config", "cli", "plant", "control", "policy", "entry")
 OURS = "mjxball"
 
 

@@ -14,11 +14,11 @@ import optax
 from mjxball.algorithms.base import Environments, Phase, PolicyNetwork, RecurrentNetwork, Schedule
 from mjxball.algorithms.recurrent import fresh_layers
 from mjxball.algorithms.scalar_form import scalar_form
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 
-Array = Any
 SMALL_RESPONSE = 1e-3  # to an impulse of 1, in deviations of observations and in actions: below that it is over
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjxball.algorithms.base import RecurrentNetwork
+from mjxball.arrays import Array
 
-Array = Any
 SHORTEST_MEMORY, LONGEST_MEMORY = 1.5, 150.0  # control steps that units of a GRU keep their state for at the start
 RECURRENT_GAIN = 0.7  # of a GRU's orthogonal recurrent weights at the start
 

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.leader import clip_command
 from mjxball.control.observation import ERROR, ERROR_RATE
 
-Array = Any
 BANDWIDTH = 6.0  # w_b [rad/s]; the loop limit-cycles from 16
 RATIO, TEAM_RATIO = 0.5, 1.0  # r of a pair's and of several followers
 MOMENT_LIMIT, RATE_LIMIT = 0.15, 0.3  # for each follower [kg m], [kg m/s]

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control import leader, rotations
 from mjxball.control.constants import drone_loop, thrust_slopes
@@ -14,7 +15,6 @@ from mjxball.control.observation import ERROR, ERROR_RATE, copy_command, mount_a
 from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 
-Array = Any
 SIGNS = (-1.0, 1.0)  # of the roll torque of a load at +y, of the pitch torque of one at +x
 
 

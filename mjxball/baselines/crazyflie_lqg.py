@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import CopiedPid, assembly_model
 from mjxball.baselines.lqg_design import discretise
 from mjxball.config import Config, ball_limit
@@ -18,7 +19,6 @@ from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.observation import ERROR, ERROR_RATE
 from mjxball.errors import InputError
 
-Array = Any
 # What costs 1: states and the follower's commands in their units, and the commands' change in a second.
 COSTS = {"y": 0.1, "vy": 0.5, "height": 0.1, "climb": 0.5, "rate": 3.0}
 LOAD_COST = 1e-2  # of a rolling ball's torque [N m]

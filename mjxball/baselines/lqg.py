@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import ideal_model
 from mjxball.baselines.lqg_design import SLOW, Filter, Tuning, feedback, filtered, kalman
 from mjxball.config import Config
@@ -17,7 +18,6 @@ from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 from mjxball.plant import plant_parameters
 
-Array = Any
 VERTICAL_LIMIT = 2.0  # of the position and velocity part [m/s2]
 CORRECTION_LIMIT = 0.6  # of all followers' roll and pitch against the load's torque [rad]
 PAIR_INERTIA = 0.0644  # of the pair about pitch, for which the tunings below are [kg m2]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm, solve_continuous_are, solve_discrete_are
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import AssemblyModel
 
-Array = Any
 TILT, VERTICAL = 0.15, 1.0  # [rad], [m/s2] that cost 1
 THETA_NOISE, RATE_NOISE, CLIMB_NOISE = 2e-3, 2e-2, 2e-2  # deviations of a measurement [rad], [rad/s], [m/s]
 

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.baselines.mpc_design import (
     LIFT,
     MEASURED,
@@ -54,7 +55,6 @@ from mjxball.control.observation import ERROR, ERROR_RATE, mount_angles
 from mjxball.errors import InputError
 from mjxball.plant.parts import clipped, joined
 
-Array = Any
 BLOCKS = (1, 1, 1, 2, 2, 3, 4, 6, 8, 10, 12)  # control steps for which a correction is held: 1 s
 CHECKED = (*range(8), 9, 11, 13, 16, 19, 23, 28, 34, 42)  # control steps at which the limits are kept
 MASSES = tuple(0.1 * number for number in range(11))  # of objects [kg]; the law is designed for the nearest

@@ -5,11 +5,12 @@ Body axes. All N - 1 followers are taken to send the command of the one that pla
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import AssemblyModel, ideal_model, pair_model
 from mjxball.baselines.lqg_design import RATE_NOISE, TILT, VERTICAL, discretise, steady_gain
 from mjxball.config import Config
@@ -20,7 +21,6 @@ from mjxball.plant import plant_parameters
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-Array = Any
 NAME = "mpc"
 STATES, TEAM_STATES = 16, 18
 # Places in the state. Along x: error [m], its rate [m/s], pitch [rad], its rate [rad/s], torque of the rotors [N m], of

@@ -6,16 +6,15 @@ delay; the script goes on from them.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import pair_model
 from mjxball.config import Config
 from mjxball.control import leader
 from mjxball.control.followers import PrivilegedInfo, copy_gains
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 from mjxball.plant.parts import clipped, joined
-
-Array = Any
 
 
 class ObserverGains(NamedTuple):

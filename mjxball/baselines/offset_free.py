@@ -8,10 +8,11 @@ the follower computes from its own observation, and takes the estimates off.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import pair_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, THETA_NOISE, Tuning, feedback, steady_filter
@@ -21,7 +22,6 @@ from mjxball.control.leader import clip_command
 from mjxball.control.observation import ERROR, ERROR_RATE, copy_command
 from mjxball.plant.parts import clipped, joined
 
-Array = Any
 NAME = "lqg-offset-free"
 TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=0.003, tilt_limit=0.3)
 LIFT_WALK = 0.01  # intensity of the white noise that drives the lift error [(m/s2)2/s]

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import SIGNS, CopiedPid, assembly_model
 from mjxball.config import Config
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.control.leader import clip_command
 from mjxball.control.observation import ACTION_SIZE, scale_action
 
-Array = Any
 RANDOM_COMMANDS = 4096  # after which `random` repeats itself
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.baselines.assembly_model import ideal_model
 from mjxball.baselines.lqg import CORRECTION_LIMIT, VERTICAL_LIMIT
 from mjxball.baselines.lqg_design import CLIMB_NOISE, RATE_NOISE, Tuning, feedback, steady_filter
@@ -24,7 +25,6 @@ from mjxball.errors import InputError
 from mjxball.plant import plant_parameters
 from mjxball.plant.parts import clipped, joined
 
-Array = Any
 TUNING = Tuning(position=0.2, velocity=0.6, torque_walk=20.0, tilt_limit=0.3)  # of a load's torque over the inertia
 # [s] in which the estimates of d, d' and the lift error are forgotten.
 LOAD_TIME, RATE_TIME, LIFT_TIME = 3.0, 0.3, 5.0

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from mjxball.arrays import Array
 from mjxball.control import mixer
 from mjxball.plant.parameters import AttitudeGains
 from mjxball.plant.parts import clipped, joined
-
-Array = Any
 
 
 def rotor_commands(

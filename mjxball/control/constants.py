@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from mjxball.arrays import Array
 from mjxball.config import Config, Plant
 from mjxball.control import crazyflie
 from mjxball.control.mixer import torque_per_force
 from mjxball.plant import plant_parameters
 from mjxball.plant.rotors import lever
-
-Array = Any
 
 
 def trim_limit(

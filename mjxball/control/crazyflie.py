@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Autopilot
 from mjxball.plant.parts import clipped, joined
 
-Array = Any
 PERIOD = 0.002  # [s] of the attitude and rate loops: 500 Hz
 FULL = 65535.0  # motor command of full power
 THRUST_FLOOR, THRUST_CEILING = 10001, 60000  # what the laptop sends while flying; the firmware caps at the second

@@ -5,8 +5,9 @@ One for training, for flight and for every export; all functions run on NumPy an
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from mjxball.arrays import Array
 from mjxball.control import leader
 from mjxball.control.geometry import GEOMETRY_SIZE
 from mjxball.control.observation import (
@@ -19,7 +20,6 @@ from mjxball.control.observation import (
     scale_action,
 )
 
-Array = Any
 # What a recurrent network sees besides: tanh of the object's error and of its rate over these, so that millimetres at
 # the goal are not lost beside metres on the way to it.
 NEAR_ERROR, NEAR_ERROR_RATE = 0.03, 0.1  # [m], [m/s]

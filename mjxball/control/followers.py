@@ -7,11 +7,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control.observation import OBSERVATION, OBSERVATION_SIZE, copy_command
 from mjxball.errors import InputError
 
-Array = Any
 LARGEST = 1e6  # sum of the absolute numbers of an observation: no flight comes near it, and float32 can filter it
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
+from mjxball.arrays import Array
 from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.control.observation import mount_frames
 from mjxball.plant.parts import joined
 
-Array = Any
 GEOMETRY = ("command_share", "roll_acceleration_per_lift", "pitch_acceleration_per_lift", "rotor_room")
 GEOMETRY_SIZE = len(GEOMETRY)
 # Medians of random rigs (`sim.rigs`), with tilt torques of a ring of N drones N a m r^2, a = 1 for a pair and 1/2 else:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from mjxball.arrays import Array
 from mjxball.plant import parts
-
-Array = Any
 
 
 def desired_acceleration(error: Array, error_rate: Array, integral: Array, kp: Array, kd: Array, ki: Array) -> Array:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from mjxball.arrays import Array
 from mjxball.plant.parts import joined
 from mjxball.plant.rotors import lever
-
-Array = Any
 
 
 def wrench_from_rotors(force: Array, arm: Array | float, yaw_per_thrust: Array | float, layout: str = "plus") -> Array:

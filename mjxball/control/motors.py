@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control import crazyflie
 from mjxball.control.constants import hover
 
-Array = Any
 FULL = crazyflie.FULL  # PWM of full power, and thrust command of full thrust
 USUAL_BATTERY = 3.7  # [V] in hover, where none is drawn or measured
 Curve = tuple[float, float]  # force of a motor at full power: share of p^2 and of p, p = command / 65535 [N]

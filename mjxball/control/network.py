@@ -6,11 +6,11 @@ Written once, for training and for flight; runs on NumPy and on JAX arrays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-Array = Any
+from mjxball.arrays import Array
 
 
 def gru_cell(hidden: Array, seen: Array, kernel: Array, recurrent: Array, bias: Array) -> Array:

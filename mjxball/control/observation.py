@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config, Plant
 from mjxball.control import leader, rotations
-
-Array = Any
 
 # (name, unit) of every slot, in order (the paper's; body rates instead of the paper's Euler rates).
 OBSERVATION: tuple[tuple[str, str], ...] = (

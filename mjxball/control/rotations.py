@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from mjxball.arrays import Array
 from mjxball.plant import parts
-
-Array = Any  # any array that implements the Python array API standard
 
 
 def rotate(matrix: Array, vector: Array) -> Array:

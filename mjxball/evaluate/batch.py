@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.followers import Baseline, Follower, Law
@@ -16,7 +17,7 @@ from mjxball.errors import InputError
 from mjxball.evaluate import metrics
 from mjxball.evaluate.metrics import Metrics
 from mjxball.physics import mjx, newton_euler
-from mjxball.physics.engine import Array, Load, PlantState
+from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_cg_offset, make_control_step
 from mjxball.policy import Policy
 from mjxball.policy.policy import NetworkLaw

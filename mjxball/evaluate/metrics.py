@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Plant
 from mjxball.rewards import paper_reward
 from mjxball.sim.rollout import Tick, Trajectory
 from mjxball.sim.scenario import Scenario
 
-Array = Any
 RMSE_UNTIL = 20.0  # [s]
 PAPER_STEPS = 1000  # of an episode, over which the paper's reward is summed
 STEADY_AFTER = 20.0  # [s]

@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.control import crazyflie, leader, motors
 from mjxball.control.crazyflie import Gains
 from mjxball.fly.limits import Times
@@ -32,7 +33,6 @@ UNEVEN = 1.5  # [m/s2] likewise of the one that hears, measured: the stick bears
 STAND_BY = 0.4  # [s] before the firmware stops a drone by which the pair is to stand
 NEAR_GROUND = 0.04  # [m]
 HELD_SPEEDS = (0.2, 1.2)  # [m/s] least and most of a descent that has to end in time
-Array = Any
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ import numpy as np
 from jax._src import xla_bridge  # whether a device has been made: nothing public says it
 
 from mjxball import config as configs
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control.observation import ACTION_SIZE
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 
-Array = Any
 THREADS = Path("/proc/self/task")
 _home: dict[str, int] = {}  # number of the process in which JAX runs for the environments
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from gymnasium.utils.seeding import np_random
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.gym import common
@@ -23,7 +24,6 @@ try:
 except ModuleNotFoundError:
     raise ModuleNotFoundError("pettingzoo is not installed; pip install 'mjxball[gym]'", name="pettingzoo") from None
 
-Array = Any
 METADATA: dict[str, Any] = {"name": "mjxball_followers_v0", "render_modes": ["rgb_array"], "render_fps": 50}
 
 

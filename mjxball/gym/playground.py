@@ -12,12 +12,11 @@ import flax.struct
 import mujoco
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.assembly import build_model
 from mjxball.config import Config
 from mjxball.env import PipelineState, State, TransportEnv
 from mjxball.gym import common
-
-Array = Any
 
 
 @flax.struct.dataclass

@@ -9,6 +9,7 @@ import gymnasium
 import jax
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
@@ -17,7 +18,6 @@ from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import make_cg_offset, make_stepper, on_the_host
 from mjxball.xla import enable_compilation_cache
 
-Array = Any
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 PICTURE = (360, 480)  # height, width of a rendered frame
 

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.env import TransportEnv
 from mjxball.gym import common
 from mjxball.xla import enable_compilation_cache
 
-Array = Any
 METADATA: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
 
 

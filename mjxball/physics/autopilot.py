@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control import attitude, crazyflie, motors, rotations
-from mjxball.physics.engine import Array, Load, PlantState
+from mjxball.physics.engine import Load, PlantState
 from mjxball.plant import PlantParameters, parts, plant_parameters
 from mjxball.plant.parameters import shared
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Plant
 from mjxball.control import mixer, rotations
 from mjxball.plant import PlantParameters, parts
 from mjxball.plant.parameters import of_drone, own_inertia, shared
 
-Array = Any  # NumPy's or JAX's
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config, cg_limit
 from mjxball.errors import InputError
-from mjxball.physics.engine import Array, CgState, Load, PathShape, joined
+from mjxball.physics.engine import CgState, Load, PathShape, joined
 from mjxball.plant import PlantParameters, parts, plant_parameters
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from mjxball.plant import ROLLING_INERTIA, plant_parameters
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from mjxball.physics.engine import Array, Coordinates, Scalar, Vector
+    from mjxball.arrays import Array
+    from mjxball.physics.engine import Coordinates, Scalar, Vector
 
 
 def make_engine(plant: Plant, attitude: Attitude) -> Engine:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from mjxball.arrays import Array
 from mjxball.config import Attitude, Plant
 from mjxball.control import rotations
-from mjxball.physics.engine import Array, CgState, Engine, PlantState, Wrench, coordinates, joined
+from mjxball.physics.engine import CgState, Engine, PlantState, Wrench, coordinates, joined
 from mjxball.plant import ROLLING_INERTIA, PlantParameters, parts, plant_parameters
 from mjxball.plant.parameters import rigid_inertia, rigid_mass, rigid_moment, shell_and_ball
 from mjxball.plant.parts import Part, Parts, Rows

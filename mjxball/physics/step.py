@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.physics import motion
 from mjxball.physics.autopilot import Autopilot, make_autopilot
-from mjxball.physics.engine import Array, Engine, Load, PlantState, Wrench, total_wrench
+from mjxball.physics.engine import Engine, Load, PlantState, Wrench, total_wrench
 from mjxball.plant import PlantParameters, parts, plant_parameters
 from mjxball.plant.parameters import shared
 

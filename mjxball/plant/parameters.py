@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Attitude, Plant, ball_limit
 from mjxball.plant import parts
 from mjxball.plant.parts import Part, Parts, Rows
 
-Array = Any
 ROLLING_INERTIA = 0.4  # spin inertia of a solid ball over r^2 and its mass: (7/5) m x'' = m g sin
 
 

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Attitude, Config, Plant
 from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, plant_parameters, rigid_inertia
 
-Array = Any
 LOSS_MASSES, LOSS_DIRECTIONS = 6, 8
 
 

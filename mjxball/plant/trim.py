@@ -23,12 +23,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config, Plant
 from mjxball.errors import InputError
 from mjxball.plant.commands import Commands, asked_rows, commanded, effect_of
 from mjxball.plant.parameters import PlantParameters
 
-Array = Any
 TINY, LEAST_SCATTER = 1e-9, 1e-3  # [N], [m2] below which drones sit in one place
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
@@ -19,7 +20,6 @@ from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of, load_file
 from mjxball.policy.single import SingleFollower
 
-Array = Any
 ROUNDED = 1e-5  # that a GRU's state may be beyond 1
 
 

@@ -13,7 +13,8 @@ from mjxball.sim.laws import Body, Laws
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-    from mjxball.physics.engine import Array, Load, PlantState, Scalar, Vector
+    from mjxball.arrays import Array
+    from mjxball.physics.engine import Load, PlantState, Scalar, Vector
     from mjxball.physics.step import ControlStep
     from mjxball.plant import PlantParameters
     from mjxball.sim.disturbances import Observation, Sample, SensorModel, SensorState

@@ -23,7 +23,8 @@ from mjxball.errors import InputError
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-    from mjxball.physics.engine import Array, Vector
+    from mjxball.arrays import Array
+    from mjxball.physics.engine import Vector
 
     Observation = Float[Array, "... 18"]
 

@@ -18,7 +18,8 @@ from mjxball.plant.parts import clipped, joined
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from mjxball.physics.engine import Array, Vector
+    from mjxball.arrays import Array
+    from mjxball.physics.engine import Vector
     from mjxball.sim.disturbances import Observation
 
     Integral = Float[Array, "... integrals"]  # 3, or 7 where the residual is on the PID law

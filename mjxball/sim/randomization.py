@@ -21,7 +21,8 @@ from mjxball.sim import rigs
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-    from mjxball.physics.engine import Array, Scalar, Vector
+    from mjxball.arrays import Array
+    from mjxball.physics.engine import Scalar, Vector
 
 
 DRAWS = 18  # random numbers of a reset

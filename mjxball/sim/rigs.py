@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Attitude, Config, Drone, Plant, Range
 from mjxball.control.mixer import torque_per_force
 from mjxball.plant.parameters import AttitudeGains, PlantParameters, design_gains, rigid_inertia
 from mjxball.plant.trim import safe_radius
 
-Array = Any
 # A drone of 1 kg: arm [m], inertia over mass and arm^2 about (roll, pitch, yaw); the pair's.
 ARM, GYRATION = 0.12, np.array([0.16, 0.16, 0.28])
 CARRIER_THICKNESS = 0.04  # edge of the carrier across, over its diameter

@@ -34,7 +34,8 @@ from mjxball.sim.scenario import CgPath, Scenario, check_scenario, of_plant
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
 
-    from mjxball.physics.engine import Array, Coordinates
+    from mjxball.arrays import Array
+    from mjxball.physics.engine import Coordinates
 
 # Observations (n, 18), of several followers (n, F, 18), and who tells what is known -> commands (n, 3), or (n, F, 3).
 Act = Callable[[np.ndarray, Callable[[], PrivilegedInfo]], np.ndarray]

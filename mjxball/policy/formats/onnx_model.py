@@ -18,7 +18,6 @@ from mjxball.control import observation as layout
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.policy import NetworkLaw, Policy, known_geometry
 
-Array = Any
 OPSET, IR_VERSION = 17, 8  # of 2022: read by every runtime of the last years
 BATCH = "flights"
 
