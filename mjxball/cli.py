@@ -293,7 +293,7 @@ def _with_plant(
     flags: Mapping[str, str] | None = None,
     found: configs.PlantFile | None = None,
 ) -> configs.Config:
-    """`configs.with_plant`; stderr says, a line each, what is assumed of a model and what of it is left out."""
+    """`mjxball.config.with_plant`; stderr says, a line each, what is assumed of a model and what of it is left out."""
     if path is not None:
         found = found or read_plant(path)
         for line in found.assumed:

@@ -201,9 +201,9 @@ def _repeated(drone: dict[str, Any], count: int | None, settings: _Settings) -> 
     settings.lines.append(f"assumed {count} drones, {spacing:.3g} m from each to the next: 17/6 of the arm")
     if count > 2:
         mass = CARRIER * count * drone["mass"]
-        inertia = [float(f"{mass * radius**2 / part:.4g}") for part in (4, 4, 2)]
+        quarter = float(f"{mass * radius**2 / 4:.4g}")
         settings.assume("carrier_mass", float(f"{mass:.4g}"), "a twentieth of the drones'")
-        settings.assume("carrier_inertia", inertia, "of a disc to the mounts")
+        settings.assume("carrier_inertia", [quarter, quarter, 2 * quarter], "of a disc to the mounts")
     return [{**drone, "mount": mount.tolist()} for mount in mounts]
 
 

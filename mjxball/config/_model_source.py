@@ -12,7 +12,7 @@ from mjxball.errors import InputError
 MODELS = (".xml", ".urdf")  # endings of the files
 MAX_ASSET = 2**26  # bytes of a mesh or texture
 LONGEST = 200  # characters of a name or a message that a sentence shows
-FIRST = re.compile(r"\ufeff?(?:\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*<([\w:.-]+)", re.DOTALL)
+FIRST = re.compile(r"\ufeff?(?>\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*+<([\w:.-]+)", re.DOTALL)
 ROTOR = re.compile(r"prop|rotor|motor|thrust", re.IGNORECASE)  # in the name of a URDF's link
 
 

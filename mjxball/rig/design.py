@@ -19,7 +19,7 @@ SHARES = (0.25, 0.5, 1.0)  # of the way to the object's end, at which the heavie
 def parser() -> cli.Parser:
     """The flags."""
     result = cli.make_parser("python -m mjxball.rig.design", "Say whether a rig can fly and what load it balances.")
-    about = "shipped plant, file of a rig, or model of a drone, MJCF or URDF (pair)"
+    about = "shipped plant, file of a rig, or a model of a drone, MJCF or URDF (pair)"
     result.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
     result.add_argument("--out", type=Path, metavar="PLAN.svg", help="write a picture of the rig from above")
     return result
