@@ -29,6 +29,7 @@ CARRIER = 0.05  # mass of a team's carrier over that of its drones
 WIDTH, HEIGHT, BALL, AMPLITUDE = 0.10 / 0.34, 0.05 / 0.34, 0.02 / 0.34, 0.05 / 0.34  # over the object's length
 SQUARE = 0.3  # of the arm that a rotor may be off a square cross
 SHOWN = 0.01  # of the arm or of the inertia: what is left out beyond it has a line
+LARGEST = 1e12  # of a number that is taken for what follows from it
 LINE = 20.0  # times as far apart along an axis as across it are two drones on a line
 SHARED = ("arm", "rotor_force_max", "rotor_lag", "yaw_per_thrust")  # of a drone, or of all
 QUARTERS = math.pi / 2 * np.arange(4)
@@ -60,9 +61,9 @@ class _Settings:
         self.lines.append(f"left out: {what}")
 
     def number(self, name: str) -> float:
-        """plant.`name` as the user says it, or as it was found; 0 if neither."""
+        """plant.`name` as the user says it, unless no plant may have that, else as it was found, or 0."""
         said, found = self.said.get(f"plant.{name}"), self.found.get(f"plant.{name}", 0.0)
-        return float(said if isinstance(said, (int, float)) else found)
+        return float(said if isinstance(said, (int, float)) and 0 < said < LARGEST else found)
 
 
 def plant_of(model: Model, said: Mapping[str, Any], count: int | None) -> tuple[dict[str, Any], list[str]]:
@@ -236,7 +237,9 @@ def _assume_load(drones: list[Any], model: Model, settings: _Settings) -> None:
         mounts = [tuple(map(float, row.mount)) for row in rows]
         masses = [float(row.mass) for row in rows]
         forces = [float(row.rotor_force_max or settings.number("rotor_force_max")) for row in rows]
-    except (TypeError, ValueError):  # refused where the settings are checked
+    except (TypeError, ValueError, OverflowError):
+        return  # refused where the settings are checked, as mounts that are none
+    if not all(len(mount) == 3 and all(map(math.isfinite, mount)) for mount in mounts):
         return
     if model.load is None:
         axis = _axis(mounts)
@@ -250,7 +253,7 @@ def _assume_load(drones: list[Any], model: Model, settings: _Settings) -> None:
     axis = str(settings.said.get("plant.cg_axis", settings.found.get("plant.cg_axis")))
     if len(axis) == 1:
         along = [mount["xy".index(axis) if axis in "xy" else 0] for mount in mounts]
-        length = float(np.ptp(along)) or float(np.ptp(mounts))
+        length = float(np.ptp(along)) or SPACING * settings.number("arm")
         size = [length, WIDTH * length, HEIGHT * length]
         size = size if axis == "x" else [size[1], size[0], size[2]]
     else:

@@ -28,12 +28,15 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, bool]
     if first not in ("mujoco", "robot"):
         begins = f"it begins with <{printable(first)}>" if first else "it is no XML"
         raise InputError(f"{begins}, expected <mujoco> (MJCF) or <robot> (URDF)")
+    warnings: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warnings.append)  # else they go to a file in the current directory
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         if first == "robot":
             _free(spec, rotors)
         _check_assets(spec, path)
-        return spec.compile(), first == "robot"
+        model = spec.compile()
     except InputError:
         raise
     except Exception as error:  # whatever MuJoCo's parser, compiler and plug-ins raise
@@ -41,6 +44,11 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, bool]
         if "mjMINVAL" in said:
             raise InputError("a body that moves has no mass or no inertia, expected both above 0") from None
         raise InputError(f"MuJoCo does not compile it: {said}") from None
+    finally:
+        mujoco.set_mju_user_warning(before)
+    if any("NaN" in warning for warning in warnings):
+        raise InputError("a number of it is NaN, expected numbers")
+    return model, first == "robot"
 
 
 def _free(spec: Any, rotors: Collection[str]) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from mjxball.config._load import follow_plant
 from mjxball.config._model import read_model
 from mjxball.config._model_plant import plant_of
@@ -72,11 +74,12 @@ def _of_model(path: Path) -> PlantFile:
     if not isinstance(rotors, list) or not all(isinstance(name, str) for name in rotors):
         raise InputError(f"plant file {beside}: rotors must be a list of names, not {rotors!r}")
     said = _settings(beside, values)
-    model = read_model(path, rotors)
-    try:
-        settings, assumed = plant_of(model, said.settings, count)
-    except InputError as error:
-        raise InputError(f"model {path}: {error}") from None
+    with np.errstate(all="ignore"):  # numbers that are not finite are refused where the settings are checked
+        model = read_model(path, rotors)
+        try:
+            settings, assumed = plant_of(model, said.settings, count)
+        except InputError as error:
+            raise InputError(f"model {path}: {error}") from None
     own = {name: value for name, value in said.settings.items() if name != DRONES}
     return PlantFile(said.preset, _defaults() | settings | own, tuple(assumed))
 

@@ -246,6 +246,7 @@ REFUSED = {
     ),
     "no mesh": (MESH, "its mesh frame.obj is missing, expected at "),
     "no mass": (changed(INERTIAL, ""), "no mass or no inertia"),
+    "a place that is no number": (changed('pos="0.15', 'pos="nan'), "a number of it is NaN"),
     "no rotors": (mjcf(f'<body pos="0 0 1"><freejoint/>{INERTIAL}</body>', ""), "it has no rotors, expected rotors"),
     "five rotors": (driven('<motor site="0" gear="0 0 1 0 0 0" ctrlrange="0 1"/>'), "body quad has 5 rotors"),
     "a joint's motor": (
@@ -299,6 +300,17 @@ BESIDE = {
     "a base": ('base = "pair"', "not base"),
     "drones that are none": ("[plant]\ndrones = [1, 2]", "a list of tables"),
     "an arm that is a word": ('[plant]\narm = "long"', "plant.arm takes numbers"),
+    "a flat mount": ("[[plant.drones]]\nmount = [0.5, 0]\n[[plant.drones]]\nmount = [-0.5, 0]", "takes 3 numbers"),
+    "an endless mount": (
+        "[[plant.drones]]\nmount = [inf, 0, 0]\n[[plant.drones]]\nmount = [0, 0, 0]",
+        "must be finite",
+    ),
+    "two in one place": ("[[plant.drones]]\nmount = [0, 0, 0]\n[[plant.drones]]\nmount = [0, 0, 0]", "the same place"),
+    "a mass beyond all floats": (f"[plant.drones.1]\nmass = 1{'0' * 400}", "is not finite"),
+    "an arm beyond all floats": (f"[plant]\narm = 1{'0' * 400}", "is not finite"),
+    "an endless arm": ("[plant]\narm = inf", "plant.arm must be finite"),
+    "no gravity": ("[plant]\ngravity = 0.0", "plant.gravity must be greater than 0"),
+    "negative rotors": ("[plant]\nrotor_force_max = -1.0", "plant.rotor_force_max must be greater than 0"),
     "no axis": ('[plant]\ncg_axis = "z"', "cg_axis must be x or y or xy"),
     "across the drones": ('[plant]\ncg_axis = "y"', "sit at one place along y"),
 }
@@ -321,8 +333,9 @@ def test_mistakes_are_refused_in_one_sentence(mistake: str, tmp_path: Path, caps
     assert not out.exists()
 
 
-def test_half_models_are_read_or_refused(tmp_path: Path) -> None:
-    """Cut anywhere, and with numbers taken out, no model makes anything but a plant or one sentence."""
+def test_half_models_are_read_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut anywhere, and with numbers that are none, a model makes a plant or one sentence; MuJoCo leaves no file."""
+    monkeypatch.chdir(tmp_path)
     numbers = [f'{name}="' for name in ("mass", "pos", "gear", "ctrlrange", "diaginertia", "site")]
     texts = [DRONE[:end] + "</mujoco>" for end in range(0, len(DRONE), 97)]
     texts += [
@@ -335,3 +348,4 @@ def test_half_models_are_read_or_refused(tmp_path: Path) -> None:
         except InputError:
             refused += 1
     assert refused > len(texts) / 2
+    assert {path.suffix for path in tmp_path.iterdir()} == {".xml"}
