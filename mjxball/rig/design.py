@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from mjxball.files import write_whole
 from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.terminal import say
 
+WAYS = tuple((math.cos(turn * math.pi / 6), math.sin(turn * math.pi / 6)) for turn in range(6))  # and their opposites
 SHARES = (0.25, 0.5, 1.0)  # of the way to the object's end, at which the heaviest load is shown
 
 
@@ -44,9 +46,14 @@ def _design(options: argparse.Namespace) -> int:
 
 
 def balanced(settings: Config) -> float:
-    """How far from O the CG of the rig's own object may rest [m], on the object; negative: not even at O."""
+    """How far from O the CG of the rig's own object may rest [m], on the object; negative: not even at O.
+
+    In the plane the least of twelve directions.
+    """
     plant, margin = settings.plant, settings.scenario.trim_margin
-    return min(largest_amplitude(settings, plant.object_mass, margin), cg_limit(plant))
+    ways = WAYS if len(plant.directions) == 2 else (None,)
+    held = (largest_amplitude(settings, plant.object_mass, margin, way) for way in ways)
+    return min(*held, cg_limit(plant))
 
 
 def report(settings: Config, held: float) -> list[str]:
@@ -54,11 +61,12 @@ def report(settings: Config, held: float) -> list[str]:
     plant, limit = settings.plant, cg_limit(settings.plant)
     load, share = f"its object of {plant.object_mass:.3g} kg", 1 / thrust_over_weight(plant)
     can = f"can fly and balances {load} up to {held:.3g} m" if held >= 0 else f"cannot balance {load} even at 0 m"
+    axis = plant.cg_axis[0]
     loads = (f"{heaviest_object(settings, part * limit):.3g} kg at {part * limit:.3g} m" for part in SHARES)
     return [
         f"{plant.count} drones, {total_mass(plant):.4g} kg in all: hovering takes {share:.0%} of the rotors' force",
         f"the rig {can} from O, with {settings.scenario.trim_margin:.0%} of what rotors and commands reach left",
-        f"the heaviest object that it balances, by the distance of its CG from O: {', '.join(loads)}",
+        f"the heaviest object that it balances, by the distance of its CG from O along {axis}: {', '.join(loads)}",
     ]
 
 

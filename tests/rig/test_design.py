@@ -8,6 +8,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import models
+import numpy as np
 import pytest
 
 from mjxball.cli import plant_setup
@@ -25,9 +26,13 @@ def test_a_model_is_judged_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixtu
     picture = ElementTree.fromstring(out.read_text())
     shapes = [shape.tag.rpartition("}")[2] for shape in picture]
     assert (shapes.count("circle"), shapes.count("ellipse")) == (3, 1)
-    (held,) = (shape for shape in picture if shape.tag.endswith("ellipse"))
-    assert held.get("rx") == held.get("ry")  # in the plane it is a circle
-    assert design.balanced(settings) <= cg_limit(settings.plant)
+    (ring,) = (shape for shape in picture if shape.tag.endswith("ellipse"))
+    assert ring.get("rx") == ring.get("ry")  # in the plane it is a circle
+    held = design.balanced(settings)
+    assert 0 < held <= cg_limit(settings.plant)
+    for angle in np.linspace(0, 2 * math.pi, 12, endpoint=False):
+        place = (held * math.cos(angle), held * math.sin(angle))
+        assert largest_margin(settings, 0.36, place).margin > settings.scenario.trim_margin - 1e-9
     assert design.main(["--plant", str(path), "--out", str(out)]) == 2  # nothing is overwritten
 
 
