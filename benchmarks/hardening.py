@@ -285,7 +285,10 @@ def files(every: dict[str, Program]) -> Iterator[Case]:
         }.items():
             if name in ("eval", "fly") or flaw in ODD_FILES or flaw == "a twice given key":
                 yield Case(name, f"policy: {flaw}", (*every[name].start, *line), made)
-    for flaw, (file, content) in {**{f: ("rig.toml", c) for f, c in ODD_FILES.items()}, **rigs()}.items():
+    odd = {f: ("rig.toml", c) for f, c in ODD_FILES.items()} | {
+        f"model: {f}": ("rig.xml", c) for f, c in ODD_FILES.items()
+    }
+    for flaw, (file, content) in {**odd, **rigs()}.items():
         yield _with(every["train"], f"--plant {flaw}", "--plant", file, files={file: content})
         if flaw in ODD_FILES or len(flaw) % 2:
             yield _with(every["eval"], f"--plant {flaw}", "--plant", file, files={file: content})

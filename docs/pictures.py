@@ -35,7 +35,7 @@ from mjxball.evaluate.scenarios import REFERENCE
 from mjxball.fly.recording import read_recording
 from mjxball.plotting import INK, legend_above, line, logarithmic, pyplot, save, series_styles
 from mjxball.policy.file import policy_path, shipped_policy
-from mjxball.rig.design import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
+from mjxball.rig.margins import FREQUENCIES, apply, closed_poles, delivered_gains, design, loop_gain
 
 REPOSITORY = Path(__file__).parents[1]
 RESULTS = REPOSITORY / "benchmarks" / "results"

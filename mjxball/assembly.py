@@ -204,7 +204,9 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.assembly`; returns the exit code."""
     parser = make_parser("python -m mjxball.assembly", "Write a plant as MJCF.")
     parser.add_argument("out", metavar="OUT.xml", type=Path, help="file to write; must not exist")
-    parser.add_argument("--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or a file of a rig (pair)")
+    parser.add_argument(
+        "--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or a file of a rig or drone (pair)"
+    )
     options = parser.parse_args(arguments)
 
     def command() -> int:

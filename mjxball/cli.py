@@ -11,7 +11,7 @@ import re
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -257,9 +257,7 @@ def apply_config_flags(config: configs.Config, options: argparse.Namespace) -> c
         for name, text in vars(options).items()
         if name.startswith("config:") and text is not None
     }
-    if options.plant is not None:
-        read_plant(options.plant)
-    return configs.with_plant(config, options.plant, flags)
+    return _with_plant(config, options.plant, flags)
 
 
 def read_plant(path: Path) -> configs.PlantFile:
@@ -277,13 +275,27 @@ def plant_setup(path: Path | None, default: str = "paper") -> configs.Config:
     """
     if path is None:
         return configs.preset(default)
-    preset = configs.preset(read_plant(path).preset or default)
-    return apply_plant(configs.apply_overrides(preset, {"scenario.team_sizes": (), "rigs.number": 0}), path)
+    found = read_plant(path)
+    preset = configs.preset(found.preset or default)
+    return _with_plant(
+        configs.apply_overrides(preset, {"scenario.team_sizes": (), "rigs.number": 0}), path, None, found
+    )
 
 
 def apply_plant(config: configs.Config, path: Path | None) -> configs.Config:
     """`config` with the settings of the plant file `path`, if there is one, validated."""
-    if path is None:
-        return config
-    read_plant(path)
-    return configs.with_plant(config, path)
+    return config if path is None else _with_plant(config, path)
+
+
+def _with_plant(
+    config: configs.Config,
+    path: Path | None,
+    flags: Mapping[str, str] | None = None,
+    found: configs.PlantFile | None = None,
+) -> configs.Config:
+    """`mjxball.config.with_plant`; stderr says, a line each, what is assumed of a model and what of it is left out."""
+    if path is not None:
+        found = found or read_plant(path)
+        for line in found.assumed:
+            warn(f"{path.name}: {line}")
+    return configs.with_plant(config, path, flags, found)

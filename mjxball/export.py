@@ -129,7 +129,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("out", metavar="OUT", type=Path, help="file to write, whose ending says what; must not exist")
     parser.add_argument("--crazyflie", action="store_true", help="OUT is a directory: apps for a pair of Crazyflies")
     parser.add_argument("--int8", action="store_true", help="weights of 8 bits; .npz: rounded to them")
-    about = f"team in which a policy flies that has to be told: {', '.join(configs.PLANTS)}, or a rig in TOML or JSON"
+    plants = f"{', '.join(configs.PLANTS)}, or a rig in TOML, JSON, MJCF or URDF"
+    about = f"team in which a policy flies that has to be told: {plants}"
     parser.add_argument("--plant", metavar="NAME|FILE", type=Path, help=about)
     parser.add_argument("--drone", metavar="N", type=int, help="its number in --plant where several drones follow")
     options = parser.parse_args(arguments)

@@ -54,8 +54,17 @@ def curves(shown: Sequence[Curve], x_label: str, y_label: str, width: int = 480,
     return _svg(width, height, parts)
 
 
-def plan(mounts: Iterable[Sequence[float]], leader: int, arms: Sequence[float], edges: Sequence[float]) -> str:
-    """A rig from above, x to the right: its box, and each drone with the reach of its rotors; the leader filled."""
+def plan(
+    mounts: Iterable[Sequence[float]],
+    leader: int,
+    arms: Sequence[float],
+    edges: Sequence[float],
+    held: Sequence[float] = (),
+) -> str:
+    """A rig from above, x to the right: its box, and each drone with the reach of its rotors; the leader filled.
+
+    An ellipse with the half axes `held` (x, y) shows where the load's CG may rest.
+    """
     places = [(float(mount[0]), float(mount[1])) for mount in mounts]
     reach = max([*(max(abs(x), abs(y)) + arm for (x, y), arm in zip(places, arms, strict=True)), *edges[:2], 1e-9])
     size = 150.0
@@ -71,6 +80,10 @@ def plan(mounts: Iterable[Sequence[float]], leader: int, arms: Sequence[float], 
         cx, cy = at(x, y)
         look = f'fill="{COLOURS[0]}" fill-opacity="{0.6 if number == leader else 0.1}" stroke="{COLOURS[0]}"'
         parts.append(f'<circle cx="{cx:.1f}" cy="{cy:.1f}" r="{scale * arm:.1f}" {look}/>')
+    if held:
+        rx, ry = (max(scale * half, 1.0) for half in held)
+        middle, look = size / 2, f'fill="{COLOURS[1]}" fill-opacity="0.5"'
+        parts.append(f'<ellipse cx="{middle:.1f}" cy="{middle:.1f}" rx="{rx:.1f}" ry="{ry:.1f}" {look}/>')
     return _svg(int(size), int(size), parts)
 
 

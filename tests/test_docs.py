@@ -26,7 +26,7 @@ RUN = [
     "README.md",
     "docs/getting-started.md",
     "docs/view.md",
-    *(f"docs/howto/own-{n}.md" for n in ("rig", "reward", "baseline", "environment", "algorithm")),
+    *(f"docs/howto/own-{n}.md" for n in ("rig", "model", "reward", "baseline", "environment", "algorithm")),
 ]
 MAINS = {
     "train.py": "mjxball.commands.train",
@@ -37,6 +37,7 @@ MAINS = {
     "mjxball.view": "mjxball.view.command",
     "mjxball.fly": "mjxball.fly.main",
     "mjxball.assembly": "mjxball.assembly",
+    "mjxball.rig.design": "mjxball.rig.design",
 }
 
 
@@ -235,12 +236,13 @@ def test_a_flag_that_does_not_exist_is_seen(monkeypatch: pytest.MonkeyPatch) -> 
 def test_python_on_the_page_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All blocks of a page, in order, in one namespace, as a reader would type them; their asserts count.
 
-    A block of TOML that begins with a file's name is that file.
+    A block of TOML or XML that begins with a file's name is that file.
     """
     (tmp_path / "policies").symlink_to(REPOSITORY / "policies")
     monkeypatch.chdir(tmp_path)
     text = (REPOSITORY / page).read_text()
-    for block, name in re.findall(r"^```toml\n(# (\S+\.toml)\n.*?)^```", text, flags=re.DOTALL | re.MULTILINE):
+    named = r"^```(?:toml|xml)\n((?:#|<!--) (\S+\.(?:toml|xml))(?: -->)?\n.*?)^```"
+    for block, name in re.findall(named, text, flags=re.DOTALL | re.MULTILINE):
         (tmp_path / name).write_text(block)
     blocks = re.findall(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
     assert blocks

@@ -90,7 +90,9 @@ def parser() -> cli.Parser:
         metavar="T:DM",
         help="DM [kg] added to, or if negative dropped from, the object at T [s]",
     )
-    result.add_argument("--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or a file of a rig")
+    result.add_argument(
+        "--plant", type=Path, metavar="NAME|FILE", help="shipped plant, file of a rig, or a model of a drone"
+    )
     result.add_argument("--physics", choices=ENGINES, default="mjx", help="physics engine (default mjx)")
     result.add_argument("--json", type=Path, metavar="FILE", help="write the results as JSON")
     result.add_argument("--out", type=Path, metavar="DIR", help="write report.html, JSON and figures")

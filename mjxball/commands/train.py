@@ -84,7 +84,7 @@ def parser() -> cli.Parser:
     run.add_argument("--algorithm", metavar="NAME", help=about)
     about = "engine, mjx (default) or newton-euler, which is quicker"
     run.add_argument("--physics", choices=TRAINING_ENGINES, metavar="ENGINE", help=about)
-    about = f"{', '.join(config.PLANTS)}, or a rig in TOML or JSON (docs/howto/own-rig.md)"
+    about = f"{', '.join(config.PLANTS)}, or a rig in TOML, JSON, MJCF or URDF (docs/howto/own-rig.md)"
     run.add_argument("--plant", type=Path, metavar="NAME|FILE", help=about)
     own = result.add_argument_group("in place of ours")
     own.add_argument("--env", metavar="MODULE:CLASS", help="train on a Brax environment of your own")

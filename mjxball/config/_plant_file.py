@@ -1,4 +1,4 @@
-"""Plant files: a rig in TOML or JSON, those that are shipped among them (`plants/*.toml`)."""
+"""Plant files: a rig in TOML or JSON, those that are shipped among them (`plants/*.toml`), or a model for MuJoCo."""
 
 from __future__ import annotations
 
@@ -7,17 +7,22 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from mjxball.config._load import follow_plant
+from mjxball.config._model import read_model
+from mjxball.config._model_plant import plant_of
+from mjxball.config._model_source import MODELS
 from mjxball.config._plant import Plant
 from mjxball.config._renamed import current_name
 from mjxball.config._settings import Config
 from mjxball.config._tree import apply_overrides, leaves, override
-from mjxball.config._validate import check_leaves, validate
+from mjxball.config._validate import MOST_DRONES, check_leaves, validate
 from mjxball.errors import InputError
 from mjxball.files import MissingFileError, read_text
 from mjxball.reading import parse_json
 
-PLANT_PARTS = ("plant", "attitude", "autopilot", "scenario", "motion")  # what a plant file may set
+PLANT_PARTS = ("plant", "attitude", "autopilot", "leader", "scenario", "motion")  # what a plant file may set
 SHIPPED = Path(__file__).parent / "plants"
 PLANTS = tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))  # names that `--plant` takes
 DRONES = "plant.drones"
@@ -29,22 +34,63 @@ class PlantFile(NamedTuple):
 
     preset: str | None  # that the settings belong to
     settings: dict[str, Any]  # by dotted path; plant.drones a list of tables
+    assumed: tuple[str, ...] = ()  # of a model: a line for everything that neither it nor the file beside it says
 
 
 def read_plant(source: Path | str) -> PlantFile:
-    """The plant file `source`, .toml or .json, or the shipped one of that name. Raises InputError if it is neither.
+    """The plant file `source`, .toml or .json, the shipped one of that name, or the model .xml (MJCF) or .urdf.
 
     A file holds tables `[plant]`, `[attitude]`, ... of settings, or dotted paths; `preset`, which it belongs to; and
     `base`, a shipped plant from which it differs. One that lists `[[plant.drones]]` describes a whole plant: what it
-    leaves out has its default. Values are not checked.
+    leaves out has its default. Values are not checked. Beside a model its `.toml` may say what the model does not, and
+    `drones`, how many fly of a single one, and `rotors`, names of the sites or bodies where they are. Raises InputError
+    if the source is none of these.
     """
     path = Path(source)
+    if path.suffix.lower() in MODELS:
+        return _of_model(path)
     if str(source) in PLANTS and not path.exists():
         path = SHIPPED / f"{source}.toml"
     values = _parsed(path)
     base = values.pop("base", None)
     if base is not None and base not in PLANTS:
         raise InputError(f"plant file {path}: base must be one of {', '.join(PLANTS)}, not {base!r}")
+    found = _settings(path, values)
+    if DRONES in found.settings:
+        found = found._replace(settings=_defaults() | found.settings)
+    if base is None:
+        return found
+    below = read_plant(SHIPPED / f"{base}.toml")
+    return PlantFile(found.preset or below.preset, below.settings | found.settings)
+
+
+def _of_model(path: Path) -> PlantFile:
+    """The model `path` and what the file beside it says."""
+    beside = path.with_suffix(".toml")
+    values = _parsed(beside) if beside.exists() else {}
+    count, rotors = values.pop("drones", None), values.pop("rotors", [])
+    if count is not None and (type(count) is not int or not 2 <= count <= MOST_DRONES):
+        raise InputError(f"plant file {beside}: drones must be a whole number from 2 to {MOST_DRONES}, not {count!r}")
+    if not isinstance(rotors, list) or not all(isinstance(name, str) for name in rotors):
+        raise InputError(f"plant file {beside}: rotors must be a list of names, not {rotors!r}")
+    said = _settings(beside, values)
+    with np.errstate(all="ignore"):  # numbers that are not finite are refused where the settings are checked
+        model = read_model(path, rotors)
+        try:
+            settings, assumed = plant_of(model, said.settings, count)
+        except InputError as error:
+            raise InputError(f"model {path}: {error}") from None
+    own = {name: value for name, value in said.settings.items() if name != DRONES}
+    return PlantFile(said.preset, _defaults() | settings | own, tuple(assumed))
+
+
+def _defaults() -> dict[str, Any]:
+    """Settings of a plant as they are if a file that describes a whole one leaves them out."""
+    return {f"plant.{name}": value for name, value, _ in leaves(Plant()) if not name.startswith("drones.")}
+
+
+def _settings(path: Path, values: dict[str, Any]) -> PlantFile:
+    """Preset and settings in the `values` of the file `path`."""
     preset = values.pop("preset", None)
     if preset is not None and not isinstance(preset, str):
         raise InputError(f"plant file {path}: preset must be the name of one, not {preset!r}")
@@ -52,13 +98,7 @@ def read_plant(source: Path | str) -> PlantFile:
     for name in (*settings, *values):  # tables without settings are in `values` alone
         if name.partition(".")[0] not in PLANT_PARTS or (name in PLANT_PARTS and name in settings):
             raise InputError(f"plant file {path} may set {', '.join(PLANT_PARTS)}, not {name}")
-    if DRONES in settings:
-        whole = {f"plant.{name}": value for name, value, _ in leaves(Plant()) if not name.startswith("drones.")}
-        settings = whole | settings
-    if base is None:
-        return PlantFile(preset, settings)
-    below = read_plant(SHIPPED / f"{base}.toml")
-    return PlantFile(preset or below.preset, below.settings | settings)
+    return PlantFile(preset, settings)
 
 
 def _parsed(path: Path) -> dict[str, Any]:
@@ -93,14 +133,18 @@ def _check_inertias(plant: Plant) -> None:
             raise InputError(f"{name} {inertia!r} is that of no body: one number is larger than the sum of the others")
 
 
-def with_plant(config: Config, source: Path | str | None, flags: Mapping[str, str] | None = None) -> Config:
+def with_plant(
+    config: Config, source: Path | str | None, flags: Mapping[str, str] | None = None, found: PlantFile | None = None
+) -> Config:
     """`config` with the settings of the plant file `source`, then of `flags` (path -> text), validated as a whole.
+
+    `found` is what was read of it, None: it is read.
 
     The load that is drawn follows from the plant where neither says otherwise. Raises InputError with one sentence.
     """
     flags = flags or {}
     try:
-        settings = {} if source is None else read_plant(source).settings
+        settings = {} if source is None else (found or read_plant(source)).settings
         changed = apply_overrides(config, settings)
         for path, text in flags.items():
             changed = override(changed, path, text)
@@ -114,6 +158,6 @@ def with_plant(config: Config, source: Path | str | None, flags: Mapping[str, st
         raise InputError(f"plant file {source} holds a number that is not finite") from None
     except InputError as error:
         text = str(error)
-        if source is None or text.startswith(("plant file", "--")):
+        if source is None or text.startswith(("plant file", "model", "--")):
             raise
         raise InputError(f"plant file {source}{' with these flags' if flags else ''}: {text}") from None

@@ -12,7 +12,7 @@ from typing import Any
 from mjxball.config import Config, ball_limit, preset, thrust_over_weight, total_mass
 from mjxball.errors import InputError
 from mjxball.files import read_text
-from mjxball.plant.trim import largest_amplitude
+from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.reading import check_times
 from mjxball.sim.scenario import CIRCLE, Scenario, check_scenario, of_plant
 from mjxball.terminal import warn
@@ -24,7 +24,6 @@ STANDARD = (
     *(dataclasses.replace(REFERENCE, omega=omega) for omega in (0.31, 0.62, 1.0, 2.0, 3.1)),
 )
 MOST_SAMPLES = 100_000
-HALVINGS = 12  # of the range of masses in which the heaviest object is looked for
 SLOWEST = 60.0  # [s] between two samples of a waveform, as a rule
 
 
@@ -61,23 +60,14 @@ def rig_line(settings: Config, mass: float | None = None) -> str:
     reference = of_plant(settings, Scenario())
     mass = reference.mass if mass is None else mass
     offset = largest_amplitude(settings, mass, margin)
+    heaviest = heaviest_object(settings, reference.amplitude)
     trimmed = f"CG trimmed up to {offset:.3g} m" if offset >= 0 else "CG not trimmed even at O"
     return (
         f"rig: {plant.count} drones, {total_mass(plant, mass):.4g} kg with an object of {mass:g} kg, "
         f"thrust over weight {thrust_over_weight(plant, mass):.3g}, {trimmed} with {margin:.0%} of what rotors "
-        f"and commands reach left; so it can hover objects of up to {heaviest(settings, reference.amplitude):.3g} kg, "
+        f"and commands reach left; so it can hover objects of up to {heaviest:.3g} kg, "
         f"{reference.amplitude:g} m off"
     )
-
-
-def heaviest(settings: Config, amplitude: float) -> float:
-    """The heaviest object [kg] whose CG can be held `amplitude` [m] off O with the plant's `trim_margin`, 0: none."""
-    plant, margin = settings.plant, settings.scenario.trim_margin
-    low, high = 0.0, thrust_over_weight(plant, 0.0) * total_mass(plant, 0.0)
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if largest_amplitude(settings, middle, margin) >= amplitude else (low, middle)
-    return low
 
 
 def read_waveform(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -24,12 +24,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from mjxball.arrays import Array
-from mjxball.config import Config, Plant
+from mjxball.config import Config, Plant, thrust_over_weight, total_mass
 from mjxball.errors import InputError
 from mjxball.plant.commands import Commands, asked_rows, commanded, effect_of
 from mjxball.plant.parameters import PlantParameters
 
 TINY, LEAST_SCATTER = 1e-9, 1e-3  # [N], [m2] below which drones sit in one place
+HALVINGS = 12  # of the range of masses in which the heaviest object is looked for
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -148,6 +149,16 @@ def largest_amplitude(
             return -math.inf
         ends.append(side * float(found[-1]))
     return min(ends)
+
+
+def heaviest_object(settings: Config, amplitude: float) -> float:
+    """The heaviest object [kg] whose CG can be held `amplitude` [m] off O with the plant's `trim_margin`, 0: none."""
+    plant, margin = settings.plant, settings.scenario.trim_margin
+    low, high = 0.0, thrust_over_weight(plant, 0.0) * total_mass(plant, 0.0)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if largest_amplitude(settings, middle, margin) >= amplitude else (low, middle)
+    return low
 
 
 def safe_radius(

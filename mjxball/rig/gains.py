@@ -12,7 +12,7 @@ from mjxball import cli, config
 from mjxball.control.crazyflie import gains_to_json, pair_gains
 from mjxball.errors import InputError
 from mjxball.files import write_whole
-from mjxball.rig.design import (
+from mjxball.rig.margins import (
     REQUIREMENTS,
     Design,
     Gains,

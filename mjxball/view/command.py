@@ -49,7 +49,9 @@ def parser() -> Parser:
     flown = result.add_argument_group(
         "scenario of what is flown on the spot", "the follower's reference scenario, changed by"
     )
-    flown.add_argument("--plant", type=Path, metavar="NAME|FILE", help="shipped plant, or a file of a rig")
+    flown.add_argument(
+        "--plant", type=Path, metavar="NAME|FILE", help="shipped plant, file of a rig, or a model of a drone"
+    )
     flown.add_argument("--omega", type=float, metavar="W", help="CG speed [rad/s]")
     flown.add_argument("--amplitude", type=float, metavar="A", help="of the CG [m]")
     flown.add_argument("--mass", type=float, metavar="M", help="of the object [kg]")

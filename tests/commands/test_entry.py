@@ -20,6 +20,7 @@ from mjxball import __version__
 
 MODULES = (
     *("mjxball.export", "mjxball.assembly", "mjxball.view", "mjxball.rig.gains", "mjxball.rig.identify"),
+    "mjxball.rig.design",
     *("mjxball.fly", "mjxball.fly.twin", "mjxball.fly.watchdog"),
 )
 COMMANDS = (*MODULES, "train.py", "eval.py")

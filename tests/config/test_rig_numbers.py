@@ -19,8 +19,8 @@ from mjxball.config import Config, Drone, Plant, preset, validate, with_plant
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import group_by_plant
-from mjxball.evaluate.scenarios import REFERENCE, heaviest, rig_line, standard_scenarios
-from mjxball.plant.trim import largest_margin
+from mjxball.evaluate.scenarios import REFERENCE, rig_line, standard_scenarios
+from mjxball.plant.trim import heaviest_object, largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario, of_plant
@@ -79,7 +79,7 @@ def test_every_command_flies_the_object_of_the_plant(tmp_path: Path, capsys: pyt
     assert [cell["mass"] for cell in json.loads(out.read_text())["cells"]] == [0.35]
     first = capsys.readouterr().out.splitlines()[0]
     assert first == rig_line(rig)
-    held = heaviest(rig, 0.05)
+    held = heaviest_object(rig, 0.05)
     assert f"can hover objects of up to {held:.3g} kg, 0.05 m off" in first
     assert largest_margin(rig, held, 0.05).margin == pytest.approx(rig.scenario.trim_margin, abs=5e-3)
     # 8 rotors of 5.5 N, two drones of 1 kg

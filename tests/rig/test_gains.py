@@ -17,7 +17,16 @@ from mjxball.errors import InputError
 from mjxball.fly.preflight import read_gains
 from mjxball.rig import gains as command
 from mjxball.rig.attitude import axes
-from mjxball.rig.design import REQUIREMENTS, Gains, delivered_gains, design, gains_of, is_stable, margins, worst_margins
+from mjxball.rig.margins import (
+    REQUIREMENTS,
+    Gains,
+    delivered_gains,
+    design,
+    gains_of,
+    is_stable,
+    margins,
+    worst_margins,
+)
 
 PAIR = preset("flight")
 ROLL, PITCH, YAW = axes(PAIR)

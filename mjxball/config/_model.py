@@ -1,0 +1,276 @@
+"""What a model, MJCF or URDF, says of a drone or of a rig: mass, centre, inertia and rotors. Needs MuJoCo."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjxball.config._model_source import ROTOR, compiled, printable
+from mjxball.errors import InputError
+from mjxball.files import read_text
+
+MAX_MODEL = 2**20  # bytes
+UPRIGHT = 1e-3  # [rad] that a rotor may lean
+WANTED = "expected rotors: <motor> on a <site> with gear 0 0 1 0 0 YAW"
+Vector = np.ndarray
+
+
+class Rigid(NamedTuple):
+    """A rigid body in the axes of the model's free body, from its origin."""
+
+    mass: float  # [kg]
+    centre: Vector  # (3,) centre of mass [m]
+    inertia: np.ndarray  # (3, 3) about `centre` [kg m2]
+
+
+class Rotor(NamedTuple):
+    """What pushes up; None is what the model does not say."""
+
+    place: Vector  # (3,) in the same axes [m]
+    force_max: float | None = None  # [N]
+    yaw: float | None = None  # yaw moment over force, signed [m]
+    lag: float | None = None  # time constant of the force [s]
+
+
+class ModelDrone(NamedTuple):
+    """A drone; a single rotor stands for the thrust of all four, whose places are not known."""
+
+    name: str
+    rigid: Rigid
+    rotors: tuple[Rotor, ...]
+
+
+class Model(NamedTuple):
+    """One drone, or a rig of several on a carrier."""
+
+    drones: tuple[ModelDrone, ...]
+    carrier: Rigid | None  # what is no drone and no load; None of a single drone
+    load: tuple[float, str] | None  # mass [kg] of a body on slides, and their axes: x, y or xy
+    gravity: float  # [m/s2]
+    left_out: tuple[str, ...]  # of what the model says
+
+
+def read_model(path: Path, rotors: Sequence[str] = ()) -> Model:
+    """The model in `path`; `rotors` names its sites or bodies where rotors are, if no actuators say so.
+
+    Raises InputError, one sentence, for what is no model, or neither a quadrotor nor a rigid rig of several.
+    """
+    text = read_text(path, "model", MAX_MODEL)
+    try:
+        return _Tree(*compiled(path, text, rotors), rotors, path).model()
+    except InputError as error:
+        raise InputError(f"model {path}: {error}") from None
+
+
+class _Tree:
+    """A compiled model at its start: the one tree of bodies that flies."""
+
+    def __init__(self, model: Any, is_urdf: bool, named: Sequence[str], path: Path):
+        import mujoco
+
+        self.m, self.d, self.mujoco = model, mujoco.MjData(model), mujoco
+        self.is_urdf, self.named, self.beside = is_urdf, named, path.with_suffix(".toml").name
+        mujoco.mj_kinematics(model, self.d)
+        mujoco.mj_collision(model, self.d)
+        self.root = self._root()
+        self.turn = self.d.xmat[self.root].reshape(3, 3).T
+        self.moments: set[int] = set()  # bodies that actuators turn without pushing
+        self.bearing: set[int] = set()  # bodies at which rotors are
+        self.left_out: list[str] = []
+
+    def model(self) -> Model:
+        """All that is to be known."""
+        m, d = self.m, self.d
+        if m.neq or m.ntendon:
+            raise InputError("it has equality constraints or tendons, expected bodies that are fixed to each other")
+        if d.ncon:
+            one, other = (self._named("geom", geom) for geom in d.contact[0].geom)
+            raise InputError(f"{one} touches {other} at the start, expected no contact: the rig flies free")
+        gravity = m.opt.gravity
+        if gravity[:2].any() or gravity[2] >= 0:
+            raise InputError(f"gravity is {_words(gravity)} m/s2, expected one that pulls along -z")
+        if m.opt.density or m.opt.viscosity or m.opt.wind.any():
+            self._leave_out("air: density, viscosity and wind")
+        groups = self._groups()
+        if len(groups) == 1:
+            (rotors,) = groups.values()
+            self._load(lone=True)
+            return Model((self._drone(self.root, rotors),), None, None, -gravity[2], tuple(self.left_out))
+        if self.root in groups:
+            raise InputError(
+                f"{self._named('body', self.root)} carries rotors and drones, expected each drone in a body of its own"
+            )
+        drones = tuple(self._drone(body, rotors) for body, rotors in groups.items())
+        flying = set().union(*(self._below(body) for body in groups))
+        load, bodies = self._load(lone=False)
+        carrier = self._rigid(self._below(self.root) - flying - bodies)
+        return Model(drones, carrier, load, -gravity[2], tuple(self.left_out))
+
+    def _drone(self, body: int, rotors: Sequence[Rotor]) -> ModelDrone:
+        return ModelDrone(self._name(body), self._rigid(self._below(body)), tuple(rotors))
+
+    def _root(self) -> int:
+        m, kinds = self.m, self.mujoco.mjtJoint
+        free = [int(body) for body, kind in zip(m.jnt_bodyid, m.jnt_type, strict=True) if kind == kinds.mjJNT_FREE]
+        if not free:
+            raise InputError("no body of it flies, expected one with a <freejoint/>")
+        if len(free) > 1:
+            one, other = (self._named("body", body) for body in free[:2])
+            raise InputError(f"{one} and {other} fly apart, expected one free body that carries everything")
+        for joint, body in enumerate(m.jnt_bodyid):
+            if m.body_rootid[body] != free[0]:
+                raise InputError(f"{self._named('joint', joint)} moves what does not fly, expected one tree of bodies")
+        return free[0]
+
+    def _groups(self) -> dict[int, list[Rotor]]:
+        """The rotors of every drone, by the drone's body."""
+        m = self.m
+        found: dict[int, list[Rotor]] = {}
+        for body, rotor in self._named_rotors() if self.named or self.is_urdf else self._actuated():
+            found.setdefault(body, []).append(rotor)
+        self.bearing = set(found)
+        if not found:
+            where = f"links called like rotors, or named in {self.beside}: rotors = [...]"
+            raise InputError(f"it has no rotors, {f'expected {where}' if self.is_urdf else WANTED}")
+        if len(found) > 1 and not self.moments and all(len(rotors) == 1 for rotors in found.values()):
+            groups: dict[int, list[Rotor]] = {}
+            for body, (rotor,) in found.items():  # each in a body of its own
+                groups.setdefault(int(m.body_parentid[body]), []).append(rotor)
+            found = groups
+        for body, rotors in found.items():
+            if len(rotors) not in ((1, 4) if body in self.moments else (4,)):
+                named = f"; name them in {self.beside}: rotors = [...]" if self.is_urdf else ""
+                raise InputError(f"{self._named('body', body)} has {len(rotors)} rotors, expected 4 a drone{named}")
+        return found
+
+    def _named_rotors(self) -> list[tuple[int, Rotor]]:
+        """At the sites or bodies that are named, of a URDF those called like rotors."""
+        m, d, kind = self.m, self.d, self.mujoco.mjtObj
+        if m.nu:
+            self._leave_out("actuators: the file beside the model names its rotors")
+        names = self.named or [one for body in range(m.nbody) if ROTOR.search(one := m.body(body).name)]
+        found = []
+        for name in names:
+            site = self.mujoco.mj_name2id(m, kind.mjOBJ_SITE, name)
+            body = int(m.site_bodyid[site]) if site >= 0 else self.mujoco.mj_name2id(m, kind.mjOBJ_BODY, name)
+            if body <= 0 or m.body_rootid[body] != self.root:
+                raise InputError(f"{self.beside} says rotors {name!r}, expected a site or body of what flies")
+            place = d.site_xpos[site] if site >= 0 else d.xipos[body] if self.is_urdf else d.xpos[body]
+            found.append((body, Rotor(self._here(place))))
+        return found
+
+    def _actuated(self) -> list[tuple[int, Rotor]]:
+        return [one for number in range(self.m.nu) if (one := self._actuator(number)) is not None]
+
+    def _actuator(self, number: int) -> tuple[int, Rotor] | None:
+        """(body, rotor) of an actuator, None if it only turns its body."""
+        m, name = self.m, self._named("actuator", number)
+        site, reference = m.actuator_trnid[number]
+        if m.actuator_trntype[number] != self.mujoco.mjtTrn.mjTRN_SITE or reference >= 0:
+            raise InputError(f"{name} acts on no site, {WANTED}")
+        gain, lag = m.actuator_gainprm[number][0], self._lag(number)
+        fixed = m.actuator_gaintype[number] == self.mujoco.mjtGain.mjGAIN_FIXED
+        if not fixed or m.actuator_biasprm[number].any() or not gain or lag is None:
+            raise InputError(f"{name} is no plain motor, {WANTED}")
+        frame = self.turn @ self.d.site_xmat[site].reshape(3, 3)
+        force, moment = (frame @ (gain * part) for part in m.actuator_gear[number].reshape(2, 3))
+        body, size = int(m.site_bodyid[site]), float(np.linalg.norm(force))
+        if not size:
+            self.moments.add(body)
+            return None
+        if np.linalg.norm(force[:2]) > UPRIGHT * size or force[2] < 0 or np.linalg.norm(moment[:2]) > UPRIGHT * size:
+            raise InputError(
+                f"{name} pushes along {_words(force / size)} and turns about {_words(moment / size)} in the axes of "
+                f"{self._named('body', self.root)}, expected 0 0 1 and 0 0 YAW: z is up"
+            )
+        low, high = self._inputs(number, gain)
+        if high <= 0:
+            raise InputError(f"{name} pushes with at most {high * size:g} N, expected more than 0")
+        if -np.inf < low < 0:
+            self._leave_out("rotors that push down")
+        most = high * size if np.isfinite(high) else None
+        return body, Rotor(self._here(self.d.site_xpos[site]), most, moment[2] / size, lag or None)
+
+    def _lag(self, number: int) -> float | None:
+        """Time constant of an actuator [s], 0: none; None if its dynamics are others."""
+        kind, kinds = int(self.m.actuator_dyntype[number]), self.mujoco.mjtDyn
+        if kind == kinds.mjDYN_NONE:
+            return 0.0
+        filters = (kinds.mjDYN_FILTER, kinds.mjDYN_FILTEREXACT)
+        return float(self.m.actuator_dynprm[number][0]) if kind in filters else None
+
+    def _inputs(self, number: int, gain: float) -> tuple[float, float]:
+        """Least and largest control [ctrl], by ctrlrange and forcerange."""
+        m, low, high = self.m, -np.inf, np.inf
+        if m.actuator_ctrllimited[number]:
+            low, high = m.actuator_ctrlrange[number]
+        if m.actuator_forcelimited[number]:
+            least, most = sorted(m.actuator_forcerange[number] / gain)
+            low, high = max(low, least), min(high, most)
+        return float(low), float(high)
+
+    def _load(self, lone: bool) -> tuple[tuple[float, str] | None, set[int]]:
+        """The load on its slides, and its bodies; propellers may spin, nothing else may move."""
+        m, kinds = self.m, self.mujoco.mjtJoint
+        loads: dict[int, set[str]] = {}
+        for joint, (body, kind) in enumerate(zip(m.jnt_bodyid, m.jnt_type, strict=True)):
+            axis = np.abs(self.turn @ self.d.xmat[body].reshape(3, 3) @ m.jnt_axis[joint])
+            if kind == kinds.mjJNT_FREE:
+                continue
+            if kind == kinds.mjJNT_HINGE and int(body) in self.bearing - {self.root}:
+                self._leave_out("the spin of propellers")
+                continue
+            if lone or kind != kinds.mjJNT_SLIDE or axis[:2].max() < 1 - UPRIGHT or m.body_parentid[body] != self.root:
+                raise InputError(
+                    f"{self._named('joint', joint)} moves {self._named('body', int(body))}, expected a rigid "
+                    f"{'drone' if lone else 'rig with at most a load that slides along x or y'}"
+                )
+            loads.setdefault(int(body), set()).add("xy"[int(axis[:2].argmax())])
+        if len(loads) > 1:
+            one, other = (self._named("body", body) for body in [*loads][:2])
+            raise InputError(f"{one} and {other} both slide, expected one load")
+        for body, axes in loads.items():
+            below = self._below(body)
+            return (self._rigid(below).mass, "".join(sorted(axes))), below
+        return None, set()
+
+    def _leave_out(self, what: str) -> None:
+        if what not in self.left_out:
+            self.left_out.append(what)
+
+    def _here(self, point: Vector) -> Vector:
+        return np.array(self.turn @ (point - self.d.xpos[self.root]))
+
+    def _below(self, body: int) -> set[int]:
+        """`body` and all that it carries; MuJoCo numbers them after it."""
+        found = {body}
+        for other in range(body + 1, self.m.nbody):
+            if int(self.m.body_parentid[other]) in found:
+                found.add(other)
+        return found
+
+    def _rigid(self, bodies: Collection[int]) -> Rigid:
+        """The `bodies` as one."""
+        ids = sorted(bodies)
+        masses, places = self.m.body_mass[ids], np.array([self._here(self.d.xipos[one]) for one in ids]).reshape(-1, 3)
+        mass = float(masses.sum())
+        centre = masses @ places / mass if mass else places.mean(axis=0)
+        inertia = np.zeros((3, 3))
+        for one, part, place in zip(ids, masses, places - centre, strict=True):
+            frame = self.turn @ self.d.ximat[one].reshape(3, 3)
+            inertia += frame @ np.diag(self.m.body_inertia[one]) @ frame.T
+            inertia += part * (place @ place * np.eye(3) - np.outer(place, place))
+        return Rigid(mass, centre, inertia)
+
+    def _name(self, body: int) -> str:
+        return printable(self.m.body(body).name)
+
+    def _named(self, kind: str, number: int) -> str:
+        return f"{kind} {printable(getattr(self.m, kind)(number).name) or number}"
+
+
+def _words(vector: Vector) -> str:
+    return " ".join(f"{part:.3g}" for part in vector + 0.0)

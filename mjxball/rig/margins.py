@@ -1,0 +1,197 @@
+"""Gains for the coupled pair: the stiffest attitude loop that keeps stated margins over what is not known."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from mjxball.config import Autopilot, Config
+from mjxball.control.crazyflie import RATE_LIMITS
+from mjxball.rig.attitude import Axis, axes
+
+Array = np.ndarray
+FREQUENCIES = np.geomspace(0.02, 400.0, 1200)  # [rad/s]
+
+
+class Gains(NamedTuple):
+    """kp, ki, kd of an attitude loop and of the rate loop below it, in the firmware's units."""
+
+    attitude: tuple[float, float, float]
+    rate: tuple[float, float, float]
+
+
+class Margins(NamedTuple):
+    """How far a stable loop is from instability; all 0 for an unstable one."""
+
+    phase: float  # [deg]
+    gain_up: float  # factor on the loop's gain
+    gain_down: float  # factor by which it may be divided, inf without integrators
+    delay: float  # [s]
+    crossover: float  # highest frequency of unit gain [rad/s]
+
+
+def loop_gain(gains: Gains, gain: float, lag: float, delay: float, frequency: Array) -> Array:
+    """L (k,) at `frequency` (k,) [rad/s], the loop cut at the motor commands.
+
+    `gain` [deg/s2] of the axis per unit, `lag` and `delay` [s]. Both derivatives are the measurement's.
+    """
+    s = 1j * frequency
+    (ap, ai, ad), (rp, ri, rd) = gains
+    outer = (ap + ai / s + ad * s) / s
+    control = (rp + ri / s) * (1 + outer) + rd * s
+    return control * gain / (s * (lag * s + 1)) * np.exp(-s * delay)
+
+
+def closed_poles(gains: Gains, gain: float, lag: float, delay: float) -> Array:
+    """Poles of the closed loop [1/s], the delay in its third-order Padé form."""
+    (ap, ai, ad), (rp, ri, rd) = gains
+    poly = np.polynomial.polynomial
+    # The controller is number / s^3 and the axis gain / (s (lag s + 1)); ascending powers of s.
+    number = poly.polyadd(poly.polymul([ri, rp], [ai, ap, 1 + ad]), [0, 0, 0, 0, rd])
+    bottom = poly.polymul([0, 0, 0, 0, 1], [1, lag])
+    pade = np.array([120, 60 * delay, 12 * delay**2, delay**3])
+    top = poly.polymul(gain * number, pade * [1, -1, 1, -1])
+    whole: Array = np.trim_zeros(
+        poly.polyadd(top, poly.polymul(bottom, pade))
+    )  # without the integrators that are not there
+    return poly.polyroots(whole)
+
+
+def is_stable(gains: Gains, gain: float, lag: float, delay: float) -> bool:
+    """Whether all poles of the closed loop lie left."""
+    return bool((closed_poles(gains, gain, lag, delay).real < 0).all())
+
+
+def margins(gains: Gains, gain: float, lag: float, delay: float) -> Margins:
+    """Margins of the loop; found on a grid of frequencies, good to 1 %."""
+    if not is_stable(gains, gain, lag, delay):
+        return Margins(0.0, 0.0, 0.0, 0.0, 0.0)
+    value = loop_gain(gains, gain, lag, delay, FREQUENCIES)
+    size, angle = np.abs(value), np.unwrap(np.angle(value))
+    turns = np.round((angle[-1] + np.pi / 2 + FREQUENCIES[-1] * delay + np.pi / 2) / (2 * np.pi))
+    angle = angle - 2 * np.pi * turns  # at high frequency: -90 or -180 degrees and the delay's
+    crossing = np.flatnonzero((size[:-1] >= 1) != (size[1:] >= 1))
+    flips = np.flatnonzero(np.diff(np.floor((angle + np.pi) / (2 * np.pi))))
+    at_flip = size[flips]
+    down, up = at_flip[at_flip > 1], at_flip[at_flip <= 1]
+    spare = angle[crossing] + np.pi
+    return Margins(
+        float(np.degrees(np.abs(spare).min())),
+        float(1 / up.max()) if up.size else np.inf,
+        float(down.min()) if down.size else np.inf,
+        float((np.maximum(spare, 0) / FREQUENCIES[crossing]).min()),
+        float(FREQUENCIES[crossing[-1]]),
+    )
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """What is required of every axis. `worst` is each margin's smallest over the corners of what is not known."""
+
+    delay: float = 0.01  # of the loop itself: filters, estimator, sampling, motor drivers [s]
+    phase: float = 50.0  # at nominal lag, inertia and delay [deg]
+    gain: float = 3.0  # either way, likewise
+    worst_phase: float = 15.0  # [deg]
+    worst_gain: float = 2.0
+    worst_delay: float = 0.02  # [s]
+    lags: tuple[float, float] = (0.03, 0.15)  # of the motors [s]
+    inertias: tuple[float, float] = (0.6, 1.4)  # factors
+    attitude_error: float = 5.0  # attitude error that may take half of the headroom [deg]
+    bandwidth_ratio: float = 4.0  # the rate loop's bandwidth over the attitude loop's, at least
+    largest_derivative: float = 30.0  # largest kd of a rate loop, twelve times the delivered one: noise of the gyro
+    keep_below: float = 1.5  # an axis whose inertia is less than this times the drones' own keeps the delivered gains
+    unloaded_share: float = 0.15  # share of the headroom that the integral of an axis without a load may take
+
+
+REQUIREMENTS = Requirements()
+
+
+class Design(NamedTuple):
+    """Gains of one axis and what they are worth."""
+
+    axis: Axis
+    gains: Gains
+    nominal: Margins
+    worst: Margins  # each the smallest of the corners
+
+
+def design(config: Config) -> tuple[Design, ...]:
+    """Gains for roll, pitch and yaw of the pair in `config`. Raises ValueError if nothing keeps the margins."""
+    return tuple(design_axis(axis, config) for axis in axes(config))
+
+
+def design_axis(axis: Axis, config: Config) -> Design:
+    """The stiffest of a grid of gains: rate kp, its kd as a lead, attitude kp.
+
+    The rate integral alone holds lasting moments, sized for `Axis.trim`: both drones turn one body, so that the
+    integrals of two drones that see it differently run apart, and what they fight with must stay bounded.
+    An axis that both turn as each does alone keeps the delivered gains, which are flown everywhere.
+    """
+    if axis.inertia_ratio < REQUIREMENTS.keep_below:
+        return Design(
+            axis,
+            delivered_gains(axis),
+            *nominal_and_worst(delivered_gains(axis), axis, config.plant.rotor_lag),
+        )
+    held = max(axis.trim, REQUIREMENTS.unloaded_share * axis.headroom)
+    number = ("roll", "pitch", "yaw").index(axis.name)
+    integral = held / RATE_LIMITS[number]
+    lag = config.plant.rotor_lag
+    for attitude, rate, lead in candidates(axis, lag):
+        gains = rounded(Gains((attitude, 0.0, 0.0), (rate, integral, lead * rate)))
+        nominal = margins(gains, axis.gain, lag, REQUIREMENTS.delay)
+        if nominal.phase < REQUIREMENTS.phase or min(nominal.gain_up, nominal.gain_down) < REQUIREMENTS.gain:
+            continue
+        nominal, worst = nominal_and_worst(gains, axis, lag)
+        if worst.phase >= REQUIREMENTS.worst_phase and min(worst.gain_up, worst.gain_down) >= REQUIREMENTS.worst_gain:
+            return Design(axis, gains, nominal, worst)
+    raise ValueError(f"no gains keep the margins about {axis.name}")
+
+
+def candidates(axis: Axis, lag: float) -> list[tuple[float, float, float]]:
+    """(attitude kp, rate kp, lead time) within authority and noise, the stiffest first."""
+    stiffest = 0.5 * axis.headroom / REQUIREMENTS.attitude_error
+    rates, leads = np.geomspace(2.0, 60.0, 35) / axis.gain, np.linspace(0.0, lag, 6)
+    grid = itertools.product(np.geomspace(0.8, 8.0, 24), rates, leads)
+    stable = ((a, r, d) for a, r, d in grid if REQUIREMENTS.bandwidth_ratio * a <= r * axis.gain)
+    kept = [(a, r, d) for a, r, d in stable if a * r <= stiffest and d * r <= REQUIREMENTS.largest_derivative]
+    # Among the equally stiff the one with less lead, which is less noise.
+    return sorted(((float(a), float(r), float(d)) for a, r, d in kept), key=lambda c: (-c[0] * c[1], c[2]))
+
+
+def worst_margins(gains: Gains, axis: Axis) -> Margins:
+    """Smallest margins over the corners of lag and inertia, at the longest delay."""
+    corners = itertools.product(REQUIREMENTS.lags, REQUIREMENTS.inertias)
+    found = [margins(gains, axis.gain / inertia, lag, REQUIREMENTS.worst_delay) for lag, inertia in corners]
+    return Margins(*(min(column) for column in zip(*found, strict=True)))
+
+
+def nominal_and_worst(gains: Gains, axis: Axis, lag: float) -> tuple[Margins, Margins]:
+    """(nominal, worst) margins."""
+    return margins(gains, axis.gain, lag, REQUIREMENTS.delay), worst_margins(gains, axis)
+
+
+def rounded(gains: Gains) -> Gains:
+    """To three significant digits, as they are written to the drones."""
+    attitude, rate = ([float(f"{value:.3g}") for value in row] for row in gains)
+    return Gains((attitude[0], attitude[1], attitude[2]), (rate[0], rate[1], rate[2]))
+
+
+def delivered_gains(axis: Axis) -> Gains:
+    """The gains that a drone is delivered with."""
+    return gains_of(Autopilot(), axis)
+
+
+def gains_of(autopilot: Autopilot, axis: Axis) -> Gains:
+    """The gains of one axis in `autopilot`."""
+    return Gains(getattr(autopilot, axis.name), getattr(autopilot, f"{axis.name}_rate"))
+
+
+def apply(autopilot: Autopilot, designs: tuple[Design, ...]) -> Autopilot:
+    """`autopilot` with the gains of `designs`."""
+    roll, pitch, yaw = (one.gains for one in designs)
+    autopilot = replace(autopilot, roll=roll.attitude, pitch=pitch.attitude, yaw=yaw.attitude)
+    return replace(autopilot, roll_rate=roll.rate, pitch_rate=pitch.rate, yaw_rate=yaw.rate)
