@@ -29,7 +29,7 @@ from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.env import TransportEnv
 from mjxball.evaluate.policies import load_policy
 from mjxball.policy.file import shipped_policy
-from mjxball.policy.policy import NetworkLaw, Policy
+from mjxball.policy.inference import NetworkLaw, Policy
 from mjxball.sim.rollout import make_privileged_info, simulate_batch
 from mjxball.sim.scenario import Scenario
 from mjxball.xla import enable_compilation_cache

@@ -33,9 +33,9 @@ from mjxball.config import Config, from_record, preset, replace
 from mjxball.control.followers import Copy, Law
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import flies_any_rig, load_policy
-from mjxball.evaluate.rigs import AnyRigLaw, Flown, fly, rig_laws
+from mjxball.evaluate.random_rigs import AnyRigLaw, Flown, fly, rig_laws
 from mjxball.policy import Policy
-from mjxball.policy.policy import NetworkLaw
+from mjxball.policy.inference import NetworkLaw
 from mjxball.sim.rigs import HELD_OUT, HELD_OUT_RIGS, RigTable, draw_rigs, rig_config, unpadded
 
 SIZES, FLIGHTS = (2, 3, 4, 5, 6), 3

@@ -50,7 +50,7 @@ from mjxball.evaluate.policies import load_policy
 from mjxball.evaluate.variants import Suite, Variant
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
-from mjxball.policy.policy import NetworkLaw
+from mjxball.policy.inference import NetworkLaw
 from mjxball.reading import parse_json
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario

@@ -10,8 +10,8 @@ from command_line import TRANSPORT
 from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.fly import card, packets
-from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import FlightSettings
+from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin import virtual
 from mjxball.fly.twin.conditions import DELIVERED, DroneKind

@@ -34,7 +34,7 @@ MAINS = {
     "eval.py": "mjxball.commands.evaluate",
     "mjxball-eval": "mjxball.commands.evaluate",
     "mjxball.export": "mjxball.export",
-    "mjxball.view": "mjxball.view.command",
+    "mjxball.view": "mjxball.view.main",
     "mjxball.fly": "mjxball.fly.main",
     "mjxball.assembly": "mjxball.assembly",
     "mjxball.rig.design": "mjxball.rig.design",

@@ -23,7 +23,7 @@ from mjxball.export import main as export
 from mjxball.fly.main import make_parser as fly_parser
 from mjxball.policy import Policy, policy_path, shipped_policies, shipped_policy
 from mjxball.policy.file import load_file
-from mjxball.view.command import main as view
+from mjxball.view.main import main as view
 
 PARTS = ("mjxball", "policies", "docs", "tests", "benchmarks")
 FILES = ("*.toml", "*.md", "*.py", "*.cff", "LICENSE", "MANIFEST.in", "constraints.txt")
@@ -112,7 +112,7 @@ WORKS = {
     "runpy.run_module('mjxball.export', run_name='__main__')",
     "gym": "import gymnasium, mjxball.gym; env = gymnasium.make('mjxball/Flight-v0')\n"
     "env.reset(seed=0); env.step(env.action_space.sample())",
-    "view": "import sys; from mjxball.view.command import main\n"
+    "view": "import sys; from mjxball.view.main import main\n"
     "sys.exit(main([str(shipped_policy('flight')), '--seconds', '2', '--out', 'flight.html']))",
     "train": "import sys; from mjxball.entry import evaluate\n"
     "sys.argv = ['mjxball-eval', '--followers', 'copy', '--seconds', '1']; sys.exit(evaluate())",

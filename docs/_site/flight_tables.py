@@ -7,14 +7,14 @@ import math
 from pathlib import Path
 from typing import Any
 
-from mjxball.fly import command, lift
+from mjxball.fly import lift, setpoints
 from mjxball.fly.card import config_of
-from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import STAND_SPARE, Limits, Times
 from mjxball.fly.log_schema import KINDS
 from mjxball.fly.main import make_parser
 from mjxball.fly.mocap_supervision import MocapLimits
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR
+from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.supervisor import TRANSITIONS, Event, State
 from mjxball.fly.twin.conditions import Conditions
 from mjxball.policy import Policy
@@ -77,8 +77,8 @@ def bounds() -> str:
         "landing speed of the goal": f"{times.land_speed:g} m/s",
         "descent": f"{times.descend_speed:g} m/s for at most {times.descend_limit:g} s",
         "*hold* ends after the last word of a drone by": f"{times.drone_watchdog:g} s",
-        "thrust in *hold* below hover": f"up to {100 * command.UNEVEN / command.GRAVITY:.0f} %, "
-        f"{100 * command.GENTLE / command.GRAVITY:.0f} % where neither drone is heard",
+        "thrust in *hold* below hover": f"up to {100 * setpoints.UNEVEN / setpoints.GRAVITY:.0f} %, "
+        f"{100 * setpoints.GENTLE / setpoints.GRAVITY:.0f} % where neither drone is heard",
         "no good pose of a drone (motion capture)": f"{MocapLimits().lost:g} s",
     }
     return "\n".join(["| bound | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])

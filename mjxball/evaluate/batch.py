@@ -20,7 +20,7 @@ from mjxball.physics import mjx, newton_euler
 from mjxball.physics.engine import Load, PlantState
 from mjxball.physics.step import TRAINING_ENGINES, jax_repeat, make_cg_offset, make_control_step
 from mjxball.policy import Policy
-from mjxball.policy.policy import NetworkLaw
+from mjxball.policy.inference import NetworkLaw
 from mjxball.sim import rollout
 from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.disturbances import Sample, SensorModel, followers_axis, record, sensors_of

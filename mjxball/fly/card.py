@@ -15,8 +15,8 @@ from mjxball.config import Config
 from mjxball.control import crazyflie, motors, rotations
 from mjxball.control.crazyflie import PairGains
 from mjxball.control.motors import MOTORS, Motor
-from mjxball.fly.command import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
 from mjxball.fly.limits import Limits, Times
+from mjxball.fly.setpoints import CURVE_NAMES, OLDER, CommandMap, CurveName, ForceCurve, Variant, Variants
 from mjxball.fly.telemetry import Rig
 from mjxball.policy import Policy, PolicyFile, load_file, team
 from mjxball.sim.laws import Body, Laws

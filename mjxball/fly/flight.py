@@ -8,9 +8,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjxball.fly import command, packets, probe
+from mjxball.fly import packets, probe, setpoints
 from mjxball.fly.card import Commands, Controller
-from mjxball.fly.command import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
 from mjxball.fly.display import View
 from mjxball.fly.ending import Ending
 from mjxball.fly.figures import Flown
@@ -20,6 +19,7 @@ from mjxball.fly.mocap import Mocap
 from mjxball.fly.monitor import Monitor, Sustained, UplinkWatch, link_faults, tilt_angle
 from mjxball.fly.packets import ZERO, PacketError, Setpoint
 from mjxball.fly.preflight import SpinCheck
+from mjxball.fly.setpoints import SPIN_THRUST, CommandMap, CurveName, LastKnownState, Mapped, Variants
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State, Supervisor
 from mjxball.fly.takeoff import TakeOff
 from mjxball.fly.telemetry import DroneLink, Note, ObjectState, Rig, object_state
@@ -174,7 +174,7 @@ class Flight:
 
     def _last_known_state(self) -> LastKnownState:
         seen, trim = self._object(), sum(self._trims)
-        lift = command.GRAVITY * (sum(sent.thrust for sent in self._sent) / trim - 1) if trim else 0.0
+        lift = setpoints.GRAVITY * (sum(sent.thrust for sent in self._sent) / trim - 1) if trim else 0.0
         trims = (round(self._trims[0]), round(self._trims[1]))
         return LastKnownState(trims, self._height(seen), float(seen.velocity[2]), lift)
 
@@ -208,7 +208,7 @@ class Flight:
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(self._now))
             laws = [law + self._probe() for law in (self._commands.leader, self._commands.follower)]
-            mapped = [command.to_setpoint(law, constants) for law, constants in zip(laws, self.maps, strict=True)]
+            mapped = [setpoints.to_setpoint(law, constants) for law, constants in zip(laws, self.maps, strict=True)]
         except (PacketError, ValueError, FloatingPointError) as error:
             return None, [Fault(Event.BAD_STATE, str(error))]
         self._highest_place = max(self._highest_place, self._height(seen))
@@ -296,7 +296,7 @@ class Flight:
         if entered is State.LAND and before.state is not State.HOLD:
             self._land_height = self._height(self._object())
         if entered is State.DESCEND:
-            self._shares = command.blind_shares(self._last_known_state(), 0.0, self.settings.period)
+            self._shares = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
         if entered is State.HOLD:
             self._hold(faults)
 
@@ -310,7 +310,7 @@ class Flight:
             age = self._now - min(heard, default=self._now)
         self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
         # Gently: a drone that does not hear keeps its thrust, and the other must not sink away from it.
-        self._shares = command.blind_shares(self._last_known_state(), age, self.settings.period, command.GENTLE)
+        self._shares = setpoints.blind_shares(self._last_known_state(), age, self.settings.period, setpoints.GENTLE)
 
     # What is sent.
 
@@ -319,7 +319,7 @@ class Flight:
         if state in GUIDED:
             return [one.setpoint for one in mapped] if mapped else list(self._sent)
         if state is State.SPIN:
-            return [command.level(SPIN_THRUST)] * 2
+            return [setpoints.level(SPIN_THRUST)] * 2
         if state is State.RAMP:
             rising = self._object()
             return self._take_off.wanted(self.elapsed, rising, self._height(rising), self.maps)
@@ -328,25 +328,25 @@ class Flight:
         # Both drones alike: braking sideways by what is measured; sinking by it in DESCEND, else by the clock.
         seen, tilt = self._trusted(), (0.0, 0.0)
         if seen is not None and not (self.settings.stand or self._monitor.estimators.contradiction):
-            tilt = command.brake(seen.velocity)
+            tilt = setpoints.brake(seen.velocity)
         if seen is not None and state is State.DESCEND:
-            share = command.sinking_share(float(seen.velocity[2]), self.settings.times)
+            share = setpoints.sinking_share(float(seen.velocity[2]), self.settings.times)
         elif seen is not None and any(self._fresh):
-            share = command.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
+            share = setpoints.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
             share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]
         shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
-        return [command.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
+        return [setpoints.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 
     def _transmit(self, wanted: list[Setpoint]) -> None:
         state, dry = self.supervisor.state, self.settings.dry_run
         if state is State.RAMP:
             rises = zip(wanted, self.maps, strict=True)
-            self._trims = [min(float(s.thrust), command.MOST_TRIM * c.hover_thrust) for s, c in rises]
+            self._trims = [min(float(s.thrust), setpoints.MOST_TRIM * c.hover_thrust) for s, c in rises]
         elif state in GUIDED:
             parts = zip(self._trims, wanted, self.maps, strict=True)
             period = self.settings.period
-            self._trims = [command.smoothed(trim, s.thrust, period, c.hover_thrust) for trim, s, c in parts]
+            self._trims = [setpoints.smoothed(trim, s.thrust, period, c.hover_thrust) for trim, s, c in parts]
         self._sent = wanted
         self.highest = [max(most, value.thrust) for most, value in zip(self.highest, wanted, strict=True)]
         sometimes = self._count % 10 == 0 and not dry

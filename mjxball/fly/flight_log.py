@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mjxball.errors import InputError
-from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.log_schema import SCHEMA, Record, decode
+from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.reading import parse_json, time_fault
 
 SYNC_PERIOD = 1.0  # [s] between two fsyncs: a killed process loses nothing that was flushed, a power cut this much

@@ -13,8 +13,8 @@ import numpy as np
 
 from mjxball.control import motors
 from mjxball.control.motors import Motor
-from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import NAMES
+from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.supervisor import Event, Fault
 from mjxball.fly.telemetry import ObjectState, Rig
 

@@ -17,7 +17,7 @@ from mjxball import cli
 from mjxball.cli import run_command
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.fly import limits, onboard
+from mjxball.fly import app_flight, limits
 from mjxball.fly.app import generate
 from mjxball.fly.card import (
     Controller,
@@ -31,13 +31,13 @@ from mjxball.fly.card import (
     times_of,
     variants,
 )
-from mjxball.fly.command import CURVE_NAMES
 from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.mocap import KINDS, MocapSettings, ready
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.process import Child
 from mjxball.fly.session import FlightSetup, fly
+from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
 from mjxball.policy import Policy, policy_path
@@ -243,9 +243,9 @@ def on_board(
     generate.check_policy(policy, name)
     idents = [generate.ident_of(policy, int8) for int8 in (False, True)]
     weights = (weight_bytes(policy), generate.key_of(policy)) if options.upload else None
-    apps = onboard.Apps(name, idents, round(1000 * policy.card["control_period"]), weights)
-    variants = onboard.variants_of(setup.variants, setup.rig, settings)
-    return replace(setup, variants=variants, apps=apps), onboard.settings_of(settings)
+    apps = app_flight.Apps(name, idents, round(1000 * policy.card["control_period"]), weights)
+    variants = app_flight.variants_of(setup.variants, setup.rig, settings)
+    return replace(setup, variants=variants, apps=apps), app_flight.settings_of(settings)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -22,7 +22,6 @@ from mjxball.control.motors import Motor
 from mjxball.errors import InputError
 from mjxball.files import read_text
 from mjxball.fly import packets
-from mjxball.fly.command import CURVE_NAMES, CurveName, Variant, Variants
 from mjxball.fly.connection import LinkError
 from mjxball.fly.limits import NAMES, Check, Limits
 from mjxball.fly.link import Link
@@ -30,6 +29,7 @@ from mjxball.fly.mocap import KALMAN, Mocap
 from mjxball.fly.monitor import down_reason, stick_faults, tilt_angle
 from mjxball.fly.packets import GRAVITY, THRUST_CEILING, DroneState, Health
 from mjxball.fly.process import together, wait_until
+from mjxball.fly.setpoints import CURVE_NAMES, CurveName, Variant, Variants
 from mjxball.fly.supervisor import Event, Fault
 from mjxball.fly.telemetry import DroneLink, Note, Rig, yaw_of
 from mjxball.reading import parse_json

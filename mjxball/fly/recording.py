@@ -17,10 +17,10 @@ from mjxball.control.crazyflie import PARAMETERS, Gains, PairGains
 from mjxball.errors import InputError
 from mjxball.fly import flight_log
 from mjxball.fly.card import ThrustChoice, command_maps, drone_of, gains_of, with_curve
-from mjxball.fly.command import CURVE_NAMES, CurveName, ForceCurve
 from mjxball.fly.limits import NAMES, ticks_per_command
 from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
+from mjxball.fly.setpoints import CURVE_NAMES, CurveName, ForceCurve
 from mjxball.fly.supervisor import State
 from mjxball.fly.telemetry import ObjectState, Rig, object_state
 from mjxball.fly.twin.conditions import DroneKind, Surroundings, drone_kind

@@ -16,8 +16,8 @@ from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.errors import InputError
 from mjxball.fly import packets
+from mjxball.fly.app_flight import Apps, OnboardFlight
 from mjxball.fly.card import Controller
-from mjxball.fly.command import CurveName, Variants
 from mjxball.fly.display import Display, listening
 from mjxball.fly.figures import LEAST, SETTLING
 from mjxball.fly.flight import Flight
@@ -25,9 +25,9 @@ from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
-from mjxball.fly.onboard import Apps, OnboardFlight
 from mjxball.fly.preflight import Preflight, check, prepare
 from mjxball.fly.process import Metronome, Timing, together, urgent
+from mjxball.fly.setpoints import CurveName, Variants
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.watchdog import NOTHING, Watchdog

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjxball.control import rotations
-from mjxball.fly import command
-from mjxball.fly.command import CommandMap
+from mjxball.fly import setpoints
 from mjxball.fly.limits import NAMES, Times
 from mjxball.fly.packets import THRUST_CEILING, Setpoint
+from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.telemetry import ObjectState, Rig
 
 BEGIN = 0.85  # of the ramp, at 88 % of hover: a side that the load is not on comes off at 96 %
@@ -52,16 +52,16 @@ class TakeOff:
         tilt = (0.0, 0.0)
         if elapsed < BEGIN * self._times.ramp:
             # The floor need not be level.
-            setpoints = [command.ramp(elapsed, self._times, constants) for constants in maps]
-            self._share = setpoints[0].thrust / maps[0].hover_thrust - CLIMB_GAIN * CLIMB
+            found = [setpoints.ramp(elapsed, self._times, constants) for constants in maps]
+            self._share = found[0].thrust / maps[0].hover_thrust - CLIMB_GAIN * CLIMB
             self._apart, self._resting = 0.0, angle
         else:
             shares = self._shares(angle, seen, height)
-            tilt = tilt if self._stand else command.brake(seen.velocity)
+            tilt = tilt if self._stand else setpoints.brake(seen.velocity)
             thrusts = [share * constants.hover_thrust for share, constants in zip(shares, maps, strict=True)]
-            setpoints = [command.level(thrust, tilt) for thrust in thrusts]
-        self.sent = [float(one.thrust) for one in setpoints]
-        return setpoints
+            found = [setpoints.level(thrust, tilt) for thrust in thrusts]
+        self.sent = [float(one.thrust) for one in found]
+        return found
 
     def _shares(self, angle: float, seen: ObjectState, height: float) -> tuple[float, float]:
         """Shares of hover of leader and follower: a climb that is held, a stick that comes to be level."""

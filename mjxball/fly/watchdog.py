@@ -20,9 +20,9 @@ from typing import Any
 
 from mjxball.cli import make_parser
 from mjxball.fly import packets
-from mjxball.fly.command import LastKnownState, blind_shares
 from mjxball.fly.packets import Packet, Setpoint
 from mjxball.fly.process import Child
+from mjxball.fly.setpoints import LastKnownState, blind_shares
 
 FRAME = struct.Struct("<BHHfff")  # what is going on, then `LastKnownState`
 IDLE, FLYING, GOODBYE = 0, 1, 2

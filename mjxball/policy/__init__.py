@@ -14,7 +14,7 @@ from mjxball.policy.file import (
     shipped_policies,
     shipped_policy,
 )
-from mjxball.policy.policy import Policy
+from mjxball.policy.inference import Policy
 
 __all__ = [
     "Policy",

@@ -14,7 +14,7 @@ from mjxball.control.motors import firmware
 from mjxball.control.observation import mount_frames
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of
-from mjxball.policy.policy import geometry_of, not_told
+from mjxball.policy.inference import geometry_of, not_told
 
 CRAZYFLIES = Path("crazyflie")  # the plant that a policy for any rig flies where none is named
 

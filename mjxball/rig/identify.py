@@ -20,9 +20,9 @@ from mjxball.control.crazyflie import PARAMETERS, THRUST_CEILING, PairGains, pai
 from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.fly.card import with_curve
-from mjxball.fly.command import CurveName
 from mjxball.fly.preflight import read_gains
 from mjxball.fly.recording import one_curve, own_curve
+from mjxball.fly.setpoints import CurveName
 from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify, pair_mass
 from mjxball.rig.log import Log, read_log

@@ -11,9 +11,9 @@ import numpy as np
 from mjxball.control import rotations
 from mjxball.control.crazyflie import PERIOD, PairGains
 from mjxball.errors import InputError
-from mjxball.fly.command import CurveName
 from mjxball.fly.limits import NAMES
 from mjxball.fly.recording import GUIDED, FlightLog, Outage, load, numbers, outages
+from mjxball.fly.setpoints import CurveName
 from mjxball.policy.container import read_arrays
 from mjxball.reading import check_times
 

@@ -3,7 +3,7 @@
 import sys
 
 from mjxball.cli import quit_on_interrupt
-from mjxball.view.command import main
+from mjxball.view.main import main
 
 if __name__ == "__main__":
     quit_on_interrupt()  # there is nothing to save

@@ -27,7 +27,7 @@ from mjxball.control.network import gru_cell
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.policy import Policy, PolicyFile, PolicyFileError, load_file, save_file
-from mjxball.policy.policy import NetworkLaw
+from mjxball.policy.inference import NetworkLaw
 from mjxball.train.program import Environments
 
 UNITS = 7

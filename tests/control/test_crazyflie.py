@@ -17,7 +17,7 @@ from mjxball.config import PLANTS, Autopilot, preset, replace, validate, with_pl
 from mjxball.control import crazyflie, mixer
 from mjxball.errors import InputError
 from mjxball.fly import packets
-from mjxball.fly.command import CommandMap, ForceCurve, to_setpoint
+from mjxball.fly.setpoints import CommandMap, ForceCurve, to_setpoint
 
 STOCK = Autopilot(kind="crazyflie")
 LEVEL, STILL = np.zeros(3), np.zeros(3)

@@ -22,7 +22,7 @@ from mjxball.policy import Policy, PolicyFile
 from mjxball.policy.container import PolicyFileError
 from mjxball.policy.export import policy_file
 from mjxball.policy.file import save_file
-from mjxball.policy.policy import geometry_of
+from mjxball.policy.inference import geometry_of
 from mjxball.sim.follower import follower_law
 
 TEAM = preset("team")

@@ -13,8 +13,8 @@ from mjxball import config as configs
 from mjxball.control import crazyflie, rotations
 from mjxball.errors import InputError
 from mjxball.fly import card
-from mjxball.fly.command import ForceCurve, to_setpoint
 from mjxball.fly.limits import FlightSettings
+from mjxball.fly.setpoints import ForceCurve, to_setpoint
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.physics import StandIn, make_pair
 from mjxball.plant import plant_parameters

@@ -13,9 +13,9 @@ from tables import rows
 from mjxball.control import motors
 from mjxball.control.motors import MOTORS
 from mjxball.fly.card import command_maps, config_of
-from mjxball.fly.command import CommandMap
 from mjxball.fly.lift import ALL, LiftWatch
 from mjxball.fly.limits import FlightSettings
+from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.supervisor import Event, State
 from mjxball.fly.telemetry import ObjectState, Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mjxball.fly import packets, session
-from mjxball.fly.command import LastKnownState, Variant
 from mjxball.fly.limits import FlightSettings, Times
+from mjxball.fly.setpoints import LastKnownState, Variant
 from mjxball.fly.supervisor import AIRBORNE, Event, Fault, State, Supervisor
 
 NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]

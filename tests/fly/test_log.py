@@ -33,7 +33,7 @@ from mjxball.fly.packets import DroneState
 from mjxball.fly.recording import SILENCE, load, read_recording
 from mjxball.policy import Policy
 from mjxball.rig import identify
-from mjxball.view.command import main as view
+from mjxball.view.main import main as view
 
 PRESET = configs.preset("flight")
 HEADER = {"policy": "nobody", "config": configs.to_dict(PRESET), "gains": gains_to_json(pair_gains(PRESET.autopilot))}

@@ -14,7 +14,6 @@ import pytest
 from tables import rows
 
 from mjxball.control import rotations
-from mjxball.fly.command import CommandMap, Variant
 from mjxball.fly.connection import READ, Deadlines, Element, Identity, LinkError, Parameters, connect
 from mjxball.fly.limits import Limits
 from mjxball.fly.packets import DroneState, Health, Packet, Sensed
@@ -27,6 +26,7 @@ from mjxball.fly.preflight import (
     reset_estimator,
     stick_check,
 )
+from mjxball.fly.setpoints import CommandMap, Variant
 from mjxball.fly.telemetry import HealthSample, Rig, SensedSample
 
 KALMAN, COMPLEMENTARY = 2.0, 1.0

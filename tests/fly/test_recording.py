@@ -25,7 +25,7 @@ from mjxball.fly.twin.physics import make_pair
 from mjxball.policy import Policy, shipped_policy
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
-from mjxball.view.command import main as view
+from mjxball.view.main import main as view
 
 OLDER = drone_kind(curve="older")  # the motors of the preset
 EXACT = Surroundings(exact=True)  # neither the simulation nor `fly_again` has an estimator

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mjxball.fly.card import Controller, goal_of, limits_of, load_policy
-from mjxball.fly.command import CommandMap
 from mjxball.fly.limits import FlightSettings, Times
+from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.supervisor import Event, State
 from mjxball.fly.takeoff import BEGIN, MOST, TakeOff
 from mjxball.fly.telemetry import ObjectState, Rig

@@ -9,7 +9,7 @@ import pytest
 
 from mjxball.control import motors, rotations
 from mjxball.control.motors import MOTORS
-from mjxball.fly import command, preflight
+from mjxball.fly import preflight, setpoints
 from mjxball.fly.limits import Limits
 from mjxball.fly.monitor import JUMP, VARIANCE, EstimatorWatch, UplinkWatch, stick_faults
 from mjxball.fly.packets import MOTORS as MOTOR_VARIABLES
@@ -157,7 +157,7 @@ def test_a_drone_that_stopped_listening_is_found_within_the_firmwares_half_secon
 @pytest.mark.parametrize("name", ["2.1", "thrust-upgrade", "brushless"])
 @pytest.mark.parametrize("battery", [3.3, 3.7, 4.2])
 def test_both_firmwares_are_told_apart_by_their_pwm(name: str, battery: float) -> None:
-    motor, sent = MOTORS[name], float(command.SPIN_THRUST)
+    motor, sent = MOTORS[name], float(setpoints.SPIN_THRUST)
     pwm = float(motors.compensated(motor, np.float64(sent), np.float64(battery)))
     turned = np.array([1.0, -1.0, 1.0, -1.0]) * 800  # yaw and roll at work do not matter
     compensates = Health((0, 0, 0), tuple((pwm + turned).astype(int)), sent)

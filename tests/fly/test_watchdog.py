@@ -16,8 +16,8 @@ from conftest import too_busy
 from tables import rows
 
 from mjxball.fly import flight_log, packets, watchdog
-from mjxball.fly.command import LastKnownState, blind_shares
 from mjxball.fly.process import urgent
+from mjxball.fly.setpoints import LastKnownState, blind_shares
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin
 from mjxball.fly.watchdog import FLYING, GOODBYE, IDLE, NOTHING, packed

@@ -17,9 +17,9 @@ from mjxball import cli
 from mjxball import config as configs
 from mjxball.config import Config
 from mjxball.fly import card
-from mjxball.fly.command import CurveName
 from mjxball.fly.flight_log import Journal, read
 from mjxball.fly.limits import NAMES, FlightSettings
+from mjxball.fly.setpoints import CurveName
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin import conditions as kinds
 from mjxball.fly.twin.conditions import Conditions

@@ -19,13 +19,13 @@ from mjxball.control.followers import PrivilegedInfo
 from mjxball.env import TransportEnv
 from mjxball.errors import InputError
 from mjxball.evaluate.policies import load_policy
-from mjxball.evaluate.rigs import AnyRigLaw, Flown, fly, rig_laws, stacked
+from mjxball.evaluate.random_rigs import AnyRigLaw, Flown, fly, rig_laws, stacked
 from mjxball.physics.newton_euler import make_engine
 from mjxball.physics.step import make_control_step
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import largest_margin
 from mjxball.policy.file import load_file, save_file, shipped_policy
-from mjxball.policy.policy import geometry_of
+from mjxball.policy.inference import geometry_of
 from mjxball.sim.outside import outside
 from mjxball.sim.rigs import (
     TRAINING,

@@ -31,10 +31,10 @@ from mjxball.fly.main import main as fly
 from mjxball.fly.recording import read_recording
 from mjxball.fly.supervisor import State
 from mjxball.fly.twin.physics import make_pair
-from mjxball.view.command import main
 from mjxball.view.flight import flight_from
 from mjxball.view.live import LiveView, Server
 from mjxball.view.live_log import COLUMNS, STEP, LiveLog, columns
+from mjxball.view.main import main
 from mjxball.view.page import flight_page
 
 LIMIT = 20.0  # [s] that anything may take here on a busy machine

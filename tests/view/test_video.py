@@ -14,8 +14,8 @@ from command_line import assert_one_line, call, listing
 
 from mjxball.errors import InputError
 from mjxball.evaluate.render import render
-from mjxball.view.command import main
 from mjxball.view.flight import Flight, flight_from, save_flight
+from mjxball.view.main import main
 
 Image = pytest.importorskip("PIL.Image")
 

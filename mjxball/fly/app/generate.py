@@ -17,7 +17,7 @@ from mjxball.config import Config
 from mjxball.errors import InputError
 from mjxball.fly import card
 from mjxball.fly.app.protocol import CAUSES
-from mjxball.fly.command import CURVE_NAMES
+from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.fly.telemetry import Rig
 from mjxball.policy.file import PolicyFile
 from mjxball.policy.formats.c_header import APP, c_header, float_bytes, footprint, weight_bytes

@@ -17,9 +17,9 @@ from mjxball.assembly import ASSEMBLY, BALL_JOINT, FOLLOWER, LEADER, build_spec
 from mjxball.config import Config, Plant
 from mjxball.control import crazyflie, rotations
 from mjxball.control.crazyflie import with_stock_gains
+from mjxball.fly.twin.avionics import TICK, Onboard, Power
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.estimators import matrix_of, skew
-from mjxball.fly.twin.onboard import TICK, Onboard, Power
 from mjxball.fly.twin.pair import RUNNING, Modes, PairState
 from mjxball.physics import motion
 from mjxball.physics.engine import Load, PlantState

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from mjxball.fly.packets import ZERO, Setpoint
+from mjxball.fly.twin.arming import AIRBORNE, PERIOD, Phase, Supervisor
 from mjxball.fly.twin.conditions import DELIVERED, DroneKind
-from mjxball.fly.twin.supervisor import AIRBORNE, PERIOD, Phase, Supervisor
 
 THRUST_FLOOR, THRUST_CEILING = 1000, 60000  # [thrust units] below: motors stand still; above: cut
 PLANNER_PERIOD = 0.01  # [s] of the high-level commander, whose planner never flies here: it asks for motors off

@@ -13,8 +13,8 @@ from mjxball.config import Config
 from mjxball.control import motors, rotations
 from mjxball.errors import InputError
 from mjxball.fly.card import config_of, is_crazyflie
-from mjxball.fly.command import ForceCurve
 from mjxball.fly.packets import Setpoint, angles
+from mjxball.fly.setpoints import ForceCurve
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.pair import RUNNING, Modes, Pair, PairState, Report, remembered
 

@@ -15,24 +15,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.fly import onboard, packets
+from mjxball.fly import app_flight, packets
 from mjxball.fly.app.host import Library
 from mjxball.fly.app.protocol import APP_VARIABLES, sample_of
 from mjxball.fly.card import Controller, motor_of, times_of, variants
-from mjxball.fly.command import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
 from mjxball.fly.flight import Flight
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.monitor import down_reason, tilt_angle
 from mjxball.fly.packets import Packet
+from mjxball.fly.setpoints import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
 from mjxball.fly.supervisor import State, Supervisor
 from mjxball.fly.telemetry import HealthSample, Note, Rig, SensedSample, Telemetry
 from mjxball.fly.twin import logs
+from mjxball.fly.twin.arming import PERIOD
 from mjxball.fly.twin.conditions import DELIVERED, QUIET, Conditions, DroneKind, Surroundings
 from mjxball.fly.twin.drone import TwinDrone, advance
 from mjxball.fly.twin.pair import Pair, PairState
 from mjxball.fly.twin.physics import pair_of
 from mjxball.fly.twin.protocol import header
-from mjxball.fly.twin.supervisor import PERIOD
 from mjxball.policy import Policy
 
 STEP = 0.005  # [s] between two steps of the drones; delays are a whole number of them
@@ -193,8 +193,8 @@ class VirtualTwin:
         settings = settings or FlightSettings(seconds=2.0, stand=stand, times=times)
         self.settings = dataclasses.replace(settings, motor=motor_of(self.config))
         if self._onboard:
-            self.settings = onboard.settings_of(self.settings)
-            self.variants = onboard.variants_of(self.variants, self.rig, self.settings)
+            self.settings = app_flight.settings_of(self.settings)
+            self.variants = app_flight.variants_of(self.variants, self.rig, self.settings)
         self.track: list[Moment] = []
         self._start_flight(settle)
 
@@ -202,7 +202,7 @@ class VirtualTwin:
         """Prepare the drones, wait `settle` [s], and begin a flight as one whose checks have passed, if they would."""
         curve: CurveName = "linear" if "linear" in self.variants[0] else "older"
         controller, curves = Controller(self.policy), [curve, curve]
-        kind = onboard.OnboardFlight if self._onboard else Flight
+        kind = app_flight.OnboardFlight if self._onboard else Flight
         self.flight = kind(self.links, controller, self.variants, curves, self.rig, self.settings, self.log.note)
         for link, own in zip(self.links, self.variants, strict=True):
             link.telemetry = Telemetry()

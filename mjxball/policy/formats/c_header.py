@@ -23,7 +23,7 @@ from mjxball.control.observation import (
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.formats import c_texts
-from mjxball.policy.policy import known_geometry
+from mjxball.policy.inference import known_geometry
 from mjxball.policy.quantize import Rows, balanced, rows_of
 
 FLOAT = 4  # bytes

@@ -16,7 +16,7 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from mjxball.control import observation as layout
 from mjxball.policy.file import PolicyFile, law_of
-from mjxball.policy.policy import NetworkLaw, Policy, known_geometry
+from mjxball.policy.inference import NetworkLaw, Policy, known_geometry
 
 OPSET, IR_VERSION = 17, 8  # of 2022: read by every runtime of the last years
 BATCH = "flights"

@@ -18,9 +18,9 @@ from mjxball.export import main as export
 from mjxball.fly.app import generate, protocol
 from mjxball.fly.app.host import App, compile_pair
 from mjxball.fly.app.protocol import CAUSES, Phase
+from mjxball.fly.app_flight import Apps, send_weights
 from mjxball.fly.connection import LinkError
 from mjxball.fly.main import main as fly
-from mjxball.fly.onboard import Apps, send_weights
 from mjxball.fly.packets import Packet
 from mjxball.fly.telemetry import Rig
 from mjxball.policy import load_file

@@ -12,6 +12,7 @@ from twin_peer import ask, written
 from mjxball.fly import packets
 from mjxball.fly.packets import ARMED, AUTO_ARMED, CAN_ARM, CAN_FLY, CRASHED, FLYING, LOCKED, TUMBLED, ZERO, Setpoint
 from mjxball.fly.twin import logs, protocol
+from mjxball.fly.twin.arming import PERIOD, Phase
 from mjxball.fly.twin.conditions import (
     DELIVERED,
     DRONES,
@@ -26,7 +27,6 @@ from mjxball.fly.twin.drone import TwinDrone, advance
 from mjxball.fly.twin.firmware import BOOT_TIME, Firmware, Motors, Order
 from mjxball.fly.twin.physics import StandIn
 from mjxball.fly.twin.protocol import Peer, header
-from mjxball.fly.twin.supervisor import PERIOD, Phase
 
 BRUSHLESS = DRONES["brushless"]
 HIGH = Setpoint(8.0, -5.0, 10.0, 45000)

@@ -18,7 +18,7 @@ from mjxball.errors import InputError
 from mjxball.export import in_team
 from mjxball.policy import Policy, PolicyFile, load_file
 from mjxball.policy.file import law_of, shipped_policy
-from mjxball.policy.policy import NetworkLaw
+from mjxball.policy.inference import NetworkLaw
 from mjxball.sim.rollout import simulate
 from mjxball.sim.scenario import Scenario
 

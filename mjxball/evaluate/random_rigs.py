@@ -17,7 +17,7 @@ from mjxball.control.geometry import team_geometry
 from mjxball.env import PipelineState, State, TransportEnv
 from mjxball.evaluate.metrics import AT_LIMIT_WITHIN, SETTLED, STEADY_AFTER, near_limit, power_of
 from mjxball.physics.motion import object_mass
-from mjxball.policy.policy import NetworkLaw
+from mjxball.policy.inference import NetworkLaw
 from mjxball.sim.rigs import RigTable, rig_config
 
 if TYPE_CHECKING:

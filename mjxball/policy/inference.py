@@ -18,7 +18,7 @@ from mjxball.control.geometry import team_geometry
 from mjxball.control.network import Network
 from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile, law_of, load_file
-from mjxball.policy.single import SingleFollower
+from mjxball.policy.unbatched import SingleFollower
 
 ROUNDED = 1e-5  # that a GRU's state may be beyond 1
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from mjxball.errors import InputError
 from mjxball.fly.app.protocol import GROUP, AppSample, Phase, order, reason, upload
-from mjxball.fly.command import CURVE_NAMES, CurveName, Mapped, Variant, Variants
 from mjxball.fly.connection import LinkError
 from mjxball.fly.flight import Flight
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.monitor import UplinkWatch, tilt_angle
 from mjxball.fly.packets import ZERO, Setpoint
+from mjxball.fly.setpoints import CURVE_NAMES, CurveName, Mapped, Variant, Variants
 from mjxball.fly.supervisor import AIRBORNE, GUIDED, TRANSITIONS, Event, Fault, State
 from mjxball.fly.takeoff import STUCK
 from mjxball.fly.telemetry import DroneLink, Rig, object_state
