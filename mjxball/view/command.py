@@ -27,7 +27,7 @@ def parser() -> Parser:
         "source",
         nargs="+",
         metavar="POLICY|RUN|LOG",
-        help="recorded flight (.npz), flight log (.jsonl), or what to fly: a run directory, policy, baseline or "
+        help="recorded flight (.npz), flight log (.jsonl, .mcap), or what to fly: a run directory, policy, baseline or "
         "module:Class, your own; two are shown side by side with one clock",
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
