@@ -26,14 +26,11 @@ from mjxball.fly import flight_log
 from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import Record
 from mjxball.fly.log_sources import HEADER, RECORD
-from mjxball.fly.messages import TYPES, definition, messages
-from mjxball.fly.packets import DroneState
+from mjxball.fly.messages import Encoder
 from mjxball.fly.recording import read_recording
-from mjxball.fly.telemetry import Rig
 
 ABOUT = ("policy", "version", "config_hash", "mocap", "curve", "command")  # fields of the header, as metadata
 CHUNK_PERIOD = 0.25  # [s] between two chunks of an MCAP file that is recorded
-LATEST = 2**31  # [s] since 1970, from which on a bag cannot hold a time
 
 
 class _Whole:
@@ -63,46 +60,29 @@ class _Whole:
         self._rest.clear()
 
 
-class Recorder:
+class Recorder(Encoder):
     """Writes the records of a flight log as an MCAP file, chunk by chunk."""
 
     def __init__(self, stream: BinaryIO):
         """Write to `stream`, which can seek. Raises InputError without mcap-ros2-support."""
-        try:
-            from mcap.writer import Writer as McapWriter
-            from mcap_ros2.writer import Writer
-        except ModuleNotFoundError:
-            raise InputError("MCAP needs mcap-ros2-support; pip install 'mjxball[logs]'") from None
         self._file = _Whole(stream)
-        self._bag = McapWriter(self._file, use_summary_offsets=False)  # type: ignore[arg-type]
+        super().__init__(self._begun())
+
+    def _begun(self) -> Any:
+        from mcap.writer import Writer
+
+        self._bag = Writer(self._file, use_summary_offsets=False)  # type: ignore[arg-type]
         self._bag.start(profile="ros2", library=f"mjxball {__version__}")
-        self._writer = Writer(io.BytesIO())
-        self._writer._writer = self._bag  # its own lacks `flush`
-        self._schemas: dict[str, Any] = {}
-        self._newest: dict[str, DroneState] = {}
+        return self._bag
 
-    def take(self, line: bytes, record: Record) -> None:
+    def take_line(self, line: bytes, record: Record) -> None:
         """Write one `record`, the header first, and the `line` that holds it. Raises InputError: its clock is none."""
+        self.take(record)
         if record["kind"] == "header":
-            self._rig = Rig.of_plant(record["config"].plant)
-            # Nanoseconds since 1970, or since the log's own clock began.
-            self._shift = record["wall"] - record["t"] if "wall" in record else 0.0
             about = {name: str(record[name]) for name in ABOUT if name in record}
-            self._writer.add_metadata("mjxball", {**about, "config": json.dumps(to_dict(record["config"]))})
-        seconds = record["t"] + self._shift
-        if not 0 <= seconds < LATEST:
-            raise InputError(f"the flight log's wall clock, {seconds:g} s, is none that a bag can hold")
-        now = round(seconds * 1e9)
+            self._bag.add_metadata("mjxball", {**about, "config": json.dumps(to_dict(record["config"]))})
         name = HEADER if record["kind"] == "header" else RECORD
-        self._write(f"/{name}", {"data": line.decode()}, now)
-        for topic, fields in messages(record, self._newest, self._rig, now):
-            self._write(topic, fields, now)
-
-    def _write(self, topic: str, fields: dict[str, Any], now: int) -> None:
-        name = TYPES[topic.rpartition("/")[2]]
-        if name not in self._schemas:
-            self._schemas[name] = self._writer.register_msgdef(name.replace("/", "/msg/"), definition(name))
-        self._writer.write_message(topic, self._schemas[name], fields, now)
+        self.write(f"/{name}", {"data": line.decode()}, self.time(record))
 
     def flush(self) -> None:
         """End the chunk and write the index after it, where the next chunk will be: the file is whole."""
@@ -117,7 +97,7 @@ def write_mcap(path: Path, log: Path) -> list[str]:
     stream = io.BytesIO()
     recorder = Recorder(stream)
     for line, record in flight_log.read_lines(log, remarks.append):
-        recorder.take(line, record)
+        recorder.take_line(line, record)
     recorder.flush()
     write_whole(path, stream.getvalue())
     return remarks
@@ -137,7 +117,7 @@ def record_lines(source: BinaryIO, target: BinaryIO) -> int:
             records = tail.read()
             going, waiting = records is not None, waiting or bool(records)
             for line, record in zip(tail.lines, records or (), strict=True):
-                recorder.take(line, record)
+                recorder.take_line(line, record)
         if waiting and time.monotonic() - written >= CHUNK_PERIOD:
             recorder.flush()
             written, waiting = time.monotonic(), False

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 from mjxball.control import rotations
+from mjxball.errors import InputError
 from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
 from mjxball.fly.telemetry import Rig, object_state
 
 WORLD, OBJECT = "world", "object"  # frames, beside one a drone
+LATEST = 2**31  # [s] since 1970, from which on a message cannot hold a time
 INFO, WARN, ERROR = 20, 30, 40  # levels of rcl_interfaces/msg/Log
 TEXTS = {
     "console": INFO,
@@ -91,6 +94,48 @@ def definition(name: str) -> str:
     visit(name)
     line = "=" * 80
     return "\n".join([FIELDS[name], *(f"{line}\nMSG: {inner}\n{FIELDS[inner]}" for inner in found)])
+
+
+class Encoder:
+    """Makes messages of the records of a flight log, and gives them to a sink."""
+
+    def __init__(self, sink: Any):
+        """`sink` takes schemas, channels and messages as `mcap.writer.Writer` does.
+
+        Raises InputError without mcap-ros2-support.
+        """
+        try:
+            from mcap_ros2.writer import Writer
+        except ModuleNotFoundError:
+            raise InputError("messages of ROS 2 need mcap-ros2-support; pip install 'mjxball[logs]'") from None
+        self._writer = Writer(io.BytesIO())
+        self._writer._writer = sink  # its own is none that can be given
+        self._schemas: dict[str, Any] = {}
+        self._newest: dict[str, DroneState] = {}
+
+    def take(self, record: Record) -> None:
+        """Write the messages of one `record`, the header first. Raises InputError: its clock is none."""
+        if record["kind"] == "header":
+            self._rig = Rig.of_plant(record["config"].plant)
+            # Nanoseconds since 1970, or since the log's own clock began.
+            self._shift = record["wall"] - record["t"] if "wall" in record else 0.0
+        now = self.time(record)
+        for topic, fields in messages(record, self._newest, self._rig, now):
+            self.write(topic, fields, now)
+
+    def time(self, record: Record) -> int:
+        """Of a record [ns]. Raises InputError if a message cannot hold it."""
+        seconds = record["t"] + self._shift
+        if not 0 <= seconds < LATEST:
+            raise InputError(f"the flight log's wall clock, {seconds:g} s, is none that a bag can hold")
+        return round(seconds * 1e9)
+
+    def write(self, topic: str, fields: dict[str, Any], now: int) -> None:
+        """Write one message at `now` [ns]."""
+        name = TYPES[topic.rpartition("/")[2]]
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_msgdef(name.replace("/", "/msg/"), definition(name))
+        self._writer.write_message(topic, self._schemas[name], fields, now)
 
 
 def messages(record: Record, newest: dict[str, DroneState], rig: Rig, time: int) -> Iterator[Message]:

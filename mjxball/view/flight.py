@@ -172,7 +172,9 @@ def read_log(path: Path) -> Flight:
     from mjxball.fly.recording import read_recording
 
     if path.suffix not in (".jsonl", *BAGS):
-        raise InputError(f"{path} is no flight (.npz), flight log (.jsonl, .mcap), policy (.npz) or run directory")
+        raise InputError(
+            f"{path} is no flight (.npz), flight log (.jsonl) or bag (.mcap), policy (.npz) or run directory"
+        )
     recording = read_recording(path)
     if recording.policy == UNKNOWN:
         raise InputError(f"{path} says no goal that could be shown; eval.py --flight draws it")
