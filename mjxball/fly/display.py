@@ -156,7 +156,8 @@ def live_view(log: Path, port: int = 0, foxglove: int | None = None) -> Child:
     """
     more = [] if foxglove is None else ["--foxglove", str(foxglove)]
     flags = ["--live", "--attached", "--port", str(port), *more, "--", str(log)]
-    return Child(["mjxball.view", *flags], "the live view did not start; are the ports of --view and --foxglove free?")
+    also = " and of --foxglove" if more else ""
+    return Child(["mjxball.view", *flags], f"the live view did not start; is the port of --view{also} free?")
 
 
 KILL_KEYS = b" kK"  # the largest key, found without looking

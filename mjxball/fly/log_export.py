@@ -93,6 +93,8 @@ class Recorder(Encoder):
 
 def write_mcap(path: Path, log: Path) -> list[str]:
     """Write the flight log `log` as the MCAP file `path`; returns what a reader should know. Raises InputError."""
+    if log.suffix == ".mcap":
+        raise InputError(f"{log} is an MCAP file already")
     remarks: list[str] = []
     stream = io.BytesIO()
     recorder = Recorder(stream)

@@ -100,7 +100,7 @@ class Encoder:
     """Makes messages of the records of a flight log, and gives them to a sink."""
 
     def __init__(self, sink: Any):
-        """`sink` takes schemas, channels and messages as `mcap.writer.Writer` does.
+        """`sink` takes schemas, channels and messages as the writer of the package mcap does.
 
         Raises InputError without mcap-ros2-support.
         """

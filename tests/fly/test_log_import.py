@@ -67,7 +67,7 @@ def printed(main: Any, arguments: list[Any], capsys: pytest.CaptureFixture[str])
     return [line for line in capsys.readouterr().out.splitlines() if "figure" not in line]
 
 
-def test_a_bag_of_ours_is_the_log_itself(flight: Recording, exported: Path) -> None:
+def test_a_bag_of_ours_is_the_log_itself(log: Path, flight: Recording, exported: Path, tmp_path: Path) -> None:
     again = read_recording(exported)
     for field in dataclasses.fields(Recording):
         one, other = getattr(flight, field.name), getattr(again, field.name)
@@ -76,6 +76,9 @@ def test_a_bag_of_ours_is_the_log_itself(flight: Recording, exported: Path) -> N
         else:
             assert one == other, field.name
     assert again.setup.gains[1]["pid_attitude.roll_kp"] == 7.0
+    tables = [call(export, [path, tmp_path / f"{path.suffix[1:]}.csv"]) for path in (log, exported)]
+    assert tables == [0, 0]
+    assert (tmp_path / "jsonl.csv").read_bytes() == (tmp_path / "mcap.csv").read_bytes()
 
 
 @pytest.mark.slow
