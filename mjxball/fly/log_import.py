@@ -17,15 +17,16 @@ from mjxball.control import rotations
 from mjxball.control.crazyflie import PERIOD, pair_gains
 from mjxball.errors import InputError
 from mjxball.fly.limits import NAMES
-from mjxball.fly.log_bags import BAGS, read_bag
+from mjxball.fly.log_bags import BAGS, Found, read_bag
 from mjxball.fly.log_cfclient import read_cfclient
 from mjxball.fly.log_schema import SCHEMA, Record, StatePacket
-from mjxball.fly.log_sources import TOPICS, VARIABLES, Samples, Series
+from mjxball.fly.log_sources import TOPICS, VARIABLES, Samples
 from mjxball.fly.packets import DroneState
 from mjxball.fly.supervisor import State
 from mjxball.fly.telemetry import Rig
 
 UNKNOWN = "an unknown follower"  # name of the policy of a flight that another program recorded
+LONGEST = 4 * 3600.0  # [s] of a recording
 NEEDED = ("position", "quaternion", "sent")
 DIFFERENT = 0.5  # share of the drones' distance by which they may be elsewhere than the rig says
 ALIKE = 0.5  # correlation of the two drones' rates from which on their clocks count as brought together
@@ -53,7 +54,7 @@ def read(path: Path, remark: Callable[[str], None], assumed: Config | None = Non
         found = read_bag(path, remark)
         if found.lines:
             return found.lines
-        pair = _of_bag(path, found.series, found.has, Rig.of_plant(config.plant), remark)
+        pair = _of_bag(path, found, Rig.of_plant(config.plant), remark)
     states = [_states(own, name, remark) for name, own in zip(NAMES, pair, strict=True)]
     remark("it does not say which rig flew: plant and gains are assumed")
     return _records(config, states, [own["sent"] for own in pair])
@@ -70,8 +71,8 @@ def _of_cfclient(path: Path, remark: Callable[[str], None]) -> list[Drone]:
         if lacking:
             wanted = ", ".join(variable for variable, one in VARIABLES.items() if one.quantity == lacking[0])
             raise InputError(f"{path / name} has no {lacking[0]}; expected all numbers of it of {wanted}")
-    (time, leader), (other, follower) = (own["rates"] for own in pair)
-    late, alike = _lag((time, leader), (other, follower))
+        _check(path, own, name)
+    late, alike = _lag(*(own["rates"] for own in pair))
     if alike < ALIKE:
         raise InputError(
             f"{path} is of two clocks: at best the drones' rates agree by {alike:.2f}; expected {ALIKE:g} or more, of "
@@ -97,16 +98,18 @@ def _lag(one: Samples, other: Samples) -> tuple[float, float]:
     return float(grids[0][0] - grids[1][0] + shift * PERIOD), float(agree[best] / scale) if scale else 0.0
 
 
-def _of_bag(path: Path, series: Series, has: str, rig: Rig, remark: Callable[[str], None]) -> list[Drone]:
+def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -> list[Drone]:
     """Leader and follower by their names, or by where on the stick they are."""
-    whole = {name: own for name, own in series.items() if own.keys() >= set(NEEDED)}
+    whole = {name: own for name, own in found.series.items() if own.keys() >= set(NEEDED)}
+    for name, own in whole.items():
+        _check(path, own, name)
     if whole.keys() >= set(NAMES):
         return [whole[name] for name in NAMES]
     if len(whole) != 2:
         names = [f"/DRONE/{last} ({TOPICS[last].type})" for last in ("pose", "odom", "cmd_vel_legacy")]
         raise InputError(
             f"bag {path} holds {len(whole)} drones with poses and setpoints; expected two, each with {names[0]} or "
-            f"{names[1]}, and {names[2]}; found {has}"
+            f"{names[1]}, and {names[2]}; found {found.has}"
         )
     (one, first), (other, second) = whole.items()
     apart = _from_each_other(first, second)
@@ -149,11 +152,21 @@ def _attitude(time: np.ndarray, own: Drone) -> np.ndarray:
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
+def _check(path: Path, own: Drone, name: str) -> None:
+    """Raise InputError if a series is too short or too long, or not of finite numbers."""
+    for quantity, (time, rows) in own.items():
+        if len(time) < 2 or not (quantity == "battery" or np.isfinite(rows).all()):
+            raise InputError(
+                f"{path}: the {name}'s {quantity} has {len(time)} rows; expected two or more of finite numbers"
+            )
+        if time[-1] - time[0] > LONGEST:
+            span = f"{time[-1] - time[0]:.3g} s"
+            raise InputError(f"{path}: the {name}'s {quantity} goes on for {span}; expected {LONGEST:g} s or less")
+
+
 def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[float, DroneState]]:
     """The states of one drone at the times of its positions."""
     time, position = own["position"]
-    if len(time) < 2 or not np.isfinite(position).all():
-        raise InputError(f"the {name} has {len(time)} positions; expected two or more, all of finite numbers")
     quaternion = _attitude(time, own)
     matrices = rotations.matrix_from_quaternion(quaternion)
     derived = []

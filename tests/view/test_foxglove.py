@@ -14,9 +14,9 @@ from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
 from mjxball.fly import flight_log
+from mjxball.fly.display import live_view
 from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import FlightSettings
-from mjxball.fly.main import main as fly
 from mjxball.view.command import main as view
 from mjxball.view.foxglove import Foxglove
 
@@ -28,12 +28,17 @@ PATIENCE = 20.0  # [s]
 
 
 @pytest.fixture(scope="module")
-def records(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a short flight."""
     path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
     with Journal(path, **log_header(contents)) as notes:
         VirtualTwin(FlightSettings(seconds=0.5), contents=contents, log=notes).run()
-    return list(flight_log.read(path))
+    return path
+
+
+@pytest.fixture(scope="module")
+def records(log: Path) -> list[dict[str, Any]]:
+    return list(flight_log.read(log))
 
 
 def heard(plug: Any, operation: str) -> dict[str, Any]:
@@ -75,6 +80,15 @@ def test_a_foreign_client_reads_the_poses(records: list[dict[str, Any]]) -> None
     np.testing.assert_array_equal(places, wanted)
 
 
+def test_the_live_view_serves_it_too(log: Path) -> None:
+    with live_view(log, foxglove=0) as page:
+        address = page.line.partition("Foxglove connects to ")[2]
+        with client.connect(address, subprotocols=["foxglove.sdk.v1"]) as plug:
+            topics: set[str] = set()
+            while not topics >= {"/tf", "/follower/command", "/goal"}:
+                topics |= {one["topic"] for one in heard(plug, "advertise")["channels"]}
+
+
 def test_only_this_machine_is_served() -> None:
     with Foxglove(0) as server:
         port = int(server.address.rpartition(":")[2])
@@ -88,18 +102,12 @@ def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Foxglove(0) as server:
         taken = server.address.rpartition(":")[2]
         cases = [
-            (view, ["--live", log, "--foxglove", taken], f"port {taken} of --foxglove cannot be had"),
-            (view, ["--live", log, "--foxglove", 70000], "--foxglove must be 1 to 65535, not 70000"),
-            (view, [log, "--foxglove", 0], "--foxglove goes with --live"),
-            (fly, ["flight", "--rehearse", "--foxglove", 0], "goes with --view"),
-            (
-                fly,
-                ["flight", "--rehearse", "--view", "--log", tmp_path / "a.mcap"],
-                "--view follows a log of JSON lines",
-            ),
+            (["--live", log, "--foxglove", taken], f"port {taken} of --foxglove cannot be had"),
+            (["--live", log, "--foxglove", 70000], "--foxglove must be 1 to 65535, not 70000"),
+            ([log, "--foxglove", 0], "--foxglove goes with --live"),
         ]
-        for main, arguments, reason in cases:
-            assert call(main, arguments) == 2, arguments
+        for arguments, reason in cases:
+            assert call(view, arguments) == 2, arguments
             errors = capsys.readouterr().err
             assert reason in errors, errors
             assert_one_line(errors)
