@@ -29,7 +29,10 @@ UNKNOWN = "an unknown follower"  # name of the policy of a flight that another p
 LONGEST = 4 * 3600.0  # [s] of a recording
 NEEDED = ("position", "quaternion", "sent")
 DIFFERENT = 0.5  # share of the drones' distance by which they may be elsewhere than the rig says
+UNEVEN = 0.1  # by which the length of an attitude's quaternion may differ from 1
 ALIKE = 0.5  # correlation of the two drones' rates from which on their clocks count as brought together
+
+Drone = dict[str, Samples]  # by quantity
 
 
 def is_foreign(path: Path) -> bool:
@@ -58,9 +61,6 @@ def read(path: Path, remark: Callable[[str], None], assumed: Config | None = Non
     states = [_states(own, name, remark) for name, own in zip(NAMES, pair, strict=True)]
     remark("it does not say which rig flew: plant and gains are assumed")
     return _records(config, states, [own["sent"] for own in pair])
-
-
-Drone = dict[str, Samples]  # by quantity
 
 
 def _of_cfclient(path: Path, remark: Callable[[str], None]) -> list[Drone]:
@@ -142,18 +142,15 @@ def _at(time: np.ndarray, samples: Samples) -> np.ndarray:
 
 
 def _attitude(time: np.ndarray, own: Drone) -> np.ndarray:
-    """(n, 4) unit quaternions at `time`. Raises InputError if some are none."""
+    """(n, 4) unit quaternions at `time`."""
     when, rows = own["quaternion"]
-    length = np.linalg.norm(rows, axis=1)
-    if not (np.abs(length - 1) < 0.1).all():
-        raise InputError(f"an attitude's quaternion has length {length[np.abs(length - 1).argmax()]:.2g}; expected 1")
     turns = np.cumprod([1.0, *np.where((rows[1:] * rows[:-1]).sum(axis=1) < 0, -1.0, 1.0)])
     found = _at(time, (when, rows * turns[:, None]))
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 def _check(path: Path, own: Drone, name: str) -> None:
-    """Raise InputError if a series is too short or too long, or not of finite numbers."""
+    """Raise InputError if a series is too short or too long, not of finite numbers, or its attitudes are none."""
     for quantity, (time, rows) in own.items():
         if len(time) < 2 or not (quantity == "battery" or np.isfinite(rows).all()):
             raise InputError(
@@ -162,6 +159,10 @@ def _check(path: Path, own: Drone, name: str) -> None:
         if time[-1] - time[0] > LONGEST:
             span = f"{time[-1] - time[0]:.3g} s"
             raise InputError(f"{path}: the {name}'s {quantity} goes on for {span}; expected {LONGEST:g} s or less")
+    lengths = np.linalg.norm(own["quaternion"][1], axis=1)
+    worst = lengths[np.abs(lengths - 1).argmax()]
+    if abs(worst - 1) > UNEVEN:
+        raise InputError(f"{path}: the {name} has a quaternion of length {worst:.2g}; expected 1")
 
 
 def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[float, DroneState]]:

@@ -84,7 +84,7 @@ def _line(one: Any) -> Iterator[Part]:
 
 
 TOPICS = {
-    HEADER: Topic("std_msgs/String", "the first line of our own flight log; the bag then needs no other than", _line),
+    HEADER: Topic("std_msgs/String", "the first line of our own flight log; nothing but the next is then read", _line),
     RECORD: Topic("std_msgs/String", "its other lines", _line),
     "odom": Topic("nav_msgs/Odometry", "position, attitude; velocity in the world, as Crazyswarm2 has it", _odometry),
     "pose": Topic("geometry_msgs/PoseStamped", "position and attitude", _pose),

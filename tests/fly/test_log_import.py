@@ -224,6 +224,7 @@ def test_bad_input_is_refused_in_one_sentence(
 ) -> None:
     turn = turning(np.full(50, 0.3))
     far = [{**one, "raw": one["raw"]._replace(state=moved(one))} if "raw" in one else one for one in turn]
+    lost = [{**one, "raw": one["raw"]._replace(state=unturned(one))} if "raw" in one else one for one in turn]
     (tmp_path / "folder").mkdir()
     (tmp_path / "text.mcap").write_text("an MCAP file?")
     (tmp_path / "none.mcap").write_bytes(b"")
@@ -243,6 +244,7 @@ def test_bad_input_is_refused_in_one_sentence(
         (write_bag(tmp_path / "other", turn, pose="Pose"), "found /cf231/cmd_vel_legacy (geometry_msgs/Twist)"),
         (write_bag(tmp_path / "late", turn, late=3 * 10**9), "is stamped 3 s before it was received; expected 0.05 s"),
         (write_bag(tmp_path / "far", far), "expected 0.00 0.30 0.00, as leader and follower are"),
+        (write_bag(tmp_path / "lost", lost), "has a quaternion of length 0; expected 1"),
         (tmp_path / "folder", "without metadata.yaml, .mcap or .db3; expected a rosbag2"),
         (tmp_path / "text.mcap", "begins with b'an MCAP '; expected an MCAP file"),
         (tmp_path / "none.mcap", "is empty; expected an MCAP file"),
@@ -273,6 +275,11 @@ def moved(record: Record) -> DroneState:
     """The state in `record`, a leader's far to the left."""
     state = record["raw"].state
     return state._replace(position=state.position + (np.array([4.0, 0, 0]) if record["drone"] == "leader" else 0))
+
+
+def unturned(record: Record) -> DroneState:
+    """The state in `record` with the attitude of a tracker that sees nothing."""
+    return record["raw"].state._replace(quaternion=np.zeros(4))
 
 
 def bag_of_nothing() -> bytes:
