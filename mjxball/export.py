@@ -2,7 +2,7 @@
 
 Of a policy file, or a run's newest checkpoint, OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header);
 see docs/policy-file.md. With --crazyflie it is a new directory of apps for both drones; see docs/onboard.md. Of a
-flight log, .jsonl, it ends in .mcap (ROS 2 messages), .csv or .parquet; see docs/flight-log.md.
+flight log, .jsonl or .mcap, it ends in .mcap (ROS 2 messages), .csv or .parquet; see docs/flight-log.md.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def command() -> int:
-        if options.source.suffix == ".jsonl":
+        if options.source.suffix in (".jsonl", ".mcap"):
             if options.crazyflie or options.int8 or options.plant or options.drone is not None:
                 raise InputError("a flight log takes no other flag")
             for remark in export_log(options.source, options.out):

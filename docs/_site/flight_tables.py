@@ -11,6 +11,7 @@ from mjxball.fly import lift, setpoints
 from mjxball.fly.card import config_of
 from mjxball.fly.limits import STAND_SPARE, Limits, Times
 from mjxball.fly.log_schema import KINDS
+from mjxball.fly.log_sources import HEADER, RECORD, TOPICS, VARIABLES
 from mjxball.fly.main import make_parser
 from mjxball.fly.mocap_supervision import MocapLimits
 from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR
@@ -29,6 +30,18 @@ def log_kinds() -> str:
         for field, (type_, text, required) in kind.fields.items():
             lines.append(f"| {head} | `{field}`{'' if required else ' (optional)'} | {type_.name} | {text} |")
             head = " | "
+    return "\n".join(lines)
+
+
+def log_sources() -> str:
+    """What is read of bags and of cfclient's files."""
+    lines = ["| topic | type | what is taken |", "|---|---|---|"]
+    for name, topic in TOPICS.items():
+        place = "" if name in (HEADER, RECORD, "tf") else "/DRONE"
+        lines.append(f"| `{place}/{name}` | `{topic.type}` | {topic.text} |")
+    lines += ["", "| log variable | what | number | in SI units, or as sent |", "|---|---|---|---|"]
+    for name, variable in VARIABLES.items():
+        lines.append(f"| `{name}` | {variable.quantity} | {variable.place + 1} | × {variable.factor:.6g} |")
     return "\n".join(lines)
 
 

@@ -103,9 +103,7 @@ def parser() -> cli.Parser:
     result.add_argument("--figures", nargs="+", metavar="NAME", help=f"the paper's: {figures}, or all")
     about = "of figures: screen (default), or paper: PDF of a column's width"
     result.add_argument("--style", choices=STYLES, default="screen", help=about)
-    result.add_argument(
-        "--flight", type=Path, metavar="LOG", help="draw a flight log, its commands simulated beside it"
-    )
+    result.add_argument("--flight", type=Path, metavar="LOG", help="draw a flight log or a bag, its commands simulated")
     result.add_argument("--force", action="store_true", help="fly policies made for another plant or rate, marked")
     result.add_argument("--list", action="store_true", help="list the benchmark suites and stop")
     result.add_argument(
@@ -309,14 +307,15 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
 
 
 def _flight(options: argparse.Namespace) -> int:
-    """Draw a flight log; what was flown is the log's, so that no other flag but --out goes with it."""
-    given = [name for name in ("figures", *NOT_WITH_FIGURES) if getattr(options, name) not in (None, False, [])]
+    """Draw a flight log; what was flown is the log's, so that no other flag but --out and --plant goes with it."""
+    others = [name for name in ("figures", *NOT_WITH_FIGURES) if name != "plant"]
+    given = [name for name in others if getattr(options, name) not in (None, False, [])]
     if options.policies or given:
         what = "the policies" if options.policies else f"--{given[0].replace('_', '-')}"
         raise InputError(f"--flight draws what was flown; drop {what}")
     if options.out is None:
         raise InputError("--flight needs --out DIR, a directory to write to")
-    return evaluate_log(options.flight, options.out, options.style)
+    return evaluate_log(options.flight, options.out, options.style, options.plant)
 
 
 def _figures(options: argparse.Namespace, arguments: Sequence[str]) -> int:

@@ -9,9 +9,11 @@ import numpy as np
 
 from mjxball import cli
 from mjxball.control import rotations
+from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure, rotor_limits
 from mjxball.evaluate.plots import draw_flights
 from mjxball.evaluate.results import Result, scenario_title
+from mjxball.fly.log_import import UNKNOWN
 from mjxball.fly.recording import Recording, fly_again, read_recording
 from mjxball.fly.twin.conditions import Conditions
 from mjxball.plotting import SIMULATED, file_format, style
@@ -23,9 +25,14 @@ MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
 DIVERGED = 0.25  # [m] of difference from which on the open-loop simulation is not drawn
 
 
-def evaluate_log(path: Path, out: Path, look: str = "screen") -> int:
-    """Draw the log `path` into the new directory `out`, print how far the simulation is from it; the exit code."""
-    recording = read_recording(path)
+def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None = None) -> int:
+    """Draw the log `path` into the new directory `out`, print how far the simulation is from it; the exit code.
+
+    `plant` is the rig that flew, if the log does not say. Raises InputError if it does.
+    """
+    recording = read_recording(path, cli.plant_setup(plant, "flight"))
+    if plant is not None and recording.policy != UNKNOWN:
+        raise InputError(f"flight log {path} says which rig flew: drop --plant")
     cli.output_directory(out)
     for remark in recording.remarks:
         warn(remark)

@@ -147,13 +147,17 @@ class Display:
         self._phase = phase
 
 
-def live_view(log: Path, port: int = 0) -> Child:
+def live_view(log: Path, port: int = 0, foxglove: int | None = None) -> Child:
     """A running `python -m mjxball.view --live` of the flight log `log`, whose `line` says where its page is.
+
+    `foxglove` is the port of that for Foxglove, if there is to be one.
 
     Nothing waits for it while flying: it reads the log, and its output is not read. Raises InputError.
     """
-    flags = ["--live", "--attached", "--port", str(port), "--", str(log)]
-    return Child(["mjxball.view", *flags], "the live view did not start; is the port of --view free?")
+    more = [] if foxglove is None else ["--foxglove", str(foxglove)]
+    flags = ["--live", "--attached", "--port", str(port), *more, "--", str(log)]
+    also = " and of --foxglove" if more else ""
+    return Child(["mjxball.view", *flags], f"the live view did not start; is the port of --view{also} free?")
 
 
 KILL_KEYS = b" kK"  # the largest key, found without looking

@@ -2,23 +2,28 @@
 
 Every line has "t", seconds of the monotonic clock, and "kind"; `log_schema` says which kinds there are. `Journal`
 writes in a thread of its own and flushes as it goes, so that the log is readable after a kill -9. `Tail` reads a log
-that grows, `read` a whole one; `recording` makes a flight of it.
+that grows, `read` a whole one, or what another program recorded (`log_import`); `recording` makes a flight of it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
 import queue
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.fly import log_import
 from mjxball.fly.log_schema import SCHEMA, Record, decode
 from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.reading import parse_json, time_fault
@@ -33,8 +38,15 @@ class Journal:
     """Takes notes from any thread without ever blocking it. A context manager."""
 
     def __init__(self, path: Path | None, **header: Any):
-        """Open the new file `path` (None: keep nothing); raise OSError if it exists or cannot be written."""
-        self._stream = path.open("x", encoding="utf-8") if path else None
+        """Open the new file `path` (None: keep nothing); raise OSError if it exists or cannot be written.
+
+        One that ends in .mcap is written by a process of its own, `log_export`.
+        """
+        self._recorder = _start_recorder(path) if path and path.suffix == ".mcap" else None
+        if self._recorder is not None:
+            self._stream = self._recorder.stdin
+        else:
+            self._stream = path.open("x", encoding="utf-8") if path else None
         self._queue: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_all, name="journal", daemon=True)
         self.failure: str | None = None
@@ -56,6 +68,9 @@ class Journal:
         """Write what waits and close the file."""
         self._queue.put(None)
         self._thread.join(timeout=5)
+        if self._recorder is not None:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._recorder.wait(timeout=5)
 
     def _write_all(self) -> None:
         synced, done = time.monotonic(), False
@@ -70,7 +85,7 @@ class Journal:
                 if self._stream is not None and text:
                     self._stream.write(text)
                     self._stream.flush()
-                    if time.monotonic() - synced > SYNC_PERIOD:
+                    if self._recorder is None and time.monotonic() - synced > SYNC_PERIOD:
                         os.fsync(self._stream.fileno())
                         synced = time.monotonic()
             except OSError as error:  # a full disk must not end a flight
@@ -78,6 +93,13 @@ class Journal:
         if self._stream is not None:
             with contextlib.suppress(OSError):
                 self._stream.close()
+
+
+def _start_recorder(path: Path) -> subprocess.Popen[str]:
+    """The process that makes an MCAP file `path` of lines. Ctrl-C does not reach it: it ends when its input does."""
+    with path.open("xb") as file:
+        command = [sys.executable, "-m", "mjxball.fly.log_export"]
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=file, start_new_session=True, encoding="utf-8")
 
 
 def _plain(value: Any) -> Any:
@@ -88,10 +110,12 @@ def _plain(value: Any) -> Any:
 class Tail:
     """Reads a log while it grows; it need not exist yet. The first record that it gives is the header."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, stream: BinaryIO | None = None):
+        """Read the file `path`, or the open `stream` which is called so."""
         self.path = path
+        self.lines: list[bytes] = []  # that hold the records read last
         self.damaged: list[str] = []  # one sentence for each line that is no record of the schema, without a full stop
-        self._stream: BinaryIO | None = None
+        self._stream = stream
         self.misplaced: str | None = None  # the first record whose time goes back, one sentence without a full stop
         self._rest, self._lines, self._begun = b"", 0, False
         self._times: dict[tuple[str, Any], float] = {}  # of the newest record of every stream
@@ -106,10 +130,12 @@ class Tail:
             added = self._added()
         except OSError as error:
             raise InputError(f"flight log {self.path} cannot be read: {error.strerror or error}") from None
+        self.lines = []
         if not added:
             return None
         *lines, self._rest = (self._rest + added).split(b"\n")
-        records = [record for line in lines if (record := self._take(line)) is not None]
+        found = [(line, record) for line in lines if (record := self._take(line)) is not None]
+        self.lines, records = [line for line, _ in found], [record for _, record in found]
         if len(self._rest) > LONGEST_LINE:
             raise InputError(f"{self.path} is not a flight log: it holds a line of more than {LONGEST_LINE >> 20} MiB")
         return records
@@ -197,15 +223,30 @@ class Tail:
         return record
 
 
-def read(path: Path, remark: Callable[[str], None] | None = None) -> Iterator[Record]:
+def read(path: Path, remark: Callable[[str], None] | None = None, assumed: Config | None = None) -> Iterator[Record]:
     """Every record of a whole log, the header first; a torn last one is left out, as is any line that is no record.
 
-    A tick or state that is there twice is left out, too. `remark` is called with what is left out. Raises InputError
-    with one sentence if there is no log, or if its clock goes back: then nothing says when the rest happened.
+    A tick or state that is there twice is left out, too. `remark` is called with what is left out. What is no log of
+    ours but `log_import` reads is taken to be of the rig and the gains of `assumed`. Raises InputError with one
+    sentence if there is no log, or if its clock goes back: then nothing says when the rest happened.
     """
-    if not path.exists():
+    if not log_import.is_foreign(path):
+        yield from (record for _, record in read_lines(path, remark))
+        return
+    found = log_import.read(path, remark or (lambda _: None), assumed)
+    if isinstance(found, bytes):
+        yield from (record for _, record in read_lines(path, remark, io.BytesIO(found)))
+    else:
+        yield from found
+
+
+def read_lines(
+    path: Path, remark: Callable[[str], None] | None = None, stream: BinaryIO | None = None
+) -> Iterator[tuple[bytes, Record]]:
+    """Every record of the whole log in the file `path`, or the `stream` called so, after its line; see `read`."""
+    if stream is None and not path.exists():
         raise InputError(f"flight log {path} cannot be read: No such file or directory")
-    with contextlib.closing(Tail(path)) as tail:
+    with contextlib.closing(Tail(path, stream)) as tail:
         begun = False
         while (records := tail.read()) is not None:
             begun = begun or bool(records)
@@ -213,7 +254,7 @@ def read(path: Path, remark: Callable[[str], None] | None = None) -> Iterator[Re
                 raise InputError(
                     f"flight log {path} cannot be placed in time, {tail.misplaced}: cut it there, into two logs"
                 )
-            yield from records
+            yield from zip(tail.lines, records, strict=True)
         if not begun:
             raise InputError(f"{path} is not a flight log: it {'ends within its header' if tail.torn else 'is empty'}")
         if remark and tail.torn:

@@ -1,7 +1,8 @@
 """A flight log for other programs: MCAP with ROS 2 messages (Foxglove, PlotJuggler, `ros2 bag`), CSV and Parquet.
 
-MCAP holds everything that streams (`TYPES`), stamped with the wall clock of the header if it has one. CSV and Parquet
-hold the flight as `recording.read_recording` reads it, a row per tick, SI units.
+MCAP holds every line of the log, and what streams as messages of ROS (`messages.TYPES`), stamped with the wall clock
+of the header if it has one. CSV and Parquet hold the flight as `recording.read_recording` reads it, a row per tick, SI
+units. As a program this module is what a `flight_log.Journal` writes an MCAP file with.
 """
 
 from __future__ import annotations
@@ -10,220 +11,123 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterator
+import os
+import select
+import sys
+import time
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-import numpy as np
-
+from mjxball import __version__, cli
 from mjxball.config import to_dict
-from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.fly import flight_log
 from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import Record
-from mjxball.fly.packets import DroneState
+from mjxball.fly.log_sources import HEADER, RECORD
+from mjxball.fly.messages import Encoder
 from mjxball.fly.recording import read_recording
-from mjxball.fly.telemetry import Rig, object_state
 
-WORLD, OBJECT = "world", "object"  # frames, beside one a drone
 ABOUT = ("policy", "version", "config_hash", "mocap", "curve", "command")  # fields of the header, as metadata
-INFO, WARN, ERROR = 20, 30, 40  # levels of rcl_interfaces/msg/Log
-TEXTS = {
-    "console": INFO,
-    "transition": INFO,
-    "end": INFO,
-    "warning": WARN,
-    "gap": WARN,
-    "refused": ERROR,
-    "error": ERROR,
-    "link": ERROR,
-}
-
-# ROS 2's own message types, by field. https://github.com/ros2/common_interfaces, rcl_interfaces and geometry2.
-FIELDS = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
-    "std_msgs/String": "string data",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
-    "geometry_msgs/PointStamped": "std_msgs/Header header\ngeometry_msgs/Point point",
-    "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
-    "geometry_msgs/TwistStamped": "std_msgs/Header header\ngeometry_msgs/Twist twist",
-    "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\n"
-    "geometry_msgs/Transform transform",
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "sensor_msgs/BatteryState": "std_msgs/Header header\nfloat32 voltage\nfloat32 temperature\nfloat32 current\n"
-    "float32 charge\nfloat32 capacity\nfloat32 design_capacity\nfloat32 percentage\nuint8 power_supply_status\n"
-    "uint8 power_supply_health\nuint8 power_supply_technology\nbool present\nfloat32[] cell_voltage\n"
-    "float32[] cell_temperature\nstring location\nstring serial_number",
-    "rcl_interfaces/Log": "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\n"
-    "string function\nuint32 line",
-    # Ours.
-    "mjxball_msgs/Command": "std_msgs/Header header\nfloat64 roll  # [rad]\nfloat64 pitch  # [rad]\n"
-    "float64 vertical_acceleration  # [m/s2]",
-    "mjxball_msgs/Setpoint": "std_msgs/Header header\nfloat64 roll  # [deg], the wire's sign\nfloat64 pitch  # [deg]\n"
-    "float64 yaw_rate  # [deg/s]\nfloat64 thrust  # 0 .. 65535",
-    "mjxball_msgs/Health": "std_msgs/Header header\nfloat64[3] variance  # of the position [m2]\n"
-    "float64[4] motors  # PWM 0 .. 65535\nfloat64 thrust  # of the setpoint in force, NaN: not told",
-    "mjxball_msgs/Follower": "std_msgs/Header header\nfloat64[] observation\nfloat64[] hidden  # state of the GRU",
-}  # fmt: skip
-TYPES = {  # of the last part of a topic
-    "tf": "tf2_msgs/TFMessage",
-    "pose": "geometry_msgs/PoseStamped",
-    "measured_pose": "geometry_msgs/PoseStamped",
-    "twist": "geometry_msgs/TwistStamped",
-    "battery": "sensor_msgs/BatteryState",
-    "health": "mjxball_msgs/Health",
-    "setpoint": "mjxball_msgs/Setpoint",
-    "command": "mjxball_msgs/Command",
-    "network": "mjxball_msgs/Follower",
-    "goal": "geometry_msgs/PointStamped",
-    "phase": "std_msgs/String",
-    "rosout": "rcl_interfaces/Log",
-}
-Message = tuple[str, Any]  # topic, fields by name
+CHUNK_PERIOD = 0.25  # [s] between two chunks of an MCAP file that is recorded
 
 
-def definition(name: str) -> str:
-    """The message type `name`, "std_msgs/Header", with all that it is made of, as a ROS 2 bag holds it."""
-    found: list[str] = []
+class _Whole:
+    """A file of which what was written after the last `flush` is written anew by the next `commit`.
 
-    def visit(one: str) -> None:
-        for line in FIELDS[one].splitlines():
-            inner = line.split()[0].split("[")[0]
-            if inner in FIELDS and inner not in found:
-                found.append(inner)
-                visit(inner)
+    A commit is one write, so that the file is as one of them left it, whenever the process is killed.
+    """
 
-    visit(name)
-    line = "=" * 80
-    return "\n".join([FIELDS[name], *(f"{line}\nMSG: {inner}\n{FIELDS[inner]}" for inner in found)])
+    def __init__(self, stream: BinaryIO):
+        self._stream, self._rest, self._written, self._kept = stream, bytearray(), 0, 0
+
+    def tell(self) -> int:
+        return self._written + len(self._rest)
+
+    def write(self, data: bytes) -> int:
+        self._rest += data
+        return len(data)
+
+    def flush(self) -> None:
+        self._kept = len(self._rest)
+
+    def commit(self) -> None:
+        self._stream.seek(self._written)
+        self._stream.write(self._rest)
+        self._stream.flush()
+        self._written += self._kept
+        self._rest.clear()
+
+
+class Recorder(Encoder):
+    """Writes the records of a flight log as an MCAP file, chunk by chunk."""
+
+    def __init__(self, stream: BinaryIO):
+        """Write to `stream`, which can seek. Raises InputError without mcap-ros2-support."""
+        self._file = _Whole(stream)
+        super().__init__(self._begun())
+
+    def _begun(self) -> Any:
+        from mcap.writer import Writer
+
+        self._bag = Writer(self._file, use_summary_offsets=False)  # type: ignore[arg-type]
+        self._bag.start(profile="ros2", library=f"mjxball {__version__}")
+        return self._bag
+
+    def take_line(self, line: bytes, record: Record) -> None:
+        """Write one `record`, the header first, and the `line` that holds it. Raises InputError: its clock is none."""
+        self.take(record)
+        if record["kind"] == "header":
+            about = {name: str(record[name]) for name in ABOUT if name in record}
+            self._bag.add_metadata("mjxball", {**about, "config": json.dumps(to_dict(record["config"]))})
+        name = HEADER if record["kind"] == "header" else RECORD
+        self.write(f"/{name}", {"data": line.decode()}, self.time(record))
+
+    def flush(self) -> None:
+        """End the chunk and write the index after it, where the next chunk will be: the file is whole."""
+        self._bag.flush()
+        self._bag.finish()
+        self._file.commit()
 
 
 def write_mcap(path: Path, log: Path) -> list[str]:
     """Write the flight log `log` as the MCAP file `path`; returns what a reader should know. Raises InputError."""
-    try:
-        from mcap_ros2.writer import Writer
-    except ModuleNotFoundError:
-        raise InputError("MCAP needs mcap-ros2-support; pip install 'mjxball[logs]'") from None
+    if log.suffix == ".mcap":
+        raise InputError(f"{log} is an MCAP file already")
     remarks: list[str] = []
-    header, *records = flight_log.read(log, remarks.append)
-    # Nanoseconds since 1970, or since the log's own clock began.
-    shift = header["wall"] - header["t"] if "wall" in header else 0.0
-    ends = [one["t"] + shift for one in (header, *records)]
-    if min(ends) < 0 or max(ends) >= 2**31:
-        raise InputError(f"flight log {log}: its wall clock, {header.get('wall', 0):g} s, is none that a bag can hold")
-    rig = Rig.of_plant(header["config"].plant)
-    about = {name: str(header[name]) for name in ABOUT if name in header}
-    stream, schemas, newest = io.BytesIO(), dict[str, Any](), dict[str, DroneState]()
-    with Writer(stream) as writer:
-        writer.add_metadata("mjxball", {**about, "config": json.dumps(to_dict(header["config"]))})
-        for record in records:
-            time = round((record["t"] + shift) * 1e9)
-            for topic, fields in messages(record, newest, rig, time):
-                name = TYPES[topic.rpartition("/")[2]]
-                if name not in schemas:
-                    schemas[name] = writer.register_msgdef(name.replace("/", "/msg/"), definition(name))
-                writer.write_message(topic, schemas[name], fields, time)
+    stream = io.BytesIO()
+    recorder = Recorder(stream)
+    for line, record in flight_log.read_lines(log, remarks.append):
+        recorder.take_line(line, record)
+    recorder.flush()
     write_whole(path, stream.getvalue())
     return remarks
 
 
-def messages(record: Record, newest: dict[str, DroneState], rig: Rig, time: int) -> Iterator[Message]:
-    """What one record says, by topic; `newest` state of each drone, which a state replaces, `time` [ns]."""
-    kind, drone = record["kind"], record.get("drone", "")
-    if kind in KINDS:
-        yield from KINDS[kind](record, drone, time)
-    if kind in TEXTS:
-        told = [
-            value for name, value in record.items() if name in ("text", "told", "before", "after", "events", "cause")
-        ]
-        text = "; ".join(", ".join(one) if isinstance(one, tuple) else one for one in told if one)
-        log = {"stamp": _time(time), "level": TEXTS[kind], "name": drone or "mjxball.fly", "msg": f"{kind}: {text}"}
-        yield "/rosout", {**log, "file": "", "function": "", "line": 0}
-    if kind != "state":
-        return
-    newest[drone] = record["raw"].state
-    if len(newest) == len(NAMES):
-        seen = object_state([newest[name] for name in NAMES], rig)
-        yield from _moving(OBJECT, seen.position, seen.quaternion, seen.velocity, seen.rates, time)
+def record_lines(source: BinaryIO, target: BinaryIO) -> int:
+    """Write the lines of a flight log that come in the pipe `source` as an MCAP file until it ends.
 
-
-def _of_state(record: Record, drone: str, time: int) -> Iterator[Message]:
-    state: DroneState = record["raw"].state
-    yield from _moving(drone, state.position, state.quaternion, state.velocity, state.rates, time)
-    none = float("nan")
-    battery = dict.fromkeys(("temperature", "current", "charge", "capacity", "design_capacity", "percentage"), none)
-    unknown = dict.fromkeys(("power_supply_status", "power_supply_health", "power_supply_technology"), 0)
-    cells = {"present": True, "cell_voltage": [], "cell_temperature": [], "location": drone, "serial_number": ""}
-    yield f"/{drone}/battery", {"header": _header(drone, time), "voltage": state.battery, **battery, **unknown, **cells}
-
-
-def _moving(frame: str, place: Any, turned: Any, velocity: Any, rates: Any, time: int) -> Iterator[Message]:
-    """Pose and transform of `frame` in the world, and its twist in its own axes."""
-    header, orientation = _header(WORLD, time), _quaternion(turned)
-    yield f"/{frame}/pose", {"header": header, "pose": {"position": _vector(place), "orientation": orientation}}
-    along = rotations.matrix_from_quaternion(turned).T @ velocity
-    twist = {"linear": _vector(along), "angular": _vector(rates)}
-    yield f"/{frame}/twist", {"header": _header(frame, time), "twist": twist}
-    transform = {"translation": _vector(place), "rotation": orientation}
-    yield "/tf", {"transforms": [{"header": header, "child_frame_id": frame, "transform": transform}]}
-
-
-def _of_tick(record: Record, drone: None, time: int) -> Iterator[Message]:
-    yield "/goal", {"header": _header(WORLD, time), "point": _vector(record["goal"])}
-    yield "/phase", {"data": record["state"]}
-    for name, sent in zip(NAMES, record["sent"], strict=True):
-        header = _header(name, time)
-        numbers = dict(zip(("roll", "pitch", "yaw_rate", "thrust"), map(float, sent), strict=True))
-        yield f"/{name}/setpoint", {"header": header, **numbers}
-        if name in record:
-            law = dict(zip(("roll", "pitch", "vertical_acceleration"), map(float, record[name]), strict=True))
-            yield f"/{name}/command", {"header": header, **law}
-    if "observation" in record:
-        hidden = record.get("hidden", np.zeros(0))
-        own = {"observation": record["observation"].tolist(), "hidden": hidden.tolist()}
-        yield "/follower/network", {"header": _header(NAMES[1], time), **own}
-
-
-def _of_health(record: Record, drone: str, time: int) -> Iterator[Message]:
-    numbers = {"variance": record["variance"].tolist(), "motors": record["motors"].tolist()}
-    yield f"/{drone}/health", {"header": _header(drone, time), **numbers, "thrust": record["thrust"]}
-
-
-def _of_pose(record: Record, drone: str, time: int) -> Iterator[Message]:
-    pose = {"position": _vector(record["position"]), "orientation": _quaternion(record["quaternion"])}
-    yield f"/{drone}/measured_pose", {"header": _header(WORLD, round(time - 1e9 * record["age"])), "pose": pose}
-
-
-KINDS: dict[str, Callable[..., Iterator[Message]]] = {
-    "state": _of_state,
-    "tick": _of_tick,
-    "health": _of_health,
-    "pose": _of_pose,
-}
-
-
-def _time(time: int) -> dict[str, int]:
-    return {"sec": time // 10**9, "nanosec": time % 10**9}
-
-
-def _header(frame: str, time: int) -> dict[str, Any]:
-    return {"stamp": _time(time), "frame_id": frame}
-
-
-def _vector(numbers: Any) -> dict[str, float]:
-    return dict(zip("xyz", map(float, numbers), strict=True))
-
-
-def _quaternion(numbers: Any) -> dict[str, float]:
-    return dict(zip("wxyz", map(float, numbers), strict=True))
+    Chunks are `CHUNK_PERIOD` apart, and the disk is synced as a `flight_log.Journal` does. Returns the exit code.
+    Raises InputError: these are no lines of a flight log.
+    """
+    recorder, tail = Recorder(target), flight_log.Tail(Path("standard input"), source)
+    written = synced = time.monotonic()
+    waiting, going = False, True
+    while going:
+        if select.select([source], [], [], CHUNK_PERIOD)[0]:
+            records = tail.read()
+            going, waiting = records is not None, waiting or bool(records)
+            for line, record in zip(tail.lines, records or (), strict=True):
+                recorder.take_line(line, record)
+        if waiting and time.monotonic() - written >= CHUNK_PERIOD:
+            recorder.flush()
+            written, waiting = time.monotonic(), False
+            if written - synced > flight_log.SYNC_PERIOD:
+                os.fsync(target.fileno())
+                synced = written
+    recorder.flush()
+    return 0
 
 
 COLUMNS = {  # of CSV and Parquet, by the array of a `Recording`
@@ -278,3 +182,13 @@ def write_parquet(path: Path, log: Path) -> list[str]:
 
 
 WRITERS = {".mcap": write_mcap, ".csv": write_csv, ".parquet": write_parquet}
+
+
+def main() -> int:
+    """Record what comes on standard input in the file that is standard output; the exit code."""
+    with open(0, "rb", buffering=0) as source, open(1, "wb") as target:
+        return cli.run_command(lambda: record_lines(source, target))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -89,10 +89,11 @@ def make_parser() -> cli.Parser:
     about = "of O from its start, m (0 0 0.4; a stand: 0 0 0.08)"
     add("--goal", type=float, nargs=3, metavar=("X", "Y", "Z"), help=about)
     add("--battery", type=float, metavar="V", help="land below it (3.2; 3.35 for the brushless)")
-    about = "write everything to this new file (flight-DATE.jsonl; none for --rehearse)"
+    about = "write all to this new file, JSON lines or .mcap (flight-DATE.jsonl; none for --rehearse)"
     add("--log", type=Path, metavar="FILE", help=about)
     about = "a live page of the log, for a browser on this machine (a free port)"
     add("--view", type=int, nargs="?", const=0, metavar="PORT", help=about)
+    add("--foxglove", type=int, metavar="PORT", help="--view: for Foxglove too, on this machine alone")
     about = "the laws run on the drones (docs/onboard.md); --rehearse: the app's C, with these weights"
     add("--onboard", nargs="?", const="float32", choices=("float32", "int8"), help=about)
     add("--upload", action="store_true", help="--onboard int8: put the policy's weights into the follower's app first")
@@ -191,12 +192,29 @@ def check_options(options: argparse.Namespace) -> None:
             raise InputError(f"--{name} must be {low:g} to {high:g}, not {value:g}")
     if options.goal is not None and not all(math.isfinite(value) for value in options.goal):
         raise InputError("--goal must be three finite numbers")
-    if options.log is not None and options.log.exists():
-        raise InputError(f"log file {options.log} exists; choose another name")
-    if options.log is not None and not options.log.absolute().parent.is_dir():
-        raise InputError(f"the directory of log file {options.log} does not exist")
+    if options.log is not None:
+        check_log(options.log, viewed=options.view is not None)
+    check_view(options)
+
+
+def check_view(options: argparse.Namespace) -> None:
+    """Raise InputError for a live view that cannot be had."""
     if options.view is not None and ((options.rehearse and options.log is None) or not 0 <= options.view <= 65535):
         raise InputError("--view takes a port of 1 to 65535, or none, and shows what is logged: it needs --log FILE")
+    if options.foxglove is not None and (options.view is None or not 0 <= options.foxglove <= 65535):
+        raise InputError("--foxglove takes a port of 1 to 65535, or 0 for a free one, and goes with --view")
+
+
+def check_log(log: Path, viewed: bool) -> None:
+    """Raise InputError if the new file `log` cannot be written, or is to be `viewed` and cannot."""
+    if log.exists():
+        raise InputError(f"log file {log} exists; choose another name")
+    if not log.absolute().parent.is_dir():
+        raise InputError(f"the directory of log file {log} does not exist")
+    if log.suffix == ".mcap" and importlib.util.find_spec("mcap_ros2") is None:
+        raise InputError("a log in MCAP needs mcap-ros2-support; pip install 'mjxball[logs]'")
+    if log.suffix == ".mcap" and viewed:
+        raise InputError("--view follows a log of JSON lines: --log FILE.jsonl")
 
 
 def check_twin_options(options: argparse.Namespace) -> None:
@@ -288,7 +306,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if capture is not None:
                 setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
             if options.view is not None and log is not None:
-                print(stack.enter_context(live_view(log, options.view)).line, flush=True)  # noqa: T201
+                print(stack.enter_context(live_view(log, options.view, options.foxglove)).line, flush=True)  # noqa: T201
             if log and not options.log:
                 print(f"log: {log}", flush=True)  # noqa: T201
             return fly(uris, setup, settings, log, list(sys.argv if arguments is None else arguments))

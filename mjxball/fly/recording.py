@@ -114,10 +114,13 @@ class FlightLog(NamedTuple):
     remarks: tuple[str, ...]  # a line each: what a reader should know who relies on it
 
 
-def load(path: Path) -> FlightLog:
-    """The flight in the whole log `path`. Raises InputError with one sentence if there is none."""
+def load(path: Path, assumed: Config | None = None) -> FlightLog:
+    """The flight in the whole log `path`, of the rig `assumed` if it does not say; see `flight_log.read`.
+
+    Raises InputError with one sentence if there is none.
+    """
     remarks: list[str] = []
-    header, *records = flight_log.read(path, remarks.append)
+    header, *records = flight_log.read(path, remarks.append, assumed)
     settings = header.get("settings")
     if isinstance(settings, dict) and settings.get("dry_run") is True:
         raise InputError(f"flight log {path} holds no flight: it is of a dry run")
@@ -215,9 +218,9 @@ class Recording:
     remarks: tuple[str, ...] = ()  # what a reader of the log should know, a line each
 
 
-def read_recording(path: Path) -> Recording:
-    """The flight in the log `path`. Raises InputError with one sentence if there is none."""
-    log = load(path)
+def read_recording(path: Path, assumed: Config | None = None) -> Recording:
+    """The flight in the log `path`, of the rig `assumed` if it does not say. Raises InputError if there is none."""
+    log = load(path, assumed)
     plant = log.config.plant
     rig = Rig.of_plant(plant)
     ticks: list[Mapping[str, Any]] = []

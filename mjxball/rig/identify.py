@@ -36,7 +36,7 @@ def parser() -> cli.Parser:
     """The flags."""
     about = "Estimate hover thrust, thrust gain, motor lag, inertia across the stick and delay from logs."
     result = cli.make_parser("python -m mjxball.rig.identify", about)
-    result.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="of mjxball.fly --log, or .npz; see docs")
+    result.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="of mjxball.fly --log, a bag, .npz; see docs")
     result.add_argument("--preset", choices=("flight", "stand"), default="flight", help="rig (default flight)")
     result.add_argument("--plant", type=Path, metavar="NAME|FILE", help="masses and places as measured, to start from")
     result.add_argument(
@@ -60,7 +60,7 @@ def _identify(options: argparse.Namespace) -> int:
     if settings.plant.cg_axis != "y":
         raise InputError("identification is of the inertia about x; the stick must lie along y")
     gains = read_gains(options.gains) if options.gains else None
-    logs = [read_log(path) for path in options.logs]
+    logs = [read_log(path, settings) for path in options.logs]
     flown = [flown_with(settings, log, gains, path) for path, log in zip(options.logs, logs, strict=True)]
     curve = curve_of_all([own_curve(one) for one in flown])
     converted = with_curve(settings, curve)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjxball.config import Config
 from mjxball.control import rotations
 from mjxball.control.crazyflie import PERIOD, PairGains
 from mjxball.errors import InputError
@@ -39,13 +40,13 @@ class Log(NamedTuple):
     volts: float | None = None  # of the batteries under load, the median; None: not measured
 
 
-def read_log(path: Path) -> Log:
+def read_log(path: Path, assumed: Config | None = None) -> Log:
     """A log of `mjxball.fly --log`, or an .npz of time (T,), setpoints (T, 2, 4), states (T, 2, 13).
 
-    Raises InputError.
+    What another program logged is of the rig `assumed`, see `flight_log.read`. Raises InputError.
     """
     if path.suffix != ".npz":
-        return _of_flight(load(path))
+        return _of_flight(load(path, assumed))
     try:
         data = read_arrays(str(path), "log")
         arrays = [np.asarray(data[name], float) for name in ("time", "setpoints", "states")]
@@ -129,10 +130,11 @@ def _of_flight(flown: FlightLog) -> Log:
         )
     except ValueError as error:
         raise InputError(f"flight log {flown.path} cannot be used: {error}") from None
+    volts = [one["raw"].state.battery for rows in own for one in rows]
     return log._replace(
         remarks=flown.remarks,
         stand=flown.config.plant.stand,
         gains=flown.setup.gains,
         curves=flown.setup.curves,
-        volts=float(np.median([one["raw"].state.battery for rows in own for one in rows])),
+        volts=None if np.isnan(volts).any() else float(np.median(volts)),
     )

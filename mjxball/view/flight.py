@@ -23,6 +23,8 @@ from mjxball.config import Plant
 from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.files import write_whole
+from mjxball.fly.log_bags import BAGS
+from mjxball.fly.log_import import UNKNOWN
 from mjxball.policy.container import read_arrays
 from mjxball.policy.file import policy_path
 from mjxball.reading import check_times, parse_json
@@ -169,9 +171,13 @@ def read_log(path: Path) -> Flight:
     """
     from mjxball.fly.recording import read_recording
 
-    if path.suffix != ".jsonl":
-        raise InputError(f"{path} is no flight (.npz), flight log (.jsonl), policy (.npz) or run directory")
+    if path.suffix not in (".jsonl", *BAGS):
+        raise InputError(
+            f"{path} is no flight (.npz), flight log (.jsonl) or bag (.mcap), policy (.npz) or run directory"
+        )
     recording = read_recording(path)
+    if recording.policy == UNKNOWN:
+        raise InputError(f"{path} says no goal that could be shown; eval.py --flight draws it")
     for remark in recording.remarks:
         warn(remark)
     rows = len(recording.time)

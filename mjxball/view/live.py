@@ -18,6 +18,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from mjxball.errors import InputError
+from mjxball.view.foxglove import Foxglove
 from mjxball.view.live_log import LiveLog, columns
 from mjxball.view.page import live_page, packed
 
@@ -139,19 +140,27 @@ class Handler(BaseHTTPRequestHandler):
         """Nothing: ten requests a second."""
 
 
-def follow(path: Path, port: int = 0, attached: bool = False) -> int:
+def follow(path: Path, port: int = 0, attached: bool = False, foxglove: int | None = None) -> int:
     """Serve the flight log `path` until Ctrl-C, or, if `attached`, until standard input ends; returns the exit code.
+
+    With `foxglove`, a port, for Foxglove as well.
 
     Prints the address, and unless attached what happens to the log. Raises InputError if `path` is no flight log.
     """
-    log = LiveLog(path)
+    if foxglove is None:
+        return _follow(LiveLog(path), port, attached)
+    with Foxglove(foxglove) as server:
+        return _follow(LiveLog(path, server.take), port, attached, f"; Foxglove connects to {server.address}")
+
+
+def _follow(log: LiveLog, port: int, attached: bool, also: str = "") -> int:
     with contextlib.suppress(OSError, AttributeError):
         os.nice(10)  # whatever flies comes first
     view, leave = LiveView(log), threading.Event()
     with contextlib.closing(log), _serving(Server(port, view)) as address, _until(leave, attached):
         begun = view.update()
-        waits = "" if begun else f", and waits for {path}"
-        print(f"the live view is at {address}{waits}", flush=True)  # noqa: T201
+        waits = "" if begun else f", and waits for {log.path}"
+        print(f"the live view is at {address}{waits}{also}", flush=True)  # noqa: T201
         _watch(view, log, leave, attached)
         _linger(view)
     return 0

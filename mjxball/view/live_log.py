@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -39,13 +40,13 @@ NO_LAW = (0.0, 0.0, 0.0)
 class LiveLog:
     """A log that is being written. `update` reads on; `rows` and `status` say what is known."""
 
-    def __init__(self, path: Path):
-        """Follow the log `path`, which need not exist yet."""
+    def __init__(self, path: Path, hear: Callable[[Record], None] = lambda _: None):
+        """Follow the log `path`, which need not exist yet; `hear` is called with every record."""
         self.path = path
         self.rows: list[list[float]] = []
         self.plant: dict[str, Any] | None = None  # None: the log has not begun
         self.status = FlightStatus(f"waiting for {path.name}")
-        self._tail = Tail(path)
+        self._tail, self._hear = Tail(path), hear
         self._newest: list[DroneState | None] = [None, None]
         self._start: float | None = None
         self._firmware: FirmwareSetup  # once the log has begun
@@ -56,6 +57,7 @@ class LiveLog:
         for record in records or ():
             self.status.take(record)
             self._take(record)
+            self._hear(record)
         if self._tail.misplaced:
             self.status.fail(self._tail.misplaced)
         return records is not None

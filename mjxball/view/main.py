@@ -27,7 +27,7 @@ def parser() -> Parser:
         "source",
         nargs="+",
         metavar="POLICY|RUN|LOG",
-        help="recorded flight (.npz), flight log (.jsonl), or what to fly: a run directory, policy, baseline or "
+        help="recorded flight (.npz), flight log (.jsonl, .mcap), or what to fly: a run directory, policy, baseline or "
         "module:Class, your own; two are shown side by side with one clock",
     )
     result.add_argument("--out", type=Path, metavar="FILE.html", help="write the page here and open nothing")
@@ -45,6 +45,7 @@ def parser() -> Parser:
         "--live", action="store_true", help="follow a flight log that is being written, on a page of this machine alone"
     )
     live.add_argument("--port", type=int, default=None, metavar="PORT", help="of that page (a free one)")
+    live.add_argument("--foxglove", type=int, metavar="PORT", help="for Foxglove too, on this machine alone")
     live.add_argument("--attached", action="store_true", help=argparse.SUPPRESS)  # end when standard input does
     flown = result.add_argument_group(
         "scenario of what is flown on the spot", "the follower's reference scenario, changed by"
@@ -99,6 +100,8 @@ def _check(options: argparse.Namespace) -> None:
     """Refuse what does not go together, before anything is flown."""
     if options.port is not None:
         raise InputError("--port is the port of --live; any other page needs no server")
+    if options.foxglove is not None:
+        raise InputError("--foxglove goes with --live; any other flight can be opened in Foxglove as a file")
     if options.save and len(options.source) > 1:
         raise InputError("--save writes one flight: leave one of the two out")
     if options.speed is not None and not 0.01 <= options.speed <= 100:
@@ -130,8 +133,9 @@ def _follow(options: argparse.Namespace) -> int:
     if options.out or options.save or options.video:
         raise InputError("--live writes no file; play the log with --out, --save or --video once the flight has ended")
     path, port = Path(options.source[0]), options.port or 0
-    if not 0 <= port <= 65535:
-        raise InputError(f"--port must be 1 to 65535, not {port}")
+    for name, number in (("port", port), ("foxglove", options.foxglove or 0)):
+        if not 0 <= number <= 65535:
+            raise InputError(f"--{name} must be 1 to 65535, not {number}")
     if not path.absolute().parent.is_dir():
         raise InputError(f"directory {path.absolute().parent} of the log does not exist")
-    return follow(path, port, options.attached)
+    return follow(path, port, options.attached, options.foxglove)

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mjxball.fly.flight_log import LONGEST_LINE
+from mjxball.fly.flight_log import LONGEST_LINE, read
+from mjxball.fly.log_import import is_foreign
 from mjxball.fly.log_schema import Record, decode
 from mjxball.fly.supervisor import FAULTS, State
 from mjxball.reading import parse_json
@@ -120,6 +121,9 @@ def marks_of_log(path: Path, last: float) -> tuple[Mark, ...]:
 
 def _told(path: Path) -> Iterable[Record]:
     """Records of a log that was read before, but not those that come in streams: of the ticks the last alone."""
+    if is_foreign(path):
+        yield from read(path)
+        return
     tick = b""
     with path.open("rb") as stream:
         while line := stream.readline(LONGEST_LINE):

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import csv
 import re
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_line import assert_one_line, call
+from command_line import REPOSITORY, assert_one_line, call, environment
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
 
 from mjxball.export import main
-from mjxball.fly.flight_log import Journal
+from mjxball.fly.flight_log import Journal, read
 from mjxball.fly.limits import NAMES, FlightSettings
-from mjxball.fly.log_export import FIELDS, TYPES
+from mjxball.fly.messages import TYPES
 from mjxball.fly.recording import Recording, read_recording
 
-OURS = "mjxball_msgs"
 PARTS = ("pose", "twist", "battery", "health", "setpoint", "command")
 
 
@@ -49,7 +52,16 @@ def test_rosbags_reads_every_message_of_the_bag(log: Path, flight: Recording, tm
             found.setdefault(connection.topic, []).append((time, reader.deserialize(raw, connection.msgtype)))
     assert kinds == {topic: TYPES[topic.rpartition("/")[2]] for topic in kinds}
     drones = {f"/{drone}/{part}" for drone in NAMES for part in PARTS}
-    assert kinds.keys() >= {*drones, "/tf", "/object/pose", "/goal", "/phase", "/rosout", "/follower/network"}
+    assert kinds.keys() >= {
+        *drones,
+        "/tf",
+        "/object/pose",
+        "/goal",
+        "/phase",
+        "/rosout",
+        "/follower/network",
+        "/record",
+    }
     # Each number stands where a reader of ROS expects it.
     last = found["/object/pose"][-1][1]
     place, turned = last.pose.position, last.pose.orientation
@@ -65,32 +77,6 @@ def test_rosbags_reads_every_message_of_the_bag(log: Path, flight: Recording, tm
     assert "transition: ramp; fly" in " ".join(one.msg for _, one in found["/rosout"])
 
 
-def test_the_types_are_those_of_ros() -> None:
-    """As `rosbags` has them, field by field and in their order."""
-    typesys = pytest.importorskip("rosbags.typesys")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    for name, text in FIELDS.items():
-        if name.startswith(OURS):
-            continue
-        wanted = typesys.get_types_from_msg(text, name.replace("/", "/msg/"))
-        for kind, (_, fields) in wanted.items():
-            assert fields == store.fielddefs[kind][1], kind
-
-
-def test_a_twist_is_in_the_axes_of_its_frame(log: Path, tmp_path: Path) -> None:
-    """A drone that turned by 90 degrees to the left and moves along x of the world moves to its own right."""
-    from mjxball.fly.log_export import _moving
-
-    left = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
-    (twist,) = (
-        one
-        for topic, one in _moving("leader", np.zeros(3), left, np.array([1.0, 0, 0]), np.zeros(3), 0)
-        if "twist" in topic
-    )
-    along = twist["twist"]["linear"]
-    np.testing.assert_allclose([along["x"], along["y"], along["z"]], [0.0, -1.0, 0.0], atol=1e-12)
-
-
 def test_csv_and_parquet_hold_the_flight(log: Path, flight: Recording, tmp_path: Path) -> None:
     assert call(main, [log, tmp_path / "flight.csv"]) == 0
     with (tmp_path / "flight.csv").open(newline="") as stream:
@@ -103,6 +89,92 @@ def test_csv_and_parquet_hold_the_flight(log: Path, flight: Recording, tmp_path:
     columns = parquet.read_table(tmp_path / "flight.parquet").to_pydict()
     np.testing.assert_array_equal(columns["follower_sent_thrust"], flight.sent[:, 1, 3])
     assert list(columns) == list(rows[0])
+
+
+def killed(command: list[str], path: Path, lines: list[bytes], stdout: Any) -> subprocess.Popen[bytes]:
+    """A program that was killed with `lines` on its standard input once the file `path` had not grown for a while."""
+    process = subprocess.Popen(
+        [sys.executable, *command], cwd=REPOSITORY, env=environment(), stdin=subprocess.PIPE, stdout=stdout
+    )
+    assert process.stdin is not None
+    process.stdin.write(b"".join(lines))
+    process.stdin.flush()
+    size, since = 0, time.monotonic()
+    while not size or time.monotonic() - since < 1.5:
+        now = path.stat().st_size if path.exists() else 0
+        size, since = now, time.monotonic() if now != size else since
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    return process
+
+
+def times_of(path: Path) -> list[int]:
+    """Of the ticks in a bag, by `rosbags`."""
+    with pytest.importorskip("rosbags.highlevel").AnyReader([path]) as reader:
+        goals = [one for one in reader.connections if one.topic == "/goal"]
+        return [time for _, time, _ in reader.messages(goals)]
+
+
+def test_a_killed_recorder_leaves_a_whole_file(log: Path, tmp_path: Path) -> None:
+    """All but what came after its last chunk, for `rosbags`, mcap's own streaming reader and ours."""
+    stream_reader = pytest.importorskip("mcap.stream_reader")
+    lines = log.read_bytes().splitlines(keepends=True)
+    path = tmp_path / "killed.mcap"
+    with path.open("xb") as target:
+        killed(["-m", "mjxball.fly.log_export"], path, lines[:400], target)
+    ticks = [one for one in read(path) if one["kind"] == "tick"]
+    assert len(ticks) == sum(b'"kind": "tick"' in line for line in lines[:400]) > 10
+    assert len(times_of(path)) == len(ticks)
+    with path.open("rb") as stream:
+        kinds = [type(one).__name__ for one in stream_reader.StreamReader(stream, validate_crcs=True).records]
+    assert (kinds.count("DataEnd"), kinds[-1]) == (1, "Footer")
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from mjxball.fly.flight_log import Journal
+from mjxball.reading import parse_json
+first, *lines = [parse_json(line) for line in sys.stdin.buffer]
+header = {name: value for name, value in first.items() if name not in ("t", "kind", "schema", "wall", "pid")}
+journal = Journal(Path(sys.argv[1]), **header)
+for line in lines:
+    journal.note(**line)
+while True:
+    pass
+"""
+
+
+def test_the_recorder_of_a_killed_runner_ends_its_file(log: Path, flight: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "flight.mcap"
+    lines = log.read_bytes().splitlines(keepends=True)
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, path], cwd=REPOSITORY, env=environment(), stdin=subprocess.PIPE
+    ) as process:
+        assert process.stdin is not None
+        process.stdin.write(b"".join(lines))
+        process.stdin.close()
+        wanted = sum(b'"kind": "tick"' in line for line in lines)
+        until = time.monotonic() + 60
+        while not (path.exists() and path.stat().st_size and len(times_of(path)) == wanted):
+            assert time.monotonic() < until, "the recorder writes nothing"
+            time.sleep(0.1)
+        process.send_signal(signal.SIGKILL)
+    again = read_recording(path)
+    np.testing.assert_array_equal(again.position, flight.position)
+
+
+def test_a_recorder_that_ends_is_told_of(log: Path, tmp_path: Path) -> None:
+    """The flight goes on; the log says that it is not complete."""
+    notes = Journal(tmp_path / "flight.mcap", policy="no header of a flight")
+    for _ in range(100):
+        notes.note("warning", text="x")
+        if notes.failure:
+            break
+        time.sleep(0.1)
+    notes.close()
+    assert notes.failure == "Broken pipe"
 
 
 def clock(log: Path, other: Path, wall: str) -> Path:
@@ -120,6 +192,7 @@ def test_refusals(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ([log, tmp_path / "new.csv", "--int8"], "takes no other flag"),
         ([tmp_path / "noise.jsonl", tmp_path / "new.mcap"], "noise.jsonl"),
         ([tmp_path / "none.jsonl", tmp_path / "new.mcap"], "none.jsonl"),
+        ([tmp_path / "old.mcap", tmp_path / "new.mcap"], "is an MCAP file already"),
         ([clock(log, tmp_path / "late.jsonl", "1e300"), tmp_path / "new.mcap"], "none that a bag can hold"),
         ([clock(log, tmp_path / "early.jsonl", "-1e9"), tmp_path / "new.mcap"], "none that a bag can hold"),
     ]

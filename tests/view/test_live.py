@@ -209,11 +209,19 @@ def test_refusals(arguments: list[str], message: str, tmp_path: Path, monkeypatc
     assert message in errors
 
 
-@pytest.mark.parametrize("more", [["--view"], ["--view", "70000", "--log", "new.jsonl"]])
-def test_flying_with_a_view_needs_a_log_and_a_port(more: list[str], capsys: Any) -> None:
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--view"], "it needs --log FILE"),
+        (["--view", "70000", "--log", "new.jsonl"], "it needs --log FILE"),
+        (["--view", "--log", "new.mcap"], "--view follows a log of JSON lines"),
+        (["--foxglove", "0"], "goes with --view"),
+    ],
+)
+def test_flying_with_a_view_needs_a_log_and_a_port(more: list[str], message: str, capsys: Any) -> None:
     pytest.importorskip("cflib")
     assert call(fly, [TRANSPORT, "--rehearse", *more]) == 2
-    assert "it needs --log FILE" in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.fixture

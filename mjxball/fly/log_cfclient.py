@@ -1,0 +1,66 @@
+"""Log blocks that cfclient wrote as CSV, of two drones, as series of numbers."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from mjxball.errors import InputError
+from mjxball.fly.limits import NAMES
+from mjxball.fly.log_sources import VARIABLES, Samples, Series
+from mjxball.reading import check_times
+
+WIDTHS = {"position": 3, "quaternion": 4, "velocity": 3, "rates": 3, "sent": 4, "battery": 1}
+
+
+def read_cfclient(path: Path) -> Series:
+    """The folder `path` with the folders `leader` and `follower` of CSV files that cfclient wrote.
+
+    The times of each drone are those of its own clock. Raises InputError: there are none, or they are damaged.
+    """
+    return {name: _joined(_columns(path / name)) for name in NAMES}
+
+
+def _columns(folder: Path) -> dict[str, Samples]:
+    files = sorted(folder.glob("*.csv"))
+    if not files:
+        raise InputError(f"{folder} holds no .csv; expected the files that cfclient wrote of this drone")
+    return {name: samples for file in files for name, samples in _read_csv(file).items()}
+
+
+def _read_csv(file: Path) -> dict[str, Samples]:
+    with contextlib.suppress(UnicodeDecodeError, csv.Error):
+        with file.open(newline="", encoding="utf-8") as stream:
+            head, *rows = list(csv.reader(stream)) or [[]]
+        if head[:1] != ["Timestamp"]:
+            raise InputError(f"{file} begins with {','.join(head)[:40]!r}; expected cfclient's Timestamp and variables")
+        if rows and len(rows[-1]) < len(head):
+            rows.pop()  # cfclient was ended while it wrote
+        try:
+            table = np.array(rows, float).reshape(-1, len(head))
+            if len(table) < 2:
+                raise ValueError("it holds fewer than two rows")
+            time = 1e-3 * table[:, 0]
+            check_times(time.tolist())
+        except ValueError as error:
+            raise InputError(f"{file} cannot be used: {error}") from None
+        return {name: (time, column[:, None]) for name, column in zip(head[1:], table.T[1:], strict=True)}
+    raise InputError(f"{file} is no text; expected cfclient's CSV")
+
+
+def _joined(columns: dict[str, Samples]) -> dict[str, Samples]:
+    """Quantities of which every number is there, at the times of their first one."""
+    parts: dict[tuple[str, int], Samples] = {}
+    for name, one in VARIABLES.items():
+        if name in columns:
+            parts[one.quantity, one.place] = columns[name][0], one.factor * columns[name][1]
+    joined = {}
+    for quantity, width in WIDTHS.items():
+        own = [parts[quantity, place] for place in range(width) if (quantity, place) in parts]
+        if len(own) == width:
+            time = own[0][0]
+            joined[quantity] = time, np.column_stack([np.interp(time, one[0], one[1][:, 0]) for one in own])
+    return joined

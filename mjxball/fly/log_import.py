@@ -1,0 +1,210 @@
+"""A flight that another program recorded (`log_bags`, `log_cfclient`), as records of the flight log.
+
+A bag of ours holds the log's own lines. Any other recording holds the states of two drones and the setpoints that they
+were sent; which rig flew, and with which gains, it does not say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from mjxball import config as configs
+from mjxball.config import Config
+from mjxball.control import rotations
+from mjxball.control.crazyflie import PERIOD, pair_gains
+from mjxball.errors import InputError
+from mjxball.fly.limits import NAMES
+from mjxball.fly.log_bags import BAGS, Found, read_bag
+from mjxball.fly.log_cfclient import read_cfclient
+from mjxball.fly.log_schema import SCHEMA, Record, StatePacket
+from mjxball.fly.log_sources import TOPICS, VARIABLES, Samples
+from mjxball.fly.packets import DroneState
+from mjxball.fly.supervisor import State
+from mjxball.fly.telemetry import Rig
+
+UNKNOWN = "an unknown follower"  # name of the policy of a flight that another program recorded
+LONGEST = 4 * 3600.0  # [s] of a recording
+NEEDED = ("position", "quaternion", "sent")
+DIFFERENT = 0.5  # share of the drones' distance by which they may be elsewhere than the rig says
+UNEVEN = 0.1  # by which the length of an attitude's quaternion may differ from 1
+ALIKE = 0.5  # correlation of the two drones' rates from which on their clocks count as brought together
+
+Drone = dict[str, Samples]  # by quantity
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether `path` is no file of JSON lines: a folder, a bag, or a CSV file."""
+    return path.is_dir() or path.suffix in (*BAGS, ".csv")
+
+
+def read(path: Path, remark: Callable[[str], None], assumed: Config | None = None) -> bytes | list[Record]:
+    """The lines of a log of ours in the bag `path`, or records made of what another program recorded there.
+
+    The rig, firmware and gains are those of `assumed`, by default the preset flight. `remark` is called with what a
+    reader should know. Raises InputError with one sentence that says what was found, and what was expected.
+    """
+    config = configs.preset("flight") if assumed is None else assumed
+    if path.suffix == ".csv":
+        raise InputError(
+            f"{path} is of one drone; expected the folder of leader and follower, each with its .csv files"
+        )
+    if path.is_dir() and any((path / name).is_dir() for name in NAMES):
+        pair = _of_cfclient(path, remark)
+    else:
+        found = read_bag(path, remark)
+        if found.lines:
+            return found.lines
+        pair = _of_bag(path, found, Rig.of_plant(config.plant), remark)
+    states = [_states(own, name, remark) for name, own in zip(NAMES, pair, strict=True)]
+    remark("it does not say which rig flew: plant and gains are assumed")
+    return _records(config, states, [own["sent"] for own in pair])
+
+
+def _of_cfclient(path: Path, remark: Callable[[str], None]) -> list[Drone]:
+    """Leader and follower, whose clocks are brought together by their rates, which are the stick's."""
+    pair = list(read_cfclient(path).values())
+    for name, own in zip(NAMES, pair, strict=True):
+        lacking = [what for what in (*NEEDED, "rates") if what not in own]
+        if lacking:
+            wanted = ", ".join(variable for variable, one in VARIABLES.items() if one.quantity == lacking[0])
+            raise InputError(f"{path / name} has no {lacking[0]}; expected all numbers of it of {wanted}")
+        _check(path, own, name)
+    late, alike = _lag(*(own["rates"] for own in pair))
+    if alike < ALIKE:
+        raise InputError(
+            f"{path} is of two clocks: at best the drones' rates agree by {alike:.2f}; expected {ALIKE:g} or more, of "
+            "two drones on one stick"
+        )
+    remark(f"the follower's clock is put {late:+.3f} s to the leader's, where their rates agree")
+    return [pair[0], {name: (times + late, rows) for name, (times, rows) in pair[1].items()}]
+
+
+def _lag(one: Samples, other: Samples) -> tuple[float, float]:
+    """(seconds to add to the clock of `other` so that its rates are those of `one`, correlation then)."""
+    grids = [np.arange(time[0], time[-1], PERIOD) for time, _ in (one, other)]
+    a, b = (
+        np.stack([np.interp(grid, time, row) for row in (rows - rows.mean(axis=0)).T])
+        for grid, (time, rows) in zip(grids, (one, other), strict=True)
+    )
+    length = a.shape[1] + b.shape[1]
+    products = np.fft.rfft(a, length) * np.conj(np.fft.rfft(b, length))
+    agree = np.fft.irfft(products, length).sum(axis=0)
+    best = int(np.argmax(agree))
+    shift = best if best < a.shape[1] else best - length
+    scale = np.sqrt(float((a**2).sum() * (b**2).sum()))
+    return float(grids[0][0] - grids[1][0] + shift * PERIOD), float(agree[best] / scale) if scale else 0.0
+
+
+def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -> list[Drone]:
+    """Leader and follower by their names, or by where on the stick they are."""
+    whole = {name: own for name, own in found.series.items() if own.keys() >= set(NEEDED)}
+    for name, own in whole.items():
+        _check(path, own, name)
+    if whole.keys() >= set(NAMES):
+        return [whole[name] for name in NAMES]
+    if len(whole) != 2:
+        names = [f"/DRONE/{last} ({TOPICS[last].type})" for last in ("pose", "odom", "cmd_vel_legacy")]
+        raise InputError(
+            f"bag {path} holds {len(whole)} drones with poses and setpoints; expected two, each with {names[0]} or "
+            f"{names[1]}, and {names[2]}; found {found.has}"
+        )
+    (one, first), (other, second) = whole.items()
+    apart = _from_each_other(first, second)
+    sides = [float(np.linalg.norm(sign * apart - rig.span)) for sign in (1.0, -1.0)]
+    if min(sides) > DIFFERENT * np.linalg.norm(rig.span):
+        raise InputError(
+            f"bag {path}: {one} is {_told(apart)} m from {other}; expected {_told(rig.span)}, as leader and follower "
+            "are on this rig: name another with --plant, or call the drones so"
+        )
+    if sides[1] < sides[0]:
+        one, first, other, second = other, second, one, first
+    remark(f"by their places on the rig {one} is taken for the leader and {other} for the follower")
+    return [first, second]
+
+
+def _told(vector: np.ndarray) -> str:
+    return " ".join(f"{value:.2f}" for value in vector)
+
+
+def _from_each_other(first: Drone, second: Drone) -> np.ndarray:
+    """(3,) usual place of `first` from `second` in its own axes [m]."""
+    time, position = first["position"]
+    matrices = rotations.matrix_from_quaternion(_attitude(time, first))
+    return np.median(np.einsum("nji,nj->ni", matrices, position - _at(time, second["position"])), axis=0)
+
+
+def _at(time: np.ndarray, samples: Samples) -> np.ndarray:
+    """`samples` at `time` (n,), in between on a straight line."""
+    return np.stack([np.interp(time, samples[0], column) for column in samples[1].T], axis=1)
+
+
+def _attitude(time: np.ndarray, own: Drone) -> np.ndarray:
+    """(n, 4) unit quaternions at `time`."""
+    when, rows = own["quaternion"]
+    turns = np.cumprod([1.0, *np.where((rows[1:] * rows[:-1]).sum(axis=1) < 0, -1.0, 1.0)])
+    found = _at(time, (when, rows * turns[:, None]))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def _check(path: Path, own: Drone, name: str) -> None:
+    """Raise InputError if a series is too short or too long, not of finite numbers, or its attitudes are none."""
+    for quantity, (time, rows) in own.items():
+        if len(time) < 2 or not (quantity == "battery" or np.isfinite(rows).all()):
+            raise InputError(
+                f"{path}: the {name}'s {quantity} has {len(time)} rows; expected two or more of finite numbers"
+            )
+        if time[-1] - time[0] > LONGEST:
+            span = f"{time[-1] - time[0]:.3g} s"
+            raise InputError(f"{path}: the {name}'s {quantity} goes on for {span}; expected {LONGEST:g} s or less")
+    lengths = np.linalg.norm(own["quaternion"][1], axis=1)
+    worst = lengths[np.abs(lengths - 1).argmax()]
+    if abs(worst - 1) > UNEVEN:
+        raise InputError(f"{path}: the {name} has a quaternion of length {worst:.2g}; expected 1")
+
+
+def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[float, DroneState]]:
+    """The states of one drone at the times of its positions."""
+    time, position = own["position"]
+    quaternion = _attitude(time, own)
+    matrices = rotations.matrix_from_quaternion(quaternion)
+    derived = []
+    if "velocity" in own:
+        velocity = _at(time, own["velocity"])
+    elif "along" in own:
+        velocity = np.einsum("nij,nj->ni", matrices, _at(time, own["along"]))
+    else:
+        velocity = np.gradient(position, time, axis=0)
+        derived.append("velocity")
+    if "rates" in own:
+        rates = _at(time, own["rates"])
+    else:
+        change = np.gradient(quaternion, time, axis=0)
+        back = quaternion * np.array([1.0, -1.0, -1.0, -1.0])
+        rates = 2 * np.asarray(rotations.multiply_quaternions(back, change))[:, 1:]
+        derived.append("rates")
+    if derived:
+        remark(f"the {name}'s {' and '.join(derived)} are differences of its poses")
+    battery = _at(time, own["battery"])[:, 0] if "battery" in own else np.full(len(time), np.nan)
+    rows = zip(position, velocity, quaternion, rates, battery, strict=True)
+    return [(float(now), DroneState(*row[:4], 0, float(row[4]))) for now, row in zip(time, rows, strict=True)]
+
+
+def _records(config: Config, states: list[list[tuple[float, DroneState]]], sent: list[Samples]) -> list[Record]:
+    """A header, states, and a tick for each of the leader's setpoints once the follower has one; laws fly it all."""
+    begin = min(own[0][0] for own in states)
+    header = {"schema": SCHEMA, "policy": UNKNOWN, "config": config, "gains": pair_gains(config.autopilot)}
+    found: list[Record] = [{"t": begin, "kind": "header", **header}]
+    for name, own in zip(NAMES, states, strict=True):
+        found += [{"t": now, "kind": "state", "drone": name, "raw": StatePacket(0, state)} for now, state in own]
+    (times, leader), (others, follower) = sent
+    latest = np.searchsorted(others, times, side="right") - 1
+    goal = np.full(3, np.nan)
+    for now, own, row in zip(times[latest >= 0], leader[latest >= 0], latest[latest >= 0], strict=True):
+        setpoints = np.stack([own, follower[row]])
+        state = State.FLY if (setpoints[:, 3] > 0).all() else State.DONE
+        found.append({"t": float(now), "kind": "tick", "state": state.value, "goal": goal, "sent": setpoints})
+    found.sort(key=lambda one: float(one["t"]))
+    return [*found, {"t": found[-1]["t"], "kind": "end", "code": 0}]

@@ -1,0 +1,309 @@
+"""Flights that others recorded, written by libraries that know nothing of us, against the log they were made of."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import assert_one_line, call
+from fly_policies import untrained
+from fly_virtual import VirtualTwin, log_header
+from foreign_logs import NAMES, write_bag, write_cfclient
+
+from mjxball.commands import evaluate
+from mjxball.control.rotations import quaternion_from_euler
+from mjxball.errors import InputError
+from mjxball.export import main as export
+from mjxball.fly import flight_log
+from mjxball.fly.flight_log import Journal
+from mjxball.fly.limits import FlightSettings
+from mjxball.fly.log_schema import Record, StatePacket
+from mjxball.fly.packets import DroneState
+from mjxball.fly.recording import Recording, read_recording
+from mjxball.rig import identify
+from mjxball.rig.log import read_log
+
+pytest.importorskip("rosbags")
+pytest.importorskip("mcap_ros2")
+MEASURED = ("time", "position", "velocity", "quaternion", "rates", "sent")
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short flight's log, as the runner writes it."""
+    path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
+    with Journal(path, **log_header(contents)) as notes:
+        VirtualTwin(FlightSettings(seconds=1.0), contents=contents, log=notes).run()
+        notes.note("parameter", drone="follower", name="pid_attitude.roll_kp", value=7.0)
+        notes.note("end", code=0)
+    return path
+
+
+@pytest.fixture(scope="module")
+def flight(log: Path) -> Recording:
+    return read_recording(log)
+
+
+@pytest.fixture(scope="module")
+def records(log: Path) -> list[Record]:
+    """States and ticks in the order of time."""
+    own = (one for one in flight_log.read(log) if one["kind"] in ("state", "tick"))
+    return sorted(own, key=lambda one: float(one["t"]))
+
+
+@pytest.fixture(scope="module")
+def exported(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bag") / "flight.mcap"
+    assert call(export, [log, path]) == 0
+    return path
+
+
+def printed(main: Any, arguments: list[Any], capsys: pytest.CaptureFixture[str]) -> list[str]:
+    assert call(main, arguments) == 0
+    return [line for line in capsys.readouterr().out.splitlines() if "figure" not in line]
+
+
+def test_a_bag_of_ours_is_the_log_itself(log: Path, flight: Recording, exported: Path, tmp_path: Path) -> None:
+    again = read_recording(exported)
+    for field in dataclasses.fields(Recording):
+        one, other = getattr(flight, field.name), getattr(again, field.name)
+        if isinstance(one, np.ndarray):
+            np.testing.assert_array_equal(one, other, field.name)
+        else:
+            assert one == other, field.name
+    assert again.setup.gains[1]["pid_attitude.roll_kp"] == 7.0
+    tables = [call(export, [path, tmp_path / f"{path.suffix[1:]}.csv"]) for path in (log, exported)]
+    assert tables == [0, 0]
+    assert (tmp_path / "jsonl.csv").read_bytes() == (tmp_path / "mcap.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_its_report_has_the_same_numbers(log: Path, exported: Path, tmp_path: Path, capsys) -> None:
+    reports = [
+        printed(evaluate.main, ["--flight", path, "--out", tmp_path / path.suffix[1:]], capsys)
+        for path in (log, exported)
+    ]
+    assert reports[0] == reports[1]
+    assert len(reports[0]) > 2
+
+
+@pytest.mark.parametrize("sqlite", [False, True])
+@pytest.mark.parametrize("odometry", [False, True])
+def test_a_bag_of_crazyswarm2(
+    records: list[Record], flight: Recording, tmp_path: Path, sqlite: bool, odometry: bool
+) -> None:
+    """Its names are sorted the other way round than its drones stand. A file in it without its folder does as well."""
+    bag = write_bag(tmp_path / "bag", records, sqlite=sqlite, odometry=odometry)
+    (file,) = (one for one in bag.iterdir() if one.suffix != ".yaml")
+    for path in (bag, file):
+        again = read_recording(path)
+        known = MEASURED if odometry else ("time", "position", "quaternion", "sent")
+        for name in known:
+            np.testing.assert_allclose(getattr(again, name), getattr(flight, name), atol=1e-6, err_msg=name)
+        assert "cf7 is taken for the leader" in " ".join(again.remarks)
+        assert ("differences of its poses" in " ".join(again.remarks)) is not odometry
+        assert len(read_log(path).setpoints) > 100
+
+
+def test_messages_of_ours_without_the_lines(exported: Path, flight: Recording, tmp_path: Path) -> None:
+    """As `ros2 bag record` leaves them that was told a few topics."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    kept = ("pose", "twist", "setpoint", "battery")
+    plugin = StoragePlugin.MCAP
+    with AnyReader([exported]) as reader, Writer(tmp_path / "few", version=9, storage_plugin=plugin) as writer:
+        topics = {
+            one.topic: writer.add_connection(one.topic, one.msgtype, typestore=reader.typestore)
+            for one in reader.connections
+            if one.topic.endswith(kept)
+        }
+        for connection, time, raw in reader.messages():
+            if connection.topic in topics:
+                writer.write(topics[connection.topic], time, raw)
+    again = read_recording(tmp_path / "few")
+    for name in MEASURED:
+        np.testing.assert_allclose(getattr(again, name), getattr(flight, name), atol=1e-6, err_msg=name)
+
+
+def turning(rates: np.ndarray, step: float = 0.01) -> list[Record]:
+    """Both drones of the stick turn by the same yaw rates (n,) [rad/s], with what the pair is sent."""
+    found: list[Record] = []
+    for number, yaw in enumerate(np.cumsum(rates) * step):
+        turned = quaternion_from_euler(np.array([0.0, 0.0, yaw]))
+        for name, side in (("leader", 1.0), ("follower", -1.0)):
+            place = 0.15 * side * np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+            state = DroneState(place, np.zeros(3), turned, np.array([0.0, 0.0, rates[number]]), 0, 3.9)
+            found.append({"t": number * step, "kind": "state", "drone": name, "raw": StatePacket(0, state)})
+        found.append({"t": number * step, "kind": "tick", "sent": np.array([[1.0, 2.0, 3.0, 4e4]] * 2)})
+    return found
+
+
+def test_rates_and_velocity_of_poses(tmp_path: Path) -> None:
+    """A steady turn: the velocity of each drone is rate times arm."""
+    path = write_bag(tmp_path / "bag", turning(np.full(200, 0.8)))
+    raw = [one for one in flight_log.read(path) if one["kind"] == "state" and one["drone"] == "leader"]
+    for one in raw[2:-2]:
+        state = one["raw"].state
+        np.testing.assert_allclose(state.rates, [0, 0, 0.8], atol=1e-4)
+        assert np.linalg.norm(state.velocity) == pytest.approx(0.8 * 0.15, rel=1e-4)
+
+
+def test_cfclient_s_two_clocks_are_brought_together(tmp_path: Path) -> None:
+    random = np.random.default_rng(3)
+    rates = np.convolve(random.normal(size=900), np.ones(30) / 6, "same")
+    boots = {"leader": 12.5, "follower": 860.0}
+    told: list[str] = []
+    path = write_cfclient(tmp_path / "logdata", turning(rates), boots)
+    found = list(flight_log.read(path, told.append))
+    times = {name: [one["t"] for one in found if one.get("drone") == name] for name in boots}
+    np.testing.assert_allclose(times["leader"], times["follower"], atol=0.004)  # two steps of the grid
+    tick = next(one for one in found if one["kind"] == "tick")
+    np.testing.assert_allclose(tick["sent"], [[1.0, 2.0, 3.0, 4e4]] * 2)
+    assert any("its" not in text and "-847.5" in text for text in told)
+
+
+def test_cfclient_s_drones_on_two_sticks_are_refused(tmp_path: Path) -> None:
+    random = np.random.default_rng(4)
+    one, other = (turning(random.normal(size=500)) for _ in range(2))
+    mixed = [row for row in one if row.get("drone") != "follower"] + [row for row in other if "drone" in row][1::2]
+    path = write_cfclient(tmp_path / "logdata", sorted(mixed, key=lambda row: float(row["t"])), dict.fromkeys(NAMES, 0))
+    with pytest.raises(InputError, match=r"is of two clocks: at best the drones' rates agree by 0\.[0-4]"):
+        list(flight_log.read(path))
+
+
+def in_chunks(path: Path, target: Path) -> Path:
+    """A copy of the bag `path` in chunks of 10 kB."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    with path.open("rb") as source, target.open("xb") as stream:
+        writer, schemas, channels = Writer(stream, chunk_size=10_000), dict[int, int](), dict[int, int]()
+        writer.start(profile="ros2")
+        for kind, channel, message in make_reader(source).iter_messages():
+            if kind.id not in schemas:
+                schemas[kind.id] = writer.register_schema(kind.name, kind.encoding, kind.data)
+            if channel.id not in channels:
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", schemas[kind.id])
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return target
+
+
+def truncated(path: Path, size: int, target: Path) -> Path:
+    target.write_bytes(path.read_bytes()[:size])
+    return target
+
+
+def test_an_mcap_file_that_is_cut_is_read_as_far_as_it_goes(records: list[Record], tmp_path: Path) -> None:
+    from rosbags.rosbag2 import ReaderError
+    from rosbags.rosbag2.storage_mcap import McapReader
+
+    bag = in_chunks(write_bag(tmp_path / "bag", records) / "bag.mcap", tmp_path / "chunks.mcap")
+    size, counts = bag.stat().st_size, []
+    whole = sum(one["kind"] == "state" for one in flight_log.read(bag))
+    for share in np.linspace(0.3, 0.999, 15):
+        cut = truncated(bag, round(share * size), tmp_path / "cut.mcap")
+        with pytest.raises(ReaderError):
+            McapReader(cut).open()
+        told: list[str] = []
+        counts.append(sum(one["kind"] == "state" for one in flight_log.read(cut, told.append)))
+        assert "cut short" in told[0]
+    assert counts == sorted(counts)
+    assert 0 < counts[0] < counts[-1] == whole
+    with pytest.raises(InputError, match=r"bag .* is empty: it holds no message"):
+        list(flight_log.read(truncated(bag, 60, tmp_path / "head.mcap")))
+
+
+def test_bad_input_is_refused_in_one_sentence(
+    records: list[Record], log: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turn = turning(np.full(50, 0.3))
+    far = [{**one, "raw": one["raw"]._replace(state=moved(one))} if "raw" in one else one for one in turn]
+    lost = [{**one, "raw": one["raw"]._replace(state=unturned(one))} if "raw" in one else one for one in turn]
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "text.mcap").write_text("an MCAP file?")
+    (tmp_path / "none.mcap").write_bytes(b"")
+    (tmp_path / "void.mcap").write_bytes(bag_of_nothing())
+    (tmp_path / "noise.db3").write_bytes(bytes(range(256)))
+    (tmp_path / "one.csv").write_text("Timestamp,pm.vbat\n1,3.9\n")
+    half = write_cfclient(tmp_path / "half", turn, {"leader": 0, "follower": 0})
+    shutil.rmtree(half / "follower")
+    ours = write_cfclient(tmp_path / "ours", turn, {"leader": 0, "follower": 0})
+    (ours / "leader" / "flight.csv").write_text("time,phase\n0,fly\n")
+    less = write_cfclient(tmp_path / "less", turn, {"leader": 0, "follower": 0})
+    next((less / "leader").glob("target*")).unlink()
+    two = write_cfclient(tmp_path / "back", turn, {"leader": 0, "follower": 0})
+    (two / "leader" / "more.csv").write_text("Timestamp,pm.vbat\n20,3.9\n10,3.9\n")
+    cases = [
+        (write_bag(tmp_path / "idle", turn, commands=False), "holds 0 drones with poses and setpoints; expected two"),
+        (write_bag(tmp_path / "other", turn, pose="Pose"), "found /cf231/cmd_vel_legacy (geometry_msgs/Twist)"),
+        (write_bag(tmp_path / "late", turn, late=3 * 10**9), "is stamped 3 s before it was received; expected 0.05 s"),
+        (write_bag(tmp_path / "far", far), "expected 0.00 0.30 0.00, as leader and follower are"),
+        (write_bag(tmp_path / "lost", lost), "has a quaternion of length 0; expected 1"),
+        (tmp_path / "folder", "without metadata.yaml, .mcap or .db3; expected a rosbag2"),
+        (tmp_path / "text.mcap", "begins with b'an MCAP '; expected an MCAP file"),
+        (tmp_path / "none.mcap", "is empty; expected an MCAP file"),
+        (tmp_path / "void.mcap", "is empty: it holds no message"),
+        (tmp_path / "noise.db3", "cannot be read"),
+        (tmp_path / "gone.mcap", "does not exist; expected a rosbag2"),
+        (tmp_path / "one.csv", "is of one drone; expected the folder"),
+        (half, "follower holds no .csv"),
+        (ours, "begins with 'time,phase'; expected cfclient's Timestamp"),
+        (less, "leader has no sent; expected all numbers of it of ctrltarget.roll"),
+        (two, "row 2: the time goes back by 0.01 s"),
+    ]
+    for path, reason in cases:
+        for main, arguments in (
+            (evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]),
+            (identify.main, [path]),
+        ):
+            assert call(main, arguments) == 2, path
+            errors = capsys.readouterr().err
+            assert reason in errors, errors
+            assert_one_line(errors)
+    assert call(evaluate.main, ["--flight", exported, "--plant", "crazyflie", "--out", tmp_path / "drawn"]) == 2
+    assert "says which rig flew: drop --plant" in capsys.readouterr().err
+    assert not (tmp_path / "drawn").exists()
+
+
+def moved(record: Record) -> DroneState:
+    """The state in `record`, a leader's far to the left."""
+    state = record["raw"].state
+    return state._replace(position=state.position + (np.array([4.0, 0, 0]) if record["drone"] == "leader" else 0))
+
+
+def unturned(record: Record) -> DroneState:
+    """The state in `record` with the attitude of a tracker that sees nothing."""
+    return record["raw"].state._replace(quaternion=np.zeros(4))
+
+
+def bag_of_nothing() -> bytes:
+    """An MCAP file of ROS 2 that is whole and holds nothing."""
+    import io
+
+    from mcap.writer import Writer
+
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start(profile="ros2")
+    writer.finish()
+    return stream.getvalue()
+
+
+def test_a_type_of_the_same_name_with_other_fields(tmp_path: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "mjxball_msgs/msg/Setpoint"
+    store.register(get_types_from_msg("float64 roll\nfloat64 pitch", kind))
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        channel = writer.add_connection("/leader/setpoint", kind, typestore=store)
+        writer.write(channel, 10**9, store.serialize_cdr(store.types[kind](1.0, 2.0), kind))
+    with pytest.raises(InputError, match=r"Setpoint of /leader/setpoint has another definition .* 'header'"):
+        list(flight_log.read(tmp_path / "bag"))
