@@ -12,7 +12,7 @@ import pytest
 from command_line import assert_one_line, call
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
-from mjxball.view.command import main as view
+from mjxball.view.main import main as view
 
 from mjxball.fly import flight_log
 from mjxball.fly.display import live_view
