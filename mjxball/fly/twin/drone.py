@@ -57,7 +57,7 @@ class TwinDrone:
             functools.partial(self._pair.receive_pose, self.number),
             self._estimator,
             self.app,
-            self._deck and self._deck.parameters,
+            None if self._deck is None else self._deck.parameters,
         )
 
     def _new_app(self) -> App | None:

@@ -26,7 +26,7 @@ LOG_CODES = dict(LOG_TYPES.values())
 
 
 def listed(table: str) -> list[dict[str, str]]:
-    """Rows of `names.csv` in the order of the firmware's own table, "log" or "param"; "deck log", "deck param" on top."""
+    """Rows of `names.csv` in the order of the firmware's own table "log" or "param", or of what decks add to it."""
     with Path(__file__).with_name("names.csv").open(encoding="utf-8", newline="") as file:
         return [row for row in csv.DictReader(file) if row["table"] == table]
 

@@ -1,4 +1,4 @@
-"""Positioning systems of the twin: what reaches one drone's Kalman filter, how often, how wrong, and when it is missing.
+"""Positioning systems of the twin: what reaches a drone's Kalman filter, how often, how wrong, and when it is missing.
 
 - mocap: poses, 100 a second, 0.3 mm and 1 mrad (Merriaux 2017, Sensors 17(7) 1591, Vicon: 0.15 mm at rest, below 2 mm
   in motion).
@@ -10,8 +10,8 @@
   TDoA 3, 2018). Errors of ranges differ by 54 mm from anchor to anchor (Bitcraze, "accuracy and precision of the Loco
   Positioning"); their noise is such that an estimate at rest moves by 5 to 20 mm, as there: 0.10 m a difference.
 - flow: deck v2. 85 counts and 24 heights a second, with the deviations that the firmware's filter takes, 2 counts and
-  2.5 mm (bitcraze/crazyflie-firmware 2026.08; rates of the flights flowv2_flight_carpet 01 to 03 of the same dataset, where the position is
-  0.06, 0.24 and 0.86 m off after 65 s).
+  2.5 mm (bitcraze/crazyflie-firmware 2026.08; rates of the flights flowv2_flight_carpet 01 to 03 of the same dataset,
+  where the position is 0.24, 0.06 and 0.86 m off after 65 s).
 
 A distortion and the anchors' errors are the world's and the same for both drones. Gyroscopes have no bias here, so yaw,
 which loco and flow do not measure, keeps still. The measurement models are those of the firmware's filter, but the
@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 
@@ -89,8 +90,8 @@ class Deck(Positioning):
     """A system whose deck corrects the drone's filter by itself. What is frozen or jumps is the pose that it sees."""
 
     period = 1  # [ms] between two moments at which it may measure
-    parameters: Mapping[str, float] = {}  # that tell that it is there
-    logged: Mapping[str, float] = {}  # log variables of it, while all is well
+    parameters: ClassVar[Mapping[str, float]] = {}  # that tell that it is there
+    logged: ClassVar[Mapping[str, float]] = {}  # log variables of it, while all is well
 
     def __init__(self, surroundings: Surroundings, drone: int):
         """Of `drone`: 0 leader, 1 follower."""
@@ -105,14 +106,18 @@ class Deck(Positioning):
     def _normal(self) -> float:
         return self._noise * float(self._random.standard_normal())
 
-    def correct(self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int) -> None:
+    def correct(
+        self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int
+    ) -> None:
         """Correct `kalman` at millisecond `step` by what is seen of the true `position` (3,) and `quaternion` (4,).
 
         `rates` (3,) [rad/s] are the gyroscope's.
         """
         self._correct(kalman, *self._disturbed(position, quaternion), rates, step)
 
-    def _correct(self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int) -> None:
+    def _correct(
+        self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int
+    ) -> None:
         raise NotImplementedError
 
 
@@ -120,8 +125,8 @@ class Lighthouse(Deck):
     """See the module."""
 
     period = 20
-    parameters = {"deck.bcLighthouse4": 1.0}
-    logged = {f"lighthouse.bs{name}": 0b11 for name in ("Receive", "Active", "GeoVal", "CalVal", "CalCon")}
+    parameters: ClassVar = {"deck.bcLighthouse4": 1.0}
+    logged: ClassVar = {f"lighthouse.bs{name}": 0b11 for name in ("Receive", "Active", "GeoVal", "CalVal", "CalCon")}
     DISTORTION, JITTER, YAW_JITTER = 0.01, 1e-3, 0.01  # [1], [m], [rad]
     DEVIATIONS = 2.5e-3, 0.01  # that the filter takes, of position and yaw [m, rad]
     GAPS, SHORTEST, LONGER = 1.2, 0.05, 0.085  # [1/s], [s], mean beyond the shortest [s]
@@ -138,7 +143,9 @@ class Lighthouse(Deck):
             self._blind = step + round(1000 * (self.SHORTEST + self._random.exponential(self.LONGER)))
         return True
 
-    def _correct(self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int) -> None:
+    def _correct(
+        self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int
+    ) -> None:
         jitter = self.JITTER * self._noise * self._random.standard_normal(3)
         place = position + self._distortion @ position + jitter
         kalman.correct(place, None, (self.DEVIATIONS[0], 1.0))
@@ -151,8 +158,8 @@ class Loco(Deck):
     """See the module."""
 
     period = 5  # in which two packets come
-    parameters = {"deck.bcLoco": 1.0}
-    logged = {"loco.mode": 3, "ranging.state": 0, "tdoaEngine.stEst": 340.0}
+    parameters: ClassVar = {"deck.bcLoco": 1.0}
+    logged: ClassVar = {"loco.mode": 3, "ranging.state": 0, "tdoaEngine.stEst": 340.0}
     ANCHORS = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-2.0, 2.0) for z in (0.2, 2.5)])  # [m]
     LOST, BIAS, JITTER = 0.15, 0.054, 0.10  # share of packets, [m], [m]
     DEVIATION = 0.15  # that the filter takes [m]
@@ -160,7 +167,9 @@ class Loco(Deck):
     def _draw_world(self, world: np.random.Generator) -> None:
         self._bias = self._noise * self.BIAS * world.standard_normal(len(self.ANCHORS))
 
-    def _correct(self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int) -> None:
+    def _correct(
+        self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int
+    ) -> None:
         true = np.linalg.norm(self.ANCHORS - position, axis=1) + self._bias
         for _ in range(2):
             if self._random.random() < self.LOST:
@@ -178,7 +187,7 @@ class Flow(Deck):
     """See the module."""
 
     period = 12
-    parameters = {"deck.bcFlow2": 1.0}
+    parameters: ClassVar = {"deck.bcFlow2": 1.0}
     PIXELS, APERTURE, COUNTS = 35.0, 0.71674, 10.0  # of the camera: [pixels], [rad], counts a pixel
     DEVIATION, HEIGHT = 2.0, 2.5e-3  # [counts], [m]
     LOWEST = 0.1  # [m] height that the filter takes at least
@@ -188,7 +197,9 @@ class Flow(Deck):
         self._before: tuple[np.ndarray, np.ndarray, int] | None = None  # position, quaternion, [ms]
         self._ranged = -self.HEIGHTS  # [ms]
 
-    def _correct(self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int) -> None:
+    def _correct(
+        self, kalman: Kalman, position: np.ndarray, quaternion: np.ndarray, rates: np.ndarray, step: int
+    ) -> None:
         before, self._before = self._before, (position, quaternion, step)
         matrix = matrix_of(quaternion)
         if step - self._ranged >= self.HEIGHTS:

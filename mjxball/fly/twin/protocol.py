@@ -20,7 +20,6 @@ from mjxball.fly.app.protocol import PARAMETERS as APP_PARAMETERS
 from mjxball.fly.packets import PacketError
 from mjxball.fly.twin.conditions import DroneKind
 from mjxball.fly.twin.firmware import Firmware
-from mjxball.fly.twin.logs import OF_APP as LOGGED_BY_APP
 from mjxball.fly.twin.logs import (
     LOG_TYPES,
     LOG_VARIABLES,
@@ -33,6 +32,7 @@ from mjxball.fly.twin.logs import (
     item,
     listed,
 )
+from mjxball.fly.twin.logs import OF_APP as LOGGED_BY_APP
 
 VERSION = 12
 MAX_DATA = 30
@@ -101,8 +101,6 @@ class Parameter(NamedTuple):
     def unpack(self, data: bytes) -> float:
         """Value in `data`; raises struct.error for a wrong length."""
         return float(struct.unpack("<" + PARAM_TYPES[self.kind][1], data)[0])
-
-
 
 
 def _parameters(table: str) -> tuple[Parameter, ...]:
