@@ -1,7 +1,7 @@
-"""Two robots of a Crazyswarm2 file (`crazyflies.yaml`, fileversion 1 to 3): links, places, bodies, parameters.
+"""Two robots of a Crazyswarm2 file (crazyflies.yaml, fileversion 1 to 3): links, places, bodies, parameters.
 
-Its layout is of IMRCLab/crazyswarm2 1.0, `crazyflie/config/crazyflies.yaml` and `docs2/usage.rst`. Parameters of a
-robot come before those of its type, and these before those of `all`.
+Its layout is of IMRCLab/crazyswarm2 at f6154e2, crazyflie/config/crazyflies.yaml and docs2/usage.rst. Parameters of a
+robot come before those of its type, and these before those of all.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Which positioning deck a drone flies on, and whether it is ready, by the firmware's parameters and log variables.
 
-Names and meanings are of bitcraze/crazyflie-firmware 2026.08: `lighthouse_core.c`, `lighthouse_position_est.c`,
-`locodeck.c`, `lpsTdoa3Tag.c`, `flowdeck_v1v2.c`. `ranging.state` stays 0 in TDoA 3, whose rate is `tdoaEngine.stEst`.
+Names and meanings are of bitcraze/crazyflie-firmware 2026.08: lighthouse_core.c, lighthouse_position_est.c, locodeck.c,
+lpsTdoa2Tag.c, lpsTdoa3Tag.c, tdoaEngineInstance.c, flowdeck_v1v2.c. In TDoA 3 ranging.state stays 0, and
+tdoaEngine.stEst is the rate of measurements.
 """
 
 from __future__ import annotations
