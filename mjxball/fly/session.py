@@ -18,6 +18,7 @@ from mjxball.errors import InputError
 from mjxball.fly import packets, positioning
 from mjxball.fly.card import Controller
 from mjxball.fly.command import CurveName, Variants
+from mjxball.fly.connection import LinkError
 from mjxball.fly.display import Display, listening
 from mjxball.fly.figures import LEAST, SETTLING
 from mjxball.fly.flight import Flight
@@ -79,6 +80,8 @@ def fly(
                 curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
                 if setup.mocap is None:
                     system = positioning.common(links)
+                    if setup.apps is not None and system.noise:
+                        raise LinkError(f"apps on board descend at the variance of {system.name}: leave --onboard out")
                     settings = dataclasses.replace(settings, limits=system.widen(settings.limits))
                 if setup.apps is not None:
                     setup.apps.check(links, _say)
