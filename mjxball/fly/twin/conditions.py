@@ -206,7 +206,7 @@ class DroneFaults:
 class BodyFault(NamedTuple):
     """What happens to the body of a drone, see `Pair.disturb`."""
 
-    what: str  # of its poses, see `estimators.Positioning.disturb`; "battery", "fade", "gain"
+    what: str  # of its poses, see `positioning.Positioning.disturb`; "battery", "fade", "gain"
     value: float
 
 
