@@ -4,6 +4,10 @@ Without sockets or clock. Measured are the seconds until each drone's motors are
 largest tilt and drift between the fault and then. The table in docs/flying.md is made from
 benchmarks/results/fly_faults_virtual.json. `--onboard float32` (or `int8`) has the laws on the drones, in the apps' own
 C, compiled by gcc: a dead laptop and a lost heartbeat are faults as well then.
+
+`--positioning` flies each positioning system of the twin instead, without a fault and with a pose lost: the error of O
+in hover after `SETTLING` seconds. A flow deck, which the runner refuses, flies with its guards wide open. The table in
+docs/positioning.md is made from benchmarks/results/fly_positioning.json.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ import multiprocessing
 import statistics
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +29,17 @@ from harness import Row, arguments, table, write
 from mjxball.cli import run_command
 from mjxball.fly.app.host import Library, compile_pair
 from mjxball.fly.card import Controller, goal_of, limits_of, times_of
+from mjxball.fly.figures import SETTLING
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import State
-from mjxball.fly.twin.conditions import FAULT_KINDS, Surroundings, drone_kind
+from mjxball.fly.twin.conditions import FAULT_KINDS, POSITIONING, Surroundings, drone_kind
 from mjxball.fly.twin.virtual import MemoryLog, Moment, VirtualTwin
 from mjxball.policy import Policy, load_file
 from mjxball.policy.file import shipped_policy
 
 SETTLE = 1.0  # [s] that estimators get before a flight, as the check before a real one gives them
 SETTLED, HOVER = 3.0, 6.0  # [s] under both laws, until a fault may come and until the flight lands
+AXES = ("x", "y", "z")
 Injection = Callable[[VirtualTwin, int], None]
 
 
@@ -134,6 +141,43 @@ def settings_of(policy: Policy, seconds: float) -> FlightSettings:
 def cores_of(path: Path, weights: str) -> tuple[Library, Library]:
     """The apps of the policy in `path`, `weights` float32 or int8."""
     return compile_pair(load_file(path), path.stem, weights == "int8")
+
+
+def hover_on(path: Path, system: str, number: int, fault: str = "") -> Row:
+    """A flight of 20 s under both laws on positioning `system`; `fault` is injected in its middle, at the leader."""
+    policy = Policy.load(path)
+    settings = settings_of(policy, 4 * SETTLING)
+    if system == "flow":
+        settings = replace(settings, limits=replace(settings.limits, variance=math.inf, noise=10.0, stick_error=10.0))
+    world = VirtualTwin(policy, settings, surroundings=Surroundings(seed=number, positioning=system), settle=SETTLE)
+    if system == "flow":  # its filters begin where the drones stand
+        for link_, mount in zip(world.links, world.rig.mounts, strict=True):
+            link_.write_parameters({"kalman.initialX": mount[0], "kalman.initialY": mount[1]})
+        world.next_flight(0.0, SETTLE)
+    start, now = world.state.position.mean(axis=0), 0.0
+    if fault:
+        world.fly_until(State.FLY)
+        world.fly_for(2 * SETTLING)
+        now = world.now
+        injected(fault)(world, 0)
+    world.run()
+    flown = [moment for moment in world.track if moment.state == State.FLY.value]
+    late = [moment for moment in flown if moment.time > flown[0].time + SETTLING]
+    error = np.array([moment.position - start - world.settings.goal for moment in late])
+    row = {"positioning": system, "fault": fault, "seed": number, "cause": cause_of(world)}
+    row |= {name: 1000 * float(np.sqrt((error[:, axis] ** 2).mean())) for axis, name in enumerate(AXES)}
+    row["rms"] = 1000 * float(np.sqrt((error**2).sum(axis=1).mean()))
+    row["tilt"] = math.degrees(max(moment.tilt for moment in world.track))
+    row["seen"] = flown[-1].time - now if fault and cause_of(world) else None
+    return row | {"speed": world.touchdown_speed()}
+
+
+def positionings(options: argparse.Namespace) -> list[Row]:
+    """`hover_on` every system, `options.trials` times; the first flight of each with a pose lost as well."""
+    runs = [(options.policy, system, number, "") for system in POSITIONING for number in range(options.trials)]
+    runs += [(options.policy, system, 0, "pose-lost") for system in POSITIONING[:-1]]
+    with multiprocessing.get_context("fork").Pool(options.jobs) as pool:
+        return pool.starmap(hover_on, runs, chunksize=1)
 
 
 def hovering(path: Path, number: int, onboard: str = "") -> VirtualTwin:
@@ -266,9 +310,15 @@ def main(given: Sequence[str] | None = None) -> int:
     parser.add_argument("--trials", type=int, default=1, help="flights of each fault at each drone")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", nargs="+", choices=FAULTS, metavar="FAULT", help="these faults alone")
+    parser.add_argument("--positioning", action="store_true", help="hover on each positioning system instead")
     parser.add_argument("--onboard", choices=("float32", "int8"), default="", help="the laws' weights on the drones")
     options = parser.parse_args(given)
     options.only = options.only or [one for one in FAULTS if options.onboard or one not in ONBOARD]
+    if options.positioning:
+        rows = positionings(options)
+        table(rows, form=".1f")
+        write(options.json, {"flights": rows})
+        return 0
     rows = all_of(options)
     show(rows)
     write(options.json, {"faults": rows})

@@ -13,7 +13,8 @@ from mjxball.fly.limits import FlightSettings
 from mjxball.fly.mocap import Mocap, MocapSettings
 from mjxball.fly.mocap_supervision import Frame, Pose
 from mjxball.fly.twin.conditions import QUIET
-from mjxball.fly.twin.estimators import ATTITUDE_NOISE, POSITION_NOISE, product
+from mjxball.fly.twin.estimators import product
+from mjxball.fly.twin.positioning import ATTITUDE_NOISE, POSITION_NOISE
 from mjxball.fly.twin.virtual import STEP, VirtualTwin
 from mjxball.policy import Policy
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,27 @@ def faults() -> str:
         off = ", ".join(f"{value:.2f}" for value in worst["off"])
         numbers = f"{worst['speed']:.2f} m/s | {worst['tilt']:.0f}° | {worst['drift']:.2f} m"
         lines.append(f"| {name} ({worst['drone']}) | {reaction(worst)} | {off} | {numbers} |")
+    return "\n".join(lines)
+
+
+POSITIONING = FAULTS.with_name("fly_positioning.json")
+
+
+def positioning() -> str:
+    """Hover of `flight` on each system, by `benchmarks/fly_faults_virtual.py --positioning`."""
+    rows = json.loads(POSITIONING.read_text(encoding="utf-8"))["flights"]
+    names = ("rms", "x", "y", "z")
+    lines = [f"| system | {' | '.join(names)} | largest tilt | noticed after |", "|---" * (len(names) + 3) + "|"]
+    for system in dict.fromkeys(row["positioning"] for row in rows):
+        own = [row for row in rows if row["positioning"] == system]
+        flown = [row for row in own if not row["fault"]]
+        cells = []
+        for name in names:
+            found = [row[name] for row in flown]
+            cells.append(f"{statistics.median(found):.0f} ({max(found):.0f})")
+        seen = [f"{row['seen']:.1f} s" for row in own if row["fault"]]
+        cells += [f"{max(row['tilt'] for row in flown):.1f}°", *(seen or [""])]
+        lines.append(f"| {system} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

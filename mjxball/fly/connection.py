@@ -180,6 +180,10 @@ class Parameters:
                 self._answers[packet.channel, struct.unpack("<H", data[:2])[0]] = data[2:]
                 self._changed.notify_all()
 
+    def known(self, names: Iterable[str]) -> list[str]:
+        """Those of `names` that the firmware lists."""
+        return [name for name in names if self._find(name) is not None]
+
     def read(self, names: Iterable[str]) -> dict[str, float]:
         """Values by name. Raises LinkError for an unknown one, or one that is not answered."""
         elements = {name: self._element(name) for name in names}

@@ -41,6 +41,8 @@ class Limits:
     longest_gap: float = 0.1  # between two ticks [s]
     fresh: float = 0.03  # [s] that states must be fresh before a flight that was held goes on
     gaps: int = 4  # of the states in one flight, after which it lands
+    variance: float = 5e-4  # of an estimated position that is believed [m2]: without poses it is reached in about 1 s
+    noise: float = 0.0  # of a position beyond motion capture's, standard deviation [m], see `positioning`
 
     def on_stand(self, goal_height: float) -> Limits:
         """Bounds for a stand: a ceiling, and no word about sideways, which its estimators invent."""

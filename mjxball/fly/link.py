@@ -11,7 +11,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from mjxball.fly import packets
@@ -21,6 +21,7 @@ from mjxball.fly.packets import Packet, PacketError
 from mjxball.fly.process import bounded
 from mjxball.fly.telemetry import HealthSample, Note, SensedSample, Telemetry
 
+Variable = tuple[str, str | None]  # name and type of a log variable; None: as the firmware has it
 PROTOCOL = 12  # CRTP version with a supervisor port
 LOG_PORT, LOG_DATA = 5, 2
 DEADLINES = Deadlines()
@@ -83,7 +84,7 @@ class Link:
             self._request(request)
         both.wait(self._deadlines.version)
         self._crazyflie.remove_port_callback(packets.VERSION.port, answered)
-        names, began = [name for name in REVISION if self._element(name) is not None], time.monotonic()
+        names, began = self.parameters.known(REVISION), time.monotonic()
         revision = self.parameters.read(names)
         trip = (time.monotonic() - began) if names else math.nan
         self.identity = Identity(
@@ -124,14 +125,36 @@ class Link:
                 raise LinkError(f"the {self.name} sends no state within {self._deadlines.first_state:g} s")
             time.sleep(0.01)
 
-    def _listed(self, variables: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    def _listed(self, variables: Iterable[Variable]) -> list[Variable]:
         """Those of `variables` that the firmware lists."""
         find = self._crazyflie.log.toc.get_element_by_complete_name
         return [(name, kind) for name, kind in variables if find(name) is not None]
 
-    def _health_variables(self) -> list[tuple[str, str]]:
+    def _health_variables(self) -> list[Variable]:
         motors = next((names for names in packets.MOTORS if len(self._listed(names)) == len(names)), ())
         return [*packets.VARIANCES, *motors, *self._listed([packets.ACTING_THRUST])]
+
+    def read_logs(self, names: Sequence[str]) -> dict[str, float]:
+        """Values of those of the log variables `names` that the firmware lists, as one packet has them.
+
+        Raises LinkError if none comes.
+        """
+        listed = self._listed([(name, None) for name in names])
+        if not listed:
+            return {}
+        block, values, came = self._log_block("once", listed, 100), dict[str, float](), threading.Event()
+
+        def take(stamp: int, data: Mapping[str, float], config: Any) -> None:
+            values.update(data)
+            came.set()
+
+        block.data_received_cb.add_callback(take)
+        self._ask(block.start)
+        arrived = came.wait(self._deadlines.first_state)
+        self._ask(block.delete)
+        if not arrived:
+            raise LinkError(f"the {self.name} does not send {', '.join(name for name, _ in listed)}")
+        return values
 
     def write_parameters(self, values: Mapping[str, float], check: bool = True) -> None:
         """Write each parameter and read it back (see `Parameters.write`). Raises LinkError."""
@@ -152,7 +175,7 @@ class Link:
         self.busy = True
         threading.Thread(target=write, daemon=True).start()
 
-    def _log_block(self, title: str, variables: Iterable[tuple[str, str]], period_ms: int) -> Any:
+    def _log_block(self, title: str, variables: Iterable[Variable], period_ms: int) -> Any:
         from cflib.crazyflie.log import LogConfig
 
         block = LogConfig(title, period_ms)

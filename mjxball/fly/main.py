@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from mjxball import cli
+from mjxball import cli, terminal
 from mjxball.cli import run_command
 from mjxball.config import Config
 from mjxball.errors import InputError
@@ -31,6 +31,7 @@ from mjxball.fly.card import (
     times_of,
     variants,
 )
+from mjxball.fly.crazyswarm import CrazyswarmPair, read_pair
 from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.mocap import KINDS, MocapSettings, ready
@@ -46,6 +47,8 @@ from mjxball.reading import parse_json
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
 DONGLE = re.compile(r"radio://([^/]+)/")
+RADIO = re.compile(r"radio://([^/]+)/(\d{1,3})")
+APART = 2  # channels of 1 MHz that a link of 2 Mbit/s takes
 # Numbers with least and most: of the battery, and of the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
 WORSE = {  # once the motors turn: cflib connects over a good link only
@@ -56,7 +59,7 @@ WORSE = {  # once the motors turn: cflib connects over a good link only
 
 
 # What `--help` leaves to `--help all`, besides all of the groups `twin` and `thrust`.
-RARE = {"--upload", "--mocap-rate", "--mocap-std", "--mocap-option"}
+RARE = {"--upload", "--crazyflies", "--mocap-rate", "--mocap-std", "--mocap-option"}
 
 
 def make_parser() -> cli.Parser:
@@ -81,6 +84,8 @@ def make_parser() -> cli.Parser:
     add = parser.add_argument_group("the drones").add_argument
     add("--leader", metavar="URI", help="radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
     add("--follower", metavar="URI", help="likewise, on a dongle of its own if there are two")
+    about = "links and parameters of two robots of a Crazyswarm2 file; --leader and --follower then are names in it"
+    add("--crazyflies", type=Path, metavar="FILE.yaml", help=about)
     add("--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given")
     add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
 
@@ -164,6 +169,18 @@ def mocap_settings(options: argparse.Namespace) -> MocapSettings | None:
     return MocapSettings(options.mocap, options.mocap_host or "", bodies, rate, (deviation[0], deviation[1]), more)
 
 
+def crazyflies(options: argparse.Namespace) -> CrazyswarmPair | None:
+    """The pair of --crazyflies, whose links and bodies `options` get. Raises InputError."""
+    if options.crazyflies is None:
+        return None
+    if options.rehearse:
+        raise InputError("--crazyflies names drones to fly: leave it out with --rehearse")
+    pair = read_pair(options.crazyflies, options.leader, options.follower)
+    options.leader, options.follower = pair.uris
+    options.bodies = options.bodies or (pair.bodies if options.mocap else None)
+    return pair
+
+
 def default_rate(uris: Sequence[str | None]) -> float:
     """Poses a second to each drone: 100, and 50 where both share one dongle, which 400 packets a second would fill."""
     dongles = [DONGLE.match(uri or "") for uri in uris]
@@ -186,6 +203,7 @@ def check_options(options: argparse.Namespace) -> None:
             raise InputError(f"--{flag} {uri}: the twin of --rehearse answers at udp://127.0.0.1:PORT only")
     if options.leader is not None and options.leader == options.follower:
         raise InputError("--leader and --follower are the same drone")
+    check_radios(options.leader or "", options.follower or "")
     for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0), *LINK):
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
@@ -215,6 +233,16 @@ def check_log(log: Path, viewed: bool) -> None:
         raise InputError("a log in MCAP needs mcap-ros2-support; pip install 'mjxball[logs]'")
     if log.suffix == ".mcap" and viewed:
         raise InputError("--view follows a log of JSON lines: --log FILE.jsonl")
+
+
+def check_radios(leader: str, follower: str) -> None:
+    """Raise InputError if two radios would disturb each other: they send whenever they like."""
+    one, other = (RADIO.match(uri) for uri in (leader, follower))
+    if one and other and one[1] != other[1] and abs(int(one[2]) - int(other[2])) < APART:
+        raise InputError(
+            f"two radios on channels {one[2]} and {other[2]} disturb each other: leave {APART} MHz between them, or "
+            "use one radio for both"
+        )
 
 
 def check_twin_options(options: argparse.Namespace) -> None:
@@ -271,6 +299,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(arguments)
 
     def command() -> int:
+        swarm = crazyflies(options)
         check_options(options)
         check_twin_options(options)
         capture = mocap_settings(options)
@@ -279,6 +308,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         controller = Controller(policy)
         config = controller.config
         more = read_gains(options.gains) if options.gains else ({}, {})
+        if swarm is not None:
+            more = {**swarm.parameters[0], **more[0]}, {**swarm.parameters[1], **more[1]}
         if options.twin_load is not None:
             check_loaded(config)
         rig = Rig.of_card(policy.card)
@@ -296,6 +327,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if options.onboard:
             setup, settings = on_board(options, setup, settings)
+        for text in swarm.told(rig) if swarm is not None else []:
+            terminal.say(text)
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
             if options.rehearse:

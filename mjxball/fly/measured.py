@@ -83,9 +83,9 @@ class _Moment(NamedTuple):
 class ImuWatch:
     """Holds one drone's measured motion against its IMU. `update` with every packet of what is sensed."""
 
-    def __init__(self, axes: Sequence[int] = (0, 1, 2)):
-        """`axes` of the world along which the way counts."""
-        self._axes = list(axes)
+    def __init__(self, axes: Sequence[int] = (0, 1, 2), noise: float = 0.0):
+        """`axes` of the world along which the way counts; `noise` [m] of a position beyond motion capture's."""
+        self._axes, self._way = list(axes), WAY + DOUBT * math.sqrt(6) * noise  # of a second difference
         self._moments: collections.deque[_Moment] = collections.deque()
         self._turned = np.array([1.0, 0.0, 0.0, 0.0])
         self._state: Sample | None = None
@@ -178,18 +178,22 @@ class ImuWatch:
         share = np.where(times > middle, end - times, (times - begin) * ratio)[:, None]
         noise = math.sqrt(0.5 * float(np.square(np.diff(felt, axis=0)).sum(axis=1).mean()))
         step = (end - begin) / max(len(seen) - 1, 1)
-        limit = WAY + BIAS * float(share.sum()) * step + DOUBT * noise * step * math.sqrt(float(np.square(share).sum()))
+        limit = (
+            self._way
+            + BIAS * float(share.sum()) * step
+            + DOUBT * noise * step * math.sqrt(float(np.square(share).sum()))
+        )
         return np.trapezoid(share * felt, times, axis=0), limit
 
 
 class DroneWatch:
     """Everything of this module for one drone."""
 
-    def __init__(self, axes: Sequence[int]):
-        """`axes` of the world along which the drone can move."""
+    def __init__(self, axes: Sequence[int], noise: float = 0.0):
+        """`axes` of the world along which the drone can move; `noise` as of `ImuWatch`."""
         self._estimate = Repeats(("estimate", "gyroscope"))
         self._pose = Repeats(("x", "y", "z", "attitude"))
-        self.imu = ImuWatch(axes)
+        self.imu = ImuWatch(axes, noise)
         self._seen: Sample | None = None
         self._sensed = -math.inf  # [s] of the newest packet
         self._measured: Sequence[object] = ()  # pose in it

@@ -22,13 +22,13 @@ from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, St
 from mjxball.fly.telemetry import DroneLink, ObjectState, Rig, Sample, object_of_one, object_state
 
 # From where on an estimator is not believed, and a drone counts as not hearing.
-VARIANCE = 5e-4  # of the estimated position along any axis [m2]: without poses it is reached in about a second
 JUMP = 0.08  # of the position, beyond what its velocity explains [m]
 JUMP_TIME = 0.1  # between two states, beyond which nothing is said about a jump [s]
 HEIGHT, CLIMB = 0.05, 0.3  # of one drone against the other one and the roll [m, m/s]
 LASTING = 0.25  # [s] that heights or climbs must disagree
 APART, DOUBT = 0.015, 4.0  # the same along any axis against its mean: [m], and in standard deviations of the filters
 USUAL = 10.0  # [s] of that mean
+LIMITS = Limits()
 ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
 RECENT = 0.1  # [s] within which a thrust in force that stands still must have been sent
 SAME = 1.5  # [thrust units] within which two thrusts are one, rounded
@@ -95,9 +95,9 @@ class Monitor:
         self._held = dataclasses.replace(bounds, tilt=min(bounds.hold_tilt, bounds.tilt))
         self._low = [Sustained(bounds.battery_time) for _ in NAMES]
         self.origin = np.zeros(3)  # where O stood at the start [m]
-        self.estimators = EstimatorWatch(rig, sideways=not settings.stand)
+        self.estimators = EstimatorWatch(rig, not settings.stand, bounds)
         axes = (2,) if settings.stand else (0, 1, 2)
-        self._drones = [DroneWatch(axes) for _ in NAMES]
+        self._drones = [DroneWatch(axes, bounds.noise) for _ in NAMES]
         self.uplinks = [UplinkWatch(name) for name in NAMES]
         self.object: ObjectState | None = None  # newest that can be trusted
 
@@ -164,9 +164,9 @@ class Monitor:
 class EstimatorWatch:
     """Checks both estimators. `update` once a tick; `trusted` says whose position may be used."""
 
-    def __init__(self, rig: Rig, sideways: bool = True):
+    def __init__(self, rig: Rig, sideways: bool = True, limits: Limits = LIMITS):
         """`sideways` false: on a stand, where the estimators invent motion along the locked axes."""
-        self._rig = rig
+        self._rig, self._limits = rig, limits
         self._axes = (0, 1, 2) if sideways else (2,)
         self._before: list[Sample | None] = [None, None]
         self._height, self._climb, self._apart = Sustained(LASTING), Sustained(LASTING), Sustained(REPEATING)
@@ -206,9 +206,9 @@ class EstimatorWatch:
         if health is None:
             return ""
         variance = max(health.variance[axis] for axis in self._axes)
-        if variance <= VARIANCE:
+        if variance <= self._limits.variance:
             return ""
-        return f"position variance {variance:.2g} m2, no more than {VARIANCE:g} is believed"
+        return f"position variance {variance:.2g} m2, no more than {self._limits.variance:g} is believed"
 
     def _against_each_other(self, samples: Sequence[Sample], now: float) -> list[Fault]:
         """Places, heights and climbs of the two ends of one stick, whose attitude both drones measure."""
@@ -221,7 +221,7 @@ class EstimatorWatch:
         faster = float((leader.velocity - follower.velocity - matrix @ turning)[2])
         details = {
             f"the leader's height is {100 * beside[2]:+.0f} cm from where the follower and the roll put it": (
-                self._height.update(abs(beside[2]) > HEIGHT, now)
+                self._height.update(abs(beside[2]) > max(HEIGHT, DOUBT * math.sqrt(2) * self._limits.noise), now)
             ),
             f"the leader climbs {faster:+.1f} m/s against the follower": self._climb.update(abs(faster) > CLIMB, now),
         }

@@ -15,9 +15,10 @@ from mjxball import __version__, terminal
 from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.errors import InputError
-from mjxball.fly import packets
+from mjxball.fly import packets, positioning
 from mjxball.fly.app_flight import Apps, OnboardFlight
 from mjxball.fly.card import Controller
+from mjxball.fly.connection import LinkError
 from mjxball.fly.display import Display, listening
 from mjxball.fly.figures import LEAST, SETTLING
 from mjxball.fly.flight import Flight
@@ -77,6 +78,11 @@ def fly(
                 if setup.mocap is not None:
                     setup.mocap.note = journal.note
                 curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
+                if setup.mocap is None:
+                    system = positioning.common(links)
+                    if setup.apps is not None and system.noise:
+                        raise LinkError(f"apps on board descend at the variance of {system.name}: leave --onboard out")
+                    settings = dataclasses.replace(settings, limits=system.widen(settings.limits))
                 if setup.apps is not None:
                     setup.apps.check(links, _say)
                 pair = (links, setup.controller, setup.variants, curves, setup.rig)
@@ -141,7 +147,9 @@ def _emergency(flight: Flight) -> bool:
 
 def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings, journal: Journal) -> bool:
     checks = check(links, setup.rig, settings.limits, setup.preflight)
-    if setup.mocap is not None:
+    if setup.mocap is None:
+        checks += [one for one in map(positioning.check, links) if one is not None]
+    else:
         checks += setup.mocap.checks()
         setup.mocap.guarding = True
     for one in checks:

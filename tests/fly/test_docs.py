@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import sys
 
 import pytest
 from command_line import REPOSITORY
 
 from mjxball.fly.supervisor import State
+from mjxball.fly.twin.conditions import POSITIONING
 
 DOCS = REPOSITORY / "docs"
 SUPERVISOR = (DOCS / "supervisor.md").read_text(encoding="utf-8")
@@ -19,6 +21,19 @@ import flight_tables  # noqa: E402
 
 def test_every_state_is_explained() -> None:
     assert [state.value for state in State if f"| {state.value} | " not in SUPERVISOR] == []
+
+
+def test_positioning_is_that_which_was_measured() -> None:
+    """A line for each system of the twin; the median flight is between the best and the worst."""
+    found = json.loads(flight_tables.POSITIONING.read_text(encoding="utf-8"))["flights"]
+    lines = flight_tables.positioning().splitlines()[2:]
+    assert [line.split(" | ")[0].strip("| ") for line in lines] == list(POSITIONING)
+    for line, system in zip(lines, POSITIONING, strict=True):
+        flown = [row["rms"] for row in found if row["positioning"] == system and not row["fault"]]
+        assert not [row["cause"] for row in found if row["positioning"] == system and not row["fault"] and row["cause"]]
+        median, worst = (float(part) for part in re.findall(r"[0-9]+", line.split(" | ")[1]))
+        assert min(flown) - 0.5 <= median <= worst
+        assert worst == pytest.approx(max(flown), abs=0.51)
 
 
 def test_faults_are_those_that_were_measured() -> None:

@@ -70,6 +70,15 @@ def link(twin: Twin, links: Callable[..., Link]) -> Link:
     return opened
 
 
+def test_log_variables_are_read_once(link: Link) -> None:
+    """Those that are not listed are left out, and the block that read them is gone: 16 blocks are all there are."""
+    for _ in range(20):
+        found = link.read_logs(["kalman.varPX", "pm.vbat", "lighthouse.status"])
+        assert found.keys() == {"kalman.varPX", "pm.vbat"}
+        assert 3.0 < found["pm.vbat"] < 4.3
+    assert link.read_logs(["lighthouse.status"]) == {}
+
+
 def test_states_arrive_and_are_young(link: Link) -> None:
     before = link.telemetry.received
     assert wait_for(lambda: link.telemetry.received >= before + 50)

@@ -119,6 +119,16 @@ def test_gains_and_poses_come_before_the_reset(measured: bool) -> None:
         assert drone.values["stabilizer.estimator"] == KALMAN
 
 
+def test_another_programs_controller_is_replaced() -> None:
+    """Crazyswarm2 flies with the Mellinger controller, which takes none of the gains."""
+    drones = [Drone("leader"), Drone("follower")]
+    for drone in drones:
+        drone.values["stabilizer.controller"] = 2.0
+        drone.names.append("stabilizer.controller")
+    prepare(drones, [OWN, OWN], ASKED, print)
+    assert [drone.values["stabilizer.controller"] for drone in drones] == [1.0, 1.0]
+
+
 def test_gains_for_another_firmware_are_refused() -> None:
     with pytest.raises(LinkError, match="has the linear force curve"):
         prepare([Drone()], [{"older": OWN["linear"]}], ASKED, print)

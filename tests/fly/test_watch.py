@@ -11,7 +11,7 @@ from mjxball.control import motors, rotations
 from mjxball.control.motors import MOTORS
 from mjxball.fly import preflight, setpoints
 from mjxball.fly.limits import Limits
-from mjxball.fly.monitor import JUMP, VARIANCE, EstimatorWatch, UplinkWatch, stick_faults
+from mjxball.fly.monitor import JUMP, EstimatorWatch, UplinkWatch, stick_faults
 from mjxball.fly.packets import MOTORS as MOTOR_VARIABLES
 from mjxball.fly.packets import VARIANCES, DroneState, Health, health_of
 from mjxball.fly.supervisor import Event
@@ -100,7 +100,7 @@ def test_two_drones_are_as_far_apart_as_their_stick_is_long() -> None:
 def test_a_variance_that_grows_is_found() -> None:
     watch = EstimatorWatch(RIG)
     seen = [sample(n, 0.0) for n in range(2)]
-    blind = WELL._replace(variance=(1e-5, 1e-5, 1.1 * VARIANCE))
+    blind = WELL._replace(variance=(1e-5, 1e-5, 1.1 * Limits().variance))
     assert [fault.event for fault in watch.update(seen, [WELL, blind], 0.0)] == [Event.ESTIMATOR]
     assert watch.trusted == [True, False]
     sideways = WELL._replace(variance=(1.0, 1.0, 1e-5))

@@ -12,13 +12,13 @@ import pytest
 from command_line import assert_one_line, call
 from fly_policies import untrained
 from fly_virtual import VirtualTwin, log_header
-from mjxball.view.main import main as view
 
 from mjxball.fly import flight_log
 from mjxball.fly.display import live_view
 from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import FlightSettings
 from mjxball.view.foxglove import Foxglove
+from mjxball.view.main import main as view
 
 pytest.importorskip("foxglove")
 client = pytest.importorskip("websockets.sync.client")

@@ -10,8 +10,9 @@ from mjxball.config import Autopilot
 from mjxball.control import crazyflie, motors
 from mjxball.control.crazyflie import PARAMETERS, gains_of, with_gains
 from mjxball.fly.twin.conditions import OLDER_FORCE, Battery, DroneKind, Surroundings
-from mjxball.fly.twin.estimators import Complementary, Imu, Kalman, Positioning, euler_of
+from mjxball.fly.twin.estimators import Complementary, Imu, Kalman, euler_of
 from mjxball.fly.twin.pair import RUNNING, Modes, Report, remembered
+from mjxball.fly.twin.positioning import Deck, positioning_of
 
 TAKEN = 0.01  # share of the measured voltage that the firmware's low-pass filter takes, 1000 times a second
 FIRST = 4.2  # [V] that the filter starts from
@@ -80,10 +81,11 @@ class Onboard:
         self.imu = Imu(random, surroundings.noise)
         self.filters = [Kalman(), Kalman()]
         self.plain = [Complementary(random), Complementary(random)]
-        self.positioning = [Positioning(surroundings, random, phase) for phase in range(2)]
+        self.positioning = [positioning_of(surroundings, random, drone) for drone in range(2)]
         self.estimators = [KALMAN if surroundings.deck else COMPLEMENTARY] * 2
         self.deviations = [[0.01, 4.5e-3], [0.01, 4.5e-3]]  # of poses [m, rad]: locSrv.extPosStdDev, extQuatStdDev
         self.poses = np.zeros((2, 7))
+        self.initial = np.zeros((2, 3))  # where a filter that is reset begins [m]: kalman.initialX and so on
         self.idle = [float(kind.idle)] * 2
         self._autopilots = [autopilot] * 2
         self._arrange_gains()
@@ -117,6 +119,8 @@ class Onboard:
             self._resets.add(drone)
         elif name == "stabilizer.estimator":
             self._switch(drone, int(value))
+        elif name.startswith("kalman.initial") and name[-1] in "XYZ":
+            self.initial[drone, "XYZ".index(name[-1])] = value
         elif name == "powerDist.idleThrust" and not self.kind.auto_arm:
             self.idle[drone] = value
         elif name == "locSrv.extPosStdDev":
@@ -174,12 +178,17 @@ class Onboard:
             self._counts[drone] += 1
             if drone in self._resets:
                 self._resets.discard(drone)
-                self.filters[drone].reset()
+                self.filters[drone].reset(self.initial[drone])
             if self.estimators[drone] == KALMAN:
                 self._filter(step + drone * PREDICTION // 2, drone)
-                if self.positioning[drone].due(step):
+                system = self.positioning[drone]
+                if system.due(step):
                     positions, quaternion, _ = where()
-                    self.receive_pose(drone, *self.positioning[drone].measure(positions[drone], quaternion))
+                    if isinstance(system, Deck):
+                        system.correct(self.filters[drone], positions[drone], quaternion, seen[drone, 3:], step)
+                        self._look(drone)
+                    else:
+                        self.receive_pose(drone, *system.measure(positions[drone], quaternion))
             elif step % AIR == 0:
                 height = float(where()[0][drone, 2])
                 self.plain[drone].update(seen[drone, :3], seen[drone, 3:], height, AIR * 1e-3)

@@ -74,8 +74,10 @@ class Surroundings:
     load: AddedLoad | None = None  # put on in flight
     seed: int = 0
     pose_loss: float = 0.0  # share of the positioning system's poses that never come
+    positioning: str = "mocap"  # one of `POSITIONING`: what a deck measures
 
 
+POSITIONING = ("mocap", "lighthouse", "loco", "flow")  # see `positioning`
 DELIVERED = DroneKind()
 QUIET = Surroundings()
 
@@ -94,6 +96,8 @@ def add_twin_options(parser: argparse._ActionsContainer) -> None:
     add("--twin-noise", type=float, metavar="X", help=f"{about}factor on the noise of its sensors (1)")
     add("--twin-pose-hz", type=float, metavar="HZ", help=f"{about}poses of its positioning system (100)")
     add("--twin-deck", choices=("yes", "no"), help=f"{about}its positioning; no: poses must come from here (yes)")
+    about_kind = f"{about}what that deck is (mocap: 0.3 mm at --twin-pose-hz)"
+    add("--twin-positioning", choices=POSITIONING, help=about_kind)
     add("--twin-delay", type=float, metavar="S", help=f"{about}of each datagram, from the first one on (0)")
     add("--twin-gains", type=float, nargs=2, metavar=("L", "F"), help=f"{about}factors on the motor forces (1 1)")
     about = f"{about}a load put on the stick: kg, m from O toward the leader, s after the motors first turn"
@@ -115,6 +119,11 @@ def check_twin(options: argparse.Namespace) -> None:
         for value, (low, high), what in zip(options.twin_load, LOAD_RANGES, ("KG", "M", "S"), strict=True):
             if not low <= value <= high:
                 raise InputError(f"--twin-load: {what} must be {low:g} to {high:g}, not {value:g}")
+    if options.twin_positioning not in (None, "mocap"):
+        for name in ("deck", "pose_hz"):
+            if getattr(options, f"twin_{name}") is not None:
+                flag = f"--twin-{name.replace('_', '-')}"
+                raise InputError(f"{flag} is for --twin-positioning mocap, not {options.twin_positioning}")
     if options.twin_seed is not None and options.twin_seed < 0:
         raise InputError(f"--twin-seed must not be negative, not {options.twin_seed}")
 
@@ -135,7 +144,8 @@ def surroundings(options: argparse.Namespace) -> Surroundings:
     given = {name: getattr(options, f"twin_{name}") for name in ("noise", "pose_hz", "delay", "seed", "gains")}
     given = {name: tuple(one) if name == "gains" else one for name, one in given.items() if one is not None}
     load = AddedLoad(*options.twin_load) if options.twin_load is not None else None
-    return Surroundings(deck=options.twin_deck != "no", load=load, **given)
+    deck, system = options.twin_deck != "no", options.twin_positioning or "mocap"
+    return Surroundings(deck=deck, load=load, positioning=system, **given)
 
 
 @dataclass(frozen=True)
@@ -196,7 +206,7 @@ class DroneFaults:
 class BodyFault(NamedTuple):
     """What happens to the body of a drone, see `Pair.disturb`."""
 
-    what: str  # of its poses, see `estimators.Positioning.disturb`; "battery", "fade", "gain"
+    what: str  # of its poses, see `positioning.Positioning.disturb`; "battery", "fade", "gain"
     value: float
 
 

@@ -17,6 +17,7 @@ from mjxball.fly.twin.conditions import BodyFault, DroneFaults, LinkFaults, What
 from mjxball.fly.twin.firmware import Firmware, Motors, Order
 from mjxball.fly.twin.logs import Readings, Snapshot
 from mjxball.fly.twin.pair import Modes, Pair, PairState
+from mjxball.fly.twin.positioning import DECKS
 from mjxball.fly.twin.protocol import Peer
 
 GRAVITY = 9.81  # [m/s2]
@@ -40,6 +41,7 @@ class TwinDrone:
         self.firmware = Firmware(pair.kind, phase=float(self._random.random()))
         self._estimator = 2 if pair.surroundings.deck else 1
         self._core = core
+        self._deck = DECKS.get(pair.surroundings.positioning)
         self.app = self._new_app()
         self.peer = self._new_peer()
         self.link, self.faults = LinkFaults(), DroneFaults()
@@ -55,6 +57,7 @@ class TwinDrone:
             functools.partial(self._pair.receive_pose, self.number),
             self._estimator,
             self.app,
+            None if self._deck is None else self._deck.parameters,
         )
 
     def _new_app(self) -> App | None:
@@ -163,7 +166,8 @@ class TwinDrone:
         voltage = float(state.battery[self.number]) + self.faults.battery
         setpoint = self.firmware.order.setpoint
         logged = {} if self.app is None else self.app.logged()
-        return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, logged)
+        deck = {} if self._deck is None else self._deck.logged
+        return Snapshot(state.report, self.number, setpoint, self.firmware.info, voltage, position, logged, deck)
 
     def send(self, now: float) -> list[bytes]:
         """Datagrams that leave for the laptop at `now`."""

@@ -13,8 +13,6 @@ import math
 
 import numpy as np
 
-from mjxball.fly.twin.conditions import Surroundings
-
 GRAVITY = 9.81  # [m/s2]
 LARGEST, LEAST = 100.0, 1e-6  # of the covariance
 START = np.array([100.0, 100.0, 1.0, *[0.01] * 6])  # standard deviations after a reset [m, m/s, rad]
@@ -84,13 +82,19 @@ class Kalman:
             w, x, y, z = product(quaternion, self.quaternion * np.array([1.0, -1.0, -1.0, -1.0]))
             error[3:] = 2.0 / (w if abs(w) > 1e-3 else 1e-3) * np.array([x, y, z])
         noise = np.array([deviations[0] ** 2] * 3 + [deviations[1] ** 2] * 3)[:count]
-        old = self.covariance
-        shared = old[:, rows]
-        gain = shared @ np.linalg.inv(shared[rows] + np.diag(noise))
+        shared = self.covariance[:, rows]
+        self._take(shared @ np.linalg.inv(shared[rows] + np.diag(noise)), error, shared)
+
+    def correct_one(self, row: np.ndarray, error: float, deviation: float) -> None:
+        """Take one number: measured less predicted, its derivatives `row` (9,) by the state, its `deviation`."""
+        shared = (self.covariance @ row)[:, None]
+        self._take(shared / (float(row @ shared[:, 0]) + deviation**2), np.array([error]), shared)
+
+    def _take(self, gain: np.ndarray, error: np.ndarray, shared: np.ndarray) -> None:
         change = gain @ error
         self.position = self.position + change[0:3]
         self.body_velocity = self.body_velocity + change[3:6]
-        self.covariance = old - gain @ shared.T
+        self.covariance = self.covariance - gain @ shared.T
         self._turn(change[6:9])
         self.covariance = bounded(self.covariance)
 
@@ -235,57 +239,3 @@ class Imu:
         self._second = self._b0 * true - self._a2 * out
         self.filtered = out
         return out
-
-
-POSITION_NOISE, ATTITUDE_NOISE = 3e-4, 1e-3  # standard deviations [m, rad]
-Pose = tuple[np.ndarray, np.ndarray]  # position (3,) [m], quaternion (4,)
-
-
-class Positioning:
-    """Poses of one drone."""
-
-    def __init__(self, surroundings: Surroundings, random: np.random.Generator, phase: int):
-        """`phase` [ms] of its first pose: the systems of two drones do not measure at the same moment."""
-        self._every = max(round(1000 / surroundings.pose_hz), 1)
-        self._noise, self._random = surroundings.noise, random
-        self._phase = phase * self._every // 2
-        self._loss = surroundings.pose_loss
-        self._lost = not surroundings.deck
-        self._frozen = np.zeros(7, bool)  # of x, y, z and the quaternion
-        self._repeats = 1  # poses in a row that are one
-        self._offset, self._count = np.zeros(3), 0
-        self._last: np.ndarray | None = None  # (7,) position [m], quaternion
-
-    def disturb(self, what: str, value: float) -> None:
-        """See `Pair.disturb`: "frozen" or "lost", "frozen z" alone, each "repeated" `value` times, a "jump"."""
-        match what:
-            case "frozen":
-                self._frozen[:] = bool(value)
-            case "frozen z":
-                self._frozen[2] = bool(value)
-            case "lost":
-                self._lost = bool(value)
-            case "repeated":
-                self._repeats = round(value)
-            case "jump":
-                self._offset = np.array([0.0, 0.0, value])
-
-    def due(self, step: int) -> bool:
-        """True if a pose comes at millisecond `step`."""
-        return (
-            not self._lost
-            and (step + self._phase) % self._every == 0
-            and not (self._loss and self._random.random() < self._loss)
-        )
-
-    def measure(self, position: np.ndarray, quaternion: np.ndarray) -> Pose:
-        """The pose that is measured of the true `position` (3,) and `quaternion` (4,)."""
-        drawn = self._noise * self._random.standard_normal(6)
-        turned = product(quaternion, np.array([1.0, *(0.5 * ATTITUDE_NOISE * drawn[3:])]))
-        place = position + POSITION_NOISE * drawn[:3] + self._offset
-        found = np.concatenate([place, turned / np.sqrt(turned @ turned)])
-        self._count += 1
-        if self._last is not None:
-            found = self._last if self._count % self._repeats else np.where(self._frozen, self._last, found)
-        self._last = found
-        return found[:3], found[3:]

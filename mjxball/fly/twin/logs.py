@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -26,7 +26,7 @@ LOG_CODES = dict(LOG_TYPES.values())
 
 
 def listed(table: str) -> list[dict[str, str]]:
-    """Rows of `names.csv`, in the order of the firmware's own table, "log" or "param"."""
+    """Rows of `names.csv` in the order of the firmware's own table "log" or "param", or of what decks add to it."""
     with Path(__file__).with_name("names.csv").open(encoding="utf-8", newline="") as file:
         return [row for row in csv.DictReader(file) if row["table"] == table]
 
@@ -38,10 +38,9 @@ def item(type_byte: int, name: str) -> bytes:
 
 
 LOG_VARIABLES: tuple[tuple[str, str], ...] = tuple((row["name"], row["type"]) for row in listed("log"))
-LOG_ITEMS = [item(LOG_TYPES[kind][0], name) for name, kind in LOG_VARIABLES]
 OF_APP = tuple((f"{GROUP}.{name}", kind) for name, kind in LOGGED)
-APP_ITEMS = [item(LOG_TYPES[kind][0], name) for name, kind in OF_APP]
 KNOWN = LOG_VARIABLES + OF_APP  # those of the app are listed by a drone that has one
+OF_DECKS = tuple((row["name"], row["type"]) for row in listed("deck log"))
 
 
 class Snapshot(NamedTuple):
@@ -54,6 +53,7 @@ class Snapshot(NamedTuple):
     voltage: float  # [V]
     position: np.ndarray  # (3,) that is reported [m]
     app: Mapping[str, float] = {}  # what the app on board logs
+    deck: Mapping[str, float] = {}  # what its positioning deck logs, by full names
 
     @property
     def quaternion(self) -> np.ndarray:
@@ -150,6 +150,8 @@ class Readings:
         self._groups: dict[str, dict[str, float]] = {}
 
     def __getitem__(self, name: str) -> float:
+        if name in self.snapshot.deck:
+            return self.snapshot.deck[name]
         group, _, variable = name.partition(".")
         if group not in self._groups:
             make = GROUPS.get(group)
@@ -179,7 +181,9 @@ class Block:
 class Blocks:
     """All blocks of one drone."""
 
-    def __init__(self) -> None:
+    def __init__(self, known: Sequence[tuple[str, str]] = KNOWN) -> None:
+        """`known` are the variables that the drone lists, in order."""
+        self._known = known
         self.by_number: dict[int, Block] = {}
 
     def is_due(self, now: float) -> bool:
@@ -241,9 +245,9 @@ class Blocks:
                 return TOO_BIG
             if sum(len(one.variables) for one in self.by_number.values()) >= MAX_VARIABLES:
                 return NO_MEMORY
-            if index >= len(KNOWN):
+            if index >= len(self._known):
                 return UNKNOWN
-            block.variables.append((KNOWN[index][0], code))
+            block.variables.append((self._known[index][0], code))
         return 0
 
 

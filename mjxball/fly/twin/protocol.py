@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,16 +21,18 @@ from mjxball.fly.packets import PacketError
 from mjxball.fly.twin.conditions import DroneKind
 from mjxball.fly.twin.firmware import Firmware
 from mjxball.fly.twin.logs import (
-    APP_ITEMS,
-    LOG_ITEMS,
+    LOG_TYPES,
+    LOG_VARIABLES,
     MAX_BLOCKS,
     MAX_VARIABLES,
+    OF_DECKS,
     UNKNOWN,
     Blocks,
     Readings,
     item,
     listed,
 )
+from mjxball.fly.twin.logs import OF_APP as LOGGED_BY_APP
 
 VERSION = 12
 MAX_DATA = 30
@@ -59,6 +61,8 @@ DEFAULTS = {
     "kalman.maxVel": 10.0,
     "kalman.pNAcc_xy": 0.5,
     "kalman.pNAcc_z": 1.0,
+    "lighthouse.fwdToEstimator": 1.0,
+    "loco.fwdToEstimator": 1.0,
     "locSrv.extPosStdDev": 0.01,
     "locSrv.extQuatStdDev": 4.5e-3,
     "pm.criticalLowVoltage": 3.0,
@@ -99,10 +103,15 @@ class Parameter(NamedTuple):
         return float(struct.unpack("<" + PARAM_TYPES[self.kind][1], data)[0])
 
 
-PARAMETERS = tuple(
-    Parameter(row["name"], row["type"], DEFAULTS.get(row["name"], 0.0), row["access"] == "r", row["access"] == "p")
-    for row in listed("param")
-)
+def _parameters(table: str) -> tuple[Parameter, ...]:
+    return tuple(
+        Parameter(row["name"], row["type"], DEFAULTS.get(row["name"], 0.0), row["access"] == "r", row["access"] == "p")
+        for row in listed(table)
+    )
+
+
+PARAMETERS = _parameters("param")
+DECK_PARAMETERS = _parameters("deck param")
 OF_APP = tuple(Parameter(f"{GROUP}.{name}", kind, 0.0, read_only) for name, kind, read_only in APP_PARAMETERS)
 
 
@@ -134,15 +143,22 @@ class Peer:
         on_pose: Pose = lambda position, quaternion: None,
         estimator: int = 2,
         app: App | None = None,
+        decks: Mapping[str, float] | None = None,
     ):
-        """`estimator` is what the drone's decks ask for: 1 complementary, 2 Kalman; `app`: what runs beside it."""
+        """`estimator` is what the drone's decks ask for: 1 complementary, 2 Kalman; `app`: what runs beside it.
+
+        With `decks` it lists what positioning decks have: values of those parameters that are not 0.
+        """
         self.firmware, self._app = firmware, app
         self.values = defaults_of(firmware.kind, estimator)
-        self.parameters = PARAMETERS if app is None else PARAMETERS + OF_APP
-        self.values |= {one.name: one.default for one in self.parameters[len(PARAMETERS) :]}
+        none: tuple[Any, ...] = ()
+        more = (none if app is None else OF_APP) + (none if decks is None else DECK_PARAMETERS)
+        self.parameters = PARAMETERS + more
+        self.values |= {one.name: one.default for one in more} | dict(decks or {})
         parameters = [item(one.type_byte, one.name) for one in self.parameters]
-        variables = LOG_ITEMS if app is None else LOG_ITEMS + APP_ITEMS
-        self.logs = Blocks()
+        known = LOG_VARIABLES + (none if app is None else LOGGED_BY_APP) + (none if decks is None else OF_DECKS)
+        variables = [item(LOG_TYPES[kind][0], name) for name, kind in known]
+        self.logs = Blocks(known)
         self._estimator = estimator
         self._on_parameter, self._on_pose = on_parameter, on_pose
         self._handlers: dict[tuple[int, int], Callable[[bytes, float], list[bytes] | None]] = {

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.fly import app_flight, packets
+from mjxball.fly import app_flight, packets, positioning
 from mjxball.fly.app.host import Library
 from mjxball.fly.app.protocol import APP_VARIABLES, sample_of
 from mjxball.fly.card import Controller, motor_of, times_of, variants
@@ -191,7 +191,8 @@ class VirtualTwin:
         self._onboard = cores is not None
         stand, times = self.config.plant.stand != "free", times_of(self.config)
         settings = settings or FlightSettings(seconds=2.0, stand=stand, times=times)
-        self.settings = dataclasses.replace(settings, motor=motor_of(self.config))
+        limits = positioning.system_of(self.drones[0].peer.values).widen(settings.limits)
+        self.settings = dataclasses.replace(settings, motor=motor_of(self.config), limits=limits)
         if self._onboard:
             self.settings = app_flight.settings_of(self.settings)
             self.variants = app_flight.variants_of(self.variants, self.rig, self.settings)

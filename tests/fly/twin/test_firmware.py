@@ -413,7 +413,8 @@ def test_rows_of_faults_end_with_motors_off() -> None:
 
 def test_row_tables_have_the_real_size() -> None:
     assert (len(protocol.PARAMETERS), len(logs.LOG_VARIABLES)) == (240, 355)
-    for items in ([logs.item(one.type_byte, one.name) for one in protocol.PARAMETERS], logs.LOG_ITEMS):
+    variables = [logs.item(logs.LOG_TYPES[kind][0], name) for name, kind in logs.LOG_VARIABLES]
+    for items in ([logs.item(one.type_byte, one.name) for one in protocol.PARAMETERS], variables):
         assert len(set(items)) == len(items)
         assert max(map(len, items)) + 3 <= 30  # one packet each
     by_name = {parameter.name: parameter for parameter in protocol.PARAMETERS}
