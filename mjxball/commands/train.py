@@ -28,7 +28,7 @@ from mjxball.evaluate.scenarios import rig_line, standard_scenarios
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.file import policy_path
 from mjxball.terminal import say, warn
-from mjxball.train import processes
+from mjxball.train import processes, shares
 from mjxball.train.curves import draw_training
 from mjxball.train.lock import LOCK, check_free
 from mjxball.train.run_directory import (
@@ -91,6 +91,11 @@ def parser() -> cli.Parser:
     own.add_argument("--reward", metavar="MODULE:FUNCTION", help="reward of (state, action, next state)")
     about = "start(name, settings), which returns log(row) for every row of metrics.csv: docs/howto/trackers.md"
     own.add_argument("--tracker", metavar="MODULE:FUNCTION", help=about)
+    parts = result.add_argument_group("a population in parts")
+    about = "train the I-th of N equal parts of --num-seeds and --sweep, I = 0 .. N - 1"
+    parts.add_argument("--share", metavar="I/N", help=about)
+    about = "bring the runs of all parts together in --out DIR and compare their members"
+    parts.add_argument("--gather", type=Path, nargs="+", metavar="RUN", help=about)
     several = result.add_argument_group("several processes")
     several.add_argument("--distributed", action="store_true", help="train with the other processes of this job")
     several.add_argument("--coordinator", metavar="HOST:PORT", help="where process 0 is reached, if nothing tells it")
@@ -131,11 +136,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _train(options: argparse.Namespace, command: str) -> int:
     meeting, started = _meeting(options), time.monotonic()
+    if options.gather is not None:
+        return _gather(options)
     check_address_space()
     # To take three quarters of a large GPU's memory at once takes 1.6 s; taken as it is needed it is as fast.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if options.resume is not None:
-        _refuse_with_resume(options)
+        _refuse_beside(options, "--resume continues with the run's own configuration", ())
         out, (settings, origin) = options.resume, _recorded(options.resume)
     else:
         settings, origin, out = _new_run(options, command)
@@ -146,9 +153,9 @@ def _train(options: argparse.Namespace, command: str) -> int:
 
     # Float32 also where JAX_ENABLE_X64 is set: a run is the same then, and can be resumed.
     with contextlib.ExitStack() as hold, jax_setting("jax_enable_x64", False):
+        if meeting:
+            processes.join(meeting)
         with processes.exit_when_a_process_is_lost(f"--resume {out}") if meeting else contextlib.nullcontext():
-            if meeting:
-                processes.join(meeting)
             hold.enter_context(processes.holding(out, meeting is not None, check))
             writes = not meeting or processes.is_writer()  # to ask wakes the devices, and waits
             with ThreadPoolExecutor(1) as beside:
@@ -287,7 +294,7 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
         "seed": seed,
         "physics": physics,
         "seeds": members,
-        "sweep": _read_sweep(options.sweep, members, settings),
+        "sweep": None if options.sweep is None else read_sweep(options.sweep, members, settings),
         "package_version": __version__,
         "commit": commit(),
         "source_hash": source_hash(),
@@ -295,6 +302,8 @@ def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, 
     }
     if options.start_from is not None:
         origin["start_from"] = _start_from(options, settings, members)
+    if options.share is not None:
+        shares.take(origin, *shares.read(options.share))
     if extensions:
         origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
     return settings, origin, out
@@ -400,12 +409,6 @@ def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
     return settings, origin
 
 
-def _read_sweep(path: Path | None, members: int, settings: config.Config) -> dict[str, list[float]] | None:
-    if path is None:
-        return None
-    return read_sweep(path, members, settings)
-
-
 def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) -> None:
     """Print every member on the reference scenario and their median, draw them over training, and tell the card."""
     from mjxball.evaluate.policies import load_policy
@@ -437,13 +440,26 @@ def _seed_of(path: Path) -> int:
     return int(path.stem.removeprefix("seed"))
 
 
-def _refuse_with_resume(options: argparse.Namespace) -> None:
+def _refuse_beside(options: argparse.Namespace, why: str, but: tuple[str, ...]) -> None:
+    """InputError that begins with `why` if something is given that makes a new run, `but` those."""
     given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    own = ("out", "seed", "num_seeds", "sweep", "physics", "plant", "start_from", *EXTENSIONS)
-    given += [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
+    own = ("out", "seed", "num_seeds", "sweep", "share", "physics", "plant", "start_from", *EXTENSIONS)
+    given += [f"--{name.replace('_', '-')}" for name in own if name not in but and getattr(options, name) is not None]
     given += [options.preset] if options.preset else []
     if given:
-        raise InputError(f"--resume continues with the run's own configuration; drop {', '.join(given)}")
+        raise InputError(f"{why}; drop {', '.join(given)}")
+
+
+def _gather(options: argparse.Namespace) -> int:
+    """Bring the parts of a population together and compare its members, as a run of all of them would."""
+    _refuse_beside(options, "--gather takes runs as they are", ("out",))
+    if options.resume or options.distributed or options.out is None:
+        raise InputError("--gather RUN ... needs --out DIR, a new directory, and neither --resume nor --distributed")
+    _output_directory(options.out)
+    settings, origin = shares.gather(options.gather, options.out)
+    say(f"gathered {origin['seeds']} members; the best is {options.out / POLICY}")
+    _compare_members(settings, options.out, origin)
+    return _evaluate(settings, origin["physics"], options.out, options.out / POLICY)
 
 
 def _is_evaluated(origin: dict[str, Any]) -> bool:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
+import socket
 import subprocess
 import sys
+import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,20 +49,83 @@ class Rendezvous:
 
 
 def join(meeting: Rendezvous) -> None:
-    """Join the other processes. Must come before anything else asks JAX for its devices."""
+    """Join the other processes. Must come before anything else asks JAX for its devices.
+
+    If they do not come together within `PATIENCE` the process says so and ends with exit code 2: JAX would abort it.
+    """
     import jax
 
+    if meeting.process == 0 and meeting.coordinator:
+        _refuse_taken(meeting.coordinator)
+    where = f"at {meeting.coordinator}" if meeting.coordinator else f"under {' and '.join(_surroundings())}"
+    late = threading.Timer(PATIENCE, _give_up, (where,))
+    late.daemon = True
+    late.start()
     try:
-        jax.distributed.initialize(
-            meeting.coordinator,
-            meeting.processes,
-            meeting.process,
-            initialization_timeout=PATIENCE,
-            heartbeat_timeout_seconds=HEARTBEAT,
+        with warnings.catch_warnings(action="ignore"):  # the sentence says what they would
+            jax.distributed.initialize(
+                meeting.coordinator,
+                meeting.processes,
+                meeting.process,
+                _only_device(),
+                initialization_timeout=10 * PATIENCE,
+                heartbeat_timeout_seconds=HEARTBEAT,
+            )
+    except Exception as error:  # those of Kubernetes' client are of a kind of their own
+        why = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        unknown = meeting.coordinator is None and isinstance(error, ValueError)
+        raise InputError(_advice() if unknown else f"the processes cannot come together {where}: {why}") from None
+    finally:
+        late.cancel()
+
+
+def _only_device() -> list[int] | None:
+    """The one GPU that this process may see is its number 0; JAX takes it for that of its place in the node."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    return [0] if visible and "," not in visible else None
+
+
+def _refuse_taken(coordinator: str) -> None:
+    """InputError if another program listens at the port of `coordinator`, at which JAX would crash."""
+    try:
+        socket.create_server(("", int(coordinator.rpartition(":")[2]))).close()
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise InputError(f"--coordinator {coordinator}: another program of this machine has that port") from None
+
+
+def _give_up(where: str) -> None:
+    warn(f"error: the processes did not come together {where} within {PATIENCE} s: each must run and reach process 0")
+    os._exit(2)  # JAX waits outside Python
+
+
+# What each says of itself, and what makes JAX understand it.
+SURROUNDINGS = {
+    "SLURM": ("SLURM_JOB_ID", "start the processes with srun"),
+    "Open MPI": (
+        "OMPI_COMM_WORLD_SIZE",
+        "of version 5 and later pass --coordinator HOST:PORT --processes $OMPI_COMM_WORLD_SIZE "
+        "--process $OMPI_COMM_WORLD_RANK",
+    ),
+    "Kubernetes": ("KUBERNETES_SERVICE_HOST", "install the Python package kubernetes and run an indexed Job or JobSet"),
+}
+
+
+def _surroundings() -> list[str]:
+    """Which of `SURROUNDINGS` this process runs in."""
+    return [name for name, (variable, _) in SURROUNDINGS.items() if variable in os.environ]
+
+
+def _advice() -> str:
+    """What to do if JAX cannot tell from the surroundings where the processes meet."""
+    found = _surroundings()
+    if not found:
+        return (
+            f"--distributed found none of {', '.join(SURROUNDINGS)}: start it with srun or mpirun, "
+            "or pass --coordinator HOST:PORT --processes N --process I"
         )
-    except (ValueError, RuntimeError) as error:
-        why = str(error).splitlines()[0][:200]
-        raise InputError(f"the processes cannot come together: {why}") from None
+    ways = "; ".join(SURROUNDINGS[name][1] for name in found)
+    return f"--distributed found {' and '.join(found)}, but not where the processes meet: {ways}"
 
 
 def leave() -> None:

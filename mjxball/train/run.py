@@ -46,7 +46,10 @@ class Stop:
 
 @contextlib.contextmanager
 def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
-    """Turn the first Ctrl-C or SIGTERM into a request to stop; before training, or a second time, it acts at once."""
+    """Turn the first Ctrl-C or SIGTERM into a request to stop; before training, or at a Ctrl-C after it, act at once.
+
+    SLURM sends SIGTERM twice to what it preempts: to the process and, forwarded by srun, again.
+    """
     stop = Stop()
     defaults = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
@@ -57,6 +60,7 @@ def graceful_interrupt(progress: Progress) -> Iterator[Stop]:
     def handler(number: int, frame: Any) -> None:
         stop.requested = True
         restore()
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if not stop.begun and jax.process_count() == 1:
             progress.end_status()
             progress.say("stopped before training began; --resume begins it")

@@ -8,9 +8,10 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
-from command_line import environment
+from command_line import assert_one_line, environment
 
 from mjxball.algorithms import ALGORITHMS
 from mjxball.commands.train import main as train
@@ -18,7 +19,7 @@ from mjxball.errors import InputError
 from mjxball.policy import Policy
 from mjxball.train.checkpoint import CHECKPOINTS
 from mjxball.train.population import grid
-from mjxball.train.processes import Rendezvous
+from mjxball.train.processes import Rendezvous, join
 from mjxball.train.program import Program
 
 REPOSITORY = Path(__file__).parents[2]
@@ -176,6 +177,71 @@ def test_every_process_can_trace_mjx() -> None:
 def test_unsound_meetings_are_refused(meeting, word) -> None:
     with pytest.raises(InputError, match=word):
         Rendezvous(*meeting)
+
+
+def refusal(code: str, **variables: str) -> str:
+    """What a process that runs `code` prints before it ends with exit code 2, one line."""
+    clean = {name: value for name, value in environment().items() if not name.startswith(("SLURM", "OMPI", "KUBE"))}
+    child = {**clean, "PYTHONPATH": str(REPOSITORY), **variables}
+    done = subprocess.run([sys.executable, "-c", code], env=child, capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert_one_line(done.stderr)
+    return done.stderr
+
+
+ALONE = "import sys; from mjxball.commands.train import main; sys.exit(main(['--distributed']))"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        ({}, "found none of SLURM, Open MPI, Kubernetes"),
+        ({"SLURM_JOB_ID": "1"}, "found SLURM, but not where the processes meet: start the processes with srun"),
+        ({"OMPI_COMM_WORLD_SIZE": "2"}, "found Open MPI"),
+        ({"KUBERNETES_SERVICE_HOST": "127.0.0.1"}, "found Kubernetes"),
+    ],
+)
+def test_without_a_coordinator_it_says_what_it_found(variables, words, tmp_path: Path) -> None:
+    assert words in refusal(f"import os; os.chdir({str(tmp_path)!r}); {ALONE}", **variables)
+    assert list(tmp_path.iterdir()) == []
+
+
+MEET = """
+import sys
+from mjxball import cli
+from mjxball.train import processes
+processes.PATIENCE = 2
+sys.exit(cli.run_command(lambda: processes.join(processes.Rendezvous({place!r}, 2, {process}))))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("process", [0, 1])
+def test_a_process_that_meets_nobody_says_so(process: int) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        place = f"127.0.0.1:{free.getsockname()[1]}"
+    assert f"did not come together at {place} within 2 s" in refusal(MEET.format(place=place, process=process))
+
+
+def test_a_taken_port_is_refused() -> None:
+    with socket.create_server(("", 0)) as taken:
+        place = f"127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(InputError, match="has that port"):
+            join(Rendezvous(place, 2, 0))
+
+
+def test_the_only_gpu_that_a_process_sees_is_its_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`srun --gpus-per-task=1` shows each its own, and JAX would ask the second process of a node for a second one."""
+    given: list[Any] = []
+    monkeypatch.setattr("jax.distributed.initialize", lambda *positional, **named: given.append(positional[3]))
+    for visible, expected in ((None, None), ("", None), ("0,1", None), ("3", [0]), ("GPU-0a1b", [0])):
+        with monkeypatch.context() as patch:
+            patch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+            if visible is not None:
+                patch.setenv("CUDA_VISIBLE_DEVICES", visible)
+            join(Rendezvous())
+        assert given[-1] == expected, visible
 
 
 def test_sizes_that_cannot_be_split_are_refused(transport) -> None:

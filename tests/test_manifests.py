@@ -1,0 +1,46 @@
+"""The JobSet and the SkyPilot task of `docs/howto/cluster.md` against the models that others have of them."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+from command_line import REPOSITORY
+
+yaml = pytest.importorskip("yaml")
+
+
+def manifests() -> list[Any]:
+    """What the page shows in YAML: the JobSet, the task."""
+    page = (REPOSITORY / "docs" / "howto" / "cluster.md").read_text()
+    return [yaml.safe_load(text) for text in re.findall(r"^```yaml\n(.*?)^```", page, re.DOTALL | re.MULTILINE)]
+
+
+def test_the_job_set_numbers_its_pods_as_its_command_says() -> None:
+    job_set, _ = manifests()
+    (job,) = job_set["spec"]["replicatedJobs"]
+    spec = job["template"]["spec"]
+    (container,) = spec["template"]["spec"]["containers"]
+    number, name = spec["completions"], job_set["metadata"]["name"]
+    assert spec["parallelism"] == number
+    assert spec["completionMode"] == "Indexed"  # which JOB_COMPLETION_INDEX is of
+    meeting = f"--coordinator {name}-{job['name']}-0-0.{name}:1234 --processes {number} --process $JOB_COMPLETION_INDEX"
+    assert meeting in container["command"][-1]
+
+
+@pytest.mark.release
+def test_the_job_set_is_one() -> None:
+    """Generated from JobSet's OpenAPI; what a model does not know is missing from what it gives back."""
+    models = pytest.importorskip("kubeflow_trainer_api.models")
+    job_set, _ = manifests()
+    assert models.JobsetV1alpha2JobSet.from_dict(job_set).to_dict() == job_set
+
+
+@pytest.mark.release
+def test_the_task_fits_the_schema_of_skypilot() -> None:
+    schemas = pytest.importorskip("sky.utils.schemas")
+    jsonschema = pytest.importorskip("jsonschema")
+    _, task = manifests()
+    jsonschema.validate(task, schemas.get_task_schema())
+    jsonschema.validate(task["resources"], schemas.get_resources_schema())
