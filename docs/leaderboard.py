@@ -37,9 +37,9 @@ meets all of its own. Every load leaves 15 % of the rotors.
 `balance`, `sac`, `universal`, `flight` and `paper` are [shipped](followers.md#trained), `transport` and `robust`
 are in `policies/archive/`.
 `transport-sac` and `transport-ppo` are what `python train.py transport --physics newton-euler` comes to in a minute on
-two cores, the latter with `--algorithm ppo`. `brax-*` and `sb3-*` are Brax's and Stable-Baselines3's own SAC and PPO,
-of seed 0, in the same environment for as many steps: `python benchmarks/foreign_trainers.py sb3-sac sb3-sac.npz` takes
-117 CPU seconds for 768 000 steps, `brax-sac` 81 s; `sb3-ppo` takes 160 s for 4 million, `brax-ppo` 98 s.
+two cores, the latter with `--algorithm ppo`. `brax-*`, `sb3-*` and `sbx-sac` are Brax's, Stable-Baselines3's and SBX's
+own SAC and PPO, of seed 0, in the same environment for as many steps: `python benchmarks/foreign_trainers.py sb3-sac
+sb3-sac.npz`. Their returns and CPU seconds: [other trainers](results.md#other-trainers).
 `balance-memoryless` is `balance` without its GRU and its last action, with layers of 64 and 64, after 500 gradients of
 64 environments (219 CPU seconds); `memoryless` is a [classical law](followers.md). RAPTOR's policies have no place in
 this interface: they command rotors, not attitudes. On random pairs, told the true state,
