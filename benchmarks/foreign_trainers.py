@@ -1,20 +1,28 @@
-"""Train a follower with Brax's or Stable-Baselines3's own SAC or PPO on the environment of a preset -> a policy file.
+"""Train a follower with Brax's, Stable-Baselines3's or SBX's own SAC or PPO on a preset's environment -> a policy file.
 
-`python benchmarks/foreign_trainers.py brax-sac|brax-ppo|sb3-sac|sb3-ppo OUT.npz [--seed N] [--steps N] ...`
+`python benchmarks/foreign_trainers.py brax-sac|brax-ppo|sb3-sac|sb3-ppo|sbx-sac OUT.npz [--seed N] [--steps N] ...`
+`python benchmarks/foreign_trainers.py table [NAME ...] [--json FILE]`: all of them and `train.py`, compared
 
 `--help` behind a trainer's name lists its settings. What the networks see, how actions are bounded and what is rewarded
 are the preset's, exactly as in `train.py`. So are the settings, but those of Brax's SAC: the best of 12 on two cores
 (docs/archive/training.md). Where the preset has none a library's own holds. A policy file ends in tanh, and so do all
-four: SB3's PPO acts through one, too. Its `VecNormalize` scales PPO's rewards. Brax has no decay of learning rates. Its
+five: SB3's PPO acts through one, too. Its `VecNormalize` scales PPO's rewards. Brax has no decay of learning rates. Its
 evaluations are left out, which makes it faster; besides OUT.npz, written at the end, there is OUT-<steps>.npz at each
 of `--snapshots` equal parts of the way; the files' times tell when each was reached. `sb3-*` need stable-baselines3 and
-PyTorch, see docs/gym.md.
+PyTorch, `sbx-sac` sbx-rl as well, see docs/gym.md.
+
+`table` trains with each trainer in a process of its own, compiled anew, and prints its CPU seconds (user) from process
+start to policy file, the mean return of the policy without noise in the same 256 random episodes, and the metrics of
+the reference scenario. `copy` is the action zero: on the preset's PD law the follower then does what its leader does.
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
+import importlib
+import resource
+import tempfile
 import time
 from collections.abc import Callable
 from importlib import metadata
@@ -25,6 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from harness import say, table, write
 from mjxball import config as configs
 from mjxball.algorithms.base import PolicyNetwork
 from mjxball.env import TransportEnv
@@ -32,6 +41,7 @@ from mjxball.policy import load_network, save_file
 from mjxball.policy.export import policy_file
 from mjxball.sim.follower import follower_law
 from mjxball.xla import enable_compilation_cache
+from training import NO_CACHE, evaluate, launch, until_policy
 
 LAST_RATE = 0.02  # of SB3's learning rates, at the end over the start: linear, as the preset's own
 SAMPLES = 100  # observations of a flight on which the policy file must answer as SB3's model
@@ -46,6 +56,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "sb3-sac": {"steps": 768_000, "num_envs": 512, "updates": 8, "batch": 256, **COMMON, "learning_rate": 4e-3},
     "sb3-ppo": {"steps": 4_000_000, "num_envs": 512, **COMMON, "learning_rate": 2e-3},
 }
+SETTINGS["sbx-sac"] = SETTINGS["sb3-sac"]
+LIBRARIES = {"brax": "brax", "sb3": "stable-baselines3", "sbx": "sbx-rl"}
+OURS = ("train.py-sac", "train.py-ppo")
+EPISODES = 256
 Export = Callable[[int, Any, Any, Any], None]  # environment steps; layers, means, deviations: see `PolicyNetwork`
 
 
@@ -178,9 +192,8 @@ class Worlds:
 
 
 def train_sb3(config: configs.Config, options: argparse.Namespace, export: Export) -> None:
-    """Train with Stable-Baselines3, `export`, and assert that the policy file answers as the model does."""
+    """Train with Stable-Baselines3 or SBX, `export`, and assert that the policy file answers as the model does."""
     import torch
-    from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.vec_env import VecNormalize
 
     from mjxball.gym.vector import FollowerVectorEnv
@@ -191,10 +204,12 @@ def train_sb3(config: configs.Config, options: argparse.Namespace, export: Expor
     mask = np.array(TransportEnv(config, options.physics).input_mask, np.float32)
     # A policy file does not clip what its network sees.
     env = VecNormalize(Worlds(worlds, mask, is_ppo), norm_reward=is_ppo, gamma=options.discount, clip_obs=np.inf)
+    is_sbx = options.trainer == "sbx-sac"
+    activation: Any = jax.nn.relu if is_sbx else torch.nn.ReLU
     own: dict[str, Any] = {
         "learning_rate": lambda left: options.learning_rate * max(left, LAST_RATE),
         "gamma": options.discount,
-        "policy_kwargs": {"net_arch": options.sizes, "activation_fn": torch.nn.ReLU},
+        "policy_kwargs": {"net_arch": options.sizes, "activation_fn": activation},
     }
     if is_ppo:
         own |= {"n_steps": ppo.unroll_length, "batch_size": options.num_envs * ppo.unroll_length // ppo.minibatches}
@@ -203,18 +218,13 @@ def train_sb3(config: configs.Config, options: argparse.Namespace, export: Expor
     else:
         own |= {"n_steps": config.sac.n_step, "tau": config.sac.tau, "learning_starts": config.sac.warmup_steps}
         own |= {"batch_size": options.batch, "train_freq": 1, "gradient_steps": options.updates}
-    model = (PPO if is_ppo else SAC)("MlpPolicy", env, seed=options.seed, device="cpu", **own)
+    library = importlib.import_module("sbx" if is_sbx else "stable_baselines3")
+    kind = library.PPO if is_ppo else library.SAC
+    model = kind("MlpPolicy", env, seed=options.seed, device="cpu", **own)
     model.learn(options.steps)
     env.training = False
 
-    if is_ppo:
-        hidden, mean, log_std = model.policy.mlp_extractor.policy_net, model.policy.action_net, model.policy.log_std
-    else:
-        hidden, mean, log_std = model.actor.latent_pi, model.actor.mu, model.actor.log_std
-    found = [(array(part.weight).T, array(part.bias)) for part in hidden if isinstance(part, torch.nn.Linear)]
-    kernel, bias = array(mean.weight).T, array(mean.bias)
-    wide = (np.zeros_like(kernel), array(log_std)) if is_ppo else (array(log_std.weight).T, array(log_std.bias))
-    found.append((np.hstack([kernel, wide[0]]), np.hstack([bias, wide[1]])))
+    found = layers_of_flax(model) if is_sbx else layers_of_torch(model, is_ppo)
     named = {f"hidden_{k}": {"kernel": weight, "bias": bias} for k, (weight, bias) in enumerate(found)}
     statistics = env.obs_rms
     export(model.num_timesteps, named, statistics.mean, np.sqrt(statistics.var + env.epsilon))
@@ -230,9 +240,72 @@ def train_sb3(config: configs.Config, options: argparse.Namespace, export: Expor
     assert apart < ROUNDING
 
 
+Layers = list[tuple[np.ndarray, np.ndarray]]  # weights (in, out) and biases (out,); the last one's have the deviations
+
+
+def layers_of_torch(model: Any, is_ppo: bool) -> Layers:
+    """The policy of SB3's `model`."""
+    import torch
+
+    if is_ppo:
+        hidden, mean, log_std = model.policy.mlp_extractor.policy_net, model.policy.action_net, model.policy.log_std
+    else:
+        hidden, mean, log_std = model.actor.latent_pi, model.actor.mu, model.actor.log_std
+    found = [(array(part.weight).T, array(part.bias)) for part in hidden if isinstance(part, torch.nn.Linear)]
+    kernel, bias = array(mean.weight).T, array(mean.bias)
+    wide = (np.zeros_like(kernel), array(log_std)) if is_ppo else (array(log_std.weight).T, array(log_std.bias))
+    return [*found, (np.hstack([kernel, wide[0]]), np.hstack([bias, wide[1]]))]
+
+
+def layers_of_flax(model: Any) -> Layers:
+    """The policy of SBX's SAC: the last two of its layers give mean and deviation."""
+    dense = model.policy.actor_state.params["params"]
+    found = [
+        (np.asarray(dense[f"Dense_{k}"]["kernel"]), np.asarray(dense[f"Dense_{k}"]["bias"])) for k in range(len(dense))
+    ]
+    *hidden, mean, log_std = found
+    return [*hidden, (np.hstack([mean[0], log_std[0]]), np.hstack([mean[1], log_std[1]]))]
+
+
 def array(tensor: Any) -> np.ndarray:
     """PyTorch's `tensor` as NumPy's."""
     return tensor.detach().numpy()
+
+
+def mean_return(network: Callable[[np.ndarray], np.ndarray], config: configs.Config, physics: str) -> float:
+    """Of `network` in `EPISODES` random episodes, each up to its end."""
+    env = TransportEnv(config, physics)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), EPISODES))
+    step, going, total = jax.jit(jax.vmap(env.step)), np.ones(EPISODES), np.zeros(EPISODES)
+    for _ in range(config.timing.episode_steps):
+        state = step(state, network(np.asarray(state.obs)))
+        total += going * np.asarray(state.reward)
+        going *= 1 - np.asarray(state.done)
+    return float(total.mean())
+
+
+def compare(options: argparse.Namespace) -> None:
+    """Train with each of `options.names`, print and write the table."""
+    config, rows = configs.preset(options.preset), []
+    with tempfile.TemporaryDirectory() as place:
+        for name in options.names:
+            out = Path(place) / f"{name}.npz"
+            command = ["benchmarks/foreign_trainers.py", name, str(out)]
+            if name in OURS:
+                algorithm, out = name.removeprefix("train.py-"), out.with_suffix("") / "policy.npz"
+                command = ["train.py", "--algorithm", algorithm, "--out", str(out.parent), options.preset]
+            before, started = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime, time.time()
+            until_policy(launch([*command, "--physics", options.physics], NO_CACHE), started, out)
+            used = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
+            steps = SETTINGS[f"sb3-{name[-3:]}"]["steps"]
+            row = {"trainer": name, "steps": steps, "cpu_seconds": used, "policy": out}
+            rows.append(row | {"return": mean_return(load_network(out), config, options.physics)})
+            say(rows[-1])
+        evaluate(rows)
+    still = np.zeros((EPISODES, TransportEnv(config, options.physics).action_size), np.float32)
+    rows.append({"trainer": "copy", "return": mean_return(lambda _: still, config, options.physics)})
+    table(rows, ("trainer", "steps", "cpu_seconds", "return", "x_peak", "settling_time"))
+    write(options.json, {"preset": options.preset, "physics": options.physics, "episodes": EPISODES, "rows": rows})
 
 
 def main() -> None:
@@ -248,12 +321,18 @@ def main() -> None:
         for setting, value in settings.items():
             flags = ["--num-envs", "--worlds"] if setting == "num_envs" else [f"--{setting.replace('_', '-')}"]
             own.add_argument(*flags, dest=setting, type=type(value), default=value, metavar="X", help=" ")
+    own = trainers.add_parser("table")
+    own.add_argument("names", nargs="*", default=[*OURS, *SETTINGS], metavar="NAME", help=", ".join([*OURS, *SETTINGS]))
+    own.add_argument("--json", type=Path, metavar="FILE", help="write what was found")
+    own.set_defaults(preset="transport", physics="newton-euler")
     options = parser.parse_args()
     enable_compilation_cache()
+    if options.trainer == "table":
+        return compare(options)
     config = configs.preset(options.preset)
     settings = {name: getattr(options, name) for name in SETTINGS[options.trainer]}
     options.sizes = [int(size) for size in options.layers.split(",")]
-    library = "brax" if options.trainer.startswith("brax") else "stable-baselines3"
+    library = LIBRARIES[options.trainer.partition("-")[0]]
     card = {"trainer": options.trainer, "library": f"{library} {metadata.version(library)}", "settings": settings}
     card |= {"seed": options.seed, "physics": options.physics}
     started = time.perf_counter()

@@ -38,6 +38,7 @@ myst_heading_anchors = 4
 myst_dmath_double_inline = True
 smartquotes = False  # which makes a dash of the two before a flag
 
+autodoc_mock_imports = ["jaxmarl"]  # not in the extra `docs`: it brings pandas, and takes 4 s
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"

@@ -37,9 +37,9 @@ meets all of its own. Every load leaves 15 % of the rotors.
 `balance`, `sac`, `universal`, `flight` and `paper` are [shipped](followers.md#trained), `transport` and `robust`
 are in `policies/archive/`.
 `transport-sac` and `transport-ppo` are what `python train.py transport --physics newton-euler` comes to in a minute on
-two cores, the latter with `--algorithm ppo`. `brax-*` and `sb3-*` are Brax's and Stable-Baselines3's own SAC and PPO,
-of seed 0, in the same environment for as many steps: `python benchmarks/foreign_trainers.py sb3-sac sb3-sac.npz` takes
-117 CPU seconds for 768 000 steps, `brax-sac` 81 s; `sb3-ppo` takes 160 s for 4 million, `brax-ppo` 98 s.
+two cores, the latter with `--algorithm ppo`. `brax-*`, `sb3-*` and `sbx-sac` are Brax's, Stable-Baselines3's and SBX's
+own SAC and PPO, of seed 0, in the same environment for as many steps: `python benchmarks/foreign_trainers.py sb3-sac
+sb3-sac.npz`. Their returns and CPU seconds: [other trainers](results.md#other-trainers).
 `balance-memoryless` is `balance` without its GRU and its last action, 219 CPU seconds of `python train.py balance
 --algorithm gradient --follower.recurrent_units 0 --follower.previous_action false --gradient.policy_layers 64,64
 --gradient.gradient_steps 500 --gradient.num_envs 64`. `memoryless` is a [classical law](followers.md). `raptor` is two

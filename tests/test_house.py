@@ -25,6 +25,19 @@ def test_the_workflow_runs_ci_on_every_supported_python() -> None:
     assert job["steps"][-1]["run"] == ".ci/run"
 
 
+def test_a_release_gets_files_that_were_tried_and_signed() -> None:
+    text = (REPOSITORY / ".github" / "workflows" / "release.yml").read_text()
+    workflow = yaml.safe_load(text)
+    (job,) = workflow["jobs"].values()
+    assert workflow["permissions"] == {"contents": "read"}
+    assert job["permissions"] == {"contents": "write", "id-token": "write", "attestations": "write"}
+    steps = [step.get("run") or step["uses"] for step in job["steps"]]
+    order = ("build && ", "mjxball-eval", "actions/attest-build-provenance@", "gh release upload")
+    places = [next(place for place, step in enumerate(steps) if word in step) for word in order]
+    assert places == sorted(places)
+    assert not any("${{" in step for step in steps)  # a tag's name would be run
+
+
 def test_ci_checks_style_and_types() -> None:
     text = (REPOSITORY / ".ci" / "run").read_text()
     for command in ("ruff check .", "ruff format --check .", "mypy"):

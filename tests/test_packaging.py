@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -103,20 +104,38 @@ def test_the_unpacked_wheel_finds_its_own_policies(wheel: Path, tmp_path: Path) 
     assert done.stdout.split() == [str(expected), str(len(shipped_policies()))]
 
 
-# extra -> what it is for, in one program.
+FLIGHT = "python -m mjxball.fly flight --rehearse --seconds 5 --log flight.jsonl"  # of the twin
+# extra -> what it is for, typed one after the other in an empty directory.
 WORKS = {
-    "": "from mjxball.policy import Policy, shipped_policy; Policy.load(shipped_policy('robust')).reset()",
-    "fly": "import sys; from mjxball.fly.main import main\n"
-    "sys.exit(main([str(shipped_policy('stand')), '--rehearse', '--dry-run', '--seconds', '1']) > 1)",
-    "onnx": "import runpy, sys; sys.argv = ['x', str(shipped_policy('flight')), 'flight.onnx']\n"
-    "runpy.run_module('mjxball.export', run_name='__main__')",
-    "gym": "import gymnasium, mjxball.gym; env = gymnasium.make('mjxball/Flight-v0')\n"
-    "env.reset(seed=0); env.step(env.action_space.sample())",
-    "view": "import sys; from mjxball.view.main import main\n"
-    "sys.exit(main([str(shipped_policy('flight')), '--seconds', '2', '--out', 'flight.html']))",
-    "train": "import sys; from mjxball.entry import evaluate\n"
-    "sys.argv = ['mjxball-eval', '--followers', 'copy', '--seconds', '1']; sys.exit(evaluate())",
-    "docs": "import furo, myst_parser, nbclient, sphinx",
+    "": [
+        "python -c 'from mjxball.policy import Policy, shipped_policy; Policy.load(shipped_policy(\"balance\"))'",
+        "python -m mjxball.export balance follower.h",
+        "python -m mjxball.export flight apps --crazyflie",
+    ],
+    "train": [
+        "mjxball-train --help",
+        "mjxball-eval balance",
+        "mjxball-eval universal --plant team3 --seconds 1",
+        "mjxball-eval --benchmark balance --tracks pair --out entry.json",
+        "python -m mjxball.view balance --seconds 2 --out flight.html",
+    ],
+    "fly": [FLIGHT],
+    "mocap": ["python -c 'import motioncapture'", FLIGHT],
+    "gym": [
+        "python -c 'import gymnasium, mjxball.gym; gymnasium.make(\"mjxball/Flight-v0\").reset(seed=0)'",
+        "python -c 'from mjxball.gym.parallel import FollowersParallelEnv; FollowersParallelEnv().reset(seed=0)'",
+    ],
+    "jaxmarl": [
+        "python -c 'import jax, jaxmarl.wrappers.baselines as jaxmarl; "
+        "from mjxball.gym.jaxmarl import FollowersMultiAgentEnv; "
+        "jaxmarl.LogWrapper(FollowersMultiAgentEnv()).reset(jax.random.key(0))'"
+    ],
+    "onnx": ["python -m mjxball.export flight flight.onnx"],
+    "fly,logs": [FLIGHT, *(f"python -m mjxball.export flight.jsonl flight.{kind}" for kind in ("mcap", "parquet"))],
+    "train,mpc": ["mjxball-eval --followers mpc --seconds 1"],
+    "view": ["python -m mjxball.view flight --seconds 2 --out flight.html"],
+    "video": ["python -m mjxball.view flight --seconds 1 --video flight.mp4"],
+    "docs": ["python -c 'import furo, myst_parser, nbclient, sphinx'"],
 }
 
 
@@ -124,28 +143,37 @@ WORKS = {
 @pytest.mark.parametrize("extra", WORKS)
 def test_each_extra_works_in_a_clean_environment(extra: str, wheel: Path, tmp_path: Path) -> None:
     venv.create(tmp_path / "venv", with_pip=True)
-    python = tmp_path / "venv" / "bin" / "python"
+    programs, empty = tmp_path / "venv" / "bin", tmp_path / "empty"
+    empty.mkdir()
     wanted = f"{wheel}[{extra}]" if extra else str(wheel)
     constraints = ["-c", REPOSITORY / "constraints.txt"]
-    subprocess.run([python, "-m", "pip", "install", "-q", *constraints, wanted], check=True, timeout=600)
-    program = f"from mjxball.policy import shipped_policy\n{WORKS[extra]}"
+    subprocess.run([programs / "python", "-m", "pip", "install", "-q", *constraints, wanted], check=True, timeout=600)
     ours = ("PYTHONPATH", "XLA_FLAGS")  # another XLA may end a process that is given our flags
-    plain = {name: value for name, value in os.environ.items() if name not in ours}
-    done = subprocess.run(
-        [python, "-c", program], cwd=tmp_path, env=plain, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    plain = {name: value for name, value in os.environ.items() if name not in ours} | {"BROWSER": "true"}
+    for line in WORKS[extra]:
+        name, *words = shlex.split(line)
+        done = subprocess.run(
+            [programs / name, *words], cwd=empty, env=plain, capture_output=True, text=True, timeout=300, check=False
+        )
+        assert done.returncode == 0, f"{line}\n{done.stderr}"
+
+
+def contents(wheel: Path) -> dict[str, bytes]:
+    """File -> what is in it; the list of hashes aside."""
+    archive = zipfile.ZipFile(wheel)
+    return {name: archive.read(name) for name in archive.namelist() if not name.endswith("/RECORD")}
 
 
 @pytest.mark.slow
-def test_the_sdist_builds_the_same_package(built: Path) -> None:
+def test_the_sdist_builds_the_same_wheel(built: Path, wheel: Path, tmp_path: Path) -> None:
     (path,) = built.glob("*.tar.gz")
     with tarfile.open(path) as archive:
-        held = {name.partition("/")[2] for name in archive.getnames()}
-    needed = {"setup.py", "pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "constraints.txt"}
-    needed |= {str(file.relative_to(REPOSITORY)) for file in (REPOSITORY / "policies").rglob("*.npz")}
-    needed |= {str(file.relative_to(REPOSITORY)) for file in (REPOSITORY / "mjxball").rglob("*.py")}
-    assert needed | parts() <= held
+        archive.extractall(tmp_path, filter="data")
+    (tree,) = tmp_path.iterdir()
+    command = [sys.executable, "-c", BUILD, str(tmp_path), "wheel"]
+    subprocess.run(command, check=True, cwd=tree, capture_output=True, timeout=120)
+    assert contents(tmp_path / wheel.name) == contents(wheel)
+    assert {"CHANGELOG.md", "CITATION.cff", "constraints.txt"} <= {path.name for path in tree.iterdir()}
 
 
 def test_a_source_tree_finds_the_policies_beside_it() -> None:

@@ -418,10 +418,10 @@ def test_playgrounds_wrappers_take_the_adapter():
 
 
 @pytest.mark.release
-@pytest.mark.parametrize(("trainer", "steps"), [("sb3-sac", 768_000), ("sb3-ppo", 204_800)])
+@pytest.mark.parametrize(("trainer", "steps"), [("sb3-sac", 768_000), ("sb3-ppo", 204_800), ("sbx-sac", 768_000)])
 def test_stable_baselines3_learns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trainer: str, steps: int):
     """Its policy file answers as its model does, which the script asserts, and sways less than the copying follower."""
-    pytest.importorskip("stable_baselines3")
+    pytest.importorskip("sbx" if trainer == "sbx-sac" else "stable_baselines3")
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     script = Path(__file__).parents[2] / "benchmarks" / "foreign_trainers.py"
     done = run([script, trainer, "out.npz", "--steps", steps], tmp_path, timeout=1800)

@@ -1,0 +1,103 @@
+"""The followers of a team as JaxMARL's `MultiAgentEnv`: agents follower_1, ..., follower_F, all inside JAX."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjxball.config import Config
+from mjxball.control.observation import ACTION_SIZE
+from mjxball.env import State, TransportEnv
+from mjxball.gym import common
+from mjxball.quiet import quietly
+
+try:
+    base = quietly("jaxmarl.environments.multi_agent_env")  # its MABrax replaces sys.stdout; `quietly` puts it back
+except ModuleNotFoundError as error:
+    if error.name != "jaxmarl":
+        raise
+    raise ModuleNotFoundError("jaxmarl is not installed; pip install 'mjxball[jaxmarl]'", name="jaxmarl") from None
+from jaxmarl.environments.spaces import Box
+
+Array = Any
+Each = dict[str, Array]  # agent -> its own
+
+
+@flax.struct.dataclass
+class FollowersState(base.State):  # type: ignore[name-defined]
+    """JaxMARL's `done` () and `step` (), and the world."""
+
+    world: State
+
+
+class FollowersMultiAgentEnv(base.MultiAgentEnv):  # type: ignore[name-defined]
+    """One world of `mjxball.env`: each follower sees (n,) float32 and acts (3,) in [-1, 1] in its own frame.
+
+    Agents, observations, rewards and ends are those of `FollowersParallelEnv`, for `jax.jit`, `vmap` and `scan`;
+    `step` begins the next episode by itself, with a world drawn from its key. `dones` of all agents are 1 together.
+    `info` holds for each agent what PettingZoo's does, and `truncation`: 1 if the episode's time was over. Where worlds
+    have teams of several sizes, an agent that is not there sees zeros, earns zeros and is done. `physics` is
+    newton-euler or mjx; `config` replaces the preset's.
+    """
+
+    def __init__(self, preset: str = "team", config: Config | None = None, physics: str = "newton-euler"):
+        self.config = common.settings(preset, config)
+        self._env = TransportEnv(self.config, physics)
+        self._drones = np.array(self.config.plant.followers)
+        super().__init__(len(self._drones))
+        self.agents = [f"follower_{number + 1}" for number in range(self.num_agents)]
+        self.observation_spaces = dict.fromkeys(self.agents, Box(-np.inf, np.inf, (self._env.policy_input_size,)))
+        self.action_spaces = dict.fromkeys(self.agents, Box(-1.0, 1.0, (ACTION_SIZE,)))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def reset(self, key: Array) -> tuple[Each, FollowersState]:
+        """A fresh world drawn from `config.scenario`."""
+        state = self._state(self._env.reset(key))
+        return self.get_obs(state), state
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def step_env(
+        self, key: Array, state: FollowersState, actions: Each
+    ) -> tuple[Each, FollowersState, Each, Each, dict[str, Array]]:
+        """Hold every agent's action (3,), clipped to [-1, 1], for one control period; `key` is not used.
+
+        A world whose actions are not all finite ends as diverged.
+        """
+        given = jnp.stack([actions[agent] for agent in self.agents])
+        world = self._env.step(state.world, given if self.num_agents > 1 else given[0])
+        moved, there = self._state(world), self._there(world)
+        rewards = self._each(jnp.where(there, jnp.reshape(world.reward, -1), 0.0))
+        dones = {**self._each(moved.done | ~there), "__all__": moved.done}
+        info = {**common.info_of(world), "truncation": world.info["truncation"]}
+        shared = {name: jnp.broadcast_to(value, self.num_agents) for name, value in info.items()}
+        return self.get_obs(moved), moved, rewards, dones, shared
+
+    def get_obs(self, state: FollowersState) -> Each:
+        """What every agent sees (n,)."""
+        seen = jnp.reshape(state.world.obs, (self.num_agents, -1))[:, : self._env.policy_input_size]
+        return self._each(jnp.where(self._there(state.world)[:, None], seen, 0.0))
+
+    def get_avail_actions(self, state: FollowersState) -> Each:
+        """Each agent's (3,): all."""
+        return self._each(jnp.ones((self.num_agents, ACTION_SIZE), bool))
+
+    @property
+    def agent_classes(self) -> dict[str, list[str]]:
+        """All are of one class."""
+        return {"follower": self.agents}
+
+    def _state(self, world: State) -> FollowersState:
+        return FollowersState(done=world.done > 0, step=world.pipeline_state.steps, world=world)
+
+    def _there(self, world: State) -> Array:
+        """Whether an agent is of this world's team (F,): drones that pad a smaller one have no mass."""
+        rig = world.pipeline_state.rig
+        return jnp.ones(self.num_agents, bool) if rig == () else rig.drone_mass[self._drones] > 0
+
+    def _each(self, values: Array) -> Each:
+        return dict(zip(self.agents, values, strict=True))
