@@ -14,6 +14,7 @@ from jax import Array
 from mjxball.algorithms.base import Phase, PolicyNetwork
 from mjxball.config import Config
 from mjxball.errors import InputError
+from mjxball.terminal import warn
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions
 from mjxball.train.live import LiveCurve, Report, in_notebook
@@ -44,7 +45,8 @@ def train(
     means of the environment's metrics as `eval_<name>`. Without `evaluate` it trains in one stretch, and what is named
     `eval_` holds nothing. `mjxball.train.compilation.compiler_options()` are the options with which `train.py` compiles
     sooner. `jax.shard_map` of it needs `check_vma=False`. `progress`: True for a live curve in a notebook, which is the
-    default there, or a function that is told how it goes (`live.Report`); then it cannot be traced, and steps in turns.
+    default there, or a function that is told how it goes (`live.Report`); then it cannot be traced, and steps in turns;
+    Ctrl-C ends it with the policy and the metrics so far.
     Raises InputError if one of them does not fit.
     """
     traced = any(isinstance(value, jax.core.Tracer) for value in (key, *(overrides or {}).values()))
@@ -98,24 +100,32 @@ def _train(
 
 
 def _in_turns(phase: Any, state: TrainState, modes: Mode, program: Program, report: Report) -> tuple[TrainState, Any]:
-    """As `jax.lax.scan` of `phase`, with training in about `CHUNKS` parts, after each of which there is a `report`."""
+    """As `jax.lax.scan` of `phase`, with training in about `CHUNKS` parts, after each of which there is a `report`.
+
+    Ctrl-C ends it with what is trained by then; before anything is, it is raised.
+    """
     turn, window = jax.jit(phase), program.algorithm.steps_per_collect
     most = math.ceil(program.total_rounds / CHUNKS / window) * window
-    seen = []
-    for number in range(len(modes.steps)):
-        mode = jax.tree.map(lambda leaf, number=number: leaf[number], modes)
-        left, total, returned = int(mode.steps), int(mode.steps), 0.0
-        while True:
-            part = min(left, most) if mode.phase.learning else left
-            state, found = turn(state, mode._replace(steps=np.int32(part)))
-            left, returned = left - part, returned + found["return"] * part / max(total, 1)
-            name = "eval_return" if mode.phase.evaluate else "episode_return"
-            if total:
-                told = {"steps": float(found["steps"]), name: float(found["return"])}
-                report({**told, "total": float(program.schedule.total_steps)})
-            if left <= 0:
-                break
-        seen.append({**found, "return": returned})
+    seen: list[dict[str, Array]] = []
+    try:
+        for number in range(len(modes.steps)):
+            mode = jax.tree.map(lambda leaf, number=number: leaf[number], modes)
+            left, total, returned = int(mode.steps), int(mode.steps), 0.0
+            while True:
+                part = min(left, most) if mode.phase.learning else left
+                state, found = turn(state, mode._replace(steps=np.int32(part)))
+                left, returned = left - part, returned + found["return"] * part / max(total, 1)
+                name = "eval_return" if mode.phase.evaluate else "episode_return"
+                if total:
+                    told = {"steps": float(found["steps"]), name: float(found["return"])}
+                    report({**told, "total": float(program.schedule.total_steps)})
+                if left <= 0:
+                    break
+            seen.append({**found, "return": returned})
+    except KeyboardInterrupt:
+        if not seen:
+            raise
+        warn(f"stopped after {int(state.steps):,} of {program.schedule.total_steps:,} steps: the policy is that of now")
     return state, jax.tree.map(lambda *values: jnp.stack(values), *seen)
 
 

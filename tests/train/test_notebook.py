@@ -120,6 +120,32 @@ def test_progress_is_told_and_changes_nothing(short: Config) -> None:
         jax.jit(lambda key: train(short, key, physics="newton-euler", progress=True))(key)
 
 
+@pytest.mark.slow
+def test_ctrl_c_leaves_the_policy_of_then(short: Config, capsys: pytest.CaptureFixture[str]) -> None:
+    import jax
+
+    from mjxball.train import train
+
+    told = []
+
+    def interrupting(said: Any) -> None:
+        told.append(said["steps"])
+        if len(told) == 4:
+            raise KeyboardInterrupt
+
+    policy, metrics = train(short, jax.random.PRNGKey(0), physics="newton-euler", progress=interrupting)
+    assert 0 < told[-1] < short.sac.total_steps
+    assert capsys.readouterr().err.startswith(f"stopped after {told[-1]:,.0f} of {short.sac.total_steps:,} steps")
+    assert np.isfinite(policy(np.zeros(18, np.float32))).all()
+    assert len(metrics["eval_return"]) < short.sac.num_evaluations
+
+    def at_once(said: Any) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(short, jax.random.PRNGKey(0), physics="newton-euler", progress=at_once)
+
+
 def test_no_notebook_here() -> None:
     assert not in_notebook()
 
