@@ -10,6 +10,7 @@ from mjxball.commands import train
 from mjxball.config import Config
 from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.sim.scenario import Scenario
+from mjxball.train import processes
 
 
 def one_second(settings: Config) -> tuple[Scenario, ...]:
@@ -20,4 +21,5 @@ def one_second(settings: Config) -> tuple[Scenario, ...]:
 if __name__ == "__main__":
     quit_on_interrupt()  # as train.py does
     train.standard_scenarios = one_second
+    processes.HEARTBEAT = 10  # a process that is lost is missed sooner
     sys.exit(train.main())
