@@ -171,14 +171,14 @@ def tutorial(out: Path) -> None:
 def excerpts(printed: str, out: Path) -> None:
     """What the page quotes of the lines that its commands have `printed`: no times, which are the machine's."""
     lines = re.split(r"[\r\n]+", printed)
-    final = [line for line in lines if re.search(r"768,000 / 768,000 steps.*eval peak", line)][-1]
+    final = [line for line in lines if re.search(r"^ *768,000 steps  eval return", line)][-1]
     head = next(k for k, line in enumerate(lines) if line.split()[:3] == ["omega", "ampl.", "mass"])
     rows = [line for line in lines[head:] if line.startswith("*")][:2]
     table = [line[:WIDTH].rstrip() for line in [*lines[head : head + 2], *rows]]
     landed = next(line for line in lines if line.startswith("landed"))
     checked = [line for line in lines if line.startswith("good")]
     texts = {
-        "training": [re.sub(r"  +[\d.]+ k/s.*left", "", final).strip(), "policy: runs/first/policy.npz"],
+        "training": [final.partition("  100%")[0].strip(), "policy: runs/first/policy.npz"],
         "results": [*table, *(line.partition(";")[0] for line in lines if "meets the bounds" in line)],
         "rehearsal": [
             checked[0],
@@ -196,7 +196,6 @@ def run(words: list[str], place: Path) -> str:
     """What one command of a page prints in the directory `place`."""
     program = [str(REPOSITORY / words[1]), *words[2:]] if words[1].endswith(".py") else words[1:]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    command: dict[str, Any] = {"cwd": place, "env": environment, "text": True}
     command: dict[str, Any] = {"cwd": place, "env": environment, "text": True}
     for _ in range(3 if "--rehearse" in words else 1):  # a busy machine misses the deadlines of a rehearsal
         done = subprocess.run(

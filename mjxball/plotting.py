@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.files import write_whole
+from mjxball.pictures import COLOURS
 
-# Distinct with protanopia and deuteranopia, and at least 3 : 1 from a white and from a dark page.
-BLUE, BROWN, GREEN, PINK, SKY, OLIVE = COLOURS = ("#1f5aff", "#98623a", "#318174", "#ff0f87", "#469ab9", "#b28f00")
+BLUE, BROWN, GREEN, PINK, SKY, OLIVE = COLOURS
 INK = "#757575"  # 4.6 : 1 on white, 4 : 1 on a dark page
 MARKERS = dict(zip(COLOURS, "osD^vP", strict=True))
 SOLID, DASH, DOT, DASH_DOT, DASH_DOT_DOT, LONG, SHORT = DASHES = tuple(

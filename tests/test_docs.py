@@ -33,6 +33,8 @@ MAINS = {
     "mjxball-train": "mjxball.commands.train",
     "eval.py": "mjxball.commands.evaluate",
     "mjxball-eval": "mjxball.commands.evaluate",
+    "mjxball-view": "mjxball.view.command",
+    "mjxball-fly": "mjxball.fly.main",
     "mjxball.export": "mjxball.export",
     "mjxball.view": "mjxball.view.command",
     "mjxball.fly": "mjxball.fly.main",

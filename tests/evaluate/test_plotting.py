@@ -15,6 +15,7 @@ from mjxball.baselines import LAWS
 from mjxball.plotting import (
     COLOURS,
     FREE,
+    GREEN,
     INK,
     LOOKS,
     SIMULATED,
@@ -27,6 +28,7 @@ from mjxball.plotting import (
     style,
 )
 from mjxball.policy.file import shipped_policies
+from mjxball.view.page import AXES, DRONES, PARTS, SCENE
 
 # Of linear RGB, severity 1: Machado, Oliveira and Fernandes, "A physiologically-based model for simulation of color
 # vision deficiency", 2009, https://doi.org/10.1109/TVCG.2009.113.
@@ -96,6 +98,16 @@ def test_followers_of_one_dash_differ_in_colour_for_the_colour_blind() -> None:
         if dash == same:
             for sight in SIGHT:
                 assert ciede2000(lab(one, sight), lab(other, sight)) > LEAST, (one, other, sight)
+
+
+def test_what_the_viewer_draws_together_differs_for_the_colour_blind() -> None:
+    style_sheet = (PARTS / "style.css").read_text()
+    bad = re.findall(r"--bad: light-dark\((\S+), (\S+)\)", style_sheet)[0]
+    groups = [DRONES, AXES, SCENE, *({"good": GREEN, "bad": one} for one in bad)]
+    for group in groups:
+        for (name, one), (other, two) in itertools.combinations(group.items(), 2):
+            for sight in SIGHT:
+                assert ciede2000(lab(one, sight), lab(two, sight)) > LEAST, (name, other, sight)
 
 
 def test_colours_are_seen_on_light_and_dark_pages() -> None:
