@@ -164,7 +164,8 @@ def tutorial(out: Path) -> None:
         flights(["copy", first / "policy.npz"], REFERENCE, out / "tutorial-flight.svg")
         screenshot(place / "benchmark" / "report.html", out / "tutorial-report.png")
         screenshot(place / "first.html", out / "tutorial-viewer.png")
-        log = without_goal(result_of(read_recording(place / "first.jsonl"), "first, flown"))
+        flown = read_recording(place / "first.jsonl")
+        log = without_goal(result_of(flown, "first, flown"), flown.guided_rows)
         draw_flights([log], "Rehearsal on the twin", out / "tutorial-rehearsal.svg", (Z, ERROR, ROLL))
 
 

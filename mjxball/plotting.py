@@ -93,7 +93,8 @@ def follower_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
             free.remove(look)
         looks[name] = _arguments(*look)
     if SIMULATED in looks:
-        looks[SIMULATED] = {"color": INK, "linewidth": 2.5, "alpha": 0.5, "zorder": 1.5, "marker": "none"}
+        looks = {name: {**look, "linewidth": 0.8} for name, look in looks.items()}
+        looks[SIMULATED] = {"color": INK, "linewidth": 4.0, "alpha": 0.4, "zorder": 1.5, "marker": "none"}
     return looks
 
 
