@@ -158,7 +158,8 @@ def tutorial(out: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         commands = [line for line in blocks.replace("\\\n", " ").splitlines() if line.startswith("python ")]
-        excerpts("".join(run(shlex.split(command, comments=True), place) for command in commands), out)
+        printed = "".join(run(shlex.split(command, comments=True), place) for command in commands)
+        excerpts(printed, (place / "first.h").read_text(), out)
         first = place / "runs" / "first"
         draw_training(first, configs.preset("transport"), out / "tutorial-training.svg")
         flights(["copy", first / "policy.npz"], REFERENCE, out / "tutorial-flight.svg")
@@ -169,8 +170,8 @@ def tutorial(out: Path) -> None:
         draw_flights([log], "Rehearsal on the twin", out / "tutorial-rehearsal.svg", (Z, ERROR, ROLL))
 
 
-def excerpts(printed: str, out: Path) -> None:
-    """What the page quotes of the lines that its commands have `printed`: no times, which are the machine's."""
+def excerpts(printed: str, header: str, out: Path) -> None:
+    """What the page quotes of the lines that its commands have `printed`, and of the C: no times of the machine."""
     lines = re.split(r"[\r\n]+", printed)
     final = [line for line in lines if re.search(r"^ *768,000 steps  eval return", line)][-1]
     head = next(k for k, line in enumerate(lines) if line.split()[:3] == ["omega", "ampl.", "mass"])
@@ -178,16 +179,15 @@ def excerpts(printed: str, out: Path) -> None:
     table = [line[:WIDTH].rstrip() for line in [*lines[head : head + 2], *rows]]
     landed = next(line for line in lines if line.startswith("landed"))
     checked = [line for line in lines if line.startswith("good")]
+    figures = next(one for one in lines if one.startswith("error rms"))
+    told = [
+        line.removeprefix(" *").strip() for line in header.splitlines() if line.startswith(" *   mjx")
+    ]
     texts = {
         "training": [final.partition("  100%")[0].strip(), "policy: runs/first/policy.npz"],
         "results": [*table, *(line.partition(";")[0] for line in lines if "meets the bounds" in line)],
-        "rehearsal": [
-            checked[0],
-            "...",
-            checked[-1],
-            landed,
-            next(one for one in lines if one.startswith("error rms")),
-        ],
+        "export": [re.sub(r";  +(.*)", r";  // \1", line) for line in told],
+        "rehearsal": [checked[0], "...", checked[-1], landed, *figures.split("; ")],
     }
     for name, text in texts.items():
         (out / f"tutorial-{name}.txt").write_text("\n".join(text) + "\n")
@@ -241,7 +241,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
 MADE = (
     *("copying.svg", "flight.svg", "crazyflie-stand.svg", "crazyflie-gains.svg", "learning-curves.svg", "viewer.png"),
     *(f"tutorial-{name}" for name in ("training.svg", "flight.svg", "report.png", "viewer.png", "rehearsal.svg")),
-    *(f"tutorial-{name}.txt" for name in ("training", "results", "rehearsal")),
+    *(f"tutorial-{name}.txt" for name in ("training", "results", "export", "rehearsal")),
 )
 
 

@@ -55,6 +55,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place / "html"
 
 
+# Blocks with more lines on the screen than in the text.
+WRAPPED = """blocks => blocks.filter(block => {
+    const { paddingTop, paddingBottom, lineHeight } = getComputedStyle(block);
+    const height = block.clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom);
+    return Math.round(height / parseFloat(lineHeight)) > block.textContent.trimEnd().split('\\n').length;
+}).map(block => block.textContent)"""
+
+
 class Loads(HTMLParser):
     """What a browser fetches by itself when it opens a page; links that a reader must click are none of it."""
 
@@ -127,6 +135,7 @@ def test_pages_fit_in_a_browser(site: Path, browser: Any) -> None:
                 "blocks => blocks.filter(block => block.scrollWidth > block.clientWidth).map(block => block.innerText)"
             )
             assert tab.eval_on_selector_all("pre", wide) == [], page.name
+            assert width < 1000 or tab.eval_on_selector_all("pre", WRAPPED) == [], page.name
         assert tab.eval_on_selector_all("img", "all => all.every(one => one.naturalWidth > 0)"), page.name
     assert [url for url in requests if not url.startswith(("file:", "data:"))] == []
     assert errors == []
