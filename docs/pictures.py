@@ -181,7 +181,7 @@ def excerpts(printed: str, header: str, out: Path) -> None:
     checked = [line for line in lines if line.startswith("good")]
     figures = next(one for one in lines if one.startswith("error rms"))
     told = [
-        line.removeprefix(" *").strip() for line in header.splitlines() if line.startswith(" *   mjx")
+        line.removeprefix(" *").strip() for line in header.splitlines() if line.startswith((" *   mjx", " *   int"))
     ]
     texts = {
         "training": [final.partition("  100%")[0].strip(), "policy: runs/first/policy.npz"],
@@ -224,7 +224,9 @@ def screenshot(page: Path, path: Path, width: int = 1200, height: int = 800) -> 
         tab.wait_for_timeout(500)
         picture = Image.open(io.BytesIO(tab.screenshot()))
         browser.close()
-    picture.convert("RGB").quantize(COLOURS_OF_PNG, dither=Image.Dither.NONE).save(path, optimize=True)
+    picture.convert("RGB").quantize(
+        COLOURS_OF_PNG, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE
+    ).save(path, optimize=True)
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {

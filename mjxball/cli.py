@@ -52,8 +52,12 @@ class Parser(argparse.ArgumentParser):
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """What argparse prints; it would pass over a text that cannot be written."""
-        code = run_command(lambda: print(message, end="", file=file or sys.stderr) or 0)  # type: ignore[func-returns-value]
-        if code:
+
+        def write() -> int:
+            print(message, end="", file=file or sys.stderr)
+            return 0
+
+        if code := run_command(write):
             self.exit(code)
 
 
@@ -67,7 +71,7 @@ class Formatter(argparse.HelpFormatter):
         return self._folded(super()._format_action_invocation(action), self._current_indent)
 
     def start_section(self, heading: str | None) -> None:
-        """See `argparse.HelpFormatter`."""
+        """What stands above a group of flags."""
         super().start_section(heading and self._folded(heading, 0))
 
     def _format_usage(self, *given: Any) -> str:

@@ -127,7 +127,9 @@ def table(results: Sequence[Result], reference: Scenario) -> str:
         rows.append([*row, *(metric_text(name, record[name]) for name in columns)])
     follower = 1 + len(conditions)
     heads = ["", *conditions.values(), "follower", *[""] * failed]
-    shown = terminal.table([*heads, *(COLUMNS[name][0] for name in columns)], rows, (follower, follower + failed), follower)
+    shown = terminal.table(
+        [*heads, *(COLUMNS[name][0] for name in columns)], rows, (follower, follower + failed), follower
+    )
     return f"{shown}\n{terminal.fitted_to(sys.stdout, _legend(reference, results[0].motion))}"
 
 

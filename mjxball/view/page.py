@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from mjxball.config import Plant
+from mjxball.pictures import COLOURS
 from mjxball.plant import rotors
-from mjxball.plotting import BLUE, BROWN, COLOURS, GREEN, OLIVE, PINK, SKY
+from mjxball.plotting import BLUE, BROWN, GREEN, OLIVE, PINK, SKY
 from mjxball.view.flight import Flight
 
 PARTS = Path(__file__).parent / "parts"

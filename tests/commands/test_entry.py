@@ -93,12 +93,10 @@ def test_installed_commands_are_completed_by_their_own_name(
     for name, place in installed.items():
         monkeypatch.setattr(sys, "argv", [f"/bin/{name}", "--print-completion", "bash"])
         handler = signal.getsignal(signal.SIGINT)
-        try:
-            assert pkgutil.resolve_name(place)() == 0
-        except SystemExit as stop:
-            assert stop.code == 0
-        finally:
-            signal.signal(signal.SIGINT, handler)
+        with pytest.raises(SystemExit) as stop:
+            pkgutil.resolve_name(place)()
+        signal.signal(signal.SIGINT, handler)
+        assert stop.value.code == 0
         assert re.search(rf"^complete .* {name}$", capsys.readouterr().out, re.MULTILINE)
 
 

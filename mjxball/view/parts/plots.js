@@ -190,7 +190,7 @@ class Plot {
 
   // The numbers of the legend. Call once all is drawn: to write text between two drawings would lay the page out twice.
   read(row) {
-    const step = Math.max(1e-4, 10 ** (Math.floor(Math.log10(this.high - this.low)) - 2));
+    const step = Math.max(1e-4, 10 ** (Math.floor(Math.log10(this.high - this.low)) - 3));
     this.series.forEach(({ value, units }, k) => {
       this.readouts[k].textContent = units ? '' : fixed(value(row), step);
     });
