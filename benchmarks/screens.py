@@ -98,6 +98,14 @@ SEEN: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
     "tags": (("-c", TAGS), "tags.txt", ("training",)),
 }
 
+# Lines of code and output that end beyond their block, and on a wide page what has more lines than its text.
+CUT = """blocks => blocks.filter(block => {
+  const { paddingTop, paddingBottom, lineHeight } = getComputedStyle(block), wide = innerWidth > 1000;
+  const lines = (block.clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom)) / parseFloat(lineHeight);
+  const broken = wide && Math.round(lines) > block.textContent.trimEnd().split('\\n').length;
+  return block.scrollWidth > block.clientWidth || broken;
+}).map(block => block.textContent.split('\\n')[0])"""
+
 
 class Terminal(pyte.HistoryScreen):
     """A screen that counts the lines which it had to break."""
@@ -221,7 +229,7 @@ def pages(out: Path, site: Path | None, only: list[str]) -> Iterator[str]:
                     yield from pictured(browser, name, path.as_uri(), out)
                 else:
                     shutil.copy(path, out / f"{name}-{path.name}")
-        for path in sorted(site.rglob("*.html")) if site and chosen(["site"], only, "pages") else ():
+        for path in sorted(site.resolve().rglob("*.html")) if site and chosen(["site"], only, "pages") else ():
             yield from pictured(browser, f"site-{path.stem}", path.as_uri(), out)
         browser.close()
 
@@ -257,8 +265,7 @@ def looked_at(browser: Any, address: str, width: int, scheme: str, picture: Path
     beyond = tab.evaluate("document.documentElement.scrollWidth") - width
     if beyond > 0:
         wrong.append(f"hangs out at the side by {beyond} px")
-    hidden = "all => all.filter(one => one.scrollWidth > one.clientWidth).map(one => one.innerText.split('\\n')[0])"
-    wrong += [f"a block is cut: {text}" for text in tab.eval_on_selector_all("pre", hidden)]
+    wrong += [f"a block is cut or broken: {text}" for text in tab.eval_on_selector_all("pre", CUT)]
     tab.close()
     return wrong
 

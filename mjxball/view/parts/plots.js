@@ -1,5 +1,5 @@
 // Time plots: lines over time with a cursor; click or drag to seek.
-const LEFT = 52, RIGHT = 8, TOP = 6, BOTTOM = 18;
+const LEFT = 54, RIGHT = 8, TOP = 6, BOTTOM = 18;
 const LEAST = 1e-3;  // of a y-range, in the plot's unit: rounding errors must not look like motion
 
 // About `count` round numbers between low and high, two at least, each with its text.
@@ -18,7 +18,7 @@ function fixed(value, step) {
 }
 
 // Three digits, of a positive number.
-const short = (value) => fixed(value, 10 ** (Math.floor(Math.log10(value)) - 2)).replace(/\.?0+$/, '');
+const short = (value) => String(+value.toPrecision(3));
 
 // Names are text: nothing is written as HTML.
 function element(kind, text = '', className = '') {
