@@ -158,35 +158,36 @@ def tutorial(out: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         commands = [line for line in blocks.replace("\\\n", " ").splitlines() if line.startswith("python ")]
-        excerpts("".join(run(shlex.split(command, comments=True), place) for command in commands), out)
+        printed = "".join(run(shlex.split(command, comments=True), place) for command in commands)
+        excerpts(printed, (place / "first.h").read_text(), out)
         first = place / "runs" / "first"
         draw_training(first, configs.preset("transport"), out / "tutorial-training.svg")
         flights(["copy", first / "policy.npz"], REFERENCE, out / "tutorial-flight.svg")
         screenshot(place / "benchmark" / "report.html", out / "tutorial-report.png")
         screenshot(place / "first.html", out / "tutorial-viewer.png")
-        log = without_goal(result_of(read_recording(place / "first.jsonl"), "first, flown"))
+        flown = read_recording(place / "first.jsonl")
+        log = without_goal(result_of(flown, "first, flown"), flown.guided_rows)
         draw_flights([log], "Rehearsal on the twin", out / "tutorial-rehearsal.svg", (Z, ERROR, ROLL))
 
 
-def excerpts(printed: str, out: Path) -> None:
-    """What the page quotes of the lines that its commands have `printed`: no times, which are the machine's."""
+def excerpts(printed: str, header: str, out: Path) -> None:
+    """What the page quotes of the lines that its commands have `printed`, and of the C: no times of the machine."""
     lines = re.split(r"[\r\n]+", printed)
-    final = [line for line in lines if re.search(r"768,000 / 768,000 steps.*eval peak", line)][-1]
+    final = [line for line in lines if re.search(r"^ *768,000 steps  eval return", line)][-1]
     head = next(k for k, line in enumerate(lines) if line.split()[:3] == ["omega", "ampl.", "mass"])
     rows = [line for line in lines[head:] if line.startswith("*")][:2]
     table = [line[:WIDTH].rstrip() for line in [*lines[head : head + 2], *rows]]
     landed = next(line for line in lines if line.startswith("landed"))
     checked = [line for line in lines if line.startswith("good")]
+    figures = next(one for one in lines if one.startswith("error rms"))
+    told = [
+        line.removeprefix(" *").strip() for line in header.splitlines() if line.startswith((" *   mjx", " *   int"))
+    ]
     texts = {
-        "training": [re.sub(r"  +[\d.]+ k/s.*left", "", final).strip(), "policy: runs/first/policy.npz"],
+        "training": [final.partition("  100%")[0].strip(), "policy: runs/first/policy.npz"],
         "results": [*table, *(line.partition(";")[0] for line in lines if "meets the bounds" in line)],
-        "rehearsal": [
-            checked[0],
-            "...",
-            checked[-1],
-            landed,
-            next(one for one in lines if one.startswith("error rms")),
-        ],
+        "export": [re.sub(r";  +(.*)", r";  // \1", line) for line in told],
+        "rehearsal": [checked[0], "...", checked[-1], landed, *figures.split("; ")],
     }
     for name, text in texts.items():
         (out / f"tutorial-{name}.txt").write_text("\n".join(text) + "\n")
@@ -196,7 +197,6 @@ def run(words: list[str], place: Path) -> str:
     """What one command of a page prints in the directory `place`."""
     program = [str(REPOSITORY / words[1]), *words[2:]] if words[1].endswith(".py") else words[1:]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    command: dict[str, Any] = {"cwd": place, "env": environment, "text": True}
     command: dict[str, Any] = {"cwd": place, "env": environment, "text": True}
     for _ in range(3 if "--rehearse" in words else 1):  # a busy machine misses the deadlines of a rehearsal
         done = subprocess.run(
@@ -224,7 +224,9 @@ def screenshot(page: Path, path: Path, width: int = 1200, height: int = 800) -> 
         tab.wait_for_timeout(500)
         picture = Image.open(io.BytesIO(tab.screenshot()))
         browser.close()
-    picture.convert("RGB").quantize(COLOURS_OF_PNG, dither=Image.Dither.NONE).save(path, optimize=True)
+    picture.convert("RGB").quantize(
+        COLOURS_OF_PNG, Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE
+    ).save(path, optimize=True)
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {
@@ -241,7 +243,7 @@ PICTURES: dict[str, Callable[[Path], None]] = {
 MADE = (
     *("copying.svg", "flight.svg", "crazyflie-stand.svg", "crazyflie-gains.svg", "learning-curves.svg", "viewer.png"),
     *(f"tutorial-{name}" for name in ("training.svg", "flight.svg", "report.png", "viewer.png", "rehearsal.svg")),
-    *(f"tutorial-{name}.txt" for name in ("training", "results", "rehearsal")),
+    *(f"tutorial-{name}.txt" for name in ("training", "results", "export", "rehearsal")),
 )
 
 

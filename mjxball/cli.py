@@ -50,15 +50,29 @@ class Parser(argparse.ArgumentParser):
         warn(f"{self.prog}: {message}{f'; did you mean {similar[0]}?' if similar else ''}")
         self.exit(2)
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """What argparse prints; it would pass over a text that cannot be written."""
+
+        def write() -> int:
+            print(message, end="", file=file or sys.stderr)
+            return 0
+
+        if code := run_command(write):
+            self.exit(code)
+
 
 class Formatter(argparse.HelpFormatter):
-    """As argparse's, and no line is longer than a terminal of 40 columns or more: a long flag or usage is folded."""
+    """As argparse's, and what is longer than a line of the terminal is folded: a flag, usage or heading."""
 
     def __init__(self, prog: str, **given: Any):
         super().__init__(prog, **{"max_help_position": 32, **given})
 
     def _format_action_invocation(self, action: argparse.Action) -> str:
         return self._folded(super()._format_action_invocation(action), self._current_indent)
+
+    def start_section(self, heading: str | None) -> None:
+        """What stands above a group of flags."""
+        super().start_section(heading and self._folded(heading, 0))
 
     def _format_usage(self, *given: Any) -> str:
         return self._folded(super()._format_usage(*given).strip(), 0) + "\n\n"
@@ -111,7 +125,7 @@ class Help(argparse.Action):
 class Completion(argparse.Action):
     """`--print-completion SHELL`: how the shell completes the command, see `shtab`, which is loaded here alone.
 
-    Of an action with `suggested` words these are offered, of a path files.
+    Of an action with `suggested` words these are offered, of a path and of what has no flag files.
     """
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option_string: Any = None) -> None:
@@ -119,12 +133,13 @@ class Completion(argparse.Action):
         try:
             import shtab
         except ModuleNotFoundError:
-            parser.error("shtab is not installed; pip install 'mjxball[train]'")
+            parser.error("shtab is not installed; pip install shtab")
         for action in parser._actions:
             action.choices = getattr(action, "suggested", action.choices)
-            if getattr(action.type, "__name__", "") in ("Path", "policy_path"):
+            named = action.option_strings or action.choices
+            if getattr(action.type, "__name__", "") in ("Path", "policy_path") or not named:
                 action.complete = shtab.FILE
-        print(shtab.complete(parser, values))  # noqa: T201
+        parser._print_message(f"{shtab.complete(parser, values)}\n", sys.stdout)
         parser.exit()
 
 
@@ -175,12 +190,17 @@ def switch_often() -> None:
 def run_command(command: Callable[[], int]) -> int:
     """Run `command`; bad input, a failing file or a missing package becomes one line on stderr and exit code 2."""
     try:
-        return command()
+        code = command()
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        return code
     except InputError as error:
         warn(f"error: {error}")
         return 2
     except OSError as error:
-        warn(f"error: {error.filename or 'a file'}: {error.strerror or error}")
+        where = error.filename or "standard output or a file"
+        _let_go_of_stdout()
+        warn(f"error: {where}: {error.strerror or error}")
         return 2
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("mjxball"):
@@ -194,6 +214,14 @@ def run_command(command: Callable[[], int]) -> int:
             raise
         warn(f"error: {why}")
         return 2
+
+
+def _let_go_of_stdout() -> None:
+    """If it cannot be written: else Python tries again as it ends, and reports that in lines of its own."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def output_directory(path: Path, but: Sequence[str] = ()) -> Path:

@@ -1,44 +1,44 @@
-"""Entry points of `mjxball-train` and `mjxball-eval`, and of train.py and eval.py; imports nothing heavy by itself."""
+"""Entry points of installed commands, and of train.py and eval.py; imports nothing heavy by itself."""
 
 from __future__ import annotations
 
+import importlib
 import traceback
-from collections.abc import Callable
 
 from mjxball.cli import FAULT, collect_seldom, quit_on_interrupt, run_command, switch_often
 
 
 def train() -> int:
     """Run `train.py`; return its exit code."""
-    quit_on_interrupt()  # until training starts there is nothing to save
     collect_seldom()
     switch_often()
-
-    def command() -> int:
-        from mjxball.commands.train import main
-
-        return main()
-
-    return _exit_code(command)
+    return _run("mjxball.commands.train")  # until training starts there is nothing to save
 
 
 def evaluate() -> int:
     """Run `eval.py`; return its exit code."""
-    quit_on_interrupt()  # there is nothing to save
     collect_seldom()
-
-    def command() -> int:
-        from mjxball.commands.evaluate import main
-
-        return main()
-
-    return _exit_code(command)
+    return _run("mjxball.commands.evaluate")
 
 
-def _exit_code(command: Callable[[], int]) -> int:
-    """That of `command`; `FAULT` after an error of the program's own: 1, which Python would say, is a result."""
+def view() -> int:
+    """Run `mjxball-view`; return its exit code."""
+    return _run("mjxball.view.main")
+
+
+def export() -> int:
+    """Run `mjxball-export`; return its exit code."""
+    return _run("mjxball.export")
+
+
+def _run(module: str) -> int:
+    """`main` of `module`, which Ctrl-C ends at once: there is nothing to save.
+
+    Returns its exit code; `FAULT` after an error of the program's own: 1, which Python would say, is a result.
+    """
+    quit_on_interrupt()
     try:
-        return run_command(command)
+        return run_command(lambda: int(importlib.import_module(module).main()))
     except Exception:
         traceback.print_exc()
         return FAULT

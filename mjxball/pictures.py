@@ -7,7 +7,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-COLOURS = ("#1b6ca8", "#d1603d", "#4c956c", "#8661c1", "#9a9a9a")
+# Of everything that is drawn. Distinct with protanopia and deuteranopia, at least 3 : 1 from white and dark pages.
+COLOURS = ("#1f5aff", "#98623a", "#318174", "#ff0f87", "#469ab9", "#b28f00")
 MOST_POINTS = 400  # of a curve
 SMALL = 'font-size="11" fill="currentColor"'
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from mjxball.files import write_whole
+from mjxball.pictures import COLOURS
 
-# Distinct with protanopia and deuteranopia, and at least 3 : 1 from a white and from a dark page.
-BLUE, BROWN, GREEN, PINK, SKY, OLIVE = COLOURS = ("#1f5aff", "#98623a", "#318174", "#ff0f87", "#469ab9", "#b28f00")
+BLUE, BROWN, GREEN, PINK, SKY, OLIVE = COLOURS
 INK = "#757575"  # 4.6 : 1 on white, 4 : 1 on a dark page
 MARKERS = dict(zip(COLOURS, "osD^vP", strict=True))
 SOLID, DASH, DOT, DASH_DOT, DASH_DOT_DOT, LONG, SHORT = DASHES = tuple(
@@ -93,7 +93,8 @@ def follower_styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
             free.remove(look)
         looks[name] = _arguments(*look)
     if SIMULATED in looks:
-        looks[SIMULATED] = {"color": INK, "linewidth": 2.5, "alpha": 0.5, "zorder": 1.5, "marker": "none"}
+        looks = {name: {**look, "linewidth": 0.8} for name, look in looks.items()}
+        looks[SIMULATED] = {"color": INK, "linewidth": 4.0, "alpha": 0.4, "zorder": 1.5, "marker": "none"}
     return looks
 
 

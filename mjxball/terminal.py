@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
 PERIOD = 0.5  # [s] between two redraws
-GAP = "   "  # between the parts of a line
+GAP = "  "  # between the parts of a line
 Lines = Sequence[Sequence[str]]  # each of parts, the most important first
 
 
@@ -88,7 +88,13 @@ class Status:
 
     def say(self, text: str) -> None:
         """Print `text` on lines of its own; at a terminal they break between words."""
-        text = fitted_to(self._stream, text)
+        self._print(fitted_to(self._stream, text))
+
+    def row(self, parts: Sequence[str]) -> None:
+        """Print `parts` on a line of their own; at a terminal as many as it holds."""
+        self._print(fitted(parts, columns_of(self._stream)) if self._stream.isatty() else GAP.join(parts))
+
+    def _print(self, text: str) -> None:
         if self._display is None:
             print(text, file=self._stream, flush=True)
         else:
@@ -128,45 +134,75 @@ def _display(stream: TextIO, render: Callable[[], Any]) -> Any:
 
 
 COMFORTABLE = 16  # width below which words are not folded
+INDENT = "  "  # of rows below what they have in common
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]], names: Sequence[int], least: int) -> str:
-    """A table of `rows` below `heads`, in which a line break parts a name from its unit. Columns `names` hold words.
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[int], name: int) -> str:
+    """A table of `rows` below `heads`, in which a line break parts a name from its unit. Columns `words` hold words.
 
-    On a terminal that is too narrow the words are folded, and columns left out from the right, never of the first
-    `least`; a line says which. Elsewhere a row is a line.
+    Column `name` says what a row is of; what stands before it many rows have in common. On a terminal that is too
+    narrow words are folded; else what is common, or the name too, is a line above its rows, whichever shows more; what
+    does not fit then is left out from the right, and a line says what. Elsewhere a row is a line.
     """
+    width = columns_of(sys.stdout) if sys.stdout.isatty() else 10_000
+    cells = list(zip(heads, *rows, strict=True))
+    shown = {0: _fitting(cells, words, width)}
+    shown |= {n: n + _fitting(cells[n:], (), width - len(INDENT)) for n in (name, name + 1)}
+    above = max(shown, key=lambda n: shown[n])
+    end = shown[above]
+    lines = _rendered(cells[above:end], [number - above for number in words], width)
+    if above:
+        common = ["  ".join(_named(heads[k], row[k], k in words) for k in range(above) if row[k]) for row in rows]
+        lines = _below(common, lines, width)
+    if end < len(heads):
+        left_out = ", ".join(head.split("\n")[0] for head in heads[end:])
+        lines += textwrap.wrap(f"left out on this narrow terminal: {left_out}", width)
+    return "\n".join(lines)
+
+
+def _below(common: Sequence[str], lines: Sequence[str], width: int) -> list[str]:
+    """The `lines` of a table, each row below what it and the rows before it have in common."""
+    top, said = len(lines) - len(common), ""
+    found = [INDENT + line for line in lines[:top]]
+    for text, line in zip(common, lines[top:], strict=True):
+        if text != said:
+            found += folded(text, width).splitlines()
+        found.append(INDENT + line)
+        said = text
+    return found
+
+
+def _fitting(cells: Sequence[Sequence[str]], words: Sequence[int], width: int) -> int:
+    """How many of the columns `cells` fit, one at least, where those of `words` are folded."""
+    total, fitting = -2, 0
+    for number, column in enumerate(cells):
+        whole = max(len(line) for cell in column for line in cell.split("\n"))
+        longest = max((len(word) for cell in column for word in cell.split()), default=0)
+        total += 2 + (max(longest, min(whole, COMFORTABLE)) if number in words else whole)
+        fitting += total <= width
+    return max(fitting, 1)
+
+
+def _named(head: str, cell: str, word: bool) -> str:
+    """A cell where no head stands above it."""
+    name, _, unit = head.partition("\n")
+    return cell if word else f"{name} {cell} {unit}".strip()
+
+
+def _rendered(cells: Sequence[Sequence[str]], words: Sequence[int], width: int) -> list[str]:
+    """Lines of the columns `cells`, each with its head."""
     from rich.console import Console
     from rich.table import Table
 
-    width = columns_of(sys.stdout) if sys.stdout.isatty() else 10_000
-    cells = list(zip(heads, *rows, strict=True))
-
-    def needed(shown: int, words: int) -> int:
-        """Width of the first `shown` columns; those of words need their longest one, or `words` for all."""
-        total = 2 * (shown - 1)
-        for number, column in enumerate(cells[:shown]):
-            whole = max(len(line) for cell in column for line in cell.split("\n"))
-            longest = max((len(word) for cell in column for word in cell.split()), default=0)
-            total += max(longest, min(whole, words)) if number in names else whole
-        return total
-
-    most, some = len(heads), min(least + 3, len(heads))
-    tries = [*((n, COMFORTABLE) for n in range(most, some - 1, -1)), *((n, 0) for n in range(some, least - 1, -1))]
-    shown = next((n for n, words in tries if needed(n, words) <= width), least)
     made = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)
-    for number, head in enumerate(heads[:shown]):
-        word = number in names
+    for number, (head, *_) in enumerate(cells):
+        word = number in words
         made.add_column(_text(head), justify="left" if word else "right", no_wrap=not word, vertical="bottom")
-    for row in rows:
-        made.add_row(*map(_text, row[:shown]))
+    for row in list(zip(*cells, strict=True))[1:]:
+        made.add_row(*map(_text, row))
     console = Console(file=io.StringIO(), width=width, color_system=None, highlight=False)
     console.print(made)
-    lines = [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
-    if shown < most:
-        left_out = ", ".join(head.split("\n")[0] for head in heads[shown:])
-        lines += textwrap.wrap(f"left out on this narrow terminal: {left_out}", width)
-    return "\n".join(lines)
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
 
 
 def _text(text: str) -> Any:

@@ -33,6 +33,8 @@ MAINS = {
     "mjxball-train": "mjxball.commands.train",
     "eval.py": "mjxball.commands.evaluate",
     "mjxball-eval": "mjxball.commands.evaluate",
+    "mjxball-view": "mjxball.view.main",
+    "mjxball-fly": "mjxball.fly.main",
     "mjxball.export": "mjxball.export",
     "mjxball.view": "mjxball.view.main",
     "mjxball.fly": "mjxball.fly.main",
@@ -52,6 +54,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return place / "html"
+
+
+# Blocks with more lines on the screen than in the text.
+WRAPPED = """blocks => blocks.filter(block => {
+    const { paddingTop, paddingBottom, lineHeight } = getComputedStyle(block);
+    const height = block.clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom);
+    return Math.round(height / parseFloat(lineHeight)) > block.textContent.trimEnd().split('\\n').length;
+}).map(block => block.textContent)"""
 
 
 class Loads(HTMLParser):
@@ -126,6 +136,7 @@ def test_pages_fit_in_a_browser(site: Path, browser: Any) -> None:
                 "blocks => blocks.filter(block => block.scrollWidth > block.clientWidth).map(block => block.innerText)"
             )
             assert tab.eval_on_selector_all("pre", wide) == [], page.name
+            assert width < 1000 or tab.eval_on_selector_all("pre", WRAPPED) == [], page.name
         assert tab.eval_on_selector_all("img", "all => all.every(one => one.naturalWidth > 0)"), page.name
     assert [url for url in requests if not url.startswith(("file:", "data:"))] == []
     assert errors == []

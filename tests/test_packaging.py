@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import venv
 import zipfile
 from importlib import metadata
@@ -85,8 +86,8 @@ def test_the_wheel_says_what_it_is(wheel: Path) -> None:
     needed = [line for line in told.splitlines() if line.startswith("Requires-Dist:") and "extra ==" not in line]
     assert needed == ["Requires-Dist: numpy<3,>=2.1"]  # the base install is NumPy alone
     commands = archive.read(f"mjxball-{__version__}.dist-info/entry_points.txt").decode()
-    assert "mjxball-train = mjxball.entry:train" in commands
-    assert "mjxball-eval = mjxball.entry:evaluate" in commands
+    declared = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
+    assert set(commands.split("\n")) >= {f"{name} = {place}" for name, place in declared.items()}
 
 
 @pytest.mark.slow

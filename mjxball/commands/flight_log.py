@@ -40,7 +40,7 @@ def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None
     simulated = result_of(fly_again(recording), SIMULATED)
     print(differences(recorded, simulated))  # noqa: T201
     with style(look):
-        print(f"figure: {draw(recorded, simulated, out)}")  # noqa: T201
+        print(f"figure: {draw(recorded, simulated, recording.guided_rows, out)}")  # noqa: T201
     return 0
 
 
@@ -57,7 +57,6 @@ def result_of(recording: Recording, name: str) -> Result:
 def trajectory_of(recording: Recording) -> Trajectory:
     """A recording as a trajectory; what was not measured is NaN."""
     rows = len(recording.time)
-    flying = [number for number, phase in enumerate(recording.phase) if phase == "fly"]
     unknown = np.full((rows, 2, 3), np.nan)
     return Trajectory(
         time=recording.time,
@@ -74,16 +73,19 @@ def trajectory_of(recording: Recording) -> Trajectory:
         object_mass=np.full(rows, np.nan),
         contact_force=unknown,
         contact_torque=unknown,
-        goal=recording.goal[flying[0] if flying else 0],
-        target=recording.goal,
+        goal=recording.goal[max(recording.guided_rows - 1, 0)],
+        target=recording.target,
         diverged=np.array(False),
     )
 
 
-def draw(recorded: Result, simulated: Result, out: Path) -> Path:
-    """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file."""
+def draw(recorded: Result, simulated: Result, guided: int, out: Path) -> Path:
+    """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file.
+
+    The goal is drawn for the first `guided` rows.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    both = [without_goal(recorded), _cut(without_goal(simulated), valid_rows(recorded, simulated))]
+    both = [without_goal(recorded, guided), _cut(without_goal(simulated, guided), valid_rows(recorded, simulated))]
     path = out / f"flight.{'png' if file_format() == 'svg' else file_format()}"
     draw_flights(both, scenario_title(recorded), path)
     return path
@@ -115,11 +117,10 @@ def valid_rows(recorded: Result, simulated: Result) -> int:
     return int(lost[0]) if len(lost) else len(apart)
 
 
-def without_goal(result: Result) -> Result:
-    """`result` without a goal after the last command of a law: what a log holds then was not flown to."""
+def without_goal(result: Result, rows: int) -> Result:
+    """`result` without a goal after `rows`: it was not flown to."""
     target = np.array(result.flight.target, float)
-    commanded = np.flatnonzero(np.isfinite(result.flight.leader_command).all(axis=-1))
-    target[commanded[-1] + 1 if len(commanded) else len(target) :] = np.nan
+    target[rows:] = np.nan
     return dataclasses.replace(result, flight=dataclasses.replace(result.flight, target=target))
 
 

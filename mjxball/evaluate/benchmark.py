@@ -208,7 +208,7 @@ def text_table(scores: Sequence[Score], suites: Sequence[Suite]) -> str:
         rows.append([mark, score.suite, variant, score.follower, failed, *medians])
     heads = ["", "suite", "variant", "follower", "failed", *(COLUMNS[name][0] for name in measured)]
     said = f"Medians over the seeds. {MARK} the reference scenario; - there is none; failed: of all seeds, or most do."
-    return f"{terminal.table(heads, rows, names=(1, 2, 3), least=5)}\n{terminal.fitted_to(sys.stdout, said)}"
+    return f"{terminal.table(heads, rows, words=(1, 2, 3), name=3)}\n{terminal.fitted_to(sys.stdout, said)}"
 
 
 def scores_of(results: Sequence[Result]) -> tuple[list[Score], list[Suite]]:

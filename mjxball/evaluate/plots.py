@@ -147,7 +147,7 @@ def heat_maps(scores: Sequence[Score]) -> str:
         axis.set_xlabel("CG speed [rad/s]", fontsize=8)
     for axis in axes[:, 0]:
         axis.set_ylabel("mass [kg]", fontsize=8)
-    figure.colorbar(image, ax=axes, label="peak [m]", shrink=0.8)
+    figure.colorbar(image, ax=axes, label="peak [m]", shrink=0.8, format="%g")
     return rendered(figure, "svg").decode()
 
 
@@ -192,7 +192,7 @@ def _draw_panel(
             factor = 1.0 if index == 2 else 57.29577951308232
             for followed in of_followers(flight, index or 0):
                 axis.plot(time, factor * followed, **look)
-            thin = {**look, "linewidth": 0.5, "label": None if number else "thin: leader"}
+            thin = {**look, "linewidth": max(0.5, 0.4 * look["linewidth"]), "label": None if number else "thin: leader"}
             axis.plot(time, factor * flight.leader_command[:, index], **thin)
     if kind == "error":
         logarithmic(axis)

@@ -125,9 +125,11 @@ def table(results: Sequence[Result], reference: Scenario) -> str:
         row += ["-" if record[name] is None else f"{record[name]:g}" for name in conditions]
         row += [result.follower, *["FAILED" if result.metrics.failed else ""] * failed]
         rows.append([*row, *(metric_text(name, record[name]) for name in columns)])
-    words = (1 + len(conditions), 2 + len(conditions))[: 1 + failed]
+    follower = 1 + len(conditions)
     heads = ["", *conditions.values(), "follower", *[""] * failed]
-    shown = terminal.table([*heads, *(COLUMNS[name][0] for name in columns)], rows, names=words, least=len(heads))
+    shown = terminal.table(
+        [*heads, *(COLUMNS[name][0] for name in columns)], rows, (follower, follower + failed), follower
+    )
     return f"{shown}\n{terminal.fitted_to(sys.stdout, _legend(reference, results[0].motion))}"
 
 

@@ -217,6 +217,17 @@ class Recording:
     cg_offset: np.ndarray  # (T,) [m]; NaN where it was not measured
     remarks: tuple[str, ...] = ()  # what a reader of the log should know, a line each
 
+    @property
+    def target(self) -> np.ndarray:
+        """(T, 3) the goal [m]; while the pair lands as it was before: one that sinks below the ground only steers."""
+        rows = np.where([phase == State.LAND.value for phase in self.phase], 0, np.arange(len(self.phase)))
+        return np.asarray(self.goal[np.maximum.accumulate(rows)])
+
+    @property
+    def guided_rows(self) -> int:
+        """How many rows there are until the laws last flew to the goal."""
+        return 1 + max((row for row, phase in enumerate(self.phase) if phase == GUIDED), default=-1)
+
 
 def read_recording(path: Path, assumed: Config | None = None) -> Recording:
     """The flight in the log `path`, of the rig `assumed` if it does not say. Raises InputError if there is none."""

@@ -115,8 +115,8 @@ def draw_members(run: Path, path: Path) -> None:
 PANELS = {
     "task": (("steady_error", "eval_steady_error", "steady-state error [m]"),),
     "paper": (
-        (None, "eval_tilt_error", "roll and pitch off the leader's [rad rms]"),
-        (None, "eval_vertical_error", "vertical command off the leader's [m/s² rms]"),
+        (None, "eval_tilt_error", "roll and pitch off\nthe leader's [rad rms]"),
+        (None, "eval_vertical_error", "vertical command off\nthe leader's [m/s² rms]"),
     ),
 }
 

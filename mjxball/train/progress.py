@@ -118,9 +118,7 @@ class Progress:
         self._events.flush()
         self._track(row)
         if not self._status.live or "eval_return" in row:
-            left = self._left(row, 0.0)
-            text = f"{row['steps']:>9,} / {self._total:,} steps  {row['rate'] / 1e3:6.1f} k/s  {left}"
-            self.say("  ".join((text, *self._summary(row))))
+            self._status.row([f"{row['steps']:>9,} steps", *self._summary(row), *self._speed(row, 0.0)])
         self._latest = row, time.monotonic()
         self._status.show(self._lines)
 
@@ -140,25 +138,22 @@ class Progress:
             doing, what, keys = self._doing
             return [[f"{doing} {self.elapsed():.0f} s", *([what] if what else [])], [keys, self._called]]
         row, came = self._latest
-        head = [
-            f"{row['steps'] / self._total:.0%}",
-            self._left(row, time.monotonic() - came),
-            f"{row['rate'] / 1e3:.1f} k/s",
-            f"{row['steps']:,} of {self._total:,} steps",
-            self._called,
-        ]
-        return [head, [KEYS, *self._summary(row)]]
+        steps = f"{row['steps']:,} of {self._total:,} steps"
+        return [[*self._speed(row, time.monotonic() - came), steps, self._called], [KEYS, *self._summary(row)]]
 
-    def _left(self, row: Row, since: float) -> str:
+    def _speed(self, row: Row, since: float) -> list[str]:
+        """Share of the steps that are done, time left, and steps per second."""
         left = max(self._total - row["steps"], 0) * self._members / max(row["rate"], 1e-9) - since
-        return f"{max(int(left), 0) // 60}:{max(int(left), 0) % 60:02d} left"
+        minutes, seconds = divmod(max(int(left), 0), 60)
+        return [f"{row['steps'] / self._total:.0%}", f"{minutes}:{seconds:02d} left", f"{row['rate'] / 1e3:.1f} k/s"]
 
     def _summary(self, row: Row) -> list[str]:
         """The return and the first metrics behind it, of the evaluation or exploring."""
         evaluated = "eval_return" in row
         chosen = [name for name in self._names if name.startswith("eval_") == evaluated and name not in COMMON]
-        shown = chosen[:3] if evaluated else ["episode_return", *chosen[:2]]
-        return [f"{name.replace('_', ' ')} {_number(row.get(name))}" for name in shown]
+        first, *rest = chosen[:3] if evaluated else ["episode_return", *chosen[:2]]
+        said = {first: first} | {name: name.removeprefix("eval_") for name in rest}
+        return [f"{text.replace('_', ' ')} {_number(row.get(name))}" for name, text in said.items()]
 
     def end_status(self) -> None:
         """Take the status away: what comes is said line by line."""

@@ -194,7 +194,7 @@ def read_log(path: Path) -> Flight:
         "cg_offset": np.zeros(rows),
         "object_mass": np.full(rows, recording.config.plant.object_mass),
         "contact_force": np.zeros((rows, 2, 3)),
-        "target": recording.goal,
+        "target": recording.target,
         **({"hidden": np.nan_to_num(recording.hidden)} if recording.hidden.shape[1] else {}),
     }
     title = f"{recording.policy}, flown (ball and contact forces were not measured)"

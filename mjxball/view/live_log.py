@@ -16,6 +16,7 @@ from mjxball.fly.limits import NAMES
 from mjxball.fly.log_schema import Record
 from mjxball.fly.packets import DroneState
 from mjxball.fly.recording import LONGEST, FirmwareSetup
+from mjxball.fly.supervisor import State
 from mjxball.fly.telemetry import Rig, object_state
 from mjxball.view.marks import FlightStatus, Mark, placed
 from mjxball.view.page import plant_of
@@ -49,6 +50,7 @@ class LiveLog:
         self._tail, self._hear = Tail(path), hear
         self._newest: list[DroneState | None] = [None, None]
         self._start: float | None = None
+        self._target: np.ndarray | None = None
         self._firmware: FirmwareSetup  # once the log has begun
 
     def update(self) -> bool:
@@ -96,6 +98,8 @@ class LiveLog:
 
     def _tick(self, record: Record) -> None:
         seen = [state for state in self._newest if state is not None]
+        if self._target is None or record["state"] != State.LAND.value:  # see `Recording.target`
+            self._target = record["goal"]
         now = record["t"]
         self._start = now if self._start is None else self._start
         time = now - self._start
@@ -111,7 +115,7 @@ class LiveLog:
             "quaternion": pair.quaternion,
             "leader_command": record.get("leader", NO_LAW),
             "follower_command": record.get("follower", NO_LAW),
-            "target": record["goal"],
+            "target": self._target,
             "thrust": thrust,
             "battery": [state.battery for state in seen],
             "late": record.get("late", 0.0),

@@ -13,13 +13,18 @@ from typing import Any
 import numpy as np
 
 from mjxball.config import Plant
+from mjxball.pictures import COLOURS
 from mjxball.plant import rotors
+from mjxball.plotting import BLUE, BROWN, GREEN, OLIVE, PINK, SKY
 from mjxball.view.flight import Flight
 
 PARTS = Path(__file__).parent / "parts"
 UNMEASURED = ("cg_offset", "object_mass", "contact_force")  # in a flight log
 SHOWN = ("time", "position", "euler", "quaternion", "leader_command", "follower_command", "target", "hidden")
 SCRIPTS = ("space.js", "flight.js", "scene.js", "plots.js", "player.js", "controls.js")
+DRONES = {f"drone-{number}": colour for number, colour in enumerate(COLOURS)}  # the leader, then followers
+AXES = {"x": PINK, "y": GREEN, "z": BLUE}
+SCENE = {"goal": GREEN, "cg": OLIVE, "thrust": SKY, "contact": PINK, "weight": BROWN, "path": BLUE}
 
 
 def flight_page(*flights: Flight) -> str:
@@ -34,9 +39,10 @@ def live_page(title: str, token: str) -> str:
 
 def _page(title: str, data: Any, start: str) -> str:
     script = "\n".join((PARTS / name).read_text(encoding="utf-8") for name in (*SCRIPTS, start))
+    colours = " ".join(f"--{name}: {colour};" for name, colour in (DRONES | AXES | SCENE | {"good": GREEN}).items())
     parts = {
         "title": html.escape(title),
-        "style": (PARTS / "style.css").read_text(encoding="utf-8"),
+        "style": f"{(PARTS / 'style.css').read_text(encoding='utf-8')}:root {{ {colours} }}",
         "data": _json(data),
         "script": script,
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 import runpy
 import signal
@@ -84,18 +85,41 @@ def test_the_version_stands_in_one_number_everywhere() -> None:
     assert f"version: {__version__}\n" in (REPOSITORY / "CITATION.cff").read_text()
 
 
-def test_installed_commands_are_called_by_their_own_name(tmp_path: Path) -> None:
-    script = tmp_path / "mjxball-eval"
-    script.write_text("import sys\nfrom mjxball.entry import evaluate\nsys.exit(evaluate())\n")
-    done = subprocess.run(
-        [sys.executable, script, "--help"],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=tmp_path,
-        env={**environment(), "PYTHONPATH": str(REPOSITORY)},
-    )
-    assert done.stdout.startswith("usage: mjxball-eval ")
+def test_installed_commands_are_completed_by_their_own_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("shtab")
+    installed = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
+    assert {f"mjxball-{name}" for name in ("train", "eval", "view", "fly", "export")} <= set(installed)
+    for name, place in installed.items():
+        monkeypatch.setattr(sys, "argv", [f"/bin/{name}", "--print-completion", "bash"])
+        handler = signal.getsignal(signal.SIGINT)
+        with pytest.raises(SystemExit) as stop:
+            pkgutil.resolve_name(place)()
+        signal.signal(signal.SIGINT, handler)
+        assert stop.value.code == 0
+        assert re.search(rf"^complete .* {name}$", capsys.readouterr().out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("words", [("train.py", "--help"), ("-m", "mjxball.fly", "--version"), ("eval.py", "--list")])
+@pytest.mark.parametrize("buffered", [True, False])
+def test_what_cannot_be_printed_is_said(words: tuple[str, ...], buffered: bool) -> None:
+    """Nor is a second line said by Python, which tries again as it ends."""
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full here")
+    with full.open("w") as out:
+        done = subprocess.run(
+            [sys.executable, *([] if buffered else ["-u"]), *words],
+            stdout=out,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            cwd=REPOSITORY,
+            env=environment(),
+        )
+    assert done.returncode == 2
+    assert_one_line(done.stderr)
 
 
 def test_without_the_train_extra_a_command_says_what_to_install(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from mjxball.baselines import LAWS
 from mjxball.plotting import (
     COLOURS,
     FREE,
+    GREEN,
     INK,
     LOOKS,
     SIMULATED,
@@ -27,6 +28,7 @@ from mjxball.plotting import (
     style,
 )
 from mjxball.policy.file import shipped_policies
+from mjxball.view.page import AXES, DRONES, PARTS, SCENE
 
 # Of linear RGB, severity 1: Machado, Oliveira and Fernandes, "A physiologically-based model for simulation of color
 # vision deficiency", 2009, https://doi.org/10.1109/TVCG.2009.113.
@@ -98,6 +100,16 @@ def test_followers_of_one_dash_differ_in_colour_for_the_colour_blind() -> None:
                 assert ciede2000(lab(one, sight), lab(other, sight)) > LEAST, (one, other, sight)
 
 
+def test_what_the_viewer_draws_together_differs_for_the_colour_blind() -> None:
+    style_sheet = (PARTS / "style.css").read_text()
+    bad = re.findall(r"--bad: light-dark\((\S+), (\S+)\)", style_sheet)[0]
+    groups = [DRONES, AXES, SCENE, *({"good": GREEN, "bad": one} for one in bad)]
+    for group in groups:
+        for (name, one), (other, two) in itertools.combinations(group.items(), 2):
+            for sight in SIGHT:
+                assert ciede2000(lab(one, sight), lab(two, sight)) > LEAST, (name, other, sight)
+
+
 def test_colours_are_seen_on_light_and_dark_pages() -> None:
     for page in PAGES:
         assert min(contrast(colour, page) for colour in COLOURS) > 3  # WCAG 2: graphics
@@ -109,9 +121,11 @@ def test_every_follower_that_has_a_name_has_a_look() -> None:
     shared = follower_styles(LOOKS)
     assert all(follower_styles([name])[name] == shared[name] for name in LOOKS)
     named = follower_styles(["flight, flown", "balance (FORCED)", SIMULATED])
-    assert named["flight, flown"] == shared["flight"]
-    assert named["balance (FORCED)"] == shared["balance"]
-    assert named[SIMULATED]["zorder"] < 2  # below a flown flight
+    for name, own in (("flight, flown", "flight"), ("balance (FORCED)", "balance")):
+        assert {**named[name], "linewidth": shared[own]["linewidth"]} == shared[own]
+    for name in set(named) - {SIMULATED}:  # what was flown is seen upon the same curve, simulated
+        assert named[name]["linewidth"] * 4 < named[SIMULATED]["linewidth"]
+    assert named[SIMULATED]["zorder"] < 2
 
 
 def test_other_names_have_looks_of_their_own() -> None:

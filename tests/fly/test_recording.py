@@ -67,6 +67,17 @@ def test_the_log_holds_the_flight(recording: Recording) -> None:
     np.testing.assert_allclose(recording.rotor_force[~flying][-1], 0.0)
 
 
+def test_the_goal_is_shown_as_it_was_before_the_landing(recording: Recording) -> None:
+    """The one that steers a landing sinks below the ground."""
+    landing = np.array(recording.phase) == "land"
+    assert recording.goal[landing, 2].min() < recording.position[0, 2]
+    np.testing.assert_allclose(
+        recording.target[landing], np.broadcast_to([0.1, 0.0, 0.4], (landing.sum(), 3)), atol=0.01
+    )
+    np.testing.assert_array_equal(recording.target[~landing][:10], recording.goal[~landing][:10])
+    assert np.flatnonzero(landing)[0] == recording.guided_rows
+
+
 def test_the_same_commands_fly_the_same_way(recording: Recording) -> None:
     """The recorded setpoints alone, with no law that sees where it is, end where the flight ended."""
     again = fly_again(recording, OLDER)

@@ -222,12 +222,30 @@ def test_dark_as_the_system_is_until_it_is_switched(browser: Any, page: Path) ->
     tab.close()
 
 
+def test_numbers_are_for_people(tab: Any) -> None:
+    """No exponents, no negative zeros; ticks have room beside their plot, those of a line of zeros as well."""
+    assert tab.evaluate("[fixed(7.51e-9, 0.01), fixed(-1e-9, 0.1), fixed(-1.26, 0.1)]") == ["0.00", "0.0", "−1.3"]
+    assert tab.evaluate("[short(0.2084), short(1e-4), short(20)]") == ["0.208", "0.0001", "20"]
+    assert tab.evaluate("ticks(1000, 1002, 2).map(([, text]) => text)") == ["1000", "1001", "1002"]
+    widest = """([low, high]) => {
+        const c = document.createElement('canvas').getContext('2d');
+        c.font = '11px system-ui, sans-serif';
+        const plot = { least: low, most: high, peers: [] };
+        plot.peers.push(plot);
+        Plot.prototype.range.call(plot);
+        return Math.max(...ticks(plot.low, plot.high, 3).map(([, text]) => c.measureText(text).width)) - LEFT;
+    }"""
+    for low, high in ((0.0, 0.0), (-1e-7, 1e-7), (-0.3, 0.2), (-1e4, 1e4)):
+        assert tab.evaluate(widest, [low, high]) < -6, (low, high)
+
+
 def test_the_goal_is_behind_the_load(browser: Any, flight: Flight, tmp_path: Path) -> None:
     """Where the object is at its goal: thin lines alone, and every face of the team is painted after them."""
     there = dataclasses.replace(flight, arrays={**flight.arrays, "target": flight["position"]})
     tab = opened(browser, written(tmp_path, there), 1000)
     order = tab.evaluate(
         """() => { const [{ scene }] = player.panes, { paintOne } = scene, found = [];
+            palette.set('goal', 'rgb(1, 2, 3)');
             scene.paintOne = function (part) { found.push([part.line === colour('goal'), Boolean(part.fill),
                 part.name === 'goal', part.width]); };
             scene.draw(100);

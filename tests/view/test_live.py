@@ -78,7 +78,7 @@ def test_rows_are_the_recording(lines: list[bytes], tmp_path: Path) -> None:
     for name, wanted in (
         ("position", recording.position),
         ("quaternion", recording.quaternion),
-        ("target", recording.goal),
+        ("target", recording.target),
         ("thrust", recording.rotor_force.sum(axis=-1)),
         ("follower_command", np.nan_to_num(recording.follower)),
     ):

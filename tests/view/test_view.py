@@ -244,7 +244,8 @@ def test_controls(tab: Any):
     assert stopped != 2.0
     plot = tab.locator(".plot canvas").first
     box = plot.bounding_box()
-    plot.click(position={"x": 46 + 0.25 * (box["width"] - 54), "y": 40})
+    left, right = tab.evaluate("[LEFT, RIGHT]")
+    plot.click(position={"x": left + 0.25 * (box["width"] - left - right), "y": 40})
     assert tab.evaluate("player.now") == pytest.approx(0.25 * SECONDS, abs=SECONDS / 100)  # a pixel or two
     before = tab.evaluate("player.camera.azimuth")
     scene = tab.locator(".view canvas").bounding_box()

@@ -61,11 +61,16 @@ class Flight {
     return most;
   }
 
-  // Name of the colour of drone number `drone`, in the scene and in the plots.
-  colour(drone) {
+  // The leader is 0, followers are 1, 2 ... in order.
+  place(drone) {
     const { leader } = this.plant;
-    return drone === leader ? 'leader' : `follower-${(drone < leader ? drone : drone - 1) % 8}`;
+    return drone === leader ? 0 : drone + (drone < leader);
   }
+
+  // Name of the colour of drone number `drone`, in the scene and in the plots, and its dash there, the leader's too.
+  colour(drone) { return `drone-${this.place(drone) % 6}`; }
+
+  dash(drone) { return this.place(drone) === 0 ? [5, 3] : this.place(drone) > 5 ? [2, 2] : []; }
 
   bounds() {
     const low = [Infinity, Infinity, Infinity], high = low.map((v) => -v);

@@ -8,12 +8,12 @@ const DEGREES = 180 / Math.PI;
 function recipes(flight) {
   const line = (name, its, value, dash) => ({ name, colour: its, value, dash });
   const { leader, axes: along } = flight.plant;
-  const drones = flight.plant.drones.map(({ name }, drone) => [name, flight.colour(drone)]);
-  const command = (index, factor) => drones.map(([name, its], drone) => (drone === leader
-    ? line(name, its, (row) => factor * flight.get('leader_command', row, index), [5, 3])
-    : line(name, its, (row) => factor
-      * flight.get('follower_command', row, 3 * (drone < leader ? drone : drone - 1) + index))));
-  const of = (array) => drones.map(([name, its], k) => line(name, its, (row) => flight.get(array, row, k)));
+  const drones = (value) => flight.plant.drones.map(({ name }, drone) =>
+    line(name, flight.colour(drone), (row) => value(row, drone), flight.dash(drone)));
+  const command = (index, factor) => drones((row, drone) => factor * (drone === leader
+    ? flight.get('leader_command', row, index)
+    : flight.get('follower_command', row, 3 * (flight.place(drone) - 1) + index)));
+  const of = (array) => drones((row, drone) => flight.get(array, row, drone));
   const found = [];
   const plot = (needed, title, unit, series) => {
     if (flight.has(needed)) found.push({ title, unit, series: series() });
@@ -31,7 +31,7 @@ function recipes(flight) {
   plot('leader_command', 'Commanded vertical acceleration', 'm/s²', () => command(2, 1));
   plot('thrust', 'Thrust', 'N', () => of('thrust'));
   plot('contact_force', 'Contact force on the object', 'N', () =>
-    drones.map(([name, its], drone) => line(name, its, (row) => flight.push(row, drone))));
+    drones((row, drone) => flight.push(row, drone)));
   plot('hidden', 'What the follower’s network remembers', 'units, −1 blue to 1 red', () =>
     [{ name: '', colour: 'none', array: 'hidden', units: flight.width('hidden'), value: () => 0 }]);
   plot('battery', 'Battery', 'V', () => of('battery'));
@@ -85,7 +85,7 @@ class Pane {
     this.tell('error', `${Math.hypot(...[0, 1, 2].map((k) => flight.error(row, k))).toFixed(3)} m`);
     this.tell('tilt', `${(DEGREES * Math.hypot(roll, pitch)).toFixed(1)}°`);
     if (flight.has('cg_offset')) {
-      const offset = flight.at('cg_offset', row).map((c) => (100 * c).toFixed(1).replace('-', '−'));
+      const offset = flight.at('cg_offset', row).map((c) => fixed(100 * c, 0.1));
       this.tell('cg', `${offset.join(', ')} cm`);
     }
     this.phase.hidden = !phase;

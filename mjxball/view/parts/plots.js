@@ -1,16 +1,24 @@
 // Time plots: lines over time with a cursor; click or drag to seek.
-const LEFT = 46, RIGHT = 8, TOP = 6, BOTTOM = 18;
+const LEFT = 54, RIGHT = 8, TOP = 6, BOTTOM = 18;
+const LEAST = 1e-3;  // of a y-range, in the plot's unit: rounding errors must not look like motion
 
-// About `count` round numbers between low and high, two at least.
+// About `count` round numbers between low and high, two at least, each with its text.
 function ticks(low, high, count) {
   const raw = (high - low) / count, power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].map((k) => k * power).find((k) => k >= raw * 0.999);
   const found = [];
   for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) found.push(k * step);
-  return found.length > 1 || count > 10 ? found : ticks(low, high, 2 * count);
+  return found.length > 1 || count > 10 ? found.map((v) => [v, fixed(v, step)]) : ticks(low, high, 2 * count);
 }
 
-const short = (value) => String(+value.toPrecision(3)).replace('-', '−');
+// `value` with the decimals that steps of `step` have.
+function fixed(value, step) {
+  const text = value.toFixed(clamp(Math.ceil(-Math.log10(step) - 1e-9), 0, 9));
+  return (+text ? text : text.replace('-', '')).replace('-', '−');
+}
+
+// Three digits, of a positive number.
+const short = (value) => String(+value.toPrecision(3));
 
 // Names are text: nothing is written as HTML.
 function element(kind, text = '', className = '') {
@@ -96,7 +104,8 @@ class Plot {
     if (this.pinned) return;
     const low = Math.min(...this.peers.map((plot) => plot.least));
     const high = Math.max(...this.peers.map((plot) => plot.most));
-    const margin = Math.max(0.06 * (high - low), 1e-3 * Math.max(Math.abs(low), Math.abs(high)), 1e-6);
+    const size = Math.max(Math.abs(low), Math.abs(high));
+    const margin = Math.max(0.06 * (high - low), (LEAST - high + low) / 2, 1e-3 * size);
     [this.low, this.high] = [low - margin, high + margin];
   }
 
@@ -132,14 +141,14 @@ class Plot {
     c.strokeStyle = colour('grid');
     c.textAlign = 'right';
     c.textBaseline = 'middle';
-    for (const v of ticks(low, high, 3)) {
+    for (const [v, text] of ticks(low, high, 3)) {
       c.beginPath(); c.moveTo(LEFT, y(v)); c.lineTo(width - RIGHT, y(v)); c.stroke();
-      c.fillText(short(v), LEFT - 6, y(v));
+      c.fillText(text, LEFT - 6, y(v));
     }
     c.textAlign = 'center';
     const marks = ticks(from, to, Math.max(2, width / 90));
-    marks.forEach((t, k) => {
-      c.fillText(short(t) + (k === marks.length - 1 ? ' s' : ''), Math.min(this.x(t), width - 14), height - 7);
+    marks.forEach(([t, text], k) => {
+      c.fillText(text + (k === marks.length - 1 ? ' s' : ''), Math.min(this.x(t), width - 14), height - 7);
     });
     c.beginPath(); c.rect(LEFT, 0, width - LEFT - RIGHT, height); c.clip();
     const phasesFirst = [...this.flight.marks].sort((a, b) => (b.kind === 'phase') - (a.kind === 'phase'));
@@ -181,7 +190,10 @@ class Plot {
 
   // The numbers of the legend. Call once all is drawn: to write text between two drawings would lay the page out twice.
   read(row) {
-    this.series.forEach(({ value, units }, k) => { this.readouts[k].textContent = units ? '' : short(value(row)); });
+    const step = Math.max(1e-4, 10 ** (Math.floor(Math.log10(this.high - this.low)) - 3));
+    this.series.forEach(({ value, units }, k) => {
+      this.readouts[k].textContent = units ? '' : fixed(value(row), step);
+    });
   }
 }
 

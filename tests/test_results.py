@@ -1,0 +1,193 @@
+"""Numbers of docs/results.md, onboard.md and followers.md are those of the files that they name."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from command_line import REPOSITORY
+from tables import rows
+
+Numbers = list[Any]  # in the order of a row; None: never
+
+
+def measured(name: str) -> Any:
+    return json.loads((REPOSITORY / "benchmarks" / "results" / f"{name}.json").read_text())
+
+
+def one(found: list[dict[str, Any]], **given: Any) -> dict[str, Any]:
+    (row,) = (row for row in found if all(row.get(key) == value for key, value in given.items()))
+    return row
+
+
+def cells() -> Iterator[tuple[str, Numbers]]:
+    found = measured("balance_cells")["summaries"]
+    wheres = [f"mass known, {kind}" for kind in ("undisturbed", "noise and 40 ms")]
+    wheres += [f"mass unknown, {kind}, trimmed by the follower alone" for kind in ("undisturbed", "noise and 40 ms")]
+    for name in ("balance", "sac", "mpc", "pid", "observer", "lqg-offset-free", "copy"):
+        own = [one(found, where=where, policy=name) for where in wheres]
+        yield name, [number for row in own for number in (row["all four"], 1e3 * row["median peaks"]["policy"])]
+
+
+def levels() -> Iterator[tuple[str, Numbers]]:
+    own = one(measured("balance_seeds")["rows"], policy="seed1.npz")
+    for row, name in (("[peak]", "peak"), ("RMSE", "rmse"), ("smallest settling", "settling_time")):
+        yield row, [own["reached"][name], len(own["levels"])]
+    yield "beyond trim", [number for pair in own["beyond trim"] for number in pair]
+
+
+def seeds() -> Iterator[tuple[str, Numbers]]:
+    found = measured("balance_seeds")["rows"]
+    yield "cases met", np.min([row["cells"] for row in found], axis=0).tolist()
+    flights = [flown for row in found for flown in row["flights"]]
+    yield "failed", [max(flown["failed"] for flown in flights)]
+    yield "99 % of", [1e3 * max(flown["99 %"] for flown in flights)]
+
+
+def stability() -> Iterator[tuple[str, Numbers]]:
+    found = measured("balance_stability")
+    own = [row for row in found["hovers"] if row["follower"] == "balance" and not row.get("unknown")]
+    worst = [max(row["radius"] for row in own), 1e3 * min(row["delay_margin"] for row in own)]
+    error = 1e3 * max(row["error"] for row in own)
+    peaks = [1e3 * found["peaks [m]"][name] for name in ("median", "99 %", "largest")]
+    yield "22 of 22", [*worst, error, found["failed"], *peaks]
+
+
+def teams() -> Iterator[tuple[str, Numbers]]:
+    found = measured("teams")["rows"]
+    for drones in range(2, 7):
+        ours, offset, lqg = (
+            one(found, drones=drones, follower=name) for name in ("universal", "lqg-offset-free", "lqg")
+        )
+        three = (ours, offset, lqg)
+        met = [100 * row["both"] for row in (ours, offset)]
+        peaks = [1e3 * row["plane_peak_median"] for row in three]
+        yield f"{drones}", [*met, *peaks, *(row["settling_median"] for row in three)]
+
+
+def rigs() -> Iterator[tuple[str, Numbers]]:
+    found = measured("rigs")
+    for drones in range(2, 7):
+        three = [
+            one(found["rows"], drones=drones, follower=name)
+            for name in ("universal", "lqg-known-rig", "lqg-slow-known-rig")
+        ]
+        ours, failed = three[0], [100 * row["failed"] for row in three]
+        peaks = [1e3 * row["peak_50"] for row in three]
+        alone = ours["crashed_alone_flights"]
+        yield f"{drones}", [*failed, alone, 100 * ours["met"], 100 * ours["sooner"], *peaks]
+    for seed in ("5101", "5102"):
+        every = measured("rigs_fresh")[f"seed {seed}"]["all"]
+        names = ("universal", "lqg-known-rig", "lqg-slow-known-rig")
+        yield f"300, seed {seed}", [100 * every[name]["met"] for name in names]
+
+
+def minutes() -> Iterator[tuple[str, Numbers]]:
+    found = [row for row in measured("horizon")["rows"] if row["seconds"] == 600]
+    for name, policy, plant in (
+        *((name, name, "paper") for name in ("balance", "sac")),
+        *((name, "universal", name) for name in ("pair", "team3", "team4", "team6")),
+    ):
+        own = [row for row in found if (row["policy"], row["plant"]) == (policy, plant)]
+        peak = max(row[f"{axis}_peak"] for row in own for axis in "xyz")
+        spread = [row["command_spread"] for row in own if row["command_spread"] is not None]
+        yield (
+            "`universal`, pair" if name == "pair" else name,
+            [1e3 * peak, max(row["rotor_power"] for row in own), *([max(spread)] if spread else [])],
+        )
+
+
+def training() -> Iterator[tuple[str, Numbers]]:
+    for place, name in (("one H200", "training_h200"), ("two cores: `train", "training_2_cores")):
+        (own,) = measured(name)["summary"]["ours"]
+        yield place, [own["cold"], own["warm"], own["x_peak"], own["settling_time"]]
+
+
+def algorithms() -> Iterator[tuple[str, Numbers]]:
+    for places, name in (
+        (("H200: SAC", "PPO", "gradients, on"), "algorithms_h200"),
+        (("two cores: SAC", "PPO", "gradients |"), "algorithms_2_cores"),
+    ):
+        for place, algorithm in zip(places, ("sac", "ppo", "gradient"), strict=True):
+            own = one(measured(name)["table"], algorithm=algorithm)
+            far = [1e3 * own["x_peak"], 1e3 * own["x_peak_worst"]]
+            yield place, [own["cold"], own["warm"], *far, own["settling_time"], own["settling_time_worst"]]
+
+
+def crazyflies() -> Iterator[tuple[str, Numbers]]:
+    for row in measured("crazyflie")["flight"]:
+        yield row["follower"], [row["crashes"], row["rmse"], row["rmse, worst of 99 %"]]
+
+
+def onboard() -> Iterator[tuple[str, Numbers]]:
+    found = measured("onboard")["inference"]
+    names = {"`balance` with": "balance, 20 units (seed 1 of six, not shipped)"}
+    for name in ("universal", "balance", "`balance` with", "flight"):
+        own = [one(found, policy=names.get(name, name), weights=weights) for weights in ("float32", "int8")]
+        yield name, [*(number for row in own for number in (row["flash"] / 1e3, row["ms"])), own[1]["error_rms"]]
+
+
+SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
+    "Against classical followers": ("results", cells),
+    "Benchmark": ("results", levels),
+    "All seeds": ("results", seeds),
+    "Stability": ("results", stability),
+    "Teams": ("results", teams),
+    "Any rig": ("results", rigs),
+    "Ten minutes": ("results", minutes),
+    "Training time": ("results", training),
+    "Training time ": ("results", algorithms),
+    "Two Crazyflies": ("results", crazyflies),
+    "Cost and tests": ("onboard", onboard),
+}
+
+
+@rows("section", SECTIONS)
+def test_a_table_is_that_of_its_file(section: str) -> None:
+    page, wanted = SECTIONS[section]
+    text = (
+        (REPOSITORY / "docs" / f"{page}.md").read_text().partition(f"## {section.strip()}\n")[2].partition("\n## ")[0]
+    )
+    lines = [line.replace("**", "") for line in text.splitlines() if line.startswith("| ")]
+    for name, numbers in wanted():
+        found = [line for line in lines if line.startswith((f"| {name}", f"| `{name}`"))]
+        assert found, name
+        assert any(agree(line, numbers) for line in found), (name, numbers, found)
+
+
+def agree(line: str, numbers: Numbers) -> bool:
+    """The row has these numbers, rounded to its digits, in this order; others may follow or stand before the first."""
+    cells = line.partition(" | ")[2]
+    shown = re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*\w)", cells)
+    return len(shown) >= len(numbers) and all(
+        abs(float(text) - number) <= 0.5001 * 10.0 ** -len(text.partition(".")[2]) if number is not None else True
+        for text, number in zip(shown, numbers, strict=False)
+    )
+
+
+@rows("policy", ("balance", "paper", "flight", "flight-upgrade", "flight-brushless", "stand", "universal"))
+def test_what_was_flown_for_ten_minutes(policy: str) -> None:
+    """Every number of millimetres is the largest error in a flight of this policy."""
+    text = (REPOSITORY / "docs" / "followers.md").read_text()
+    (row,) = re.findall(rf"^\| `{policy}` \| (.*?) \|", text.partition("steady for ten minutes")[2], flags=re.MULTILINE)
+    own = [row for row in measured("horizon")["rows"] if row["policy"] == policy]
+    peaks = [1e3 * max(row[f"{axis}_peak"] or 0.0 for axis in "xyz") for row in own]
+    shown = re.findall(r"(?:from )?([\d.]+)(?: to ([\d.]+))? mm", row)
+    assert shown
+    for number in filter(None, sum(shown, ())):
+        assert any(agree(f" | {number}", [peak]) for peak in peaks), (number, peaks)
+
+
+def test_hover_on_board() -> None:
+    text = (REPOSITORY / "docs" / "onboard.md").read_text()
+    said = re.search(r"within (\S+) mm rms on board.*? within (\S+) to (\S+) mm", text, flags=re.DOTALL)
+    assert said is not None
+    found = measured("onboard_flights")
+    hovers = [row for row in found["delay"] if row["policy"] == "flight"]
+    on_board = max(row["rmse"] for row in hovers if row["case"] != "laptop")
+    laptop = [row["rmse"] for row in hovers if row["case"] == "laptop"]
+    assert agree(" | " + " ".join(said.groups()), [on_board, min(laptop), max(laptop)])
+    assert f"Under {len({row['fault'] for row in found['faults']})} faults" in text
