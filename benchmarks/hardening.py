@@ -33,7 +33,7 @@ from mjxball.commands import evaluate, train
 from mjxball.fly import main as fly
 from mjxball.policy.file import shipped_policy
 from mjxball.rig import gains, identify
-from mjxball.view import command as view
+from mjxball.view import main as view
 
 LINES, SECONDS, MEMORY = 250, 20.0, 3.0e9  # [s] of a line, [bytes] resident at most
 POLL = 0.05  # [s]

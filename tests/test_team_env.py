@@ -149,8 +149,8 @@ def drawn() -> tuple[Config, Any, Any, Any]:
     config = settings(
         scenario__drone_mass_scale=(0.8, 1.2), scenario__mount_scale=(0.8, 1.2), scenario__lost_follower_probability=0.5
     )
-    draw = jax.jit(jax.vmap(ResetDistribution(config).draw, in_axes=(0, None, 0)))
-    load, plant, _, rig = draw(jax.random.split(jax.random.key(0), 400), 1.0, jnp.arange(400))
+    draw = jax.jit(jax.vmap(ResetDistribution(config).draw))
+    load, plant, _, rig = draw(jax.random.split(jax.random.key(0), 400), jnp.arange(400))
     assert rig is not None
     return config, load, plant, rig
 
@@ -252,7 +252,7 @@ class TestAgents:
         step = jax.jit(environments.step)
         envs, transition = step(environments.begin(states), action, jax.random.PRNGKey(1))
         world = jax.tree.map(lambda leaf: leaf[3], states.pipeline_state)
-        one = blank(env, 1.0, 3).replace(pipeline_state=world, obs=states.obs[6:])
+        one = blank(env, 3).replace(pipeline_state=world, obs=states.obs[6:])
         alone = jax.jit(env.step)(one, action[6:])
         np.testing.assert_allclose(transition.next_observation[6:], alone.obs, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(transition.reward[6:], alone.reward, rtol=1e-4)

@@ -51,7 +51,7 @@ from mjxball.xla import check_address_space, compile_small_loops_whole, enable_c
 # What `--help` shows of the settings; `--help all` has the rest.
 COMMON = (
     *("scenario.cg_speed", "scenario.cg_amplitude", "scenario.object_mass", "scenario.noise", "scenario.delay"),
-    *("follower.action_scale_tilt", "follower.history", "follower.recurrent_units", "reward.kind"),
+    *("follower.action_scale_tilt", "follower.recurrent_units", "reward.kind"),
     *("sac.total_steps", "sac.num_envs", "sac.learning_rate", "ppo.total_steps", "ppo.num_envs", "ppo.learning_rate"),
     *("gradient.gradient_steps", "gradient.num_envs", "gradient.learning_rate"),
 )

@@ -27,11 +27,11 @@ from mjxball.sim.rollout import simulate
 BALANCE = REPOSITORY / "policies" / "balance.npz"
 # The scenarios and plants of draw 0, as text. Another hash is another version of the benchmark.
 FROZEN = {
-    "pair": "a0cce6ed3c4be6a1",
-    "pair-unknown": "8d9811fd2c2d1e9f",
-    "team": "56226bc949f8775a",
-    "rigs": "23e14ba2e06abe65",
-    "crazyflie": "d2670ba291579c4c",
+    "pair": "edadcedf3bb0494b",
+    "pair-unknown": "b617b9ccfec753bc",
+    "team": "2b1d9ab0c706c442",
+    "rigs": "a1bafedbc81cfc2e",
+    "crazyflie": "3f598e64b92cc0f9",
 }
 SOURCE = """
 import numpy as np

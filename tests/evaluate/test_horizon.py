@@ -23,7 +23,7 @@ from mjxball.evaluate.policies import beyond_card, load_policy
 from mjxball.policy import Policy
 from mjxball.policy.file import load_file, save_file, shipped_policies, shipped_policy
 from mjxball.sim.scenario import Scenario
-from mjxball.view import command as view
+from mjxball.view import main as view
 
 CARD = {"flown": {"drones": [2, 3], "seconds": 60}}
 UNIVERSAL = shipped_policy("universal")
