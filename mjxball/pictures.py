@@ -64,11 +64,12 @@ def plan(
 ) -> str:
     """A rig from above, x to the right: its box, and each drone with the reach of its rotors; the leader filled.
 
-    An ellipse with the half axes `held` (x, y) shows where the load's CG may rest.
+    With `held` it is a page's picture: drones have numbers, there is a scale, and an ellipse with these half axes
+    (x, y) shows where the load's CG may rest [m].
     """
     places = [(float(mount[0]), float(mount[1])) for mount in mounts]
     reach = max([*(max(abs(x), abs(y)) + arm for (x, y), arm in zip(places, arms, strict=True)), *edges[:2], 1e-9])
-    size = 150.0
+    size = 480.0 if held else 150.0
     scale = 0.46 * size / reach
 
     def at(x: float, y: float) -> tuple[float, float]:
@@ -81,11 +82,23 @@ def plan(
         cx, cy = at(x, y)
         look = f'fill="{COLOURS[0]}" fill-opacity="{0.6 if number == leader else 0.1}" stroke="{COLOURS[0]}"'
         parts.append(f'<circle cx="{cx:.1f}" cy="{cy:.1f}" r="{scale * arm:.1f}" {look}/>')
-    if held:
-        rx, ry = (max(scale * half, 1.0) for half in held)
-        middle, look = size / 2, f'fill="{COLOURS[1]}" fill-opacity="0.5"'
-        parts.append(f'<ellipse cx="{middle:.1f}" cy="{middle:.1f}" rx="{rx:.1f}" ry="{ry:.1f}" {look}/>')
-    return _svg(int(size), int(size), parts)
+        if held:
+            called = f"{number} leads" if number == leader else str(number)
+            above = cy - scale * arm - 6
+            parts.append(f'<text x="{cx:.1f}" y="{above:.1f}" text-anchor="middle" {SMALL}>{called}</text>')
+    if not held:
+        return _svg(int(size), int(size), parts)
+    rx, ry = (max(scale * half, 1.5) for half in held)
+    middle, look = size / 2, f'fill="{COLOURS[1]}" fill-opacity="0.5"'
+    parts.append(f'<ellipse cx="{middle:.1f}" cy="{middle:.1f}" rx="{rx:.1f}" ry="{ry:.1f}" {look}/>')
+    length = 10.0 ** math.floor(math.log10(0.5 * reach))
+    foot = f"the CG may rest within {max(held):.3g} m of O, brown"
+    parts += [
+        f'<path d="M10 {size + 14:.0f} h{scale * length:.1f}" stroke="{COLOURS[0]}" stroke-width="2"/>',
+        f'<text x="10" y="{size + 30:.0f}" {SMALL}>{length:g} m</text>',
+        f'<text x="{size - 10:.0f}" y="{size + 30:.0f}" text-anchor="end" {SMALL}>{foot}</text>',
+    ]
+    return _svg(int(size), int(size) + 40, parts)
 
 
 def card(title: str, facts: Mapping[str, object], picture: str = "") -> str:
