@@ -33,7 +33,7 @@ def train(
     algorithm: Any = None,
     overrides: Mapping[str, Any] | None = None,
     evaluate: bool = True,
-    progress: bool | Report | None = None,
+    on_progress: bool | Report | None = None,
 ) -> tuple[PolicyNetwork, dict[str, Array]]:
     """Train a follower from `key` (`jax.random.PRNGKey(seed)` gives the run of `train.py --seed`) without any file.
 
@@ -44,17 +44,19 @@ def train(
     (`num_evaluations`,): `steps`, `episode_return` (exploring), the algorithm's metrics, `eval_return`, and the
     means of the environment's metrics as `eval_<name>`. Without `evaluate` it trains in one stretch, and what is named
     `eval_` holds nothing. `mjxball.train.compilation.compiler_options()` are the options with which `train.py` compiles
-    sooner. `jax.shard_map` of it needs `check_vma=False`. `progress`: True for a live curve in a notebook, which is the
-    default there, or a function that is told how it goes (`live.Report`); then it cannot be traced, and steps in turns;
-    Ctrl-C ends it with the policy and the metrics so far.
+    sooner. `jax.shard_map` of it needs `check_vma=False`. `on_progress`: True for a live curve in a notebook, which is
+    the default there, or a function that is told how it goes (`live.Report`); then it cannot be traced, and steps in
+    turns; Ctrl-C ends it with the policy and the metrics so far.
     Raises InputError if one of them does not fit.
     """
     traced = any(isinstance(value, jax.core.Tracer) for value in (key, *(overrides or {}).values()))
-    if traced and progress:
-        raise InputError("train() is traced, by jax.jit or jax.vmap, and cannot show its progress: leave progress out")
-    if progress is None:
-        progress = in_notebook() and not traced
-    report = progress if callable(progress) else LiveCurve(f"training {config.preset}") if progress else None
+    if traced and on_progress:
+        raise InputError(
+            "train() is traced, by jax.jit or jax.vmap, and cannot show its progress: leave on_progress out"
+        )
+    if on_progress is None:
+        on_progress = in_notebook() and not traced
+    report = on_progress if callable(on_progress) else LiveCurve(f"training {config.preset}") if on_progress else None
     with jax.enable_x64(False):  # float32 throughout, also where the user's own program is not
         return _train(config, key, physics, Extensions(env, reward, algorithm), overrides, evaluate, report)
 

@@ -104,8 +104,8 @@ def test_progress_is_told_and_changes_nothing(short: Config) -> None:
 
     said: list[Any] = []
     key = jax.random.PRNGKey(0)
-    quiet, expected = train(short, key, physics="newton-euler", progress=False)
-    told, found = train(short, key, physics="newton-euler", progress=said.append)
+    quiet, expected = train(short, key, physics="newton-euler", on_progress=False)
+    told, found = train(short, key, physics="newton-euler", on_progress=said.append)
     for name, values in expected.items():
         np.testing.assert_allclose(found[name], values, rtol=2e-5, err_msg=name)  # sums in another order
     seen = np.linspace(-0.5, 0.5, 18, dtype=np.float32)
@@ -117,7 +117,7 @@ def test_progress_is_told_and_changes_nothing(short: Config) -> None:
     np.testing.assert_allclose(evaluated, expected["eval_return"], rtol=2e-5)
     assert sum("episode_return" in one for one in said) > len(evaluated)
     with pytest.raises(InputError, match="traced"):
-        jax.jit(lambda key: train(short, key, physics="newton-euler", progress=True))(key)
+        jax.jit(lambda key: train(short, key, physics="newton-euler", on_progress=True))(key)
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_ctrl_c_leaves_the_policy_of_then(short: Config, capsys: pytest.CaptureF
         if len(told) == 4:
             raise KeyboardInterrupt
 
-    policy, metrics = train(short, jax.random.PRNGKey(0), physics="newton-euler", progress=interrupting)
+    policy, metrics = train(short, jax.random.PRNGKey(0), physics="newton-euler", on_progress=interrupting)
     assert 0 < told[-1] < short.sac.total_steps
     assert capsys.readouterr().err.startswith(f"stopped after {told[-1]:,.0f} of {short.sac.total_steps:,} steps")
     assert np.isfinite(policy(np.zeros(18, np.float32))).all()
@@ -143,7 +143,7 @@ def test_ctrl_c_leaves_the_policy_of_then(short: Config, capsys: pytest.CaptureF
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(short, jax.random.PRNGKey(0), physics="newton-euler", progress=at_once)
+        train(short, jax.random.PRNGKey(0), physics="newton-euler", on_progress=at_once)
 
 
 def test_no_notebook_here() -> None:
