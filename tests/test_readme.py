@@ -27,6 +27,8 @@ SHORTER = {
     "train.py --distributed": TRAINING,
     "train.py --plant": TRAINING,
     "--benchmark": "--tracks pair",
+    "--figures": "--physics newton-euler",
+    "eval.py policies/universal.npz": "--physics newton-euler",
     "--rehearse": "--seconds 5",
 }
 
