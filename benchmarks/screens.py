@@ -96,7 +96,8 @@ SEEN: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
 
 # Lines of code and output that end beyond their block, and on a wide page what has more lines than its text.
 CUT = """blocks => blocks.filter(block => {
-  const { paddingTop, paddingBottom, lineHeight } = getComputedStyle(block), wide = innerWidth > 1000;
+  const { paddingTop, paddingBottom, lineHeight } = getComputedStyle(block);
+  const wide = innerWidth > 1000 && !block.closest('details');
   const lines = (block.clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom)) / parseFloat(lineHeight);
   const broken = wide && Math.round(lines) > block.textContent.trimEnd().split('\\n').length;
   return block.scrollWidth > block.clientWidth || broken;
