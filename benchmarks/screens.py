@@ -12,31 +12,27 @@ breaks a line.
 from __future__ import annotations
 
 import argparse
-import fcntl
 import importlib.util
 import itertools
-import os
-import pty
 import re
-import select
 import shutil
-import struct
 import subprocess
 import sys
 import tempfile
-import termios
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-import pyte
-
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "tests"))
+from command_line import environment  # noqa: E402
+from pseudo_terminal import on_terminal  # noqa: E402
+
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
 WIDTHS, SCHEMES = (400, 1300), ("light", "dark")
-ROWS, LONGEST = 50, 600.0  # of a terminal; seconds that a program may take
+LONGEST = 600.0  # [s] that a program may take
+VARIABLES = {**environment(), "PYTHONPATH": str(ROOT)}
 ENGINE = ("--physics", "newton-euler")
 FLY = ("-m", "mjxball.fly", "flight", "--rehearse", "--seconds", "2")
 FAULT = ("--fault", "silent:leader@4")
@@ -100,60 +96,12 @@ SEEN: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
 
 # Lines of code and output that end beyond their block, and on a wide page what has more lines than its text.
 CUT = """blocks => blocks.filter(block => {
-  const { paddingTop, paddingBottom, lineHeight } = getComputedStyle(block), wide = innerWidth > 1000;
+  const { paddingTop, paddingBottom, lineHeight } = getComputedStyle(block);
+  const wide = innerWidth > 1000 && !block.closest('details');
   const lines = (block.clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom)) / parseFloat(lineHeight);
   const broken = wide && Math.round(lines) > block.textContent.trimEnd().split('\\n').length;
   return block.scrollWidth > block.clientWidth || broken;
 }).map(block => block.textContent.split('\\n')[0])"""
-
-
-class Terminal(pyte.HistoryScreen):
-    """A screen that counts the lines which it had to break."""
-
-    broken = 0
-
-    def draw(self, data: str) -> None:
-        """See `pyte.Screen.draw`."""
-        for letter in data:
-            self.broken += self.cursor.x == self.columns
-            super().draw(letter)
-
-    def everything(self) -> str:
-        """All lines, those that have left at the top included."""
-        gone = ["".join(line[x].data for x in range(self.columns)).rstrip() for line in self.history.top]
-        return "\n".join([*gone, *(line.rstrip() for line in self.display)]).rstrip() + "\n"
-
-
-def in_terminal(arguments: list[str], columns: int, kind: str, place: Path) -> tuple[str, int]:
-    """What the command `arguments` leaves in a terminal of `columns`, and how many lines that broke."""
-    screen = Terminal(columns, ROWS, history=5000)
-    stream, (ours, theirs) = pyte.ByteStream(screen), pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, columns, 0, 0))
-    with subprocess.Popen(
-        arguments, cwd=place, env=environment(kind), stdin=theirs, stdout=theirs, stderr=theirs
-    ) as program:
-        os.close(theirs)
-        end = time.monotonic() + LONGEST
-        while time.monotonic() < end:
-            readable, _, _ = select.select([ours], [], [], 0.5)
-            try:
-                data = os.read(ours, 1 << 16) if readable else b""
-            except OSError:  # the program has ended
-                break
-            if readable and not data:
-                break
-            stream.feed(data)
-        else:
-            program.kill()
-    os.close(ours)
-    return screen.everything(), screen.broken
-
-
-def environment(terminal: str) -> dict[str, str]:
-    """Of a program in a `terminal` of that kind, with the sources of this checkout."""
-    kept = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES", "NO_COLOR")}
-    own = {"TERM": terminal} if terminal else {}
-    return {**kept, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT), **own}
 
 
 def terminals(out: Path, only: list[str]) -> Iterator[str]:
@@ -162,7 +110,8 @@ def terminals(out: Path, only: list[str]) -> Iterator[str]:
         for label, (columns, kind) in TERMINALS.items():
             with tempfile.TemporaryDirectory() as place:
                 if columns:
-                    text, broken = in_terminal(words(PROGRAMS[name]), columns, kind, Path(place))
+                    seen = on_terminal(words(PROGRAMS[name]), columns, Path(place), kind)
+                    text, broken = f"{seen.text}\n", seen.wrapped
                 else:
                     text, broken = piped(PROGRAMS[name], Path(place)), 0
                     if "\x1b" in text:
@@ -187,7 +136,7 @@ def words(arguments: tuple[str, ...]) -> list[str]:
 
 def piped(arguments: tuple[str, ...], place: Path) -> str:
     """What Python with `arguments` prints where there is no terminal."""
-    command: dict[str, Any] = {"cwd": place, "env": environment(""), "text": True, "timeout": LONGEST}
+    command: dict[str, Any] = {"cwd": place, "env": VARIABLES, "text": True, "timeout": LONGEST}
     streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     return subprocess.run(words(arguments), check=False, **command, **streams).stdout
 
@@ -238,7 +187,7 @@ def pages(out: Path, site: Path | None, only: list[str]) -> Iterator[str]:
 def serving(arguments: tuple[str, ...], place: Path) -> Iterator[str]:
     """The address at which Python with `arguments` says that it serves."""
     streams: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    with subprocess.Popen(words(arguments), cwd=place, env=environment(""), text=True, **streams) as server:
+    with subprocess.Popen(words(arguments), cwd=place, env=VARIABLES, text=True, **streams) as server:
         yield next(found[0] for line in server.stdout or () if (found := re.search(r"http://[^\s/]+/?", line)))
         server.terminate()
 

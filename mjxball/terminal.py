@@ -141,13 +141,15 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[i
     """A table of `rows` below `heads`, in which a line break parts a name from its unit. Columns `words` hold words.
 
     Column `name` says what a row is of; what stands before it many rows have in common. On a terminal that is too
-    narrow words are folded; else what is common, or the name too, is a line above its rows, whichever shows more; what
-    does not fit then is left out from the right, and a line says what. Elsewhere a row is a line.
+    narrow words are folded; else what is common, or also the name and words behind it, is a line above its rows,
+    whichever shows more. What does not fit then is left out from the right, and a line says what. Elsewhere a row is
+    a line.
     """
     width = columns_of(sys.stdout) if sys.stdout.isatty() else 10_000
     cells = list(zip(heads, *rows, strict=True))
     shown = {0: _fitting(cells, words, width)}
-    shown |= {n: n + _fitting(cells[n:], (), width - len(INDENT)) for n in (name, name + 1)}
+    begins = (name, *(n + 1 for n in words if n >= name))
+    shown |= {n: n + _fitting(cells[n:], (), width - len(INDENT)) for n in begins}
     above = max(shown, key=lambda n: shown[n])
     end = shown[above]
     lines = _rendered(cells[above:end], [number - above for number in words], width)
