@@ -36,15 +36,18 @@ meets all of its own. Every load leaves 15 % of the rotors.
 
 `balance`, `sac`, `universal`, `flight` and `paper` are [shipped](followers.md#trained), `transport` and `robust`
 are in `policies/archive/`.
-`transport-sac` and `transport-ppo` are what `python train.py transport --physics newton-euler` comes to in a minute on
-two cores, the latter with `--algorithm ppo`. `brax-*`, `sb3-*` and `sbx-sac` are Brax's, Stable-Baselines3's and SBX's
-own SAC and PPO, of seed 0, in the same environment for as many steps: `python benchmarks/foreign_trainers.py sb3-sac
-sb3-sac.npz`. Their returns and CPU seconds: [other trainers](results.md#other-trainers).
-`balance-memoryless` is `balance` without its GRU and its last action, 219 CPU seconds of `python train.py balance
---algorithm gradient --follower.recurrent_units 0 --follower.previous_action false --gradient.policy_layers 64,64
---gradient.gradient_steps 500 --gradient.num_envs 64`. `memoryless` is a [classical law](followers.md). `raptor` is two
-policies of [RAPTOR](https://arxiv.org/abs/2509.11481), which command the rotors of leader and follower; `python
-benchmarks/raptor.py` flies them.
+`transport-sac`, `-ppo` and `-gradient` are what `python train.py transport --physics newton-euler --algorithm sac`,
+`ppo` or `gradient` comes to within a minute and a half on two cores. `brax-*`, `sb3-*` and `sbx-sac` are Brax's,
+Stable-Baselines3's and SBX's own SAC and PPO, of seed 0, in the same environment for as many steps: `python
+benchmarks/foreign_trainers.py sb3-sac sb3-sac.npz`. Their returns and CPU seconds: [other
+trainers](results.md#other-trainers). `balance-memoryless` is `balance` without its GRU and its last action, 219 CPU
+seconds of `python train.py balance --algorithm gradient --follower.recurrent_units 0 --follower.previous_action false
+--gradient.policy_layers 64,64 --gradient.gradient_steps 500 --gradient.num_envs 64`. `memoryless` is a [classical
+law](followers.md). `raptor` is two policies of [RAPTOR](https://arxiv.org/abs/2509.11481), which command the rotors of
+leader and follower; `python benchmarks/raptor.py` flies them.
+
+Entries of a track stand newest first, those of one day by their share met. `oracle` and `lqg-known-failures` are told
+what no follower can know, `stay` and `random` are no laws: they are not ranked.
 
 Columns: share met and its 95 % interval, flights that failed, median settling time, 90 % quantile of the peaks, time
 with a rotor at its limit, rms change of commands from step to step. A dash: never, or nothing to measure.

@@ -92,10 +92,9 @@ def site_of(extra: str, place: Path) -> Path:
 
 @pytest.fixture
 def here(tmp_path: Path) -> Path:
-    """A directory that looks like a checkout, with a rig of the reader's and a run to resume."""
+    """A directory that looks like a checkout."""
     for name in ("policies", "mjxball", "train.py", "eval.py"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
-    (tmp_path / "rig.toml").write_text((REPOSITORY / "mjxball/config/plants/team3.toml").read_text())
     return tmp_path
 
 

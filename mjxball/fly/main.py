@@ -59,7 +59,7 @@ WORSE = {  # once the motors turn: cflib connects over a good link only
 
 
 # What `--help` leaves to `--help all`, besides all of the groups `twin` and `thrust`.
-RARE = {"--upload", "--crazyflies", "--mocap-rate", "--mocap-std", "--mocap-option"}
+RARE = {"--upload", "--mocap-rate", "--mocap-std", "--mocap-option"}
 
 
 def make_parser() -> cli.Parser:
