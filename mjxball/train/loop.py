@@ -10,7 +10,7 @@ import jax
 
 from mjxball.train import processes
 from mjxball.train import program as programs
-from mjxball.train.population import Compiled, Population
+from mjxball.train.population import Carried, Compiled, Population
 from mjxball.train.program import Mode, Program, Statistics, TrainState
 
 if TYPE_CHECKING:
@@ -94,12 +94,13 @@ def advance(
     Results are there before the devices are done with them, unless they are CPUs. The arrays of `state` are used up.
     """
     phase, window = population.place_phase(mode.phase), population.program.algorithm.steps_per_collect
-    statistics, metrics, taken = population.no_statistics(), population.no_metrics(), 0
+    carried = Carried(state, population.no_statistics())
+    metrics, taken = population.no_metrics(), 0
     while taken < int(mode.steps):
-        state, statistics, keys = compiled.collect(state, statistics, phase)
+        keys = compiled.collect(carried, phase)
         if mode.phase.learning:
-            state, metrics = compiled.update(state, keys)
+            metrics = compiled.update(carried, keys)
         taken += window
         if pause():
             break
-    return Stretch(state, statistics, metrics, taken)
+    return Stretch(*carried.trees(), population.named(metrics), taken)

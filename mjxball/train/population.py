@@ -31,13 +31,27 @@ from mjxball.train.program import Program, Statistics, TrainState, report, train
 from mjxball.train.run_directory import Sweep, source_hash, versions
 
 
+class Carried:
+    """A state and its statistics as flat arrays, which compiled functions replace.
+
+    To take the trees apart and to build them again at every call would slow a GPU's training by a quarter.
+    """
+
+    def __init__(self, state: TrainState, statistics: Statistics):
+        self.arrays, self._structure = jax.tree.flatten((state, statistics))
+
+    def trees(self) -> tuple[TrainState, Statistics]:
+        """What they are now."""
+        return jax.tree.unflatten(self._structure, self.arrays)
+
+
 class Compiled(NamedTuple):
-    """`Program`'s functions for all members of a population. What they return replaces their arguments' arrays."""
+    """`Program`'s functions for all members of a population."""
 
     begin: Callable[[Any, Any], TrainState]  # (swept values, keys) -> `Program.begin`
     episodes: Callable[[Any, Any, Any], Any]  # (swept values, keys, training) -> `Program.episodes`
-    collect: Callable[[TrainState, Statistics, Phase], tuple[TrainState, Statistics, Array]]
-    update: Callable[[TrainState, Array], tuple[TrainState, Any]]
+    collect: Callable[[Carried, Phase], Array]  # -> keys for `update`
+    update: Callable[[Carried, Array], list[Array]]  # -> the algorithm's metrics, by name
     wait: Callable[[], Any]  # until all of them are compiled; raises what went wrong
 
 
@@ -133,14 +147,10 @@ class Population:
         return Compiled(
             begin[0] if begin else self._begin,
             episodes,
-            _of_trees(collect, 2),
-            lambda state, keys: self._named(_of_trees(update, 1)(state, keys)),
+            lambda carried, phase: collect(carried.arrays, *phase)[0],
+            lambda carried, keys: update(carried.arrays, keys),
             lambda: [*map(Future.result, pending)],
         )
-
-    def _named(self, updated: Any) -> tuple[TrainState, dict[str, Array]]:
-        state, *metrics = updated
-        return state, dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True))
 
     def _lower_here(self, creating: bool) -> Iterator[Any]:
         """collect, update, episodes and, if `creating`, begin on one device; `read_ahead` may have had the first."""
@@ -319,9 +329,13 @@ class Population:
         statistics = Statistics(zero, zero, dict.fromkeys(names, zero), dict.fromkeys(names, peak))
         return self._placed(statistics, self._statistics_spec)
 
-    def no_metrics(self) -> dict[str, Any]:
+    def no_metrics(self) -> list[Any]:
         """Of no update."""
-        return dict.fromkeys(self.program.algorithm.metrics, self.no_statistics().reward)
+        return [self.no_statistics().reward] * len(self.program.algorithm.metrics)
+
+    def named(self, metrics: Sequence[Any]) -> dict[str, Any]:
+        """Metrics of `Compiled.update` by name."""
+        return dict(zip(sorted(self.program.algorithm.metrics), metrics, strict=True))
 
     def _drawn(self) -> np.ndarray:
         """Something like the keys that a collection leaves for the update."""
@@ -376,17 +390,6 @@ class Population:
 def _when_ready(pending: Future[Callable[..., Any]]) -> Callable[..., Any]:
     def call(*arguments: Any) -> Any:
         return pending.result()(*arguments)
-
-    return call
-
-
-def _of_trees(run: Callable[..., list[Array]], carried: int) -> Callable[..., Any]:
-    """`run` of `Carrying.compile` as a function of trees, of which it replaces the first `carried`."""
-
-    def call(*arguments: Any) -> Any:
-        leaves, structure = jax.tree.flatten(arguments[:carried])
-        others = run(leaves, *jax.tree.leaves(arguments[carried:]))
-        return *jax.tree.unflatten(structure, leaves), *others
 
     return call
 
