@@ -56,6 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("out", type=Path, metavar="OUT.json")
     parser.add_argument("--draw", type=int, default=0, metavar="N", help="flights drawn anew (default 0)")
     options = parser.parse_args(arguments)
+    cli.output_file(options.out, ".json")
     try:
         from foundation_policy import Raptor
     except ImportError:

@@ -14,5 +14,9 @@ FOREIGN = (Exception, SystemExit)  # what a user's own module may raise: to leav
 
 def said(error: BaseException) -> str:
     """`error` of a user's own module in one line of printable text."""
-    text = "".join(letter if letter.isprintable() else " " for letter in str(error))
+    try:
+        told = str(error)
+    except FOREIGN:  # its own words, too, are somebody else's code
+        told = ""
+    text = "".join(letter if letter.isprintable() else " " for letter in told)
     return f"{type(error).__name__}: {' '.join(text.split())[:160]}"

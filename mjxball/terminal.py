@@ -49,9 +49,9 @@ def folded(text: str, columns: int) -> str:
     return textwrap.fill(text, columns, break_on_hyphens=False).replace("\xa0", " ")
 
 
-def fitted_to(stream: TextIO, text: str) -> str:
-    """`text` for `stream`: `folded` if that is a terminal."""
-    return folded(text, columns_of(stream)) if stream.isatty() else text
+def fitted_to(stream: TextIO | None, text: str) -> str:
+    """`text` for `stream`: `folded` if that is a terminal. Of a stream that is closed the program has None."""
+    return folded(text, columns_of(stream)) if stream and stream.isatty() else text
 
 
 def say(text: str) -> None:
@@ -61,7 +61,8 @@ def say(text: str) -> None:
 
 def warn(text: str) -> None:
     """The same on stderr."""
-    print(fitted_to(sys.stderr, text), file=sys.stderr, flush=True)  # noqa: T201
+    if sys.stderr:
+        print(fitted_to(sys.stderr, text), file=sys.stderr, flush=True)  # noqa: T201
 
 
 class Status:

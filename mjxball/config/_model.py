@@ -159,6 +159,9 @@ class _Tree:
             if body <= 0 or m.body_rootid[body] != self.root:
                 raise InputError(f"{self.beside} says rotors {name!r}, expected a site or body of what flies")
             place = d.site_xpos[site] if site >= 0 else d.xipos[body] if self.is_urdf else d.xpos[body]
+            axis = self.turn @ (d.site_xmat[site] if site >= 0 else d.xmat[body]).reshape(3, 3)[:, 2]
+            if self.is_urdf and (np.linalg.norm(axis[:2]) > UPRIGHT or axis[2] < 0):
+                raise InputError(f"rotor {name} points along {_words(axis)}, expected 0 0 1: z is up")
             found.append((body, Rotor(self._here(place))))
         return found
 

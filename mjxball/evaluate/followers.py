@@ -88,7 +88,7 @@ def answered(name: str, command: Any, observation: Any) -> np.ndarray:
     """`command` (..., 3) of follower `name` to `observation` (..., 18); InputError if it is none."""
     try:
         command = np.asarray(command, float)
-    except (TypeError, ValueError):
+    except FOREIGN:
         raise InputError(f"follower {name} answered {type(command).__name__}, no array of numbers") from None
     wanted = (*np.shape(observation)[:-1], 3)
     if command.shape != wanted:

@@ -20,7 +20,7 @@ from mjxball.files import read_text
 from mjxball.fly.limits import NAMES
 from mjxball.fly.telemetry import Rig
 
-LARGEST = 2**20  # [bytes]
+LARGEST, MOST_ALIASES = 2**20, 20  # [bytes]; of a file
 WRITTEN = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
 OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
 MERGE = "tag:yaml.org,2002:merge"  # the key <<
@@ -100,7 +100,7 @@ def read_pair(path: Path, leader: str | None = None, follower: str | None = None
     }
     names, chosen = _choose(path, list(flying), [leader, follower])
     found = [_robot(f"{path}: robot {name}", name, flying[name], types, data) for name in names]
-    if found[0].uri == found[1].uri:
+    if found[0].uri.casefold() == found[1].uri.casefold():
         raise InputError(f"{path}: {names[0]} and {names[1]} have one uri, {found[0].uri}; each drone needs its own")
     return CrazyswarmPair(path, (found[0], found[1]), chosen)
 
@@ -135,14 +135,22 @@ def _parsed(path: Path) -> Any:
     class Loader(yaml.SafeLoader):
         """YAML that says everything once."""
 
+        aliases = 0
+
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-            keys = [self.construct_object(key, deep=True) for key, _ in node.value if key.tag != MERGE]
-            twice = next((key for number, key in enumerate(keys) if key in keys[:number]), None)
-            if twice is not None:
-                raise ValueError(
-                    f"the key {str(twice)[:60]!r} stands twice in line {node.start_mark.line + 1} and after"
-                )
+            keys = set()
+            for key in (self.construct_object(key, deep=True) for key, _ in node.value if key.tag != MERGE):
+                if key in keys:
+                    where = node.start_mark.line + 1
+                    raise ValueError(f"the key {str(key)[:60]!r} stands twice in line {where} and after")
+                keys.add(key)
             return super().construct_mapping(node, deep)
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            self.aliases += self.check_event(yaml.AliasEvent)
+            if self.aliases > MOST_ALIASES:  # nested ones grow without bounds
+                raise ValueError(f"it has more than {MOST_ALIASES} aliases, *name")
+            return super().compose_node(parent, index)
 
     text = read_text(path, "Crazyswarm2 file", LARGEST)
     try:

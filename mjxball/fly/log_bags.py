@@ -47,9 +47,9 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
 
 
 def _files(path: Path) -> list[Path]:
-    if path.is_file() or (path / "metadata.yaml").exists():
+    if path.is_file() or (path / "metadata.yaml").is_file():
         return [path]
-    found = sorted(one for one in path.iterdir() if one.suffix in BAGS) if path.is_dir() else []
+    found = sorted(one for one in path.iterdir() if one.suffix in BAGS and one.is_file()) if path.is_dir() else []
     if not found:
         what = "is a folder without metadata.yaml, .mcap or .db3" if path.exists() else "does not exist"
         raise InputError(f"bag {path} {what}; expected a rosbag2 file or folder")

@@ -25,7 +25,7 @@ def read_cfclient(path: Path) -> Series:
 
 
 def _columns(folder: Path) -> dict[str, Samples]:
-    files = sorted(folder.glob("*.csv"))
+    files = sorted(file for file in folder.glob("*.csv") if file.is_file())
     if not files:
         raise InputError(f"{folder} holds no .csv; expected the files that cfclient wrote of this drone")
     return {name: samples for file in files for name, samples in _read_csv(file).items()}

@@ -29,6 +29,7 @@ UNKNOWN = "an unknown follower"  # name of the policy of a flight that another p
 LONGEST = 4 * 3600.0  # [s] of a recording
 NEEDED = ("position", "quaternion", "sent")
 DIFFERENT = 0.5  # share of the drones' distance by which they may be elsewhere than the rig says
+IMPOSSIBLE = 1e4  # of a position [m], a velocity [m/s], a rate [rad/s]
 UNEVEN = 0.1  # by which the length of an attitude's quaternion may differ from 1
 ALIKE = 0.5  # correlation of the two drones' rates from which on their clocks count as brought together
 
@@ -187,6 +188,9 @@ def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[
         derived.append("rates")
     if derived:
         remark(f"the {name}'s {' and '.join(derived)} are differences of its poses")
+    for what, values in (("position", position), ("velocity", velocity), ("rates", rates)):
+        if (largest := float(np.abs(values).max())) > IMPOSSIBLE:
+            raise InputError(f"the {name}'s {what} reaches {largest:.3g}, expected metres, m/s and rad/s")
     battery = _at(time, own["battery"])[:, 0] if "battery" in own else np.full(len(time), np.nan)
     rows = zip(position, velocity, quaternion, rates, battery, strict=True)
     return [(float(now), DroneState(*row[:4], 0, float(row[4]))) for now, row in zip(time, rows, strict=True)]

@@ -23,6 +23,7 @@ from mjxball.fly import packets
 from mjxball.fly.packets import Packet, Setpoint
 from mjxball.fly.process import Child
 from mjxball.fly.setpoints import LastKnownState, blind_shares
+from mjxball.terminal import warn
 
 FRAME = struct.Struct("<BHHfff")  # what is going on, then `LastKnownState`
 IDLE, FLYING, GOODBYE = 0, 1, 2
@@ -76,6 +77,7 @@ def watch(pipe: int, runner: int) -> tuple[LastKnownState, float] | None:
         if not readable:  # it hangs in the air: only its death frees the radio
             with contextlib.suppress(ProcessLookupError):
                 os.kill(runner, signal.SIGKILL)
+            warn(f"the watchdog heard nothing of the flight for {SILENCE:g} s and ended it; it brings both drones down")
             return seen, SILENCE
         received = os.read(pipe, 4096)
         if not received:

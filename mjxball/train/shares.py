@@ -27,7 +27,7 @@ SAME = ("physics", "seeds", "source_hash", "versions", "extensions", "extension_
 
 def read(text: str) -> tuple[int, int]:
     """(I, N) of the flag `--share I/N`; InputError unless I is one of 0 .. N - 1."""
-    found = re.fullmatch(r"(\d{1,4})/(\d{1,4})", text)
+    found = re.fullmatch(r"([0-9]{1,4})/([0-9]{1,4})", text)
     if not found or int(found[1]) >= int(found[2]):
         raise InputError(f"--share must be I/N with I = 0 .. N - 1, such as 0/8, not {text!r}")
     return int(found[1]), int(found[2])
@@ -86,7 +86,10 @@ def _share(run: Path, origin: dict[str, Any]) -> tuple[int, int]:
         or not 0 <= share[0] < share[1] <= MOST_MEMBERS
     ):
         raise InputError(f"{run} is no part of a population: it was not trained with --share I/N")
-    if (origin.get("extensions") or {}).get("env"):
+    extensions = origin.get("extensions") or {}
+    if not isinstance(extensions, dict):
+        raise InputError(f"{run} says extensions {extensions!r}, expected names")
+    if extensions.get("env"):
         raise InputError(f"{run} trained on an environment of its own, whose members are not compared")
     return share[0], share[1]
 
@@ -116,15 +119,18 @@ def _evaluations(run: Path, origin: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of `members.csv`, which a run of one member does not have. InputError unless the run came to its end."""
     rows: list[dict[str, Any]] = list(read_members(run))
     if origin["seeds"] == 1:
-        rows = [
-            {
-                "steps": int(row["steps"]),
-                "seed": origin["seed"],
-                **{name: float(value or "nan") for name, value in row.items() if name.startswith("eval_")},
-            }
-            for row in read_metrics(run / METRICS)
-            if row.get("eval_return")
-        ]
+        try:
+            rows = [
+                {
+                    "steps": int(row["steps"]),
+                    "seed": origin["seed"],
+                    **{name: float(value or "nan") for name, value in row.items() if name.startswith("eval_")},
+                }
+                for row in read_metrics(run / METRICS)
+                if row.get("eval_return")
+            ]
+        except (KeyError, ValueError):
+            raise InputError(f"{run / METRICS} is damaged: it holds what is no number") from None
     if not rows or not (run / "eval").is_dir():  # which is made then
         raise InputError(f"{run} was not trained to its end; say --resume {run}")
     return rows

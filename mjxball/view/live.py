@@ -181,7 +181,7 @@ def _watch(view: LiveView, log: LiveLog, leave: threading.Event, attached: bool)
 def _linger(view: LiveView) -> None:
     """Let an open page fetch the rest."""
     until = time.monotonic() + LINGER
-    while view.update():
+    while time.monotonic() < until and view.update():
         pass
     while (
         view.last_request is not None

@@ -12,6 +12,7 @@ import pytest
 from command_line import REPOSITORY, environment, script, tiny
 from pseudo_terminal import on_terminal
 
+from mjxball import terminal
 from mjxball.evaluate.benchmark import Score, text_table
 from mjxball.evaluate.metrics import Metrics
 from mjxball.evaluate.results import metric_text
@@ -176,3 +177,13 @@ def test_a_sentence_breaks_between_words_behind_columns_too() -> None:
         "eval return -3",
         "eval peak 0.1",
     ]
+
+
+def test_a_closed_stream_is_no_fault(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of one that the caller closed Python has None."""
+    monkeypatch.setattr(sys, "stderr", None)
+    terminal.warn("a warning")
+    monkeypatch.setattr(sys, "stdout", None)
+    terminal.say("a sentence")
+    monkeypatch.undo()
+    assert capsys.readouterr() == ("", "")

@@ -278,6 +278,10 @@ REFUSED = {
 URDF = {
     "no inertial": (models.urdf(inertial=False), "no link has a mass, expected <inertial>"),
     "a negative mass": (models.urdf(mass="-1"), "no mass or no inertia"),
+    "rotors that lean": (
+        models.urdf().replace('0.01"/>', '0.01" rpy="1.2 0 0"/>'),
+        "rotor prop0 points along 0 -0.932",
+    ),
     "no rotors": (models.urdf(names="link"), "it has no rotors, expected links called like rotors"),
     "a base that is held": (
         models.urdf().replace(

@@ -121,6 +121,7 @@ def test_swapped_places_are_refused(tmp_path: Path) -> None:
     [
         ("robots: [", "no YAML: line 1"),
         ("a: 1\na: 2\n", "'a' stands twice"),
+        ("a: &a [1]\nb: [" + ", ".join(["*a"] * 21) + "]\n", "more than 20 aliases"),
         ("a: !!python/object/apply:os.system ['true']\n", "no YAML"),
         ("? [1, 2]\n: 3\n", "no YAML"),
         ("- 1\n", "must be a mapping, not a list"),
@@ -132,6 +133,7 @@ def test_swapped_places_are_refused(tmp_path: Path) -> None:
         (changed(["robots", "spare", "enabled"], True), "3 robots are enabled (cf231, spare, cf5)"),
         (changed(["robots", "cf5", "type"], "cf22"), "type cf22 is not in robot_types, which has cf21, marker"),
         (changed(["robots", "cf5", "uri"], "radio://0/80/2M/E7E7E7E7E7"), "cf231 and cf5 have one uri"),
+        (changed(["robots", "cf5", "uri"], "radio://0/80/2M/e7e7e7e7e7"), "cf231 and cf5 have one uri"),
         (changed(["robots", "cf5", "uri"], None), "cf5 has no uri"),
         (changed(["robots", "cf5", "uri"], "http://x"), "no URI such as"),
         (changed(["robots", "cf5", "uri"], "radio://1/81/2M/E7E7E7E705"), "channels 80 and 81"),

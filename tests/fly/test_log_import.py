@@ -225,6 +225,12 @@ def test_bad_input_is_refused_in_one_sentence(
     turn = turning(np.full(50, 0.3))
     far = [{**one, "raw": one["raw"]._replace(state=moved(one))} if "raw" in one else one for one in turn]
     lost = [{**one, "raw": one["raw"]._replace(state=unturned(one))} if "raw" in one else one for one in turn]
+    huge = write_cfclient(tmp_path / "huge", turn, {"leader": 0, "follower": 0})
+    state = next(file for file in (huge / "leader").glob("*.csv") if "stateEstimate.x" in file.read_text())
+    head, *rows = state.read_text().splitlines()
+    place = head.split(",").index("stateEstimate.x")
+    rows = [",".join("1e300" if k == place else one for k, one in enumerate(row.split(","))) for row in rows]
+    state.write_text("\n".join([head, *rows]))
     (tmp_path / "folder").mkdir()
     (tmp_path / "text.mcap").write_text("an MCAP file?")
     (tmp_path / "none.mcap").write_bytes(b"")
@@ -256,6 +262,7 @@ def test_bad_input_is_refused_in_one_sentence(
         (ours, "begins with 'time,phase'; expected cfclient's Timestamp"),
         (less, "leader has no sent; expected all numbers of it of ctrltarget.roll"),
         (two, "row 2: the time goes back by 0.01 s"),
+        (huge, "the leader's position reaches 1e+300, expected metres"),
     ]
     for path, reason in cases:
         for main, arguments in (

@@ -170,6 +170,7 @@ def test_every_process_can_trace_mjx() -> None:
         (("127.0.0.1:1234", 2, None), "belong together"),
         (("127.0.0.1", 2, 0), "HOST:PORT"),
         (("127.0.0.1:99999", 2, 0), "HOST:PORT"),
+        (("127.0.0.1:\N{SUPERSCRIPT TWO}", 2, 0), "HOST:PORT"),
         (("127.0.0.1:1234", 2, 2), "0 .. 1"),
         (("127.0.0.1:1234", 0, 0), "--process"),
     ],

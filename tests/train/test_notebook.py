@@ -146,8 +146,14 @@ def test_ctrl_c_leaves_the_policy_of_then(short: Config, capsys: pytest.CaptureF
         train(short, jax.random.PRNGKey(0), physics="newton-euler", on_progress=at_once)
 
 
-def test_no_notebook_here() -> None:
+def test_no_notebook_here(config: Config) -> None:
+    import jax
+
+    from mjxball.train import train
+
     assert not in_notebook()
+    with pytest.raises(InputError, match="give a function"):
+        train(config, jax.random.PRNGKey(0), on_progress=True)
 
 
 @pytest.mark.slow
