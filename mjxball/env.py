@@ -332,7 +332,7 @@ class TransportEnv:
         return law.command(action, observation), law.next(memory, observation, action) if law.size else ()
 
     def _first_privileged(self, rng: Array) -> Float[Array, "... privileged"]:
-        return self._privileged(self._fresh_world(rng, 1.0)[0])
+        return self._privileged(self._fresh_world(rng)[0])
 
     def _privileged(self, world: PipelineState) -> Float[Array, "... privileged"]:
         """CG offset, first moment, object mass, error of the believed one; of disturbed worlds the truth as well."""

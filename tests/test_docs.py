@@ -181,7 +181,7 @@ def shown(text: str) -> Iterator[list[str]]:
     prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
     lines += [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", prose)]
     for line in lines:
-        if match := re.search(r"(?:^|\s|/)(?:python3? (?:-m )?|(?=mjxball-))(\S+(?:\s.*)?)$", line):
+        if match := re.search(r"(?:^|\s|/)(?:python3? (?:-m )?|(?=mjxball-[a-z]+(?:\s|$)))(\S+(?:\s.*)?)$", line):
             words = shlex.split(match[1], comments=True)
             if len(words) > 1 and (words[0] in MAINS or words[0].startswith("benchmarks/")):
                 yield words

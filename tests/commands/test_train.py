@@ -35,7 +35,7 @@ from mjxball import config as configs
 from mjxball.commands.train import main, parser
 from mjxball.policy import Policy
 
-ROW = re.compile(r"^\s*[\d,]+ / [\d,]+ steps")
+ROW = re.compile(r"^\s*[\d,]+ steps")
 COMPILING = re.compile("compiling the training program")
 EVALUATED = {"eval_return", "eval_steady_error", "eval_peak", "eval_tilt_error", "eval_vertical_error"}
 
