@@ -123,7 +123,9 @@ def _display(stream: TextIO, render: Callable[[], Any]) -> Any:
             """The cursor stays: a process that is killed could not bring it back."""
             return False
 
-    console = Plain(file=stream, force_terminal=True, highlight=False, markup=False, emoji=False)
+    # The window says its width, not a variable that a shell exported before it was resized.
+    known = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    console = Plain(file=stream, force_terminal=True, highlight=False, markup=False, emoji=False, _environ=known)
     return Live(
         console=console,
         get_renderable=render,

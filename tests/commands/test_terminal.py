@@ -51,7 +51,10 @@ def training(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 @pytest.mark.parametrize("columns", [*WIDTHS, 0])
-def test_progress_fits_and_leaves_nothing_behind(columns: int, training: list[str], tmp_path: Path) -> None:
+def test_progress_fits_and_leaves_nothing_behind(
+    columns: int, training: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "70")  # what a shell exported before its window was resized
     seen = on_terminal(training, columns, tmp_path)
     assert (seen.code, seen.wrapped) == (0, 0), seen.text
     live = [state for state in seen.states if "Ctrl-C saves and stops" in state]
@@ -59,7 +62,9 @@ def test_progress_fits_and_leaves_nothing_behind(columns: int, training: list[st
     assert max(len(re.findall("k/s  ?", state)) + state.count("Ctrl-C") for state in live) <= 3  # one status alone
     left = seen.text.splitlines()
     assert [line for line in left if line in LINES] == LINES
-    (row,) = (line for line in left if line not in LINES)
+    rest = [line for line in left if line not in LINES]
+    assert len(rest) == 1, rest
+    (row,) = rest
     parts = ["384,000 steps", "eval return -1e+04", "steady error 0.01", "peak 0.5", "50%", "0:15 left", "25.2 k/s"]
     shown = re.split("  +", row.strip())
     assert shown == parts[: len(shown)]
