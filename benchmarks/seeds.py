@@ -38,6 +38,7 @@ import cells
 import stability
 from harness import RESULTS, Row, arguments, say, spread, write
 from mjxball import config as configs
+from mjxball.arrays import Array
 from mjxball.baselines import LAWS, make_baseline
 from mjxball.cli import run_command
 from mjxball.config import Config, preset
@@ -55,7 +56,6 @@ from mjxball.reading import parse_json
 from mjxball.sim.disturbances import Disturbance
 from mjxball.sim.scenario import Scenario
 
-Array = Any
 LEVELS, OTHERS = Path(__file__).parent / "levels.json", RESULTS / "balance.json"
 RIVALS = ("transport", "robust", "paper")  # shipped for this plant
 FLIGHTS, PHASES = 3, 3  # of a level, of a cell

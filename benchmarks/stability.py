@@ -29,6 +29,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from harness import Row, arguments, say, table, write
+from mjxball.arrays import Array
 from mjxball.baselines import make_baseline
 from mjxball.cli import run_command
 from mjxball.config import Config, preset
@@ -45,7 +46,6 @@ from mjxball.sim.closed_loop import ClosedLoop, LoopState
 from mjxball.sim.disturbances import Sample, SensorModel, SensorState
 from mjxball.sim.scenario import Scenario
 
-Array = Any
 SETTLE, WATCHED = 3000, 1000  # control steps flown towards the fixed point, and those whose mean is taken
 NEWTON, HALVINGS = 40, 12  # then steps of Newton's method, each as short as makes the residual smallest
 SOUND = 1e-8  # largest change over a control step, in SI units, of what counts as a fixed point

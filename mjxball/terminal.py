@@ -148,7 +148,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], words: Sequence[i
     whichever shows more. What does not fit then is left out from the right, and a line says what. Elsewhere a row is
     a line.
     """
-    width = columns_of(sys.stdout) if sys.stdout.isatty() else 10_000
+    width = columns_of(sys.stdout) if sys.stdout and sys.stdout.isatty() else 10_000
     cells = list(zip(heads, *rows, strict=True))
     shown = {0: _fitting(cells, words, width)}
     begins = (name, *(n + 1 for n in words if n >= name))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-Array = Any
+from mjxball.arrays import Array
 
 
 def matrix_from_euler(euler: Array) -> Array:

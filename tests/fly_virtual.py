@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 from command_line import TRANSPORT
+from fly_policies import untrained
 
 from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.fly import card, packets
+from mjxball.fly.flight_log import Journal
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.telemetry import Rig
@@ -20,7 +23,7 @@ from mjxball.fly.twin.physics import StandIn, StandInPlant
 from mjxball.fly.twin.virtual import MemoryLog, VirtualLink
 from mjxball.policy import Policy, PolicyFile
 
-__all__ = ["ARMED_BY_HAND", "MASS", "MemoryLog", "VirtualLink", "VirtualTwin", "log_header", "thrusts"]
+__all__ = ["ARMED_BY_HAND", "MASS", "MemoryLog", "VirtualLink", "VirtualTwin", "log_header", "short_log", "thrusts"]
 MASS = 0.07
 ARMED_BY_HAND = dataclasses.replace(DELIVERED, auto_arm=False)
 
@@ -49,6 +52,16 @@ def log_header(contents: PolicyFile, name: str = "nobody") -> dict[str, Any]:
     config = card.config_of(contents.card)
     gains = gains_to_json(card.gains_of(card.with_curve(config, "linear")))
     return {"policy": name, "config": configs.to_dict(config), "curve": "linear", "gains": gains}
+
+
+def short_log(path: Path, *notes: tuple[str, dict[str, Any]]) -> Path:
+    """The log of a short flight, as the runner writes it, with further `notes` at its end: (kind, fields)."""
+    contents = untrained("flight")
+    with Journal(path, **log_header(contents)) as log:
+        VirtualTwin(FlightSettings(seconds=1.0), contents=contents, log=log).run()
+        for kind, fields in notes:
+            log.note(kind, **fields)
+    return path
 
 
 def thrusts(world: virtual.VirtualTwin, number: int) -> list[tuple[float, int]]:

@@ -38,6 +38,11 @@ def shown(found: dict[str, Any], key: str, factor: float, digits: int) -> str:
     return ", ".join("never" if value is None else f"{factor * value:.{digits}f}" for value in values)
 
 
+def tracks_of(name: str) -> dict[str, Any]:
+    """Of a follower's entry."""
+    return json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())["tracks"]
+
+
 def test_the_table_of_followers_is_the_leaderboards() -> None:
     """Every row, from the entry that the page shows."""
     rows = re.findall(
@@ -47,7 +52,7 @@ def test_the_table_of_followers_is_the_leaderboards() -> None:
         row[0] for row in rows
     }
     for name, settling, peak, met, unknown, limit in rows:
-        tracks = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())["tracks"]
+        tracks = tracks_of(name)
         known = tracks["pair"]
         wanted = (shown(known, "settling_50", 1, 2), shown(known, "peak_90", 1e3, 0), shown(known, "met", 100, 0))
         assert (settling, peak, met) == wanted, name
@@ -103,6 +108,20 @@ def run(words: Sequence[str], here: Path, site: Path) -> None:
     command = [sys.executable, "-S", *words[1:]]
     done = subprocess.run(command, cwd=here, env=child, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_what_is_said_of_commands_is_the_leaderboards() -> None:
+    """`balance` against the other rows that settle within 3 s, under noise."""
+    words = r"commands change by\s+(\d+) mrad a step, those of others that settle within 3 s by (\d+) to (\d+)"
+    told = re.search(words, README)
+    assert told is not None
+    names = re.findall(r"^\| \**`([\w-]+)`", README, flags=re.MULTILINE)
+    found = {name: tracks_of(name)["pair"]["disturbed"] for name in names}
+    quick = {name: 1e3 * one["command_change"] for name, one in found.items() if (one["settling_50"] or 99) <= 3}
+    own = quick.pop("balance")
+    assert [round(one) for one in (own, min(quick.values()), max(quick.values()))] == [
+        int(one) for one in told.groups()
+    ]
 
 
 def test_the_table_is_read() -> None:

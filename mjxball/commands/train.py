@@ -235,7 +235,7 @@ def _run(
         return 0 if Run(settings, out, origin, state, told).train(beside) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
-            kept = any(path.name.isdigit() for path in (out / CHECKPOINTS).glob("*"))
+            kept = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))
             where = f"the last good policy and checkpoint are in {out}" if kept else "no checkpoint came before"
             warn(f"training diverged: {error}; {where}")
         return 1

@@ -132,8 +132,8 @@ def _place(data: Any, way: Sequence[str]) -> Any:
     """What stands in nested `data` at the end of `way`; made if it is missing, None if something else is there."""
     for step, after in zip(way, (*way[1:], ""), strict=True):
         if isinstance(data, dict):
-            data = data.setdefault(step, [] if after.isdigit() else {})
-        elif isinstance(data, list) and step.isdigit():
+            data = data.setdefault(step, [] if after.isdecimal() else {})
+        elif isinstance(data, list) and step.isdecimal():
             data += [{} for _ in range(int(step) + 1 - len(data))]
             data = data[int(step)]
         else:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjxball.arrays import Array
 from mjxball.config import Config
 from mjxball.control.observation import ACTION_SIZE
 from mjxball.env import State, TransportEnv
@@ -24,7 +24,6 @@ except ModuleNotFoundError as error:
     raise ModuleNotFoundError("jaxmarl is not installed; pip install 'mjxball[jaxmarl]'", name="jaxmarl") from None
 from jaxmarl.environments.spaces import Box
 
-Array = Any
 Each = dict[str, Array]  # agent -> its own
 
 

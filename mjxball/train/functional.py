@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,9 +17,8 @@ from mjxball.terminal import warn
 from mjxball.train import program as programs
 from mjxball.train.extensions import Extensions
 from mjxball.train.live import LiveCurve, Report, in_notebook
+from mjxball.train.loop import Plan
 from mjxball.train.program import Mode, Program, TrainState
-
-CHUNKS = 25  # reports of training, at most about
 
 
 def train(
@@ -104,12 +102,11 @@ def _train(
 
 
 def _in_turns(phase: Any, state: TrainState, modes: Mode, program: Program, report: Report) -> tuple[TrainState, Any]:
-    """As `jax.lax.scan` of `phase`, with training in about `CHUNKS` parts, after each of which there is a `report`.
+    """As `jax.lax.scan` of `phase`, with training in the parts of `loop.Plan`, after each of which there is a `report`.
 
     Ctrl-C ends it with what is trained by then; before anything is, it is raised.
     """
-    turn, window = jax.jit(phase), program.algorithm.steps_per_collect
-    most = math.ceil(program.total_rounds / CHUNKS / window) * window
+    turn, most = jax.jit(phase), Plan.of(program).chunk
     seen: list[dict[str, Array]] = []
     try:
         for number in range(len(modes.steps)):

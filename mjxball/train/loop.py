@@ -35,7 +35,7 @@ def learn(run: Run, stop: Stop) -> bool:
         goal, evaluates = plan.next(run.done)
         chunk = run.advance(programs.train(goal - run.done), pause)
         if waiting:
-            run.show(run.row(waiting))
+            run.progress.show(run.row(waiting))
         # One that is cut short has no row: who resumes has one of the rest.
         waiting = chunk if run.done == goal else None
         # All processes act on what they agreed on here, whenever a signal reaches one of them.
@@ -43,7 +43,7 @@ def learn(run: Run, stop: Stop) -> bool:
         evaluates = evaluates and waiting is not None
         if waiting and (evaluates or late or ended):
             row = run.row(waiting)
-            run.show(row | run.evaluate() if evaluates else row)
+            run.progress.show(row | run.evaluate() if evaluates else row)
             waiting = None
         if evaluates or late:
             run.save()

@@ -42,7 +42,7 @@ class Rendezvous:
                 raise InputError("--coordinator, --processes and --process belong together: give all three or none")
             return
         port = self.coordinator.rpartition(":")[2]
-        if ":" not in self.coordinator or not (port.isascii() and port.isdigit()) or not 0 < int(port) < 65536:
+        if ":" not in self.coordinator or not port.isdecimal() or not 0 < int(port) < 65536:
             raise InputError(f"--coordinator must be HOST:PORT, not {self.coordinator!r}")
         if self.processes < 1 or not 0 <= self.process < self.processes:
             raise InputError(f"--process must be 0 .. {max(self.processes - 1, 0)}, not {self.process}")

@@ -148,7 +148,7 @@ def _left_of_group() -> float:
         (Path("/sys/fs/cgroup/memory"), "memory.limit_in_bytes", "memory.usage_in_bytes"),
     ):
         numbers = [line for name in (limit, used) for line in _lines(folder / name)]
-        if len(numbers) == 2 and all(number.isdigit() for number in numbers):
+        if len(numbers) == 2 and all(number.isdecimal() for number in numbers):
             cached = [line.split()[1] for line in _lines(folder / "memory.stat") if line.startswith("inactive_file ")]
             least = min(least, float(numbers[0]) - float(numbers[1]) + sum(map(float, cached)))
     return least

@@ -221,10 +221,6 @@ class Run:
         """Whether a checkpoint is due for time alone."""
         return self.progress.elapsed() - self._saved_at > SAVE_EVERY
 
-    def show(self, row: Row) -> None:
-        """Print a row, and write it to metrics.csv and to what else keeps rows."""
-        self.progress.show(row)
-
     def row(self, chunk: Chunk) -> Row:
         """What there is to say of a chunk, once the devices are done with it."""
         statistics, metrics = processes.gather((chunk.statistics, chunk.metrics))

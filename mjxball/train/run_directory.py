@@ -124,7 +124,7 @@ def starts_of(origin: Mapping[str, Any]) -> list[dict[str, str]]:
 
 def members_of(run: Path) -> list[Path]:
     """The policies of all members of a population, by their seeds; InputError if there are none."""
-    found = [(int(path.stem[4:]), path) for path in (run / "members").glob("seed*.npz") if path.stem[4:].isdigit()]
+    found = [(int(path.stem[4:]), path) for path in (run / "members").glob("seed*.npz") if path.stem[4:].isdecimal()]
     if not found:
         raise InputError(f"{run} holds no population: train.py --num-seeds writes members/seed*.npz")
     return [path for _, path in sorted(found)]

@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import REPOSITORY, assert_one_line, call, environment
-from fly_policies import untrained
-from fly_virtual import VirtualTwin, log_header
+from fly_virtual import short_log
 
 from mjxball.export import main
 from mjxball.fly.flight_log import Journal, read
-from mjxball.fly.limits import NAMES, FlightSettings
+from mjxball.fly.limits import NAMES
 from mjxball.fly.messages import TYPES
 from mjxball.fly.recording import Recording, read_recording
 
@@ -29,11 +28,8 @@ PARTS = ("pose", "twist", "battery", "health", "setpoint", "command")
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short flight's log, as the runner writes it."""
-    path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
-    with Journal(path, **log_header(contents)) as notes:
-        VirtualTwin(FlightSettings(seconds=1.0), contents=contents, log=notes).run()
-        notes.note("warning", text="a text of one's own")
-    return path
+    path = tmp_path_factory.mktemp("log") / "flight.jsonl"
+    return short_log(path, ("warning", {"text": "a text of one's own"}))
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import assert_one_line, call
-from fly_policies import untrained
-from fly_virtual import VirtualTwin, log_header
+from fly_virtual import short_log
 from foreign_logs import NAMES, write_bag, write_cfclient
 
 from mjxball.commands import evaluate
@@ -19,8 +18,6 @@ from mjxball.control.rotations import quaternion_from_euler
 from mjxball.errors import InputError
 from mjxball.export import main as export
 from mjxball.fly import flight_log
-from mjxball.fly.flight_log import Journal
-from mjxball.fly.limits import FlightSettings
 from mjxball.fly.log_schema import Record, StatePacket
 from mjxball.fly.packets import DroneState
 from mjxball.fly.recording import Recording, read_recording
@@ -35,12 +32,9 @@ MEASURED = ("time", "position", "velocity", "quaternion", "rates", "sent")
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short flight's log, as the runner writes it."""
-    path, contents = tmp_path_factory.mktemp("log") / "flight.jsonl", untrained("flight")
-    with Journal(path, **log_header(contents)) as notes:
-        VirtualTwin(FlightSettings(seconds=1.0), contents=contents, log=notes).run()
-        notes.note("parameter", drone="follower", name="pid_attitude.roll_kp", value=7.0)
-        notes.note("end", code=0)
-    return path
+    gain = {"drone": "follower", "name": "pid_attitude.roll_kp", "value": 7.0}
+    path = tmp_path_factory.mktemp("log") / "flight.jsonl"
+    return short_log(path, ("parameter", gain), ("end", {"code": 0}))
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,10 @@ def resting(system: str, seconds: float, around: Surroundings | None = None) -> 
 
 
 def test_an_estimate_on_loco_moves_as_bitcraze_measured() -> None:
-    """At rest, TWR, four places: 7 to 20 mm, 7 to 10 mm, 5 to 16 mm along x, y, z; errors of 3 to 16 cm sideways."""
+    """At rest, TWR, four places: 7 to 20 mm, 7 to 10 mm, 5 to 16 mm along x, y, z; errors of 3 to 16 cm sideways.
+
+    The noise is fitted to these: it is no independent check of the model, but notices a change of it.
+    """
     errors = resting("loco", 5.0)
     moved = errors.std(axis=0)
     assert moved.min() > 5e-3
