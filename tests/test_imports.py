@@ -55,11 +55,12 @@ OURS = "mjxball"
 
 
 class Module(NamedTuple):
-    """One module's imports: dotted names, lazily made ones included, those for type checkers alone left out."""
+    """One module's imports: dotted names."""
 
     name: str  # mjxball.control.leader
     eager: set[str]  # at import time
     lazy: set[str]  # inside functions
+    typed: set[str]  # for type checkers alone
 
     @property
     def part(self) -> str:
@@ -71,19 +72,22 @@ def part_of(name: str) -> str:
     return name.split(".")[1] if "." in name else ""
 
 
-def imports_in(node: ast.AST, lazy: bool, found: tuple[set[str], set[str]]) -> None:
+def imports_in(node: ast.AST, kind: str, found: dict[str, set[str]]) -> None:
     if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+        for child in node.body:
+            imports_in(child, "typed", found)
         for child in node.orelse:
-            imports_in(child, lazy, found)
+            imports_in(child, kind, found)
         return
     if isinstance(node, ast.Import):
-        found[lazy].update(alias.name for alias in node.names)
+        found[kind].update(alias.name for alias in node.names)
     elif isinstance(node, ast.ImportFrom):
         assert node.level == 0, "relative imports hide where a name comes from"
-        found[lazy].update(f"{node.module}.{alias.name}" for alias in node.names)
-    inner = lazy or isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+        found[kind].update(f"{node.module}.{alias.name}" for alias in node.names)
+    if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+        kind = "lazy"
     for child in ast.iter_child_nodes(node):
-        imports_in(child, inner, found)
+        imports_in(child, kind, found)
 
 
 def read(package: Path) -> dict[str, Module]:
@@ -92,9 +96,9 @@ def read(package: Path) -> dict[str, Module]:
     for path in sorted(package.rglob("*.py")):
         parts = path.relative_to(package.parent).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-        found: tuple[set[str], set[str]] = (set(), set())
-        imports_in(ast.parse(path.read_text()), False, found)
-        modules[name] = Module(name, *found)
+        found: dict[str, set[str]] = {"eager": set(), "lazy": set(), "typed": set()}
+        imports_in(ast.parse(path.read_text()), "eager", found)
+        modules[name] = Module(name, **found)
     return modules
 
 
@@ -140,6 +144,25 @@ def loaded_by(modules: dict[str, Module], name: str) -> set[str]:
     return seen
 
 
+def circle(modules: dict[str, Module]) -> list[str]:
+    """Modules of one circle of imports, those for type checkers included; packages' own lists of names are left out."""
+
+    def follow(name: str, path: tuple[str, ...]) -> list[str]:
+        if name in path:
+            return [*path[path.index(name) :], name]
+        if name not in done:
+            done.add(name)
+            for target in sorted(own(modules[name].eager | modules[name].typed)):
+                there = target if target in modules else target.rpartition(".")[0]
+                if there in ends and (found := follow(there, (*path, name))):
+                    return found
+        return []
+
+    packages = {name.rpartition(".")[0] for name in modules}
+    ends, done = set(modules) - packages, set[str]()
+    return next((found for name in sorted(ends) if (found := follow(name, ()))), [])
+
+
 def asked(name: str) -> set[str]:
     """What the module `name` may need besides, since only who writes that format loads it."""
     return {"onnx"} if name.startswith("mjxball.policy.formats.onnx_") else set()
@@ -157,6 +180,11 @@ def modules() -> dict[str, Module]:
 
 def test_imports_run_one_way(modules: dict[str, Module]) -> None:
     assert direction_faults(modules) == []
+
+
+def test_no_imports_go_in_a_circle(modules: dict[str, Module]) -> None:
+    """Not those for type checkers either: who asks for a function's hints loads them."""
+    assert circle(modules) == []
 
 
 @pytest.mark.parametrize("part", BASE)
@@ -222,6 +250,11 @@ class TestTheReader:
     def test_unknown_part(self, tmp_path: Path) -> None:
         (fault,) = direction_faults(self.package(tmp_path, attic=""))
         assert "floor" in fault
+
+    def test_in_a_circle(self, tmp_path: Path) -> None:
+        typed = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from mjxball.run import Run"
+        modules = self.package(tmp_path, loop=typed, run="from mjxball.loop import learn")
+        assert circle(modules) == ["mjxball.loop", "mjxball.run", "mjxball.loop"]
 
     def test_through_another_module(self, tmp_path: Path) -> None:
         modules = self.package(tmp_path, policy="from mjxball.control import mean", control="import jax.numpy as jnp")

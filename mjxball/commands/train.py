@@ -212,7 +212,7 @@ def _run(
     """
     _wake_devices()
     # The algorithm's libraries are imported meanwhile, before anything asks for devices.
-    from mjxball.train import requirements
+    from mjxball.train import loop, requirements
     from mjxball.train.extensions import find
     from mjxball.train.run import Run
 
@@ -232,7 +232,7 @@ def _run(
         if steps >= total:
             return None
     try:
-        return 0 if Run(settings, out, origin, state, told).train(beside) else 130
+        return 0 if loop.train(Run(settings, out, origin, state, told), beside) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
             kept = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))

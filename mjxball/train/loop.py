@@ -1,22 +1,35 @@
-"""The training loop that `train.py` runs, of any algorithm: collect, update, evaluate, save."""
+"""The training loop that `train.py` runs, of any algorithm: advance (collect, update), evaluate, save."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 
 from mjxball.train import processes
 from mjxball.train import program as programs
-from mjxball.train.population import Carried, Compiled, Population
-from mjxball.train.program import Mode, Program, Statistics, TrainState
-
-if TYPE_CHECKING:
-    from mjxball.train.run import Chunk, Run, Stop
+from mjxball.train.program import Program
+from mjxball.train.run import Chunk, Run, Stop, graceful_interrupt
 
 CHUNKS = 25  # rows of metrics.csv in a run, at most
+
+
+def train(run: Run, beside: Callable[[], None] = lambda: None) -> bool:
+    """Train to the end, or to Ctrl-C: False. Raises TrainingDivergedError; the last good policy stays on disk.
+
+    `beside` is called when everything is compiled.
+    """
+    with contextlib.closing(run), contextlib.closing(run.progress):
+        with graceful_interrupt(run.progress) as stop:
+            run.start()
+            stop.begun = True
+            beside()
+            finished = learn(run, stop)
+            run.end(finished)
+        return finished
 
 
 def learn(run: Run, stop: Stop) -> bool:
@@ -71,36 +84,3 @@ class Plan(NamedTuple):
         goal = min(number * self.chunk, self.total)
         evaluates = number * self.evaluations // chunks > (number - 1) * self.evaluations // chunks
         return goal, evaluates or goal >= self.total
-
-
-class Stretch(NamedTuple):
-    """What `advance` returns."""
-
-    state: TrainState
-    statistics: Statistics
-    metrics: Any  # of the last update
-    steps: int  # of every environment
-
-
-def advance(
-    population: Population,
-    compiled: Compiled,
-    state: TrainState,
-    mode: Mode,
-    pause: Callable[[], bool] = lambda: False,
-) -> Stretch:
-    """Step all environments `mode.steps` times, rounded up to whole collections, and learn; fewer if `pause` says so.
-
-    Results are there before the devices are done with them, unless they are CPUs. The arrays of `state` are used up.
-    """
-    phase, window = population.place_phase(mode.phase), population.program.algorithm.steps_per_collect
-    carried = Carried(state, population.no_statistics())
-    metrics, taken = population.no_metrics(), 0
-    while taken < int(mode.steps):
-        keys = compiled.collect(carried, phase)
-        if mode.phase.learning:
-            metrics = compiled.update(carried, keys)
-        taken += window
-        if pause():
-            break
-    return Stretch(*carried.trees(), population.named(metrics), taken)

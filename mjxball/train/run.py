@@ -27,11 +27,11 @@ from mjxball.train import program as programs
 from mjxball.train.curves import MemberLog, training_summary
 from mjxball.train.events import session
 from mjxball.train.extensions import Extensions, is_pair, resolve
-from mjxball.train.loop import advance, learn
 from mjxball.train.population import Population
 from mjxball.train.program import Mode, Statistics, TrainState
 from mjxball.train.progress import Progress, Row, Start, columns, started
 from mjxball.train.run_directory import CONFIG_FILE, METRICS, POLICY, start_policy, starts_of, write_config
+from mjxball.train.stretch import advance
 
 SAVE_EVERY = 60.0  # [s] after which the next row brings a checkpoint, besides those of evaluations
 
@@ -90,7 +90,7 @@ class Chunk:
 
 
 class Run:
-    """Followers being trained into a run directory. `train()` returns False if it was interrupted.
+    """Followers being trained into a run directory, by `mjxball.train.loop.train`.
 
     Of several processes each makes the same `Run`; only the first writes and prints.
     """
@@ -142,7 +142,7 @@ class Run:
 
     @property
     def state(self) -> TrainState:
-        """What is trained; there is none before `train` unless the run was resumed."""
+        """What is trained; there is none before `start` unless the run was resumed."""
         if self._state is None:
             raise RuntimeError("the run has not started")
         return self._state
@@ -151,41 +151,8 @@ class Run:
     def state(self, state: TrainState) -> None:
         self._state = state
 
-    def train(self, beside: Callable[[], None] = lambda: None) -> bool:
-        """Train to the end or to Ctrl-C. Raises TrainingDivergedError; the last good policy stays on disk.
-
-        `beside` is called when everything is compiled.
-        """
-        with contextlib.closing(self), contextlib.closing(self.progress):
-            with graceful_interrupt(self.progress) as stop:
-                self._start()
-                stop.begun = True
-                beside()
-                finished = learn(self, stop)
-                self.save()
-                if self._pending and finished:
-                    self._pending = self._writer.submit(_keep_newest, self._pending, self._checkpoints)
-                self.progress.say(self._cost())
-            return finished
-
-    def close(self) -> None:
-        """Wait until every checkpoint is on disk."""
-        with self._clock, self._writer:
-            try:
-                if self._pending:
-                    self._pending.result()
-            finally:
-                if self._checkpoints:
-                    self._checkpoints.result().close()
-
-    def _cost(self) -> str:
-        """What the run took, for people and for `benchmarks/training.py`."""
-        host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
-        device = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
-        more = f", {device / 1e6:.0f} MB on each device" if device else ""
-        return f"peak memory {host:.0f} MB{more}; saving took {self._saving:.2f} of {self.progress.elapsed():.1f} s"
-
-    def _start(self) -> None:
+    def start(self) -> None:
+        """Compile, and make what is trained, or place what was resumed."""
         devices = self.population.devices
         what = f"the training program for {devices} x {jax.devices()[0].device_kind}"
         self.progress.begin("compiling", what, "Ctrl-C stops")
@@ -203,6 +170,30 @@ class Run:
             self._checkpoints = self._writer.submit(_open_checkpoints, self.out)
         self.progress.say(f"compiled in {self.progress.elapsed():.1f} s")
         self.progress.begin("training")
+
+    def end(self, finished: bool) -> None:
+        """Save, keep of the checkpoints the newest if training has `finished`, and say what it took."""
+        self.save()
+        if self._pending and finished:
+            self._pending = self._writer.submit(_keep_newest, self._pending, self._checkpoints)
+        self.progress.say(self._cost())
+
+    def close(self) -> None:
+        """Wait until every checkpoint is on disk."""
+        with self._clock, self._writer:
+            try:
+                if self._pending:
+                    self._pending.result()
+            finally:
+                if self._checkpoints:
+                    self._checkpoints.result().close()
+
+    def _cost(self) -> str:
+        """What the run took, for people and for `benchmarks/training.py`."""
+        host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+        device = (jax.local_devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+        more = f", {device / 1e6:.0f} MB on each device" if device else ""
+        return f"peak memory {host:.0f} MB{more}; saving took {self._saving:.2f} of {self.progress.elapsed():.1f} s"
 
     @property
     def done(self) -> int:

@@ -18,8 +18,8 @@ from mjxball.algorithms.ppo import ProximalPolicyOptimization
 from mjxball.train import program as programs
 from mjxball.train.compilation import TracedProgram, compiler_options
 from mjxball.train.extensions import Extensions, TracedOnce
-from mjxball.train.loop import advance
 from mjxball.train.population import Population
+from mjxball.train.stretch import advance
 
 
 def rolling(state: dict[str, Any], step: Any) -> tuple[dict[str, Any], Any]:

@@ -23,9 +23,9 @@ from mjxball.policy import load_file, load_network
 from mjxball.train import program as programs
 from mjxball.train import train
 from mjxball.train.extensions import Extensions, find, make_env
-from mjxball.train.loop import advance
 from mjxball.train.population import Population
 from mjxball.train.program import Program
+from mjxball.train.stretch import advance
 
 SMALL = {
     "total_steps": 6000, "num_envs": 16, "replay_size": 6400, "batch_size": 64, "warmup_steps": 400,

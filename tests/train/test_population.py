@@ -24,9 +24,9 @@ from mjxball.policy import Policy
 from mjxball.policy.file import load_file
 from mjxball.train import program as programs
 from mjxball.train.curves import best_member, read_members
-from mjxball.train.loop import advance
 from mjxball.train.population import Population, partitioned_by_gspmd
 from mjxball.train.run_directory import read_sweep
+from mjxball.train.stretch import advance
 
 REPOSITORY = Path(__file__).parents[2]
 SMALL = {
@@ -185,7 +185,7 @@ import jax, numpy as np
 from mjxball import config as C
 from mjxball.train.population import Population
 from mjxball.train import program as P
-from mjxball.train.loop import advance
+from mjxball.train.stretch import advance
 config = C.preset("transport")
 for name, value in {SMALL!r}.items():
     config = C.replace(config, "sac." + name, value)
