@@ -283,7 +283,7 @@ def remembering_pair(remembering: Trained) -> CompiledEnv:
 @pytest.fixture
 def short_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trainings in this process judge their policy by one second of flight."""
-    monkeypatch.setattr("mjxball.commands.train.standard_scenarios", short_train.one_second)
+    monkeypatch.setattr("mjxball.commands.compare.standard_scenarios", short_train.one_second)
 
 
 @pytest.fixture

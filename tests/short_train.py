@@ -6,7 +6,7 @@ import dataclasses
 import sys
 
 from mjxball.cli import quit_on_interrupt
-from mjxball.commands import train
+from mjxball.commands import compare, train
 from mjxball.config import Config
 from mjxball.evaluate.scenarios import standard_scenarios
 from mjxball.sim.scenario import Scenario
@@ -20,6 +20,6 @@ def one_second(settings: Config) -> tuple[Scenario, ...]:
 
 if __name__ == "__main__":
     quit_on_interrupt()  # as train.py does
-    train.standard_scenarios = one_second
+    compare.standard_scenarios = one_second
     processes.HEARTBEAT = 10  # a process that is lost is missed sooner
     sys.exit(train.main())

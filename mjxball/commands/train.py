@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
-import functools
-import math
 import os
 import shlex
-import statistics
 import sys
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,33 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from mjxball import __version__, cli, config
+from mjxball import cli, config
 from mjxball.algorithms import ALGORITHMS
+from mjxball.commands.compare import compare, compare_members, compile_ahead, is_evaluated
+from mjxball.commands.new_run import new_run, output_directory, recorded, refuse_beside, wake_devices
 from mjxball.errors import InputError, TrainingDivergedError
 from mjxball.evaluate.results import RESULTS
-from mjxball.evaluate.scenarios import rig_line, standard_scenarios
+from mjxball.evaluate.scenarios import rig_line
 from mjxball.physics.step import TRAINING_ENGINES
 from mjxball.policy.file import policy_path
 from mjxball.terminal import say, warn
 from mjxball.train import processes, shares
 from mjxball.train.curves import draw_training
-from mjxball.train.lock import LOCK, check_free
 from mjxball.train.run_directory import (
     CHECKPOINTS,
-    EXTENSIONS,
-    LARGEST_SEED,
-    MOST_MEMBERS,
     POLICY,
-    commit,
-    differences,
-    file_hash,
-    members_of,
-    read_sweep,
-    source_hash,
-    start_policy,
-    versions,
 )
-from mjxball.xla import check_address_space, compile_small_loops_whole, enable_compilation_cache
+from mjxball.xla import check_address_space, enable_compilation_cache
 
 # What `--help` shows of the settings; `--help all` has the rest.
 COMMON = (
@@ -142,13 +127,13 @@ def _train(options: argparse.Namespace, command: str) -> int:
     # To take three quarters of a large GPU's memory at once takes 1.6 s; taken as it is needed it is as fast.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     if options.resume is not None:
-        _refuse_beside(options, "--resume continues with the run's own configuration", ())
-        out, (settings, origin) = options.resume, _recorded(options.resume)
+        refuse_beside(options, "--resume continues with the run's own configuration", ())
+        out, (settings, origin) = options.resume, recorded(options.resume)
     else:
-        settings, origin, out = _new_run(options, command)
+        settings, origin, out = new_run(options, command)
     enable_compilation_cache()
     resume = options.resume is not None
-    check = (lambda: None) if resume else (lambda: _output_directory(out))  # what the lock's holder may have left there
+    check = (lambda: None) if resume else (lambda: output_directory(out))  # what the lock's holder may have left there
     from mjxball.train.compilation import jax_setting
 
     # Float32 also where JAX_ENABLE_X64 is set: a run is the same then, and can be resumed.
@@ -163,8 +148,8 @@ def _train(options: argparse.Namespace, command: str) -> int:
                 def prepare() -> None:
                     if writes and options.plant:
                         warn(rig_line(settings))
-                    if writes and _is_evaluated(origin):
-                        beside.submit(_prepare_evaluation, settings, origin["physics"])
+                    if writes and is_evaluated(origin):
+                        beside.submit(compile_ahead, settings, origin["physics"])
 
                 code = _run(settings, origin, out, resume, prepare, options.tracker)
             if meeting:
@@ -183,19 +168,11 @@ def _finish(settings: config.Config, origin: dict[str, Any], out: Path, code: in
     if code:
         return code
     draw_training(out, settings, out / "eval" / "training.png")
-    if not _is_evaluated(origin):
+    if not is_evaluated(origin):
         return 0
     if origin["seeds"] > 1:
-        _compare_members(settings, out, origin)
-    return _evaluate(settings, origin["physics"], out, out / POLICY)
-
-
-def _output_directory(out: Path) -> Path:
-    try:
-        return cli.output_directory(out, but=(LOCK,))
-    except InputError:
-        check_free(out)  # whoever holds it is the better reason
-        raise
+        compare_members(settings, out, origin)
+    return compare(settings, origin["physics"], out, out / POLICY)
 
 
 def _run(
@@ -210,7 +187,7 @@ def _run(
 
     `beside` is called when everything is compiled and the device begins to train.
     """
-    _wake_devices()
+    wake_devices()
     # The algorithm's libraries are imported meanwhile, before anything asks for devices.
     from mjxball.train import loop, requirements
     from mjxball.train.extensions import find
@@ -241,22 +218,6 @@ def _run(
         return 1
 
 
-@functools.cache
-def _wake_devices() -> None:
-    """Start the accelerator's runtime (2 s of waiting on a GPU) beside the imports that follow.
-
-    Whatever ends the process waits for the thread: one that Python stops inside XLA aborts it.
-    """
-    import jax  # here: two threads must not both import it
-
-    threading.Thread(target=_first_kernel, args=(jax.numpy,)).start()
-
-
-def _first_kernel(xp: Any) -> None:
-    with contextlib.suppress(RuntimeError, AssertionError):  # without a device; who needs one says so
-        xp.zeros(1).block_until_ready()
-
-
 def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:
     given = (options.coordinator, options.processes, options.process)
     if options.distributed:
@@ -266,240 +227,13 @@ def _meeting(options: argparse.Namespace) -> processes.Rendezvous | None:
     return None
 
 
-def _new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, dict[str, Any], Path]:
-    """Configuration, origin and directory of a new run; everything that can be refused is refused here."""
-    measured = cli.read_plant(options.plant).preset if options.plant else None
-    name, seed = options.preset or measured or "transport", options.seed or 0
-    _refuse_settings_of_others(options)
-    settings = cli.apply_config_flags(config.preset(name), options)
-    if not 0 <= seed <= LARGEST_SEED:
-        raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
-    for section in ALGORITHMS:
-        if (units := getattr(getattr(settings, section), "activation", "relu")) != "relu":
-            raise InputError(f"--{section}.activation {units}: policy files hold relu; see mjxball.train.train")
-    called = options.env.rpartition(":")[2] if options.env else name
-    out = _output_directory(options.out or Path("runs") / f"{called}-{time.strftime('%Y%m%d-%H%M%S')}")
-    standard_scenarios(settings)
-    members = 1 if options.num_seeds is None else options.num_seeds
-    if not 1 <= members <= MOST_MEMBERS:
-        raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
-    extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
-    if extensions.get("algorithm") == "sac":  # the default, of which nothing is to be checked
-        del extensions["algorithm"]
-    physics = options.physics or "mjx"
-    if extensions:
-        physics = _check_extensions(extensions, settings, options.physics, bool(options.distributed))
-    origin: dict[str, Any] = {
-        "command": command,
-        "seed": seed,
-        "physics": physics,
-        "seeds": members,
-        "sweep": None if options.sweep is None else read_sweep(options.sweep, members, settings),
-        "package_version": __version__,
-        "commit": commit(),
-        "source_hash": source_hash(),
-        "versions": versions(),
-    }
-    if options.start_from is not None:
-        origin["start_from"] = _start_from(options, settings, members)
-    if options.share is not None:
-        shares.take(origin, *shares.read(options.share))
-    if extensions:
-        origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
-    return settings, origin, out
-
-
-def _start_from(options: argparse.Namespace, settings: config.Config, members: int) -> Any:
-    """Which policy file the run, or each of `members`, starts from, see `run_directory.start_policy`."""
-    if (options.algorithm or "sac") != "gradient" or options.env:
-        raise InputError(
-            "--start-from needs --algorithm gradient and no --env: the others begin with more than a policy"
-        )
-    if not options.start_from.is_dir():
-        return _start(options.start_from, settings)
-    files = members_of(options.start_from)
-    if len(files) != members:
-        raise InputError(
-            f"{options.start_from} has {len(files)} members and the run {members}; say --num-seeds {len(files)}"
-        )
-    return [_start(path, settings) for path in files]
-
-
-def _start(path: Path, settings: config.Config) -> dict[str, str]:
-    start = {"policy": str(path), "sha256": file_hash(path)}
-    sizes = [len(bias) for bias in start_policy(start, settings).biases[:-1]]
-    if sizes != list(settings.gradient.policy_layers):
-        layers = ",".join(map(str, sizes))
-        raise InputError(f"{path} has hidden layers {layers}; say --gradient.policy_layers {layers}")
-    return start
-
-
-def _digest(names: dict[str, str]) -> str | None:
-    from mjxball.train.extensions import digest
-
-    return digest(names)
-
-
-def _refuse_settings_of_others(options: argparse.Namespace) -> None:
-    """Refuse a setting of an algorithm of ours that is not the one which trains."""
-    used = options.algorithm or "sac"
-    given = [name.removeprefix("config:") for name, value in vars(options).items() if value and "config:" in name]
-    for path in given:
-        section = path.partition(".")[0]
-        if used in ALGORITHMS and section in ALGORITHMS and section != used:
-            raise InputError(
-                f"--{path} is a setting of {section}, and {used} trains; drop it or say --algorithm {section}"
-            )
-
-
-def _check_extensions(names: dict[str, str], settings: config.Config, wanted: str | None, meeting: bool) -> str:
-    """The physics engine to train on; refuses what cannot be found or does not fit, before anything is written."""
-    from mjxball.train.extensions import Extensions, make_env, resolve
-
-    extensions = resolve(Extensions(**names))
-    _choose_processor(extensions.algorithm)
-    if not meeting:
-        _wake_devices()
-    engines = getattr(extensions.algorithm, "engines", TRAINING_ENGINES)
-    physics = wanted or engines[0]
-    if physics not in engines:
-        raise InputError(
-            f"--algorithm {names['algorithm']} cannot train on --physics {physics}; it can on {', '.join(engines)}"
-        )
-    if not meeting:  # else the processes meet before anything asks for devices, and training makes the same check
-        make_env(extensions, settings, physics)
-    missing = [name for name in ("init", "collect", "update", "policy") if not hasattr(extensions.algorithm, name)]
-    if extensions.algorithm is not None and missing:
-        raise InputError(
-            f"--algorithm {names['algorithm']} lacks {', '.join(missing)}; see docs/howto/own-algorithm.md"
-        )
-    return physics
-
-
-def _choose_processor(algorithm: Any) -> None:
-    """Train on the CPU, its small loops compiled whole, what is done there before a GPU has compiled it.
-
-    Where JAX_PLATFORMS says otherwise it stays so.
-    """
-    import jax
-
-    if not getattr(algorithm, "prefers_cpu", False):
-        return
-    compile_small_loops_whole()
-    if not os.environ.get("JAX_PLATFORMS"):
-        settings: Any = jax.config
-        settings.update("jax_platforms", "cpu")
-
-
-def _recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
-    """Configuration and origin of the run to be continued; InputError if this program is not the one that made it."""
-    from mjxball.train.run_directory import read_config
-
-    settings, origin = read_config(run)
-    changed = differences(origin)
-    extensions = origin.get("extensions") or {}
-    if extensions and _digest(extensions) != origin.get("extension_hash"):
-        changed.append(f"{', '.join(extensions.values())} has changed")
-    if extensions.get("algorithm"):
-        from mjxball.train.extensions import find
-
-        _choose_processor(find(extensions["algorithm"], "--algorithm"))
-    if changed:
-        raise InputError(f"{run} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
-    return settings, origin
-
-
-def _compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) -> None:
-    """Print every member on the reference scenario and their median, draw them over training, and tell the card."""
-    from mjxball.evaluate.policies import load_policy
-    from mjxball.evaluate.results import fly_scenarios, table
-    from mjxball.policy.file import load_file, save_file
-    from mjxball.train.curves import POLICIES, draw_members
-
-    policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
-    reference = standard_scenarios(settings)[-1]
-    results = fly_scenarios(settings, policies, [reference], origin["physics"])
-    print(table(results, reference))
-    compared = ("rmse", "settling_time", "x_peak", "overshoot")
-    chosen = load_file(out / POLICY)
-    seeds = [int(result.follower.removeprefix("seed")) for result in results]
-    spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in results] for name in compared}
-    spread["failed"] = [result.metrics.failed for result in results]
-    save_file(out / POLICY, dataclasses.replace(chosen, card={**chosen.card, "population": {"seed": seeds, **spread}}))
-    for name in compared:
-        values = sorted(math.inf if value is None else value for value in spread[name])
-        numbers = (statistics.median(values), values[0], values[-1])
-        missing = "never" if name == "settling_time" else "failed"
-        middle, low, high = (missing if math.isinf(value) else f"{value:.4g}" for value in numbers)
-        print(f"{name}: median {middle}, best {low}, worst {high} of {len(values)}")
-    (out / "eval").mkdir(exist_ok=True)
-    draw_members(out, out / "eval" / "members.png")
-
-
-def _seed_of(path: Path) -> int:
-    return int(path.stem.removeprefix("seed"))
-
-
-def _refuse_beside(options: argparse.Namespace, why: str, but: tuple[str, ...]) -> None:
-    """InputError that begins with `why` if something is given that makes a new run, `but` those."""
-    given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
-    own = ("out", "seed", "num_seeds", "sweep", "share", "physics", "plant", "start_from", *EXTENSIONS)
-    given += [f"--{name.replace('_', '-')}" for name in own if name not in but and getattr(options, name) is not None]
-    given += [options.preset] if options.preset else []
-    if given:
-        raise InputError(f"{why}; drop {', '.join(given)}")
-
-
 def _gather(options: argparse.Namespace) -> int:
     """Bring the parts of a population together and compare its members, as a run of all of them would."""
-    _refuse_beside(options, "--gather takes runs as they are", ("out",))
+    refuse_beside(options, "--gather takes runs as they are", ("out",))
     if options.resume or options.distributed or options.out is None:
         raise InputError("--gather RUN ... needs --out DIR, a new directory, and neither --resume nor --distributed")
-    _output_directory(options.out)
+    output_directory(options.out)
     settings, origin = shares.gather(options.gather, options.out)
     say(f"gathered {origin['seeds']} members; the best is {options.out / POLICY}")
-    _compare_members(settings, options.out, origin)
-    return _evaluate(settings, origin["physics"], options.out, options.out / POLICY)
-
-
-def _is_evaluated(origin: dict[str, Any]) -> bool:
-    """Whether what was trained is compared with `copy`: that and the standard scenarios are for ours alone."""
-    return not (origin.get("extensions") or {}).get("env")
-
-
-def _prepare_evaluation(settings: config.Config, physics: str) -> None:
-    """Import and compile what `_evaluate` needs, while the device trains: on two cores it then begins at once."""
-    import jax
-
-    from mjxball.baselines import make_baseline
-    from mjxball.plotting import pyplot
-    from mjxball.sim.rollout import simulate_batch
-
-    if jax.default_backend() != "cpu":
-        return  # a GPU trains for so short a time that this would only delay its host
-    pyplot()
-    period = settings.timing.control_period
-    scenarios = [dataclasses.replace(one, seconds=period) for one in standard_scenarios(settings)]
-    copies = [make_baseline("copy", settings) for _ in range(2)]  # as many flights as it will be
-    simulate_batch(settings, [(copy, scenarios) for copy in copies], physics)
-
-
-def _evaluate(settings: config.Config, physics: str, out: Path, policy: Path) -> int:
-    """Compare the exported policy with `copy` on its own plant and physics; figures go to DIR/eval."""
-    from mjxball.baselines import make_baseline
-    from mjxball.evaluate.plots import write_results
-    from mjxball.evaluate.policies import check_bounds, load_policy
-    from mjxball.evaluate.results import fly_scenarios, table
-
-    scenarios = standard_scenarios(settings)
-    trained = load_policy(policy, settings)
-    results = fly_scenarios(settings, [make_baseline("copy", settings), trained], scenarios, physics)
-    print(table(results, scenarios[-1]))
-    write_results(results, out / "eval")
-    reference = next(
-        result for result in results if result.follower == trained.name and result.scenario == scenarios[-1]
-    )
-    misses = check_bounds(trained, reference.metrics)
-    verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
-    say(f"{policy} {verdict}; figures in {out / 'eval'}")
-    return 0
+    compare_members(settings, options.out, origin)
+    return compare(settings, origin["physics"], options.out, options.out / POLICY)

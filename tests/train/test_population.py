@@ -152,7 +152,7 @@ def test_population_run_exports_every_member_and_the_best(
 ) -> None:
     """Judged by one flight that is just long enough for peaks."""
     shortened = lambda settings: (dataclasses.replace(standard_scenarios(settings)[-1], seconds=21.0),)  # noqa: E731
-    monkeypatch.setattr("mjxball.commands.train.standard_scenarios", shortened)
+    monkeypatch.setattr("mjxball.commands.compare.standard_scenarios", shortened)
     out, sweep = tmp_path / "run", tmp_path / "sweep.json"
     sweep.write_text(json.dumps({"follower.action_scale_tilt": [0.1, 0.2]}))
     assert train([*FLAGS, "--seeds", "2", "--seed", "7", "--sweep", str(sweep), "--out", str(out)]) == 0

@@ -1,0 +1,88 @@
+"""What comes of a training: its policy, and every member of a population, compared on standard scenarios."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import statistics
+from pathlib import Path
+from typing import Any
+
+from mjxball import config
+from mjxball.evaluate.scenarios import standard_scenarios
+from mjxball.terminal import say
+from mjxball.train.run_directory import POLICY
+
+
+def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) -> None:
+    """Print every member on the reference scenario and their median, draw them over training, and tell the card."""
+    from mjxball.evaluate.policies import load_policy
+    from mjxball.evaluate.results import fly_scenarios, table
+    from mjxball.policy.file import load_file, save_file
+    from mjxball.train.curves import POLICIES, draw_members
+
+    policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
+    reference = standard_scenarios(settings)[-1]
+    results = fly_scenarios(settings, policies, [reference], origin["physics"])
+    print(table(results, reference))
+    compared = ("rmse", "settling_time", "x_peak", "overshoot")
+    chosen = load_file(out / POLICY)
+    seeds = [int(result.follower.removeprefix("seed")) for result in results]
+    spread = {name: [None if c.metrics.failed else getattr(c.metrics, name) for c in results] for name in compared}
+    spread["failed"] = [result.metrics.failed for result in results]
+    save_file(out / POLICY, dataclasses.replace(chosen, card={**chosen.card, "population": {"seed": seeds, **spread}}))
+    for name in compared:
+        values = sorted(math.inf if value is None else value for value in spread[name])
+        numbers = (statistics.median(values), values[0], values[-1])
+        missing = "never" if name == "settling_time" else "failed"
+        middle, low, high = (missing if math.isinf(value) else f"{value:.4g}" for value in numbers)
+        print(f"{name}: median {middle}, best {low}, worst {high} of {len(values)}")
+    (out / "eval").mkdir(exist_ok=True)
+    draw_members(out, out / "eval" / "members.png")
+
+
+def _seed_of(path: Path) -> int:
+    return int(path.stem.removeprefix("seed"))
+
+
+def is_evaluated(origin: dict[str, Any]) -> bool:
+    """Whether what was trained is compared with `copy`: that and the standard scenarios are for ours alone."""
+    return not (origin.get("extensions") or {}).get("env")
+
+
+def compile_ahead(settings: config.Config, physics: str) -> None:
+    """Import and compile what `compare` needs, while the device trains: on two cores it then begins at once."""
+    import jax
+
+    from mjxball.baselines import make_baseline
+    from mjxball.plotting import pyplot
+    from mjxball.sim.rollout import simulate_batch
+
+    if jax.default_backend() != "cpu":
+        return  # a GPU trains for so short a time that this would only delay its host
+    pyplot()
+    period = settings.timing.control_period
+    scenarios = [dataclasses.replace(one, seconds=period) for one in standard_scenarios(settings)]
+    copies = [make_baseline("copy", settings) for _ in range(2)]  # as many flights as it will be
+    simulate_batch(settings, [(copy, scenarios) for copy in copies], physics)
+
+
+def compare(settings: config.Config, physics: str, out: Path, policy: Path) -> int:
+    """Compare the exported policy with `copy` on its own plant and physics; figures go to DIR/eval."""
+    from mjxball.baselines import make_baseline
+    from mjxball.evaluate.plots import write_results
+    from mjxball.evaluate.policies import check_bounds, load_policy
+    from mjxball.evaluate.results import fly_scenarios, table
+
+    scenarios = standard_scenarios(settings)
+    trained = load_policy(policy, settings)
+    results = fly_scenarios(settings, [make_baseline("copy", settings), trained], scenarios, physics)
+    print(table(results, scenarios[-1]))
+    write_results(results, out / "eval")
+    reference = next(
+        result for result in results if result.follower == trained.name and result.scenario == scenarios[-1]
+    )
+    misses = check_bounds(trained, reference.metrics)
+    verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"
+    say(f"{policy} {verdict}; figures in {out / 'eval'}")
+    return 0

@@ -1,0 +1,212 @@
+"""What `train.py` is asked to train: settings, origin and directory of a run, or why not."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from mjxball import __version__, cli, config
+from mjxball.algorithms import ALGORITHMS
+from mjxball.errors import InputError
+from mjxball.evaluate.scenarios import standard_scenarios
+from mjxball.physics.step import TRAINING_ENGINES
+from mjxball.train import shares
+from mjxball.train.lock import LOCK, check_free
+from mjxball.train.run_directory import (
+    EXTENSIONS,
+    LARGEST_SEED,
+    MOST_MEMBERS,
+    commit,
+    differences,
+    file_hash,
+    members_of,
+    read_sweep,
+    source_hash,
+    start_policy,
+    versions,
+)
+from mjxball.xla import compile_small_loops_whole
+
+
+def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, dict[str, Any], Path]:
+    """Configuration, origin and directory of a new run; everything that can be refused is refused here."""
+    measured = cli.read_plant(options.plant).preset if options.plant else None
+    name, seed = options.preset or measured or "transport", options.seed or 0
+    _refuse_settings_of_others(options)
+    settings = cli.apply_config_flags(config.preset(name), options)
+    if not 0 <= seed <= LARGEST_SEED:
+        raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
+    for section in ALGORITHMS:
+        if (units := getattr(getattr(settings, section), "activation", "relu")) != "relu":
+            raise InputError(f"--{section}.activation {units}: policy files hold relu; see mjxball.train.train")
+    called = options.env.rpartition(":")[2] if options.env else name
+    out = output_directory(options.out or Path("runs") / f"{called}-{time.strftime('%Y%m%d-%H%M%S')}")
+    standard_scenarios(settings)
+    members = 1 if options.num_seeds is None else options.num_seeds
+    if not 1 <= members <= MOST_MEMBERS:
+        raise InputError(f"--num-seeds must be between 1 and {MOST_MEMBERS}, not {members}")
+    extensions = {name: getattr(options, name) for name in EXTENSIONS if getattr(options, name)}
+    if extensions.get("algorithm") == "sac":  # the default, of which nothing is to be checked
+        del extensions["algorithm"]
+    physics = options.physics or "mjx"
+    if extensions:
+        physics = _check_extensions(extensions, settings, options.physics, bool(options.distributed))
+    origin: dict[str, Any] = {
+        "command": command,
+        "seed": seed,
+        "physics": physics,
+        "seeds": members,
+        "sweep": None if options.sweep is None else read_sweep(options.sweep, members, settings),
+        "package_version": __version__,
+        "commit": commit(),
+        "source_hash": source_hash(),
+        "versions": versions(),
+    }
+    if options.start_from is not None:
+        origin["start_from"] = _start_from(options, settings, members)
+    if options.share is not None:
+        shares.take(origin, *shares.read(options.share))
+    if extensions:
+        origin |= {"extensions": extensions, "extension_hash": _digest(extensions)}
+    return settings, origin, out
+
+
+def output_directory(out: Path) -> Path:
+    """A new directory at `out`, or why there cannot be one: somebody trains there, first."""
+    try:
+        return cli.output_directory(out, but=(LOCK,))
+    except InputError:
+        check_free(out)  # whoever holds it is the better reason
+        raise
+
+
+def _start_from(options: argparse.Namespace, settings: config.Config, members: int) -> Any:
+    """Which policy file the run, or each of `members`, starts from, see `run_directory.start_policy`."""
+    if (options.algorithm or "sac") != "gradient" or options.env:
+        raise InputError(
+            "--start-from needs --algorithm gradient and no --env: the others begin with more than a policy"
+        )
+    if not options.start_from.is_dir():
+        return _start(options.start_from, settings)
+    files = members_of(options.start_from)
+    if len(files) != members:
+        raise InputError(
+            f"{options.start_from} has {len(files)} members and the run {members}; say --num-seeds {len(files)}"
+        )
+    return [_start(path, settings) for path in files]
+
+
+def _start(path: Path, settings: config.Config) -> dict[str, str]:
+    start = {"policy": str(path), "sha256": file_hash(path)}
+    sizes = [len(bias) for bias in start_policy(start, settings).biases[:-1]]
+    if sizes != list(settings.gradient.policy_layers):
+        layers = ",".join(map(str, sizes))
+        raise InputError(f"{path} has hidden layers {layers}; say --gradient.policy_layers {layers}")
+    return start
+
+
+def _digest(names: dict[str, str]) -> str | None:
+    from mjxball.train.extensions import digest
+
+    return digest(names)
+
+
+def _refuse_settings_of_others(options: argparse.Namespace) -> None:
+    """Refuse a setting of an algorithm of ours that is not the one which trains."""
+    used = options.algorithm or "sac"
+    given = [name.removeprefix("config:") for name, value in vars(options).items() if value and "config:" in name]
+    for path in given:
+        section = path.partition(".")[0]
+        if used in ALGORITHMS and section in ALGORITHMS and section != used:
+            raise InputError(
+                f"--{path} is a setting of {section}, and {used} trains; drop it or say --algorithm {section}"
+            )
+
+
+def _check_extensions(names: dict[str, str], settings: config.Config, wanted: str | None, meeting: bool) -> str:
+    """The physics engine to train on; refuses what cannot be found or does not fit, before anything is written."""
+    from mjxball.train.extensions import Extensions, make_env, resolve
+
+    extensions = resolve(Extensions(**names))
+    _choose_processor(extensions.algorithm)
+    if not meeting:
+        wake_devices()
+    engines = getattr(extensions.algorithm, "engines", TRAINING_ENGINES)
+    physics = wanted or engines[0]
+    if physics not in engines:
+        raise InputError(
+            f"--algorithm {names['algorithm']} cannot train on --physics {physics}; it can on {', '.join(engines)}"
+        )
+    if not meeting:  # else the processes meet before anything asks for devices, and training makes the same check
+        make_env(extensions, settings, physics)
+    missing = [name for name in ("init", "collect", "update", "policy") if not hasattr(extensions.algorithm, name)]
+    if extensions.algorithm is not None and missing:
+        raise InputError(
+            f"--algorithm {names['algorithm']} lacks {', '.join(missing)}; see docs/howto/own-algorithm.md"
+        )
+    return physics
+
+
+def _choose_processor(algorithm: Any) -> None:
+    """Train on the CPU, its small loops compiled whole, what is done there before a GPU has compiled it.
+
+    Where JAX_PLATFORMS says otherwise it stays so.
+    """
+    import jax
+
+    if not getattr(algorithm, "prefers_cpu", False):
+        return
+    compile_small_loops_whole()
+    if not os.environ.get("JAX_PLATFORMS"):
+        settings: Any = jax.config
+        settings.update("jax_platforms", "cpu")
+
+
+def recorded(run: Path) -> tuple[config.Config, dict[str, Any]]:
+    """Configuration and origin of the run to be continued; InputError if this program is not the one that made it."""
+    from mjxball.train.run_directory import read_config
+
+    settings, origin = read_config(run)
+    changed = differences(origin)
+    extensions = origin.get("extensions") or {}
+    if extensions and _digest(extensions) != origin.get("extension_hash"):
+        changed.append(f"{', '.join(extensions.values())} has changed")
+    if extensions.get("algorithm"):
+        from mjxball.train.extensions import find
+
+        _choose_processor(find(extensions["algorithm"], "--algorithm"))
+    if changed:
+        raise InputError(f"{run} was made by another program and cannot be continued exactly: {'; '.join(changed)}")
+    return settings, origin
+
+
+def refuse_beside(options: argparse.Namespace, why: str, but: tuple[str, ...]) -> None:
+    """InputError that begins with `why` if something is given that makes a new run, `but` those."""
+    given = [f"--{name[7:]}" for name, value in vars(options).items() if name.startswith("config:") and value]
+    own = ("out", "seed", "num_seeds", "sweep", "share", "physics", "plant", "start_from", *EXTENSIONS)
+    given += [f"--{name.replace('_', '-')}" for name in own if name not in but and getattr(options, name) is not None]
+    given += [options.preset] if options.preset else []
+    if given:
+        raise InputError(f"{why}; drop {', '.join(given)}")
+
+
+@functools.cache
+def wake_devices() -> None:
+    """Start the accelerator's runtime (2 s of waiting on a GPU) beside the imports that follow.
+
+    Whatever ends the process waits for the thread: one that Python stops inside XLA aborts it.
+    """
+    import jax  # here: two threads must not both import it
+
+    threading.Thread(target=_first_kernel, args=(jax.numpy,)).start()
+
+
+def _first_kernel(xp: Any) -> None:
+    with contextlib.suppress(RuntimeError, AssertionError):  # without a device; who needs one says so
+        xp.zeros(1).block_until_ready()
