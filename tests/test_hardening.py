@@ -1,32 +1,17 @@
-"""`benchmarks/hardening.py` notices what a refused command must not do, and a few of its lines are refused well."""
+"""Refused command lines do nothing else, and what judges them notices if they did."""
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
-from types import ModuleType
 from typing import Any
 
+import hostile_lines
 import pytest
-from command_line import REPOSITORY
-
-
-@pytest.fixture(scope="module")
-def hardening() -> ModuleType:
-    """The script, which imports others beside it."""
-    place = str(REPOSITORY / "benchmarks")
-    sys.path.insert(0, place)
-    try:
-        import hardening
-    finally:
-        sys.path.remove(place)
-    return hardening
-
 
 GOOD = "import sys; sys.stderr.write('error: no\\n'); "
 
 
-def test_what_a_refused_command_must_not_do_is_seen(hardening: ModuleType) -> None:
+def test_what_a_refused_command_must_not_do_is_seen() -> None:
     lines = {
         GOOD + "sys.exit(2)": "",
         GOOD + "sys.exit(0)": "exit code",
@@ -39,29 +24,28 @@ def test_what_a_refused_command_must_not_do_is_seen(hardening: ModuleType) -> No
         "import time; time.sleep(60)": "time",
         "import time; b = b'x' * (3 * 10**8); time.sleep(60)": "memory",
     }
-    kept, hardening.MEMORY = hardening.MEMORY, 2e8
+    kept, hostile_lines.MEMORY = hostile_lines.MEMORY, 2e8
     try:
         for line, cause in lines.items():
-            case = hardening.Case("python", line, ("-c", line), {"mine": b"mine"})
-            wrong = hardening.run(case, 60.0 if cause != "time" else 3.0)["wrong"]
+            case = hostile_lines.Case("python", line, ("-c", line), {"mine": b"mine"})
+            wrong = hostile_lines.run(case, 60.0 if cause != "time" else 3.0)["wrong"]
             assert (not wrong) if not cause else any(text.startswith(cause) for text in wrong), (line, wrong)
     finally:
-        hardening.MEMORY = kept
+        hostile_lines.MEMORY = kept
 
 
-def test_every_command_has_many_lines(hardening: ModuleType) -> None:
-    cases = hardening.every_case()
-    assert len(cases) >= hardening.LINES
+def test_every_command_has_many_lines() -> None:
+    cases = hostile_lines.every_case()
+    assert len(cases) >= 250
     assert len({(case.program, case.flaw) for case in cases}) == len(cases)
     count = Counter(case.program for case in cases)
     assert set(count) == {"train", "eval", "view", "fly", "export", "gains", "identify"}
     assert min(count[name] for name in ("train", "eval", "view", "fly")) > 40
-    assert len(hardening.spread(cases, hardening.LINES)) == hardening.LINES
 
 
 @pytest.mark.slow
-def test_some_of_its_lines_are_refused_well(hardening: ModuleType) -> None:
-    """One of each command: the whole list is the script's."""
+def test_some_of_its_lines_are_refused_well() -> None:
+    """One of each command."""
     wanted: dict[str, Any] = {
         "train": "--plant an unknown key",
         "eval": "policy: a NaN weight",
@@ -71,7 +55,15 @@ def test_some_of_its_lines_are_refused_well(hardening: ModuleType) -> None:
         "gains": "gains.json exists",
         "identify": "log: a directory",
     }
-    found = [case for case in hardening.every_case() if wanted.get(case.program) == case.flaw]
+    found = [case for case in hostile_lines.every_case() if wanted.get(case.program) == case.flaw]
     assert {case.program for case in found} == set(wanted)
     for case in found:
-        assert hardening.run(case, 120.0)["wrong"] == [], case
+        assert hostile_lines.run(case, 120.0)["wrong"] == [], case
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("program", ["train", "eval", "view", "fly", "export", "gains", "identify"])
+def test_every_line_is_refused_well(program: str) -> None:
+    lines = [case for case in hostile_lines.every_case() if case.program == program]
+    wrong = {case.flaw: found for case in lines if (found := hostile_lines.run(case, hostile_lines.SECONDS)["wrong"])}
+    assert wrong == {}

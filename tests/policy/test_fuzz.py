@@ -1,4 +1,4 @@
-"""Damaged files load right or are refused in one sentence: the suite's share of `benchmarks/fuzz_loaders.py`."""
+"""Damaged files load right or are refused in one sentence."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import NamedTuple
 
+import damage
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
-from command_line import REPOSITORY, TRANSPORT, environment
+from command_line import TRANSPORT, environment
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -31,39 +30,33 @@ from mjxball.train.run_directory import read_config
 
 
 @pytest.fixture(scope="module")
-def fuzz() -> Iterator[ModuleType]:
-    """benchmarks/fuzz_loaders.py, which is a script."""
-    place = str(REPOSITORY / "benchmarks")
-    sys.path.insert(0, place)
-    try:
-        import fuzz_loaders
-
-        yield fuzz_loaders
-    finally:
-        sys.path.remove(place)
-
-
-@pytest.fixture(scope="module")
-def run_directory(fuzz: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The records of a run of two members, without its checkpoints."""
-    return fuzz.records(tmp_path_factory.mktemp("run"))
+    return damage.records(tmp_path_factory.mktemp("run"))
 
 
-def test_damaged_policies(fuzz: ModuleType, tmp_path: Path) -> None:
-    """140 files, 10 of each kind of damage. Seed 1: the benchmark's own files are others."""
-    counts = fuzz.fuzz_policies(140, 1, tmp_path)
+MANY = pytest.mark.release
+
+
+@pytest.mark.parametrize("files", [140, pytest.param(10_000, marks=MANY)])
+def test_damaged_policies(files: int, tmp_path: Path) -> None:
+    """At least 10 of each kind of damage."""
+    if files > 1000:
+        damage.watch()  # slows the rest of this process
+    counts = damage.fuzz_policies(files, 1, tmp_path)
     assert [count for count in counts if count.faults] == []
-    assert sum(count.files for count in counts) == 140
+    assert sum(count.files for count in counts) == files
     assert sum(count.loaded for count in counts) > 0, "nothing loads: the mutations are not what they say"
-    assert sum(count.refused for count in counts) > 50
+    assert sum(count.refused for count in counts) > files / 3
 
 
-def test_damaged_records_of_a_run(fuzz: ModuleType, run_directory: Path) -> None:
-    fuzz.read_records(run_directory)
-    counts = fuzz.fuzz_records(run_directory, 19, 1)
+@pytest.mark.parametrize("files", [19, pytest.param(1000, marks=MANY)])
+def test_damaged_records_of_a_run(files: int, run_directory: Path) -> None:
+    damage.read_records(run_directory)
+    counts = damage.fuzz_records(run_directory, files, 1)
     assert [count for count in counts if count.faults] == []
-    assert sum(count.loaded for count in counts) > 1
-    assert sum(count.refused for count in counts) > 7
+    assert sum(count.loaded for count in counts) > files / 20
+    assert sum(count.refused for count in counts) > files / 3
 
 
 class TestTheJudge:
@@ -80,13 +73,13 @@ class TestTheJudge:
         ],
         ids=["traceback", "two lines", "memory", "code", "no memory"],
     )
-    def test_fault(self, fuzz: ModuleType, load, word: str, tmp_path: Path) -> None:
-        count = fuzz.Count("planted")
-        assert word in fuzz.measured(load, tmp_path, count)
+    def test_fault(self, load, word: str, tmp_path: Path) -> None:
+        count = damage.Count("planted")
+        assert word in damage.measured(load, tmp_path, count)
         assert (count.files, count.faults) == (1, 1)
 
-    def test_hang(self, fuzz: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.setattr(fuzz, "PATIENCE", 0.2)
+    def test_hang(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.setattr(damage, "PATIENCE", 0.2)
 
         def hang(path: Path) -> None:
             while True:
@@ -96,11 +89,11 @@ class TestTheJudge:
                 except Exception:  # as a loader's own clause would
                     continue
 
-        assert fuzz.outcome(hang, tmp_path) == "it hung"
+        assert damage.outcome(hang, tmp_path) == "it hung"
 
-    def test_a_pickle_would_be_seen(self, fuzz: ModuleType, tmp_path: Path) -> None:
+    def test_a_pickle_would_be_seen(self, tmp_path: Path) -> None:
         path = tmp_path / "pickle.npz"
-        path.write_bytes(fuzz.pickled(random.Random(3), TRANSPORT.read_bytes()))
+        path.write_bytes(damage.pickled(random.Random(3), TRANSPORT.read_bytes()))
         for name in ("card", "weight_0", "observation_mean", "extra"):
             with np.load(path, allow_pickle=True) as data:
                 try:
@@ -137,25 +130,25 @@ class TestFoundHoles:
         path.write_bytes(content)
         self.refused(path, "damaged")
 
-    def test_terabyte_by_header(self, tmp_path: Path, fuzz: ModuleType) -> None:
+    def test_terabyte_by_header(self, tmp_path: Path) -> None:
         stream = io.BytesIO()
         np.lib.format.write_array_header_1_0(stream, {"descr": "<f4", "fortran_order": False, "shape": (2**28,)})
         path = self.rewritten(tmp_path, "weight_0.npy", stream.getvalue() + bytes(4096))
-        count = fuzz.Count("header")
-        assert fuzz.measured(Policy.load, path, count) == "refused"
+        count = damage.Count("header")
+        assert damage.measured(Policy.load, path, count) == "refused"
         assert count.memory < 5  # [MiB]; 1 GiB if the header were believed
 
     def test_lzma_dictionary(self, tmp_path: Path) -> None:
         path = self.rewritten(tmp_path, "extra.npy", b"x", zipfile.ZIP_LZMA)
         self.refused(path, "another method")
 
-    def test_wide_card(self, tmp_path: Path, fuzz: ModuleType) -> None:
+    def test_wide_card(self, tmp_path: Path) -> None:
         """JSON of two million empty lists: 60 times its own length in memory, if it were parsed."""
         stream = io.BytesIO()
         np.save(stream, np.array("[" + "[]," * 2_000_000 + "[]]"))
         path = self.rewritten(tmp_path, "card.npy", stream.getvalue(), zipfile.ZIP_DEFLATED)
-        count = fuzz.Count("card")
-        assert fuzz.measured(Policy.load, path, count) == "refused"
+        count = damage.Count("card")
+        assert damage.measured(Policy.load, path, count) == "refused"
         assert count.memory < 120  # [MiB]: the text itself, 24 MiB, a few times; 250 more if it were parsed
 
     def test_pipe(self, tmp_path: Path) -> None:
@@ -292,13 +285,13 @@ for name in files:
         assert len(warnings) == 1
         assert "checkpoint 9 cannot be read" in warnings[0]
 
-    def test_every_file_damaged(self, fuzz: ModuleType, written: Path) -> None:
+    def test_every_file_damaged(self, written: Path) -> None:
         self.assert_whole(self.restored(written))
         lost = 0
         files = sorted(path for path in (written / "checkpoints").rglob("*") if path.is_file())
         for number, (path, kind) in enumerate(itertools.product(files, ["overwritten", "truncated", "flipped_bits"])):
             content = path.read_bytes()
-            path.write_bytes(getattr(fuzz, kind)(random.Random(number), content or b"x"))
+            path.write_bytes(getattr(damage, kind)(random.Random(number), content or b"x"))
             found = self.restored(written)
             path.write_bytes(content)
             lost += found is None

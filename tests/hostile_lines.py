@@ -1,14 +1,13 @@
 """Bad and hostile command lines and files, each in a process and a directory of its own.
 
 A case is a command line that is sound but for one flaw, generated from the programs' own parsers, with the files that
-it is given. Of each it asserts: exit code 2, one sentence on stderr, no traceback, less than 20 s and 3 GB, nothing
-overwritten and nothing left behind. Prints what of that does not hold; exit code 1 if anything does not.
+it is given. `run` says what of this does not hold: exit code 2, one sentence on stderr, no traceback, less than 20 s
+and 3 GB, nothing overwritten and nothing left behind.
 """
 
 from __future__ import annotations
 
 import argparse
-import concurrent.futures
 import io
 import json
 import os
@@ -17,16 +16,15 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 from typing import Any
 
 import numpy as np
+from command_line import REPOSITORY as ROOT
 
-from harness import ROOT, Row, arguments, table, write
 from mjxball import cli, export
 from mjxball import config as configs
 from mjxball.commands import evaluate, train
@@ -35,7 +33,7 @@ from mjxball.policy.file import shipped_policy
 from mjxball.rig import gains, identify
 from mjxball.view import main as view
 
-LINES, SECONDS, MEMORY = 250, 20.0, 3.0e9  # [s] of a line, [bytes] resident at most
+SECONDS, MEMORY = 20.0, 3.0e9  # [s] of a line, [bytes] resident, at most
 POLL = 0.05  # [s]
 LONGEST = 1000  # characters of a sentence, paths included
 SPARSE = 6 * 10**9  # bytes of a file that takes no room on the disk
@@ -338,13 +336,7 @@ def every_case(seed: int = 0, config_flags: int = 40) -> list[Case]:
     return [*found, *settings(named["train"], random, config_flags), *files(named)]
 
 
-def spread(cases: Sequence[Case], count: int) -> list[Case]:
-    """`count` of the cases, evenly from their order; all of them if there are fewer."""
-    step = max(len(cases) / count, 1.0)
-    return [cases[int(number * step)] for number in range(min(count, len(cases)))]
-
-
-def run(case: Case, longest: float) -> Row:
+def run(case: Case, longest: float) -> dict[str, Any]:
     """What a case's process did, `wrong` being what it should not have."""
     with tempfile.TemporaryDirectory(prefix="hardening-") as folder:
         place, temporary, errors = Path(folder) / "work", Path(folder) / "tmp", Path(folder) / "stderr"
@@ -426,36 +418,3 @@ def listing(place: Path) -> dict[str, tuple[int, int]]:
         status = path.lstat()
         found[str(path.relative_to(place))] = (0 if path.is_dir() else status.st_size, status.st_mtime_ns)
     return found
-
-
-def main(given: Sequence[str] | None = None) -> int:
-    """Run, print, write."""
-    parser = arguments(__file__, __doc__)
-    parser.add_argument("--lines", type=int, default=LINES, metavar="N", help="how many of the cases, evenly chosen")
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes at a time (2)")
-    parser.add_argument("--only", default="", metavar="TEXT", help="of cases whose program and flaw have TEXT")
-    parser.add_argument("--seconds", type=float, default=SECONDS, metavar="S", help="of a line; more on a busy machine")
-    options = parser.parse_args(given)
-    cases = [case for case in every_case() if options.only in f"{case.program}: {case.flaw}"]
-    rows = []
-    with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
-        for row in pool.map(lambda case: run(case, options.seconds), spread(cases, options.lines)):
-            rows.append(row)
-            if row["wrong"]:
-                print(f"{row['program']:9} {row['flaw']:44} {'; '.join(row['wrong'])}", flush=True)
-    found = []
-    for name in dict.fromkeys(row["program"] for row in rows):
-        mine = [row for row in rows if row["program"] == name]
-        line = {"program": name, "lines": len(mine), "refused well": sum(not row["wrong"] for row in mine)}
-        most = max(row["bytes"] for row in mine) / 1e9
-        found.append(line | {"slowest s": max(row["seconds"] for row in mine), "most GB": most})
-    table(found)
-    bad = [row for row in rows if row["wrong"]]
-    causes = Counter(cause.split(":")[0] for row in bad for cause in row["wrong"])
-    print(f"{len(rows) - len(bad)} of {len(rows)} of {len(cases)} lines; {dict(causes)}")
-    write(options.json, {"lines": rows})
-    return 1 if bad else 0
-
-
-if __name__ == "__main__":
-    sys.exit(cli.run_command(main))
