@@ -30,6 +30,8 @@ TRAIN = shlex.join([sys.executable, "tests/short_train.py"])
 FIRST_EVALUATION = 2 * STEPS  # after which the run would save by itself
 MEMBERS = [*tiny(sac__total_steps=2 * FIRST_EVALUATION, sac__num_evaluations=2), "--num-seeds", "2"]
 
+pytestmark = pytest.mark.release
+
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
@@ -81,7 +83,6 @@ def assert_same_policies(first: Path, second: Path) -> None:
         assert all(one[name].tobytes() == other[name].tobytes() for name in arrays)
 
 
-@pytest.mark.slow
 def test_preempted_and_requeued_job_resumes_to_the_same_bits(cluster: Cluster, whole: Path, tmp_path: Path) -> None:
     """A job of higher priority puts it off; then SIGTERM reaches its step, as at the end of its time."""
     run = tmp_path / "run"
@@ -101,7 +102,6 @@ def test_preempted_and_requeued_job_resumes_to_the_same_bits(cluster: Cluster, w
     assert_same_policies(run, whole)
 
 
-@pytest.mark.slow
 def test_job_array_trains_a_population_in_parts(cluster: Cluster, tmp_path: Path) -> None:
     """Brought together its members are those of one run, to the last bit."""
     sweep = tmp_path / "sweep.json"
@@ -120,7 +120,6 @@ def test_job_array_trains_a_population_in_parts(cluster: Cluster, tmp_path: Path
     assert_same_policies(gathered, whole)
 
 
-@pytest.mark.slow
 def test_mpirun_trains_and_resumes_to_the_same_bits(whole: Path, tmp_path: Path) -> None:
     """SIGTERM reaches process 0, whose number is in the lock."""
     if shutil.which("mpirun") is None:
