@@ -90,6 +90,8 @@ LONGEST = (
 def pytest_configure(config: pytest.Config) -> None:
     """With `--dist loadfile`, files begin in the order of `pytest_collection_modifyitems`."""
     config.option.loadscopereorder = False
+    if config.option.markexpr == "slow":  # what is for a release is for that alone, also in a file of the second tier
+        config.option.markexpr = "slow and not release"
 
 
 @pytest.hookimpl(tryfirst=True)

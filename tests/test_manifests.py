@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,7 +20,7 @@ def manifests() -> list[Any]:
     return [yaml.safe_load(text) for text in re.findall(r"^```yaml\n(.*?)^```", page, re.DOTALL | re.MULTILINE)]
 
 
-def test_the_job_set_numbers_its_pods_as_its_command_says() -> None:
+def test_the_job_set_numbers_its_pods_as_its_command_says(tmp_path: Path) -> None:
     job_set, _ = manifests()
     (job,) = job_set["spec"]["replicatedJobs"]
     spec = job["template"]["spec"]
@@ -25,8 +28,13 @@ def test_the_job_set_numbers_its_pods_as_its_command_says() -> None:
     number, name = spec["completions"], job_set["metadata"]["name"]
     assert spec["parallelism"] == number
     assert spec["completionMode"] == "Indexed"  # which JOB_COMPLETION_INDEX is of
-    meeting = f"--coordinator {name}-{job['name']}-0-0.{name}:1234 --processes {number} --process $JOB_COMPLETION_INDEX"
-    assert meeting in container["command"][-1]
+    meeting = f"--coordinator {name}-{job['name']}-0-0.{name}:1234 --processes {number} --process 1"
+    (tmp_path / "python").write_text('#!/bin/sh\necho "$@"')
+    (tmp_path / "python").chmod(0o755)
+    child = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "JOB_COMPLETION_INDEX": "1"}
+    done = subprocess.run(container["command"], env=child, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("train.py transport-large ")
+    assert done.stdout.endswith(f" --distributed {meeting}\n")
 
 
 @pytest.mark.release

@@ -27,10 +27,14 @@ SHORTER = {
     "train.py --distributed": TRAINING,
     "train.py --plant": TRAINING,
     "--benchmark": "--tracks pair",
-    "--figures": "--physics newton-euler",
+    "--figures": "--figures speeds --physics newton-euler",
     "eval.py policies/universal.npz": "--physics newton-euler",
     "--rehearse": "--seconds 5",
 }
+
+
+# What takes half a minute, and other tests run as well: before a release.
+LONG = ("--algorithm gradient", "--plant team3", "--distributed", "--benchmark")
 
 
 def shown(found: dict[str, Any], key: str, factor: float, digits: int) -> str:
@@ -136,8 +140,13 @@ def test_an_extra_brings_what_it_names() -> None:
     assert "cflib" in needed("fly") - needed("train")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("task", "cell", "extra"), ROWS, ids=[cell[:40] for _, cell, _ in ROWS])
+def cells() -> list[Any]:
+    """Every row, its mark that of the tier which runs it."""
+    marks = {cell: "release" if any(part in cell for part in LONG) else "slow" for _, cell, _ in ROWS}
+    return [pytest.param(*row, id=row[1][:40], marks=getattr(pytest.mark, marks[row[1]])) for row in ROWS]
+
+
+@pytest.mark.parametrize(("task", "cell", "extra"), cells())
 def test_a_cell_runs_with_its_extra_alone(task: str, cell: str, extra: str, here: Path) -> None:
     site = site_of("train" if extra == "gpu" else extra, here / "site")
     if "--resume" in cell:

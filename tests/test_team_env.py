@@ -306,7 +306,7 @@ def test_the_table_of_rigs_has_one_row_for_each_size() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["sac", "ppo", "gradient"])
+@pytest.mark.parametrize("algorithm", ["sac", "ppo", pytest.param("gradient", marks=pytest.mark.release)])
 def test_every_algorithm_learns_from_all_followers(algorithm: str) -> None:
     """A few steps of each: 6 followers in four worlds, half of them padded; finite numbers, weights that move."""
     sizes = {"num_envs": 6, "policy_layers": (8,)}

@@ -133,7 +133,7 @@ def algorithm_of(name: str, transport: Config) -> tuple[Any, Environments]:
     return kind(dataclasses.replace(transport, **{part: own}), environments), environments
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent) -> None:
     """The loss beside flights, one with a small impulse of the first action: observations, actions, GRU and all."""
     worlds, steps, weight, small = 3, 6, 0.3, 2e-3

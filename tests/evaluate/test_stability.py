@@ -43,7 +43,7 @@ def test_copy_hovers_where_the_closed_form_says_and_decays_as_its_pd_law(paper: 
     assert mistaken.error == pytest.approx(0.05 * 9.81 / (2 * 1.1 * 0.5), rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_delay_margin_is_where_flights_begin_to_grow(paper: Config) -> None:
     """LQG, which is told of no delay, bears one control step and not two."""
     lqg, margin = make_baseline("lqg", paper), 1

@@ -194,9 +194,9 @@ def test_a_slow_landing_is_not_over_before_the_pair_rests() -> None:
 
 @pytest.mark.slow
 def test_flights_in_a_row_with_reboots_between_them() -> None:
-    """Six, a drone reboots before every other one."""
+    """Four, a drone reboots before every other one."""
     world = hovering(1.0)
-    for number in range(6):
+    for number in range(4):
         if number:
             world.track.clear()
             if number % 2:

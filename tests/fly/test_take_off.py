@@ -53,7 +53,7 @@ def test_a_ball_on_the_leaders_side_lifts() -> None:
 
 @pytest.mark.slow
 def test_the_ball_may_lie_anywhere_within_6_cm() -> None:
-    for number, ball in enumerate((-0.06, -0.045, -0.02, 0.0, 0.03, 0.045, 0.05)):
+    for number, ball in enumerate((-0.06, 0.0, 0.03, 0.05)):
         check_that_the_stand_keeps(ball, seed=number, noise=0.5 * number, delay=0.005 * (number % 4))
 
 

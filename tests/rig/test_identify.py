@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mjxball import cli
-from mjxball.commands import evaluate, train
+from mjxball.commands import evaluate, new_run, train
 from mjxball.commands.scenarios import scenarios_of, setup_of
 from mjxball.config import Config, preset, validate
 from mjxball.control import crazyflie, rotations
@@ -168,14 +168,14 @@ class TestPlantFile:
 
     def test_train_takes_it_with_its_preset(self, tmp_path: Path) -> None:
         options = train.parser().parse_args(["--plant", str(self.write(tmp_path)), "--out", str(tmp_path / "run")])
-        settings, _, _ = train._new_run(options, "")
+        settings, _, _ = new_run.new_run(options, "")
         assert settings.preset == "flight"
         assert settings.plant.rotor_lag == SOME.lag
 
     def test_flags_overrule_it(self, tmp_path: Path) -> None:
         path, out = self.write(tmp_path), str(tmp_path / "run")
         options = train.parser().parse_args(["--plant", str(path), "--out", out, "--plant.rotor_lag", "0.07"])
-        assert train._new_run(options, "")[0].plant.rotor_lag == 0.07
+        assert new_run.new_run(options, "")[0].plant.rotor_lag == 0.07
 
     def test_eval_takes_it(self, tmp_path: Path) -> None:
         options = evaluate.parser().parse_args(["--followers", "copy", "--plant", str(self.write(tmp_path))])

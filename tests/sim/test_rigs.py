@@ -135,7 +135,7 @@ def test_a_padded_rig_flies_as_it_does_alone() -> None:
     assert float(jnp.abs(flown[1].obs[:, 6:9]).max()) > 0.05  # it moves
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_training_differentiates_what_followers_remember() -> None:
     """The slope of what is commanded later in the first action, by a state that sums up rates: against a difference."""
     config = UNIVERSAL

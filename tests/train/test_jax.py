@@ -100,7 +100,7 @@ def test_64_bits_change_nothing_of_a_run(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found[1][name], value, err_msg=name)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_train_is_the_same_with_64_bits_and_over_a_mesh() -> None:
     """`shard_map` needs check_vma=False, as the docstring says: Brax's networks know nothing of varying axes."""
     keys = jax.random.split(jax.random.PRNGKey(0), 2)

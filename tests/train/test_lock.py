@@ -139,7 +139,7 @@ def test_a_directory_that_cannot_be_written_is_refused(tmp_path: Path, monkeypat
         pass
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_two_processes_of_one_run_are_one_holder_and_a_second_pair_is_refused(
     tmp_path: Path, holder: subprocess.Popen[str]
 ) -> None:

@@ -42,7 +42,7 @@ def test_nothing_makes_an_app_command_what_it_must_not():
         assert len(reached) >= 18, reached
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @needs_gcc
 def test_a_check_that_is_missing_is_reported():
     files = fuzz.sources_of("flight", True)
