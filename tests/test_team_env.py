@@ -104,7 +104,7 @@ class TestRings:
         )
         wider = varied(found, Factors(mount_scale=1.5), attitude, np.array(attitude.design_object_mass))
         np.testing.assert_allclose(wider.gains.kp, plant_parameters(wide, attitude).gains.kp, rtol=1e-12)
-        assert padded(found, 6).share.sum() == pytest.approx(1.0)
+        assert padded(found, 6).load_share.sum() == pytest.approx(1.0)
 
 
 def random_cases() -> list[tuple]:

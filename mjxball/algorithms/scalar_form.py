@@ -192,14 +192,14 @@ def _scan(body: Any, length: int, inputs: list[Value]) -> list[Value]:
 
     # What stays the same: the traced numbers among it are differentiated, too.
     same = parts[:count]
-    traced = [one for part in same for one in part.flat if not _known(one)]
+    traced = [one for part in same for one in part.flat if not _is_constant(one)]
 
     def step(traced: list[Any], flat: list[Any]) -> list[Any]:
         rest = iter(traced)
         filled = [np.empty(part.shape, object) for part in same]
         for part, own in zip(filled, same, strict=True):
             for index in np.ndindex(own.shape):
-                part[index] = own[index] if _known(own[index]) else next(rest)
+                part[index] = own[index] if _is_constant(own[index]) else next(rest)
         return numbers(_evaluate(body.jaxpr, body.consts, [*filled, *values(flat)]))
 
     return values(_repeated(step, length)(traced, numbers(parts[count:])))
@@ -248,7 +248,7 @@ def _parts(value: Value, aval: Any) -> Parts:
 def _array(value: Value, aval: Any) -> Any:
     if not (isinstance(value, np.ndarray) and value.dtype == object):
         return value
-    if all(map(_known, value.flat)):
+    if all(map(_is_constant, value.flat)):
         return np.array(value.tolist(), aval.dtype)
     batch = _batch(value.flat)
     if not aval.shape:
@@ -257,7 +257,7 @@ def _array(value: Value, aval: Any) -> Any:
     return jnp.stack(numbers, len(batch)).reshape(batch + aval.shape)
 
 
-def _known(number: Any) -> bool:
+def _is_constant(number: Any) -> bool:
     return isinstance(number, np.generic)
 
 
@@ -267,7 +267,7 @@ def _batch(numbers: Iterable[Any]) -> tuple[int, ...]:
 
 
 def _is(number: Any, constant: float) -> bool:
-    return _known(number) and number.dtype != bool and number == constant
+    return _is_constant(number) and number.dtype != bool and number == constant
 
 
 def _add(a: Any, b: Any) -> Any:
@@ -280,7 +280,7 @@ def _subtract(a: Any, b: Any) -> Any:
 
 def _multiply(a: Any, b: Any) -> Any:
     if _is(a, 0) or _is(b, 0):
-        return (a if _known(a) else b).dtype.type(0)
+        return (a if _is_constant(a) else b).dtype.type(0)
     return b if _is(a, 1) else a if _is(b, 1) else a * b
 
 
@@ -294,12 +294,12 @@ SHORTENED = {"add": _add, "add_any": _add, "sub": _subtract, "mul": _multiply, "
 def _compute(equation: Any, numbers: list[Any]) -> Any:
     """One number of an elementwise operation."""
     name = equation.primitive.name
-    if all(map(_known, numbers)):
+    if all(map(_is_constant, numbers)):
         with jax.ensure_compile_time_eval():
             return np.asarray(equation.primitive.bind(*map(jnp.asarray, numbers), **equation.params))[()]
     if name in SHORTENED:
         return SHORTENED[name](*numbers)
-    if name == "select_n" and _known(numbers[0]):
+    if name == "select_n" and _is_constant(numbers[0]):
         return numbers[1 + int(numbers[0])]
     batch = _batch(numbers)
     return equation.primitive.bind(*(jnp.broadcast_to(number, batch) for number in numbers), **equation.params)

@@ -35,7 +35,7 @@ class AssemblyModel(NamedTuple):
     mounts: np.ndarray  # (N, 2) from O [m]
     own_mass: np.ndarray  # (N,) [kg]
     known_mass: np.ndarray  # (N,) that a drone believes to lift besides the load [kg]
-    share: np.ndarray  # (N,) of the load's weight that each drone believes to carry
+    load_share: np.ndarray  # (N,) of the load's weight that each drone believes to carry
     effect: np.ndarray  # (F, 3, 3) lift, roll and pitch torque about O per each follower's own
     inverse_cost: np.ndarray  # (F, 3) squares of lift [N2] and torques [N2 m2] over those of the rotor forces they take
     asked_per_wrench: np.ndarray  # (F, 3, 3) each follower's lift and torques per wrench about O, if nothing fails
@@ -60,9 +60,9 @@ class AssemblyModel(NamedTuple):
         own = commands[..., 0, :] if self.followers == 1 else commands
         return own if self.angles is None else rotations.turned_about_z(own, -self.angles)
 
-    def of_flight(self, known: Array, axes: int = 0) -> Array:
+    def of_flight(self, values: Array, axes: int = 0) -> Array:
         """What of `PrivilegedInfo` is the same for all followers, without their axis before the last `axes`."""
-        return known if self.followers == 1 else known.take(0, axis=known.ndim - axes - 1)
+        return values if self.followers == 1 else values.take(0, axis=values.ndim - axes - 1)
 
     def of_followers(self, values: Array) -> Array:
         """(..., F) of `values` (..., N) of all drones."""
@@ -72,7 +72,7 @@ class AssemblyModel(NamedTuple):
     def carried(self, believed_mass: Array) -> Array:
         """What every drone believes to lift (..., N) with an object of `believed_mass` (...) [kg]."""
         xp = believed_mass.__array_namespace__()
-        known, share = (xp.asarray(part, dtype=believed_mass.dtype) for part in (self.known_mass, self.share))
+        known, share = (xp.asarray(part, dtype=believed_mass.dtype) for part in (self.known_mass, self.load_share))
         return known + share * believed_mass[..., None]
 
     def corrections(self, wrench: Array, carried: Array, thrust: Array | None = None) -> Array:
@@ -199,7 +199,7 @@ def assembly_model(config: Config, name: str) -> AssemblyModel:
         mounts=constants.mounts[:, :2],
         own_mass=constants.drone_mass,
         known_mass=constants.known_mass,
-        share=constants.share,
+        load_share=constants.load_share,
         effect=effect,
         inverse_cost=inverse_cost,
         asked_per_wrench=priced @ np.linalg.inv((effect @ priced).sum(axis=0)),

@@ -70,7 +70,7 @@ class Program:
     def __init__(self, own: Design, limits: Limits, mass: float):
         from scipy import sparse
 
-        carried = limits.own_mass + limits.share * mass
+        carried = limits.own_mass + limits.load_share * mass
         cost = np.sqrt(np.outer(BLOCKS, own.cost)).ravel()
         states, corrections, low, high, lifting = limit_rows(own, limits, carried)
         corrections = corrections / cost
@@ -194,7 +194,7 @@ class Mpc:
         observation = self._seen(observation)
         kind = xp.round(clipped(mass, 0.0, MASSES[-1]) / MASSES[1]).astype(int)
         own = Design(*(xp.asarray(part, dtype=dtype)[kind] for part in self._stacked))
-        hover = (self._limits.own_mass + self._limits.share * mass) * self._gravity / 4.0
+        hover = (self._limits.own_mass + self._limits.load_share * mass) * self._gravity / 4.0
         x, commands = self._estimate(own, state, observation), state[..., self._states :]
         now = x
         for late in range(self.delay):

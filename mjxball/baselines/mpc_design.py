@@ -102,7 +102,7 @@ class Limits(NamedTuple):
     kp: Float[np.ndarray, " 2"]  # about roll and pitch [N m/rad]
     kd: Float[np.ndarray, " 2"]  # [N m s/rad]
     own_mass: float  # that it lifts besides its share of the object [kg]
-    share: float
+    load_share: float
     torque_per_force: float  # [m]
 
 
@@ -111,7 +111,7 @@ def known_model(config: Config) -> AssemblyModel:
     if not config.plant.is_team:
         return pair_model(config, NAME)
     model, numbers = ideal_model(config, NAME), plant_parameters(config.plant, config.attitude)
-    own = numbers.known_mass, numbers.share, numbers.arm, numbers.rotor_force_max, numbers.rotor_lag, numbers.yaw
+    own = numbers.known_mass, numbers.load_share, numbers.arm, numbers.rotor_force_max, numbers.rotor_lag, numbers.yaw
     if max(float(np.ptp(part)) for part in own) > ALIKE:
         raise InputError(f"follower {NAME!r} flies teams of drones that are alike, with one plan for all; these differ")
     return model
@@ -255,6 +255,6 @@ def limits_of(config: Config) -> Limits:
         kp=np.array(model.kp),
         kd=np.array(model.kd),
         own_mass=float(model.known_mass[one]),
-        share=float(model.share[one]),
+        load_share=float(model.load_share[one]),
         torque_per_force=float(mixer.torque_per_force(arm, layout)),
     )

@@ -68,7 +68,7 @@ def design(config: Config) -> Design:
         tilt_limit=TUNING.tilt_limit,
         stiffness=kp,
         half_length=0.5 * float(pair.mounts[0, 0] - pair.mounts[1, 0]),
-        carried=pair.known_mass + pair.share * config.plant.object_mass,
+        carried=pair.known_mass + pair.load_share * config.plant.object_mass,
     )
 
 

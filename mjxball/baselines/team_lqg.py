@@ -83,10 +83,10 @@ def design(config: Config) -> Design:
     )
 
 
-class Known(NamedTuple):
+class TeamModel(NamedTuple):
     """What followers know of their team, each in its mount frame; without F where there is one."""
 
-    share: float  # N / (N - 1)
+    ratio: float  # N / (N - 1)
     # (F, 2) roll and pitch that all drones would have to command to hold what lifting 1 m/s2 more than the leader does
     # [rad per m/s2]
     lever: Array
@@ -95,10 +95,10 @@ class Known(NamedTuple):
     room: Array
 
 
-def known(config: Config) -> Known:
+def team_model(config: Config) -> TeamModel:
     """What the followers of the team of `config` know of it."""
     plant, numbers = config.plant, plant_parameters(config.plant, config.attitude)
-    lifted = numbers.known_mass + numbers.share * plant.object_mass
+    lifted = numbers.known_mass + numbers.load_share * plant.object_mass
     (x, y), kp, count = numbers.mounts[plant.leader, :2], numbers.gains.kp[:2], plant.count
     angles, hover = mount_frames(plant), plant.gravity * lifted / 4
     held = np.append(np.array([-y, x]) * lifted[plant.leader] / count / kp, 0.0)
@@ -108,7 +108,7 @@ def known(config: Config) -> Known:
     along, across = np.cos(angles) ** 2, np.sin(angles) ** 2
     room = joined([most / (along * kp[0] + across * kp[1]), most / (along * kp[1] + across * kp[0])])
     lever = rotations.turned_about_z(held, -angles)[..., :2]
-    return Known(count / (count - 1), lever, np.maximum(room, LEAST_ROOM))
+    return TeamModel(count / (count - 1), lever, np.maximum(room, LEAST_ROOM))
 
 
 class TeamOffsetFree:
@@ -118,7 +118,7 @@ class TeamOffsetFree:
     needs_privileged = False
 
     def __init__(self, config: Config):
-        self.design, self.known, self._leader = design(config), known(config), copy_gains(config)
+        self.design, self.team, self._leader = design(config), team_model(config), copy_gains(config)
 
     def start(self, observation: Array) -> Array:
         """See `Law.start`."""
@@ -143,10 +143,10 @@ class TeamOffsetFree:
         """See `Law.step`."""
         xp, dtype = observation.__array_namespace__(), observation.dtype
         turning, rising = self.estimate(state, observation)
-        led, share = copy_command(observation, *self._leader), self.known.share
+        led, ratio = copy_command(observation, *self._leader), self.team.ratio
         own = self._command(turning, rising, led, observation)
-        mean = (own + (share - 1.0) * led) / share
-        drive = mean[..., :2] + xp.asarray(self.known.lever, dtype=dtype) * (own - led)[..., 2:]
+        mean = (own + (ratio - 1.0) * led) / ratio
+        drive = mean[..., :2] + xp.asarray(self.team.lever, dtype=dtype) * (own - led)[..., 2:]
         axis, height = (xp.asarray(part, dtype=dtype).T for part in (self.design.axis, self.design.height))
         angles = [xp.concat([turning[..., k, :], drive[..., k : k + 1]], axis=-1) @ axis for k in (0, 1)]
         climbing = xp.concat([rising, mean[..., 2:]], axis=-1) @ height
@@ -155,12 +155,12 @@ class TeamOffsetFree:
     def _command(self, turning: Array, rising: Array, led: Array, observation: Array) -> Array:
         """The command (..., 3) for these estimates, only its vertical part clipped; the leader's is `led`."""
         xp, dtype, own = observation.__array_namespace__(), observation.dtype, self.design
-        share, vertical_limit = self.known.share, self._leader[-1]
-        lever, room = (xp.asarray(part, dtype=dtype) for part in (self.known.lever, self.known.room))
+        ratio, vertical_limit = self.team.ratio, self._leader[-1]
+        lever, room = (xp.asarray(part, dtype=dtype) for part in (self.team.lever, self.team.room))
         error, rate = observation[..., ERROR], observation[..., ERROR_RATE]
         k_error, k_velocity = (float(gain) for gain in own.rise)
         rise = clipped(k_error * error[..., 2] + k_velocity * rate[..., 2], -VERTICAL_LIMIT, VERTICAL_LIMIT)
-        vertical = share * (rise - rising[..., 2]) - (share - 1.0) * led[..., 2]
+        vertical = ratio * (rise - rising[..., 2]) - (ratio - 1.0) * led[..., 2]
         vertical = clipped(vertical, -vertical_limit, vertical_limit)
         k_error, k_velocity, k_angle, k_rate = (float(gain) for gain in own.tilt)
         far = k_error * error + k_velocity * rate
@@ -169,7 +169,7 @@ class TeamOffsetFree:
         wanted = far - k_angle * observation[..., 3:5] - k_rate * observation[..., 9:11]
         wanted = wanted - _within(xp, load, CORRECTION_LIMIT)
         rest = observation[..., 3:5] + own.damping * observation[..., 9:11]
-        tilts = share * wanted - (share - 1.0) * led[..., :2]
+        tilts = ratio * wanted - (ratio - 1.0) * led[..., :2]
         tilts = rest + room * _within(xp, (tilts - rest) / room, 1.0)
         return xp.concat([tilts, vertical[..., None]], axis=-1)
 

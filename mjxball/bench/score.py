@@ -57,7 +57,7 @@ def bars(track: str, draw: int, number: int) -> np.ndarray:
     infinite where all of them failed.
     """
     world = worlds_of(track, draw)[number]
-    scenarios = world.told or tuple(one for pair in world.scenarios for one in pair)
+    scenarios = world.reference_scenarios or tuple(one for pair in world.scenarios for one in pair)
     found = fly(world, [make(world.config) for make in world.references], scenarios)
     best = np.array([[numbers(one) for one in flights] for flights in found]).min(axis=0)
     peak, settling, overshoot = best.T

@@ -48,7 +48,9 @@ class World:
     config: Config
     scenarios: tuple[Pair, ...]
     references: tuple[Callable[[Config], Baseline], ...]
-    told: tuple[Scenario, ...] = ()  # what the references fly where the entrant is told less: undisturbed, disturbed
+    reference_scenarios: tuple[
+        Scenario, ...
+    ] = ()  # what the references fly where the entrant is told less: undisturbed, disturbed
     length: float = 1.0  # factor on bars in metres
 
 

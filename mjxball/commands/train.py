@@ -195,7 +195,7 @@ def _run(
 
     algorithm = (origin.get("extensions") or {}).get("algorithm") or "sac"
     find(algorithm, "--algorithm")
-    told = None if tracker is None else find(tracker, "--tracker")
+    start = None if tracker is None else find(tracker, "--tracker")
     if algorithm in ALGORITHMS:  # of others nobody knows what they take
         requirements.check(settings, algorithm, origin["seeds"])
     state = None
@@ -209,7 +209,7 @@ def _run(
         if steps >= total:
             return None
     try:
-        return 0 if loop.train(Run(settings, out, origin, state, told), beside) else 130
+        return 0 if loop.train(Run(settings, out, origin, state, start), beside) else 130
     except TrainingDivergedError as error:
         if processes.is_writer():
             kept = any(path.name.isdecimal() for path in (out / CHECKPOINTS).glob("*"))

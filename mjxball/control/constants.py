@@ -60,7 +60,7 @@ class DroneLoop(NamedTuple):
 def hover(config: Config) -> tuple[float, float]:
     """(motor command at hover, force of a motor per command there [N]), the mean of both drones."""
     constants, curve = plant_parameters(config.plant, config.attitude), config.autopilot.motor_curve
-    weight = (constants.known_mass + constants.share * config.plant.object_mass) * config.plant.gravity
+    weight = (constants.known_mass + constants.load_share * config.plant.object_mass) * config.plant.gravity
     command = float(crazyflie.motor_command(curve, weight / 4).mean())
     a, b = curve
     return command, (2 * a * command / crazyflie.FULL + b) / crazyflie.FULL
@@ -72,7 +72,7 @@ def thrust_slopes(config: Config) -> tuple[float, float]:
     if law.kind == "crazyflie" and law.thrust_law == "paper":
         slope = 4 * hover(config)[1] * law.thrust_per_acceleration
         return slope, slope
-    leader, follower = map(float, constants.known_mass + constants.share * config.plant.object_mass)
+    leader, follower = map(float, constants.known_mass + constants.load_share * config.plant.object_mass)
     return leader, follower
 
 

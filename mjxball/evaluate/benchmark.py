@@ -48,7 +48,7 @@ class Score:
     variant: str
     follower: str
     metrics: tuple[Metrics, ...]  # one for each seed
-    shown: Result  # of seed 0, with its flight
+    first: Result  # of seed 0, with its flight
 
     @property
     def failures(self) -> int:
@@ -119,13 +119,13 @@ def run_benchmark(
         progress(f"{number + 1}/{len(suites)} {suite.name}: {len(suite.variants)} variants x {num_seeds} seeds")
         groups: dict[str, tuple[Config, list[Variant]]] = {}
         for variant in suite.variants:
-            known = variant.nominal(base)
-            groups.setdefault(configs.config_hash(known), (known, []))[1].append(variant)
-        for key, (known, variants) in groups.items():
+            nominal = variant.nominal(base)
+            groups.setdefault(configs.config_hash(nominal), (nominal, []))[1].append(variant)
+        for key, (nominal, variants) in groups.items():
             own = followers
             if variants[0].team:
-                of_teams[key] = own = of_teams.get(key) or team_followers(known)
-            flown = dict(_fly(known, own, replace(suite, variants=tuple(variants)), num_seeds, physics))
+                of_teams[key] = own = of_teams.get(key) or team_followers(nominal)
+            flown = dict(_fly(nominal, own, replace(suite, variants=tuple(variants)), num_seeds, physics))
             for variant in variants:
                 for index, follower in enumerate(own):
                     results = [flown[variant.label, seed][index] for seed in range(num_seeds)]

@@ -82,11 +82,11 @@ def flight_curves(scores: Sequence[Score]) -> str:
     """One variant's flights of seed 0: x and distance from the goal of the object, and the follower's pitch command."""
     plt, shown = pyplot(), [score for score in scores if score.follower not in NOT_DRAWN]
     figure, axes = plt.subplots(3, 1, sharex=True, figsize=(10, 5.8), layout="constrained")
-    looks, first = follower_styles(score.follower for score in scores), scores[0].shown.flight
+    looks, first = follower_styles(score.follower for score in scores), scores[0].first.flight
     rows = np.unique(np.linspace(0, len(first.time) - 1, POINTS).astype(int))
     axes[0].plot(first.time[rows], first.target[rows, 0], color=INK, linestyle=":", linewidth=1, label="goal")
     for score in shown:
-        flight, look = score.shown.flight, line(looks[score.follower])
+        flight, look = score.first.flight, line(looks[score.follower])
         axes[0].plot(flight.time[rows], flight.position[rows, 0], label=score.follower, **look)
         axes[1].plot(flight.time[rows], distance(flight)[rows], **look)
         for pitch in of_followers(flight, 1):
@@ -109,12 +109,12 @@ def distance(flight: Trajectory) -> np.ndarray:
 
 def heat_maps(scores: Sequence[Score]) -> str:
     """Steady-state peak over (CG speed, object mass), one map for each follower, all on one logarithmic scale."""
-    speeds = sorted({score.shown.scenario.omega for score in scores})
-    masses = sorted({score.shown.scenario.mass for score in scores})
+    speeds = sorted({score.first.scenario.omega for score in scores})
+    masses = sorted({score.first.scenario.mass for score in scores})
     peaks: dict[str, np.ndarray] = {}
     for score in scores:
         table = peaks.setdefault(score.follower, np.full((len(masses), len(speeds)), np.nan))
-        place = masses.index(score.shown.scenario.mass), speeds.index(score.shown.scenario.omega)
+        place = masses.index(score.first.scenario.mass), speeds.index(score.first.scenario.omega)
         table[place] = score.summary("peak").median
     plt = pyplot()
     from matplotlib.colors import LogNorm

@@ -85,7 +85,7 @@ def fly(
             world = state.pipeline_state
             error = jnp.linalg.norm(world.goal - world.loop.plant.position)
             far = far | (error > config.scenario.termination_distance) | world.loop.diverged
-            memory, command = law.step(memory, state.obs[..., :18], _known(world, size))
+            memory, command = law.step(memory, state.obs[..., :18], _privileged(world, size))
             state = env.step_with_command(state, command)
             effort = jax.tree.map(jnp.add, effort, _effort(state.pipeline_state, command, rig, own.plant.gravity))
             return (state, memory, far, effort), error
@@ -157,7 +157,7 @@ def stacked(laws: Sequence[Law]) -> tuple[list[Any], Callable[[list[Any]], Law]]
     return numbers, rebuild
 
 
-def _known(world: PipelineState, size: int) -> PrivilegedInfo:
+def _privileged(world: PipelineState, size: int) -> PrivilegedInfo:
     """What a classical follower may know of its world; nothing of where the CG is."""
     load: Any = world.load
     mass = object_mass(world.loop.plant.time, load)

@@ -146,8 +146,8 @@ def lead_picture(plant: Plant, scores: Sequence[Score], policies: Sequence[str])
     best = [max(names, key=lambda name: count[name]) for names in (trained, classical) if names]
     wanted = ["copy", *best]
     shown = [score for name in wanted for score in first if score.follower == name] or first[:1]
-    start = LEAD_START if shown[0].shown.flight.time[-1] >= LEAD_START + LEAD_SECONDS else 0.0
-    flights = {score.follower: score.shown.flight for score in shown}
+    start = LEAD_START if shown[0].first.flight.time[-1] >= LEAD_START + LEAD_SECONDS else 0.0
+    flights = {score.follower: score.first.flight for score in shown}
     picture, why = film(plant, flights, LEAD_SECONDS, start, LEAD_SPEED)
     if picture is None:
         return None, f"No picture: {why}."

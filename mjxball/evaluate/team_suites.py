@@ -93,7 +93,7 @@ TEAM_SUITES: tuple[Suite, ...] = (
                 _ring(6, share=0.15, lost=((k, 10.0),)),
                 team="team",
                 drones=6,
-                known={"command.vertical_limit": 12.0},
+                design_settings={"command.vertical_limit": 12.0},
             )
             for name, k in (("next to the leader", 1), ("next but one", 2), ("opposite", 3))
         ),

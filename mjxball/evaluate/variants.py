@@ -27,7 +27,9 @@ class Variant:
     team: str = ""  # preset whose plant it flies; empty: the command's
     drones: int = 0  # of a ring of that many; 0: the preset's plant
     rig: int | None = None  # number of a held-out rig of so many drones, in place of a ring
-    known: Mapping[str, Any] = field(default_factory=dict)  # of a team, settings that its followers are made for
+    design_settings: Mapping[str, Any] = field(
+        default_factory=dict
+    )  # of a team, settings that its followers are made for
     scatter: float = 0.0  # of a team, every drone's numbers are drawn within this share of those that followers know
 
     @property
@@ -45,7 +47,7 @@ class Variant:
             found = rig_config(found, held_out(found, self.drones), self.rig)
         elif self.drones:
             found = ring_config(found, self.drones)
-        for path, value in self.known.items():
+        for path, value in self.design_settings.items():
             found = configs.replace(found, path, value)
         return configs.validate(found)
 

@@ -180,7 +180,7 @@ class Parameters:
                 self._answers[packet.channel, struct.unpack("<H", data[:2])[0]] = data[2:]
                 self._changed.notify_all()
 
-    def known(self, names: Iterable[str]) -> list[str]:
+    def listed(self, names: Iterable[str]) -> list[str]:
         """Those of `names` that the firmware lists."""
         return [name for name in names if self._find(name) is not None]
 

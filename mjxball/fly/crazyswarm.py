@@ -63,7 +63,7 @@ class CrazyswarmPair:
         one, other = self.robots
         return (one.name, other.name) if one.tracked and other.tracked else None
 
-    def told(self, rig: Rig) -> list[str]:
+    def describe(self, rig: Rig) -> list[str]:
         """Who is who, and what of the file is not used, a sentence each. Raises InputError for swapped places."""
         leader, follower = self.robots
         told = [f"{self.path.name}: {leader.name} leads, {follower.name} follows, {self.chosen}", *self._places(rig)]

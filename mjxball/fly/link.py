@@ -84,7 +84,7 @@ class Link:
             self._request(request)
         both.wait(self._deadlines.version)
         self._crazyflie.remove_port_callback(packets.VERSION.port, answered)
-        names, began = self.parameters.known(REVISION), time.monotonic()
+        names, began = self.parameters.listed(REVISION), time.monotonic()
         revision = self.parameters.read(names)
         trip = (time.monotonic() - began) if names else math.nan
         self.identity = Identity(

@@ -327,7 +327,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if options.onboard:
             setup, settings = on_board(options, setup, settings)
-        for text in swarm.told(rig) if swarm is not None else []:
+        for text in swarm.describe(rig) if swarm is not None else []:
             terminal.say(text)
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)

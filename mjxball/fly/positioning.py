@@ -132,7 +132,7 @@ def system_of(values: Mapping[str, float]) -> System:
 
 def found(link: DeckLink) -> System:
     """The system of a drone. Raises LinkError."""
-    return system_of(link.parameters.read(link.parameters.known(name for one in SYSTEMS for name in one.decks)))
+    return system_of(link.parameters.read(link.parameters.listed(name for one in SYSTEMS for name in one.decks)))
 
 
 def common(links: Sequence[DeckLink]) -> System:
@@ -151,7 +151,7 @@ def check(link: DeckLink) -> Check | None:
         return None
     name, off = system.switch
     name_of = f"{link.name} {system.name}"
-    if name in (read := link.parameters.read(link.parameters.known([name]))) and read[name] == off:
+    if name in (read := link.parameters.read(link.parameters.listed([name]))) and read[name] == off:
         return Check(name_of, False, f"its measurements do not reach the estimator: {name} is {off:g}")
     logs = link.read_logs([*system.logs, *VELOCITY])
     good, text = system.verdict(logs)

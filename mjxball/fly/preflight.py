@@ -91,7 +91,7 @@ def prepare(
         check_kind(link, required, mocap is not None)
         curves[link.name] = promised_curve(link, own)
         link.write_parameters(own[curves[link.name]].gains)
-        link.write_parameters(dict.fromkeys(link.parameters.known([CONTROLLER]), PID))
+        link.write_parameters(dict.fromkeys(link.parameters.listed([CONTROLLER]), PID))
         if mocap is not None:
             link.write_parameters(mocap.parameters())
             mocap.feed(links.index(link), link)

@@ -48,7 +48,7 @@ def rotor_targets(
 def carried_mass(numbers: PlantParameters, state: PlantState, believed_mass: Scalar) -> Float[Array, "... drones"]:
     """Mass that every drone believes to lift: itself, its share of the carrier and that of the object [kg]."""
     xp, dtype = state.rates.__array_namespace__(), state.rates.dtype
-    own, share = (xp.asarray(value, dtype=dtype) for value in (numbers.known_mass, numbers.share))
+    own, share = (xp.asarray(value, dtype=dtype) for value in (numbers.known_mass, numbers.load_share))
     return own + share * believed_mass[..., None]
 
 

@@ -162,7 +162,7 @@ def hover_rotor_force(
     """Rotor forces [N] that hover the believed object mass [kg] with the CG at O."""
     xp = believed_mass.__array_namespace__()
     numbers = plant_parameters(config.plant, config.attitude) if parameters is None else parameters
-    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (numbers.known_mass, numbers.share))
+    own, share = (xp.asarray(value, dtype=believed_mass.dtype) for value in (numbers.known_mass, numbers.load_share))
     per_rotor = (own + share * believed_mass[..., None]) * parts.entry(numbers.gravity) / 4
     per_rotor = xp.clip(per_rotor, 0.0, shared(numbers.rotor_force_max, per_rotor))
     return xp.stack([per_rotor] * 4, axis=-1)

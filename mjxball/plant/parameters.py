@@ -38,7 +38,7 @@ class PlantParameters(NamedTuple):
     rotor_force_max: Array  # (N,) [N]
     rotor_lag: Array  # (N,) time constant of a rotor's force [s]
     known_mass: Array  # (N,) that a drone believes it lifts besides the load: itself and its share of the carrier [kg]
-    share: Array  # (N,) share of the load's weight that a drone believes it carries
+    load_share: Array  # (N,) share of the load's weight that a drone believes it carries
     gains: AttitudeGains  # of each drone, about body axes
     carrier_mass: Array  # () [kg]
     carrier_inertia: Array  # (3,) about O [kg m2]
@@ -162,7 +162,7 @@ def plant_parameters(plant: Plant, attitude: Attitude) -> PlantParameters:
         rotor_force_max=np.array(plant.of_drones("rotor_force_max")),
         rotor_lag=np.array(plant.of_drones("rotor_lag")),
         known_mass=np.array(plant.known_masses),
-        share=np.array(plant.load_shares),
+        load_share=np.array(plant.load_shares),
         gains=nothing,
         carrier_mass=np.array(plant.carrier_mass),
         carrier_inertia=np.array(plant.carrier_inertia),

@@ -25,23 +25,23 @@ def entry(array: Any, *index: int) -> Part:
     return array[(..., *index)]
 
 
-def known(part: Part) -> bool:
+def is_constant(part: Part) -> bool:
     """Whether `part` is a number known beforehand."""
     return type(part) is float
 
 
 def is_zero(part: Part) -> bool:
     """Whether `part` is known to be 0."""
-    return known(part) and part == 0.0
+    return is_constant(part) and part == 0.0
 
 
 def times(a: Part, b: Part) -> Part:
     """a b."""
     if is_zero(a) or is_zero(b):
         return 0.0
-    if known(a) and a == 1.0:
+    if is_constant(a) and a == 1.0:
         return b
-    return a if known(b) and b == 1.0 else a * b
+    return a if is_constant(b) and b == 1.0 else a * b
 
 
 def plus(a: Part, b: Part) -> Part:
@@ -56,7 +56,7 @@ def minus(a: Part, b: Part) -> Part:
 
 def over(a: Part, b: Part) -> Part:
     """a / b."""
-    return 0.0 if is_zero(a) else a if known(b) and b == 1.0 else a / b
+    return 0.0 if is_zero(a) else a if is_constant(b) and b == 1.0 else a / b
 
 
 def total(values: Any) -> Part:
@@ -136,7 +136,7 @@ def diagonal_turned_about_z(yaw: Part, v: Parts) -> Rows:
 
 def cosine_and_sine(angle: Part) -> tuple[Part, Part]:
     """Of `angle` [rad]."""
-    if known(angle):
+    if is_constant(angle):
         return float(np.cos(angle)), float(np.sin(angle))
     xp = angle.__array_namespace__()
     return xp.cos(angle), xp.sin(angle)
@@ -177,7 +177,7 @@ def split(vector: Any) -> Parts:
 def stacked(parts: Parts, like: Any) -> Any:
     """Array (..., 3) of `parts`, with the shape (...) and type of `like` where they are numbers."""
     xp = like.__array_namespace__()
-    return joined([xp.full_like(like, part) if known(part) else part for part in parts])
+    return joined([xp.full_like(like, part) if is_constant(part) else part for part in parts])
 
 
 def joined(components: Sequence[Any], axis: int = -1) -> Any:

@@ -72,7 +72,7 @@ def ring_config(config: Config, count: int) -> Config:
 def padded(parameters: PlantParameters, count: int) -> PlantParameters:
     """`parameters` with drones behind the last up to `count` that weigh, lift and believe nothing."""
     missing = count - parameters.size
-    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "share", "known_mass"}
+    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass"}
 
     def longer(name: str, value: Any) -> Any:
         if name not in nothing | {"mounts", "yaw", "arm", "yaw_per_thrust", "rotor_lag"}:
@@ -126,7 +126,7 @@ def varied(parameters: PlantParameters, factors: Factors, attitude: Attitude, ob
     own, carrier = parameters.drone_mass * factors.drone_mass_scale, parameters.carrier_mass * factors.carrier_scale
     found = parameters._replace(
         drone_mass=own,
-        known_mass=own + parameters.share * carrier,
+        known_mass=own + parameters.load_share * carrier,
         own_inertia=parameters.own_inertia * factors.drone_inertia_scale,
         mounts=parameters.mounts * factors.mount_scale,
         arm=parameters.arm * factors.arm_scale,

@@ -191,9 +191,9 @@ def safe_radius(
     gravity = parameters.gravity
     mass = object_mass[..., None]
     believed = mass if believed_mass is None else believed_mass[..., None]
-    fair = gravity * (parameters.known_mass + parameters.share * mass)  # [N]
+    fair = gravity * (parameters.known_mass + parameters.load_share * mass)  # [N]
     # What the leader and what does not fly lift too little, or the leader too much.
-    given = gravity * (parameters.known_mass + parameters.share * believed) * factor * alive
+    given = gravity * (parameters.known_mass + parameters.load_share * believed) * factor * alive
     lacking = xp.where(acts > 0, 0.0, fair - given)
     own = fair + (lacking.sum(axis=-1) / followers)[..., None]
     places = parameters.mounts[..., :2] * one[..., None]

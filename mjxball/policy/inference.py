@@ -39,7 +39,7 @@ def known_geometry(card: dict[str, Any], name: str) -> np.ndarray | None:
     Raises InputError if it is told its team by `Policy.join` alone.
     """
     team = card.get("team")
-    return _known(name, law_of(card), None if team is None else np.array(team["context"]))
+    return _geometry_for(name, law_of(card), None if team is None else np.array(team["context"]))
 
 
 class Policy:
@@ -213,7 +213,7 @@ class NetworkLaw:
 
     def start(self, observation: Array) -> Array:
         """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
-        return self._law.start(observation, _known(self.name, self._law, self._geometry))
+        return self._law.start(observation, _geometry_for(self.name, self._law, self._geometry))
 
     def hidden(self, memory: Array) -> Array:
         """State (..., H) of the network's GRU in `memory` (..., m)."""
@@ -232,7 +232,7 @@ class NetworkLaw:
         return answer[..., : layout.ACTION_SIZE], command, remembered
 
 
-def _known(name: str, law: FollowerLaw, geometry: Array | None) -> Array | None:
+def _geometry_for(name: str, law: FollowerLaw, geometry: Array | None) -> Array | None:
     """`geometry`, or InputError if the law needs it and there is none."""
     if law.geometry and geometry is None:
         raise InputError(f"policy {name} has to be told its team before it flies (Policy.join)")

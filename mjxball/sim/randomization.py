@@ -42,7 +42,7 @@ class Rig(NamedTuple):
     numbers: PlantParameters  # padded to the plant's drones
     flies: Float[Array, " drones"]  # 1 for a drone that there is, 0 for one that pads
     proportion: Scalar  # its radius over the plant's, by which CG amplitudes are multiplied
-    share: Scalar  # its number of drones over the plant's, by which the object's mass is multiplied
+    size_ratio: Scalar  # its number of drones over the plant's, by which the object's mass is multiplied
     drawn: rigs.RigTable | None = None  # the row of `config.rigs`, whose load is its own
 
 
@@ -103,13 +103,13 @@ class ResetDistribution:
         mass = between(*scenario.object_mass)
         nominal = jnp.full_like(mass, self.config.plant.object_mass)
         if rig is not None:
-            mass, nominal = mass * rig.share, nominal * rig.share
+            mass, nominal = mass * rig.size_ratio, nominal * rig.size_ratio
         believed = mass if scenario.mass_known else nominal
         if scenario.unknown_mass_probability > 0:
             share, place = jax.random.uniform(jax.random.fold_in(rng, 7), (2,))
             low, high = scenario.unknown_mass
             unknown = share < scenario.unknown_mass_probability
-            proportion: Scalar | float = 1.0 if rig is None else rig.share
+            proportion: Scalar | float = 1.0 if rig is None else rig.size_ratio
             mass = jnp.where(unknown, proportion * (low + (high - low) * place), mass)
             believed = jnp.where(unknown, nominal, believed)
         load = Load(
@@ -275,7 +275,7 @@ class ResetDistribution:
         there = len(followers) if rig is None else rig.flies[followers].sum()
         chosen = jnp.asarray(followers)[jnp.floor(which * there).astype(jnp.int32)]
         size = 0 if rig is None or self._table is None else jnp.argmin(jnp.abs(self._sizes - rig.flies.sum()))
-        share, wide = (1.0, 1.0) if rig is None else (rig.share, rig.proportion)
+        share, wide = (1.0, 1.0) if rig is None else (rig.size_ratio, rig.proportion)
         held = jnp.interp(load.object_mass / share, masses, jnp.asarray(table)[size, chosen]) * wide
         happens = (lost < scenario.lost_follower_probability) & ((held > 0) | (scenario.trim_margin < 0))
         low, high = LOSS_TIME
@@ -324,7 +324,7 @@ class ResetDistribution:
         if motors.compensates(law.motor_curve):
             cap = jnp.where(uncompensated > 0, cap, jnp.minimum(most, law.motor_curve[1] * CEILING / crazyflie.FULL))
         constants = self._constants
-        carried = jnp.asarray(constants.known_mass) + jnp.asarray(constants.share) * object_mass
+        carried = jnp.asarray(constants.known_mass) + jnp.asarray(constants.load_share) * object_mass
         weight = carried * self.config.plant.gravity / 4
         enough = (scale * cap[:, None] >= (1 + LIFT) * weight) & (scale * most[:, None] >= (1 + LIFT + PULL) * weight)
         command = jnp.abs(self.hover_commands(object_mass, battery, uncompensated, scale))
@@ -338,8 +338,8 @@ class ResetDistribution:
         scale: Float[Array, "n 2"],
     ) -> Float[Array, "n 2"]:
         """(n, 2) vertical acceleration that each drone has to be told so that it hovers its share [m/s2]."""
-        carried = jnp.asarray(self._constants.known_mass) + jnp.asarray(self._constants.share) * object_mass
-        believed = jnp.asarray(self._constants.known_mass) + jnp.asarray(self._constants.share) * (
+        carried = jnp.asarray(self._constants.known_mass) + jnp.asarray(self._constants.load_share) * object_mass
+        believed = jnp.asarray(self._constants.known_mass) + jnp.asarray(self._constants.load_share) * (
             object_mass if self.config.scenario.mass_known else self.config.plant.object_mass
         )
         gravity, curve = self.config.plant.gravity, self.config.autopilot.motor_curve

@@ -194,7 +194,7 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
         rotor_force_max=alike(strongest),
         rotor_lag=alike(lag),
         known_mass=own + shares * carrier[:, None],
-        share=shares,
+        load_share=shares,
         gains=AttitudeGains(np.zeros((count, 3)), np.zeros((count, 3))),
         carrier_mass=carrier,
         carrier_inertia=(carrier * length**2)[:, None] * np.array([0.25, 0.25, 0.5]),
@@ -259,8 +259,8 @@ def trimmed_reach(
     gravity = float(numbers.gravity)
     flies = xp.astype(numbers.drone_mass > 0, load.dtype)[..., 1:]
     followers = flies.sum(axis=-1)
-    fair = gravity * (numbers.known_mass + numbers.share * load[..., None])
-    assumed = numbers.known_mass + numbers.share * believed[..., None]
+    fair = gravity * (numbers.known_mass + numbers.load_share * load[..., None])
+    assumed = numbers.known_mass + numbers.load_share * believed[..., None]
     lacking = fair[..., 0] - gravity * assumed[..., 0] * thrust[..., 0]
     middle = (flies[..., None] * numbers.mounts[..., 1:, :2]).sum(axis=-2) / followers[..., None]
     lever = middle - numbers.mounts[..., 0, :2]
@@ -292,7 +292,7 @@ def _load_shares(mounts: Array) -> Array:
 def _padded(numbers: PlantParameters, count: int) -> PlantParameters:
     """`numbers` with drones behind the last up to `count` that weigh, lift and believe nothing."""
     missing = count - numbers.size
-    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "share", "known_mass"}
+    nothing = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass"}
     found: dict[str, Any] = {}
     for name in (*nothing, "mounts", "arm", "yaw_per_thrust", "rotor_lag"):
         value = getattr(numbers, name)
@@ -303,7 +303,7 @@ def _padded(numbers: PlantParameters, count: int) -> PlantParameters:
 
 def unpadded(rigs: RigTable, size: int) -> RigTable:
     """`rigs`, all of `size` drones, without the drones that pad."""
-    padded = {"drone_mass", "own_inertia", "rotor_force_max", "share", "known_mass", "mounts", "arm"}
+    padded = {"drone_mass", "own_inertia", "rotor_force_max", "load_share", "known_mass", "mounts", "arm"}
     padded |= {"yaw_per_thrust", "rotor_lag"}
     cut: dict[str, Any] = {name: getattr(rigs.numbers, name)[:, :size] for name in padded}
     return rigs._replace(numbers=rigs.numbers._replace(**cut), thrust=rigs.thrust[:, :size])

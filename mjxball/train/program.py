@@ -88,14 +88,14 @@ class Agents:
         filled = np.arange(slots) < np.array(followers)[:, None]
         self.table = np.where(filled, self.first[:, None] + np.arange(slots), self.first[:, None])
 
-    def shown(self, states: Any) -> Any:
+    def per_agent(self, states: Any) -> Any:
         """States of worlds (worlds, [F,] ...) with all fields but `pipeline_state` for every agent (count, ...)."""
         own = {name: getattr(states, name)[self.world, self.slot] for name in ("obs", "reward")}
         shared = {name: jax.tree.map(lambda leaf: leaf[self.world], getattr(states, name)) for name in SHARED}
         return states.replace(**own, **shared)
 
-    def inside(self, states: Any) -> Any:
-        """The inverse of `shown`."""
+    def per_world(self, states: Any) -> Any:
+        """The inverse of `per_agent`."""
         own = {name: getattr(states, name)[self.table] for name in ("obs", "reward")}
         shared = {name: jax.tree.map(lambda leaf: leaf[self.first], getattr(states, name)) for name in SHARED}
         return states.replace(**own, **shared)
@@ -135,7 +135,7 @@ class Environments:
         if self._agents:
             numbers = jnp.arange(self._worlds)
             fresh = jax.vmap(self.env.reset)(keys, numbers)
-            return self._agents.shown(fresh)
+            return self._agents.per_agent(fresh)
         return jax.vmap(self.env.reset)(keys)
 
     def staggered(self, states: Any, key: Array, episode_steps: int) -> Any:
@@ -200,7 +200,7 @@ class Environments:
         """See `mjxball.algorithms.base.Environments`."""
         before, agents = envs.states, self._agents
         if agents:
-            after = agents.shown(self._step(agents.inside(before), action[agents.table]))
+            after = agents.per_agent(self._step(agents.per_world(before), action[agents.table]))
         else:
             after = self._step(before, action)
         terminated = after.done * (1 - after.info["truncation"])

@@ -95,7 +95,7 @@ def test_within_the_limits_it_is_the_lqr(plant: Config) -> None:
     # Nothing was commanded before, and measurements are taken to be a step old.
     x = own.transition @ np.reshape(state, (-1, state.shape[-1]))[0, : len(own.transition)]
     limits = limits_of(plant)
-    hover = np.array([(limits.own_mass + limits.share * mass) * 9.81 / 4])
+    hover = np.array([(limits.own_mass + limits.load_share * mass) * 9.81 / 4])
     assert not Program(own, limits, mass).broken(x[None], hover).any()
     expected = np.broadcast_to(own.feedback @ x, command.shape)
     np.testing.assert_allclose(
@@ -159,7 +159,7 @@ def test_limits_are_kept_that_the_lqr_breaks(plant: Config) -> None:
     law, limits, mass = make_law("mpc", plant), limits_of(plant), plant.plant.object_mass
     kind = round(10 * mass)
     own, tuning = law.designs[kind], law.team_tuning if plant.plant.is_team else law.tuning
-    program, carried = Program(own, limits, MASSES[kind]), limits.own_mass + limits.share * mass
+    program, carried = Program(own, limits, MASSES[kind]), limits.own_mass + limits.load_share * mass
     hover = np.array([carried * 9.81 / 4])
     for follows in (False, True):
         x, tilts, forces = np.zeros(len(own.transition)), [], []

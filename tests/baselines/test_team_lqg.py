@@ -11,7 +11,7 @@ from tables import rows
 
 from mjxball import config as configs
 from mjxball.baselines import make_baseline
-from mjxball.baselines.team_lqg import TeamOffsetFree, design, known
+from mjxball.baselines.team_lqg import TeamOffsetFree, design, team_model
 from mjxball.config import Config, preset
 from mjxball.control.observation import copy_command
 from mjxball.errors import InputError
@@ -33,11 +33,11 @@ def ring(count: int) -> Config:
 def test_what_a_follower_knows_of_a_ring(count: int) -> None:
     """Lifts of 1 m/s2 more by all followers turn the ring about the leader's mount, as a command of all N does."""
     config = ring(count)
-    numbers, found = plant_parameters(config.plant, config.attitude), known(config)
+    numbers, found = plant_parameters(config.plant, config.attitude), team_model(config)
     lever, rooms = np.atleast_2d(found.lever), np.atleast_2d(found.room)
     assert lever.shape == rooms.shape == (count - 1, 2)
-    assert found.share == count / (count - 1)
-    lifted = numbers.known_mass[0] + numbers.share[0] * config.plant.object_mass
+    assert found.ratio == count / (count - 1)
+    lifted = numbers.known_mass[0] + numbers.load_share[0] * config.plant.object_mass
     torque = lifted * np.hypot(*numbers.mounts[0, :2])
     np.testing.assert_allclose(np.hypot(*lever.T), torque / count / numbers.gains.kp[1], rtol=1e-9)
     if count % 2 == 0:  # the follower across from the leader has it straight ahead: a pure pitch, nose up to the leader
@@ -56,7 +56,7 @@ def test_turning_a_team_changes_nothing_that_its_followers_know() -> None:
             )
             for one in config.plant.drones
         )
-        found.append(known(dataclasses.replace(config, plant=dataclasses.replace(config.plant, drones=drones))))
+        found.append(team_model(dataclasses.replace(config, plant=dataclasses.replace(config.plant, drones=drones))))
     for one, other in zip(*found, strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-12)
 
@@ -67,7 +67,7 @@ def test_what_enters_the_filter_is_the_mean_of_all_commands() -> None:
     observation = 0.05 * np.random.default_rng(0).standard_normal(18)
     led, tilts = copy_command(observation, *law._leader), []
     for lever in (np.zeros(2), np.array([0.01, -0.02])):
-        law.known = law.known._replace(lever=lever, room=np.array([9.0, 9.0]))
+        law.team = law.team._replace(lever=lever, room=np.array([9.0, 9.0]))
         state = law.start(observation)
         after, own = law.step(state, observation, None)
         mean, (turning, rising) = (led + 3 * own) / 4, law.estimate(state, observation)

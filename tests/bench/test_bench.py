@@ -123,7 +123,9 @@ def fingerprint(worlds: list[World]) -> str:
     for world in worlds:
         named = ("plant", "attitude", "autopilot", "leader", "command", "timing")
         own = [in_full(getattr(world.config, name)) for name in named]
-        parts.append((own, world.config.scenario.termination_distance, world.scenarios, world.told, world.length))
+        parts.append(
+            (own, world.config.scenario.termination_distance, world.scenarios, world.reference_scenarios, world.length)
+        )
     # Six digits: a linear program bounds some amplitudes, and its last bits are its own.
     text = re.sub(r"-?\d+\.\d+(e-?\d+)?", lambda number: f"{float(number[0]):.6g}", repr(parts))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -157,8 +159,8 @@ def test_every_load_of_the_pair_can_be_trimmed():
 
 def test_references_know_the_mass_that_the_entrant_does_not():
     (world,) = TRACKS["pair-unknown"].worlds(0)
-    assert all(one.believed_mass is None for one in world.told)
-    assert [one.mass for one in world.told] == [one.mass for pair in world.scenarios for one in pair]
+    assert all(one.believed_mass is None for one in world.reference_scenarios)
+    assert [one.mass for one in world.reference_scenarios] == [one.mass for pair in world.scenarios for one in pair]
     assert all(one.believed_mass == 0.2 for pair in world.scenarios for one in pair)
 
 

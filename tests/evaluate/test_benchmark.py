@@ -97,7 +97,7 @@ def test_scores_hold_every_seed_and_one_flight(scores) -> None:
     assert len(scores) == (3 + 3) * 3
     for score in scores:
         assert len(score.metrics) == 2
-        assert score.shown.flight is not None
+        assert score.first.flight is not None
         assert score.failures == 0
     delays = [s.summary("peak").median for s in scores if s.suite == "delay" and s.follower == "copy"]
     assert len(set(delays)) == 3  # the variants really differ

@@ -69,7 +69,7 @@ def test_a_second_in_the_air_is_that_of_the_closed_form(preset: str) -> None:
     step = make_control_step(config, newton_euler.make_engine(config.plant, config.attitude))
     constants = plant_parameters(config.plant, config.attitude)
     command = np.array([[0.06, -0.05, 0.3], [0.02, 0.03, -0.2]])
-    carried = constants.drone_mass + constants.share * mass
+    carried = constants.drone_mass + constants.load_share * mass
     sent = crazyflie.setpoints(config.autopilot, command, carried, config.plant.gravity)
     for _ in range(100):
         state = step(state, command, load)

@@ -98,7 +98,7 @@ def test_the_leader_flies_the_cards_law(preset: str) -> None:
 def test_what_is_sent_is_what_was_simulated(preset: str, roll: float, pitch: float, lift: float) -> None:
     config = configs.preset(preset)
     constants = plant_parameters(config.plant, config.attitude)
-    carried = constants.drone_mass + constants.share * config.plant.object_mass
+    carried = constants.drone_mass + constants.load_share * config.plant.object_mass
     command = np.array([[roll, pitch, lift]] * 2)
     expected = crazyflie.setpoints(config.autopilot, command, carried, config.plant.gravity)
     for row, known in zip(expected, card.command_maps(config), strict=True):

@@ -81,7 +81,7 @@ def test_the_first_enabled_robot_leads_and_the_second_follows(tmp_path: Path) ->
     pair = read_pair(written(tmp_path, FILE))
     assert pair.uris == ("radio://0/80/2M/E7E7E7E7E7", "radio://0/80/2M/E7E7E7E705")
     assert pair.bodies == ("cf231", "cf5")
-    told = pair.told(RIG)
+    told = pair.describe(RIG)
     assert "cf231 leads, cf5 follows, in the order of the file" in told[0]
     np.testing.assert_array_equal(pair.robots[1].place, [0, -0.15, 0])
 
@@ -94,7 +94,7 @@ def test_a_robots_parameters_come_before_its_types_and_these_before_all(tmp_path
 
 
 def test_what_is_not_used_is_named_once(tmp_path: Path) -> None:
-    *_, last = read_pair(written(tmp_path, FILE)).told(RIG)
+    *_, last = read_pair(written(tmp_path, FILE)).describe(RIG)
     names = last.split("not used: ")[1].split(", ")
     expected = {"battery", "broadcasts", "commander.enHighLevel", "firmware_logging", "kalman.resetEstimation"}
     assert set(names) == expected | {"stabilizer.controller", "stabilizer.estimator"}
@@ -105,15 +105,15 @@ def test_names_choose_the_two(tmp_path: Path) -> None:
     path = written(tmp_path, changed(["robots", "spare", "enabled"], True))
     pair = read_pair(path, "spare", "cf5")
     assert [robot.name for robot in pair.robots] == ["spare", "cf5"]
-    assert "1.15" in pair.told(RIG)[1]  # m between them, which is told and not used
+    assert "1.15" in pair.describe(RIG)[1]  # m between them, which is told and not used
 
 
 def test_swapped_places_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path, FILE)
     with pytest.raises(InputError, match="cf5 is the leader, not cf231"):
-        read_pair(path).told(Rig(RIG.follower_mount, RIG.leader_mount))
+        read_pair(path).describe(Rig(RIG.follower_mount, RIG.leader_mount))
     swapped = read_pair(path, "cf5", "cf231")
-    assert len(swapped.told(Rig(RIG.follower_mount, RIG.leader_mount))) == 2
+    assert len(swapped.describe(Rig(RIG.follower_mount, RIG.leader_mount))) == 2
 
 
 @rows(

@@ -65,7 +65,7 @@ def record(config: Config, rig: Rig, seconds: float, noise: float = 1.0) -> dict
         euler = rotations.euler_from_matrix(rotations.matrix_from_quaternion(state.quaternion))[0]
         held = steps + np.array([0.1 * speed[1], -0.1 * speed[0], (1 - rig.thrust) * 9.81 - 1.5 * speed[2] - place[2]])
         commands.append(held)
-        sent = crazyflie.setpoints(config.autopilot, held, constants.drone_mass + constants.share * mass, 9.81)
+        sent = crazyflie.setpoints(config.autopilot, held, constants.drone_mass + constants.load_share * mass, 9.81)
         log["setpoints"].append(sent)
         rows = []
         for _ in range(2):

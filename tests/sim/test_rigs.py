@@ -13,7 +13,7 @@ import pytest
 from tables import rows
 
 from mjxball.baselines.lqg import SlowKnownRigLqg
-from mjxball.baselines.team_lqg import known
+from mjxball.baselines.team_lqg import team_model
 from mjxball.config import preset, replace, validate, with_plant
 from mjxball.control.followers import PrivilegedInfo
 from mjxball.env import TransportEnv
@@ -184,10 +184,10 @@ class TestUniversal:
             rigs = held_out(UNIVERSAL, size, 40)
             for row in range(40):
                 config = rig_config(UNIVERSAL, rigs, row)
-                share, *whole = known(config)
+                ratio, *whole = team_model(config)
                 lever, room = (np.atleast_2d(part) for part in whole)
                 guessed = np.atleast_2d(geometry_of(config.plant))
-                np.testing.assert_allclose(guessed[:, 0], share)
+                np.testing.assert_allclose(guessed[:, 0], ratio)
                 stiffness = np.square(config.attitude.natural_frequency[:2])
                 levers.append(np.hypot(*(lever * stiffness).T) / np.hypot(*guessed[:, 1:3].T))
                 rooms.append(room[:, 1] * stiffness[1] / guessed[:, 3])

@@ -181,9 +181,9 @@ class Block:
 class Blocks:
     """All blocks of one drone."""
 
-    def __init__(self, known: Sequence[tuple[str, str]] = KNOWN) -> None:
-        """`known` are the variables that the drone lists, in order."""
-        self._known = known
+    def __init__(self, listed: Sequence[tuple[str, str]] = KNOWN) -> None:
+        """`listed` are the variables that the drone lists, in order."""
+        self._listed = listed
         self.by_number: dict[int, Block] = {}
 
     def is_due(self, now: float) -> bool:
@@ -245,9 +245,9 @@ class Blocks:
                 return TOO_BIG
             if sum(len(one.variables) for one in self.by_number.values()) >= MAX_VARIABLES:
                 return NO_MEMORY
-            if index >= len(self._known):
+            if index >= len(self._listed):
                 return UNKNOWN
-            block.variables.append((self._known[index][0], code))
+            block.variables.append((self._listed[index][0], code))
         return 0
 
 
