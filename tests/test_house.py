@@ -25,6 +25,13 @@ def test_the_workflow_runs_ci_on_every_supported_python() -> None:
     assert job["steps"][-1]["run"] == ".ci/run"
 
 
+def test_what_ci_leaves_out_runs_every_week() -> None:
+    workflow = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "weekly.yml").read_text())
+    assert workflow["permissions"] == {"contents": "read"}
+    assert workflow[True]["schedule"]  # `on` in YAML
+    assert workflow["jobs"]["test"]["steps"][-1]["run"].endswith("-m release")
+
+
 def test_a_release_gets_files_that_were_tried_and_signed() -> None:
     text = (REPOSITORY / ".github" / "workflows" / "release.yml").read_text()
     workflow = yaml.safe_load(text)

@@ -34,7 +34,7 @@ SHORTER = {
 
 
 # What takes half a minute, and other tests run as well: before a release.
-LONG = ("--algorithm gradient", "--plant team3", "--distributed", "--benchmark")
+LONG = ("--algorithm gradient", "--plant team3", "--distributed", "--benchmark", "--rehearse")
 
 
 def shown(found: dict[str, Any], key: str, factor: float, digits: int) -> str:

@@ -199,7 +199,7 @@ class TestUniversal:
             assert np.abs((np.array(turned) + np.pi) % (2 * np.pi) - np.pi).max() < 0.3
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("size", [2, 5])
+    @pytest.mark.parametrize("size", [2, pytest.param(5, marks=pytest.mark.release)])
     def test_it_fails_on_no_rig_that_it_has_never_seen(self, size: int) -> None:
         rigs = held_out(UNIVERSAL, size, 4)
         law = AnyRigLaw(load_policy(POLICY, rig_config(UNIVERSAL, rigs, 0)))

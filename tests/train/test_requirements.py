@@ -78,7 +78,7 @@ def test_the_estimate_is_below_the_true_state_and_near_it_where_it_is_large(algo
         assert estimate > 1.8 * true  # nearly all of it is the replay
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_estimate_of_gradients_is_below_what_xla_takes() -> None:
     """What a window keeps for the way back is most of it."""
     settings = configs.preset("transport")
