@@ -55,8 +55,6 @@ RENAMED = {
     "gradient.damping": "gradient.gradient_decay",
     "reward.standing": "reward.steady_action",
     "reward.opposition": "reward.tilt_disagreement",
-    "rigs.fade": "rigs.thrust_fade",
-    "rigs.authority": "rigs.unsaturated_tilt",
 }
 # Former settings that are constants now, with their value. Files may hold no other.
 CONSTANT: dict[str, Any] = {
@@ -80,6 +78,25 @@ CONSTANT: dict[str, Any] = {
     "follower.history": 1,
     "follower.differential_thrust_share": 0.0,
     "follower.load_by_lift": 0.0,
+    "rigs.drone_mass": (0.03, 3.0),
+    "rigs.arm_scale": (0.8, 1.25),
+    "rigs.inertia_scale": (0.7, 1.4),
+    "rigs.spacing": (2.3, 4.5),
+    "rigs.mount_jitter": 0.1,
+    "rigs.yaw_per_thrust": (0.1, 0.25),
+    "rigs.thrust_to_weight": (1.6, 4.0),
+    "rigs.rotor_lag": (0.015, 0.15),
+    "rigs.carrier_share": (0.02, 0.1),
+    "rigs.object_share": (0.05, 0.6),
+    "rigs.believed_factor": 2.0,
+    "rigs.thrust_scale": (0.8, 1.2),
+    "rigs.thrust_fade": (0.0, 0.002),
+    "rigs.fade": (0.0, 0.002),
+    "rigs.loop_frequency": (4.0, 20.0),
+    "rigs.loop_damping": (0.5, 1.1),
+    "rigs.unsaturated_tilt": 0.15,
+    "rigs.authority": 0.15,
+    "rigs.least_damping": 0.3,
 }
 # Settings of several numbers that were one number before.
 ONCE_ONE = ("gradient.windows_per_episode",)

@@ -43,7 +43,7 @@ class Rig(NamedTuple):
     flies: Float[Array, " drones"]  # 1 for a drone that there is, 0 for one that pads
     proportion: Scalar  # its radius over the plant's, by which CG amplitudes are multiplied
     size_ratio: Scalar  # its number of drones over the plant's, by which the object's mass is multiplied
-    drawn: rigs.RigTable | None = None  # the row of `config.rigs`, whose load is its own
+    drawn: rigs.RigTable | None = None  # the row of a random rig, whose load is its own
 
 
 class ResetDistribution:
@@ -152,10 +152,9 @@ class ResetDistribution:
     def _of_rig(self, load: Load, rig: Rig, key: Array) -> Load:
         """`load` with the masses, thrusts and reach of the drawn `rig`."""
         own: Any = rig.drawn
-        ranges = self.config.rigs
         far, stepped = jax.random.uniform(key, (2,))
         load = load._replace(object_mass=own.object_mass, believed_mass=own.believed_mass, thrust_scale=own.thrust)
-        change = ranges.mass_step * (2 * stepped - 1) * own.object_mass
+        change = self.config.rigs.mass_step * (2 * stepped - 1) * own.object_mass
         told = (own.believed_mass, own.thrust, self.config.scenario.trim_margin, *rigs.command_limits(self.config))
         later = rigs.trimmed_reach(rig.numbers, own.object_mass + change, *told)
         change = jnp.where(later < 0, 0.0, change)
@@ -163,7 +162,7 @@ class ResetDistribution:
         return load._replace(
             cg_amplitude=far * reach,
             mass_change=change[None],
-            thrust_fade=own.thrust_fade if ranges.thrust_fade[1] > 0 else None,
+            thrust_fade=own.thrust_fade,
         )
 
     def trimmed(self, load: Load, rig: Rig | None = None) -> Scalar:

@@ -1,4 +1,4 @@
-"""Random rigs: teams of drones, carriers and loads of every size, from the ranges of `config.rigs` (ours).
+"""Random rigs: teams of drones, carriers and loads of every size (ours).
 
 Lengths grow with the cube root of a drone's mass, inertia with mass and square of length, as they do from a Crazyflie
 to a drone of 3 kg; factors of a draw come on top. Needs NumPy alone.
@@ -23,8 +23,26 @@ from mjxball.plant.trim import safe_radius
 # A drone of 1 kg: arm [m], inertia over mass and arm^2 about (roll, pitch, yaw); the pair's.
 ARM, GYRATION = 0.12, np.array([0.16, 0.16, 0.28])
 CARRIER_THICKNESS = 0.04  # edge of the carrier across, over its diameter
-FREQUENCY_RATIO = (0.8, 1.25)  # of the roll loop to that of pitch
+# What is drawn: by factor, that is evenly in the logarithm, where it says so, else evenly.
+DRONE_MASS = (0.03, 3.0)  # of each drone, by factor [kg]
+ARM_SCALE = (0.8, 1.25)  # on the rotors' arm, which is ARM at 1 kg
+INERTIA_SCALE = (0.7, 1.4)  # on a drone's own inertia
+SPACING = (2.3, 4.5)  # distance of neighbours on the ring over the arm
+MOUNT_JITTER = 0.1  # each mount is off the even ring by up to this share of its radius and of the angle between two
+YAW_PER_THRUST = (0.1, 0.25)  # yaw moment of a rotor over its force, over the arm
+THRUST_TO_WEIGHT = (1.6, 4.0)  # all rotors' largest force over the weight with the load
+ROTOR_LAG = (0.015, 0.15)  # time constant, by factor [s]
+CARRIER_SHARE = (0.02, 0.1)  # mass of the carrier over that of all drones
+OBJECT_SHARE = (0.05, 0.6)  # mass of the object over that of all drones
+BELIEVED_SCALE = (0.5, 2.0)  # on the object's mass, by factor: what every drone assumes
+THRUST_SCALE = (0.8, 1.2)  # share that each drone gives of the force it is asked for
+THRUST_FADE = (0.0, 0.002)  # share of all thrust that is lost in a second as batteries empty [1/s]
+LOOP_FREQUENCY = (4.0, 20.0)  # natural frequency of the pitch loop, by factor [rad/s]
+FREQUENCY_RATIO = (0.8, 1.25)  # of the roll loop to that of pitch, by factor
 YAW_RATIO = 0.4  # of the yaw loop to that of pitch
+LOOP_DAMPING = (0.5, 1.1)  # of the attitude loops without rotor lag
+UNSATURATED_TILT = 0.15  # step that all rotors answer without saturation, at least: it caps the pitch loop [rad]
+LEAST_DAMPING = 0.3  # of the attitude loops with rotor lag; a rig with less is drawn anew
 # Wrong beliefs and uneven thrusts are drawn back by three tenths, at most 8 times, while they leave the CG less than a
 # tenth of the rig's length; a rig whose CG can go less far than a fiftieth is drawn anew.
 TRAINING, HELD_OUT = 1, 2  # seeds
@@ -61,13 +79,13 @@ class Drawn(NamedTuple):
 
     rigs: RigTable
     draws: int
-    unstable: int  # rejected: poles of the attitude loop with its rotor lag are damped by less than least_damping, or
+    unstable: int  # rejected: poles of the attitude loop with its rotor lag are damped by less than LEAST_DAMPING, or
     # the rotors are too weak for the slowest loop
     untrimmed: int  # rejected: followers cannot hold the load at O, however close beliefs and thrusts are to the truth
 
 
 def draw_rigs(config: Config, size: int, count: int, seed: int) -> Drawn:
-    """`count` rigs of `size` drones from `config.rigs`, padded to the plant's drones; a `seed` draws the same."""
+    """`count` rigs of `size` drones, padded to the plant's drones; a `seed` draws the same."""
     random = np.random.default_rng([seed, size])
     parts: list[RigTable] = []
     draws = damped = untrimmed = 0
@@ -151,7 +169,7 @@ def loop_damping(frequency: Array, damping: Array, lag: Array) -> Array:
 
 def _draw(config: Config, size: int, count: int, random: np.random.Generator) -> tuple[RigTable, Array, Array]:
     """(rigs, whether their loops are damped, whether their loads can be trimmed), `count` of each."""
-    ranges, most, gravity = config.rigs, max(config.plant.count, size), config.plant.gravity
+    most, gravity = max(config.plant.count, size), config.plant.gravity
 
     def even(ends: Range, *shape: int) -> Array:
         return random.uniform(*ends, (count, *shape))
@@ -159,24 +177,24 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
     def by_factor(ends: Range, *shape: int) -> Array:
         return np.exp(even((math.log(ends[0]), math.log(ends[1])), *shape))
 
-    mass = by_factor(ranges.drone_mass)
-    arm = ARM * np.cbrt(mass) * even(ranges.arm_scale)
-    inertia = (mass * arm**2)[:, None] * GYRATION * even(ranges.inertia_scale)[:, None]
-    radius = arm * even(ranges.spacing) / (2 * math.sin(math.pi / size))
-    jitter = ranges.mount_jitter if size > 2 else 0.0  # two drones hold only what lies on the line between them
+    mass = by_factor(DRONE_MASS)
+    arm = ARM * np.cbrt(mass) * even(ARM_SCALE)
+    inertia = (mass * arm**2)[:, None] * GYRATION * even(INERTIA_SCALE)[:, None]
+    radius = arm * even(SPACING) / (2 * math.sin(math.pi / size))
+    jitter = MOUNT_JITTER if size > 2 else 0.0  # two drones hold only what lies on the line between them
     around = 2 * np.pi / size * (np.arange(size) + even((-jitter, jitter), size))
-    away = radius[:, None] * (1 + even((-ranges.mount_jitter, ranges.mount_jitter), size))
+    away = radius[:, None] * (1 + even((-MOUNT_JITTER, MOUNT_JITTER), size))
     mounts = np.stack([away * np.cos(around), away * np.sin(around), 0.0 * away], axis=-1)
     length = away.max(axis=-1)
-    carrier = mass * size * even(ranges.carrier_share)
-    load = mass * size * even(ranges.object_share)
-    believed = load * by_factor((1 / ranges.believed_factor, ranges.believed_factor))
-    thrust = even(ranges.thrust_scale, size)
-    strongest = even(ranges.thrust_to_weight) * gravity * (mass * size + carrier + load) / (4 * size)
-    lag = by_factor(ranges.rotor_lag)
+    carrier = mass * size * even(CARRIER_SHARE)
+    load = mass * size * even(OBJECT_SHARE)
+    believed = load * by_factor(BELIEVED_SCALE)
+    thrust = even(THRUST_SCALE, size)
+    strongest = even(THRUST_TO_WEIGHT) * gravity * (mass * size + carrier + load) / (4 * size)
+    lag = by_factor(ROTOR_LAG)
     place, ratio = random.uniform(0, 1, count), by_factor(FREQUENCY_RATIO)
-    damping = even(ranges.loop_damping)
-    fade = even(ranges.thrust_fade)
+    damping = even(LOOP_DAMPING)
+    fade = even(THRUST_FADE)
     shares = _load_shares(mounts)
 
     def alike(value: Array) -> Array:
@@ -190,7 +208,7 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
         mounts=mounts,
         yaw=None,
         arm=alike(arm),
-        yaw_per_thrust=alike(arm * even(ranges.yaw_per_thrust)),
+        yaw_per_thrust=alike(arm * even(YAW_PER_THRUST)),
         rotor_force_max=alike(strongest),
         rotor_lag=alike(lag),
         known_mass=own + shares * carrier[:, None],
@@ -206,16 +224,16 @@ def _draw(config: Config, size: int, count: int, random: np.random.Generator) ->
     )
     rows = rigid_inertia(whole(numbers, gravity))
     about = [rows[axis][axis] + load * ball for axis in range(3)]
-    # The loop is as fast as it was drawn, up to what the rotors can give for a step of `unsaturated_tilt`.
+    # The loop is as fast as it was drawn, up to what the rotors can give for a step of `UNSATURATED_TILT`.
     hover = gravity * (mass * size + carrier + load) / (4 * size)
     room = torque_room(arm, config.plant.layout, hover, strongest)
-    slowest, fastest = ranges.loop_frequency
-    stiffest = np.sqrt(size * room / ranges.unsaturated_tilt / np.maximum(about[0] * ratio**2, about[1]))
+    slowest, fastest = LOOP_FREQUENCY
+    stiffest = np.sqrt(size * room / UNSATURATED_TILT / np.maximum(about[0] * ratio**2, about[1]))
     pitch = slowest * (np.clip(stiffest, slowest, fastest) / slowest) ** place
     frequency = np.stack([pitch * ratio, pitch, YAW_RATIO * pitch], axis=-1)
     kp, kd = (np.stack(list(gain), axis=-1) for gain in design_gains(about, frequency.T, damping, size))
     numbers = numbers._replace(gains=AttitudeGains(kp, kd))
-    steady = loop_damping(frequency[:, :2].max(axis=-1), damping, lag) >= ranges.least_damping
+    steady = loop_damping(frequency[:, :2].max(axis=-1), damping, lag) >= LEAST_DAMPING
     steady &= stiffest >= slowest
 
     constants, limits = whole(numbers, gravity), (config.scenario.trim_margin, *command_limits(config))
