@@ -115,13 +115,15 @@ def train_brax(config: configs.Config, options: argparse.Namespace, export: Expo
         }
         own |= {"min_replay_size": config.sac.warmup_steps, "max_replay_size": options.replay}
     else:
+        from mjxball.algorithms import ppo as ours
+
         networks = functools.partial(
-            make_ppo_networks, policy_hidden_layer_sizes=sizes, value_hidden_layer_sizes=ppo.value_layers
+            make_ppo_networks, policy_hidden_layer_sizes=sizes, value_hidden_layer_sizes=ours.VALUE_LAYERS
         )
         own = {"batch_size": options.num_envs // ppo.minibatches, "num_minibatches": ppo.minibatches}
-        own |= {"unroll_length": ppo.unroll_length, "num_updates_per_batch": ppo.epochs}
-        own |= {"gae_lambda": ppo.gae_lambda, "clipping_epsilon": ppo.clipping}
-        own |= {"entropy_cost": ppo.entropy_cost, "max_grad_norm": ppo.max_grad_norm}
+        own |= {"unroll_length": ppo.unroll_length, "num_updates_per_batch": ours.EPOCHS}
+        own |= {"gae_lambda": ours.GAE_LAMBDA, "clipping_epsilon": ours.CLIPPING}
+        own |= {"entropy_cost": ppo.entropy_cost, "max_grad_norm": ours.MAX_GRAD_NORM}
     with jax.default_matmul_precision("highest"):
         train(
             environment=Masked(TransportEnv(config, options.physics)),
@@ -212,9 +214,11 @@ def train_sb3(config: configs.Config, options: argparse.Namespace, export: Expor
         "policy_kwargs": {"net_arch": options.sizes, "activation_fn": activation},
     }
     if is_ppo:
+        from mjxball.algorithms import ppo as ours
+
         own |= {"n_steps": ppo.unroll_length, "batch_size": options.num_envs * ppo.unroll_length // ppo.minibatches}
-        own |= {"n_epochs": ppo.epochs, "gae_lambda": ppo.gae_lambda, "clip_range": ppo.clipping}
-        own |= {"ent_coef": ppo.entropy_cost, "max_grad_norm": ppo.max_grad_norm}
+        own |= {"n_epochs": ours.EPOCHS, "gae_lambda": ours.GAE_LAMBDA, "clip_range": ours.CLIPPING}
+        own |= {"ent_coef": ppo.entropy_cost, "max_grad_norm": ours.MAX_GRAD_NORM}
     else:
         own |= {"n_steps": config.sac.n_step, "tau": config.sac.tau, "learning_starts": config.sac.warmup_steps}
         own |= {"batch_size": options.batch, "train_freq": 1, "gradient_steps": options.updates}

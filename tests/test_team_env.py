@@ -312,7 +312,7 @@ def test_every_algorithm_learns_from_all_followers(algorithm: str) -> None:
     sizes = {"num_envs": 6, "policy_layers": (8,)}
     own = {
         "sac": {"batch_size": 6, "replay_size": 600, "warmup_steps": 12, "total_steps": 120, "critic_layers": (8,)},
-        "ppo": {"minibatches": 1, "unroll_length": 5, "total_steps": 120, "value_layers": (8,)},
+        "ppo": {"minibatches": 1, "unroll_length": 5, "total_steps": 120},
         "gradient": {"gradient_steps": 3, "horizon": 5},
     }[algorithm]
     changes = {f"{algorithm}.{name}": value for name, value in (sizes | own).items()}

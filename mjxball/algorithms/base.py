@@ -56,13 +56,9 @@ class PolicyNetwork(NamedTuple):
         names = sorted(self.layers, key=lambda name: int(name.rsplit("_", 1)[1]))
         hidden = (observation - self.mean) / self.deviation * self.mask
         for name in names[:-1]:
-            hidden = self.activation(hidden @ self.layers[name]["kernel"] + self.layers[name]["bias"])
+            hidden = jax.nn.relu(hidden @ self.layers[name]["kernel"] + self.layers[name]["bias"])
         last = hidden @ self.layers[names[-1]]["kernel"] + self.layers[names[-1]]["bias"]
         return jnp.tanh(last[..., : last.shape[-1] // 2])
-
-    def activation(self, value: Array) -> Array:
-        """Of hidden units."""
-        return jax.nn.relu(value)
 
 
 class RecurrentNetwork(PolicyNetwork):
@@ -104,14 +100,6 @@ class RecurrentNetwork(PolicyNetwork):
             scale=(self.mask[..., own] / self.deviation[..., own]),
             gru=(gru["kernel"], gru["recurrent"], gru["bias"]),
         )
-
-
-class SwishNetwork(PolicyNetwork):
-    """The same with swish units, for which there is no policy file."""
-
-    def activation(self, value: Array) -> Array:
-        """Of hidden units."""
-        return jax.nn.swish(value)
 
 
 class Shards(NamedTuple):

@@ -20,6 +20,7 @@ from mjxball.errors import InputError
 from mjxball.policy.file import PolicyFile
 
 SMALL_RESPONSE = 1e-3  # to an impulse of 1, in deviations of observations and in actions: below that it is over
+MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
 
 
@@ -230,7 +231,7 @@ class FirstOrderGradient:
         # A window that diverged has no gradient.
         sound = jnp.isfinite(norm) & phase.learning
         slope = jax.tree.map(
-            lambda one: jnp.where(sound, one * jnp.minimum(1.0, own.max_grad_norm / (norm + 1e-9)), 0.0), state.slope
+            lambda one: jnp.where(sound, one * jnp.minimum(1.0, MAX_GRAD_NORM / (norm + 1e-9)), 0.0), state.slope
         )
         fall = own.learning_rate_final_ratio + (1.0 - own.learning_rate_final_ratio) * 0.5 * (
             1.0 + jnp.cos(jnp.pi * progress)

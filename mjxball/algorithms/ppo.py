@@ -17,7 +17,6 @@ from mjxball.algorithms.base import (
     PolicyNetwork,
     RecurrentNetwork,
     Schedule,
-    SwishNetwork,
     Transition,
 )
 from mjxball.algorithms.networks import normaliser
@@ -29,6 +28,13 @@ from mjxball.quiet import import_brax_ppo, import_brax_training
 brax = import_brax_training()
 brax_ppo = import_brax_ppo()
 ADAM = optax.scale_by_adam()
+EPOCHS = 8  # passes over the rollout in an update
+VALUE_LAYERS = (64, 64)  # hidden layers of the state value
+FINAL_RATE = 0.02  # learning rate at the end of the run over that at its start
+GAE_LAMBDA = 0.95  # of the generalised advantage estimate
+CLIPPING = 0.2  # largest change of an action's probability that is rewarded
+REWARD_SCALE = 0.02  # factor on the reward: the value's loss shares the gradient's norm
+MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
 
 
 class PpoState(NamedTuple):
@@ -37,11 +43,11 @@ class PpoState(NamedTuple):
     parameters: Any  # Brax's of policy and value
     adam: Any
     normaliser: Any  # running mean and deviation of the observations
-    rollout: Any  # Brax's `Transition`, the newest steps of all environments: (envs x unrolls, unroll_length, ...)
+    rollout: Any  # Brax's `Transition`, the newest steps of all environments: (envs, unroll_length, ...)
 
 
 class ProximalPolicyOptimization:
-    """`collect` flies `ppo.unrolls` times `ppo.unroll_length` steps, `update` learns from them alone.
+    """`collect` flies `ppo.unroll_length` steps, `update` learns from them alone.
 
     See `mjxball.algorithms.base`.
     """
@@ -56,8 +62,7 @@ class ProximalPolicyOptimization:
         ppo, slots = config.ppo, environments.recurrent_slots
         self._units = slots.stop - slots.start
         self._config, self._environments, self._shards = ppo, environments, environments.shards
-        self.steps_per_collect = ppo.unrolls * ppo.unroll_length
-        self._count = environments.count * ppo.unrolls
+        self.steps_per_collect = ppo.unroll_length
         self.schedule = Schedule(ppo.total_steps, ppo.num_envs, 0, ppo.num_evaluations)
         self._mask = environments.policy_mask
         self._sizes = (environments.observation_size, environments.action_size - self._units)
@@ -77,7 +82,7 @@ class ProximalPolicyOptimization:
         )
         size, actions = self._sizes
         specification = brax.specs.Array((size,), jnp.dtype("float32"))
-        shape = (self._count, self._config.unroll_length)
+        shape = (self._environments.count, self.steps_per_collect)
         seen, acted, none = jnp.zeros((*shape, size)), jnp.zeros((*shape, actions)), jnp.zeros(shape)
         parameters_none = jnp.zeros((*shape, 2 * actions))
         rollout = _rollout(Transition(seen, acted, none, none, seen, none), parameters_none, acted, none)
@@ -97,11 +102,7 @@ class ProximalPolicyOptimization:
             return envs, _rollout(seen._replace(action=action), parameters, raw, distribution.log_prob(parameters, raw))
 
         envs, flown = jax.lax.scan(step, envs, act_keys)
-
-        def in_unrolls(leaf: Array) -> Array:
-            return jnp.swapaxes(leaf, 0, 1).reshape((self._count, self._config.unroll_length, *leaf.shape[2:]))
-
-        flown = jax.tree.map(in_unrolls, flown)
+        flown = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), flown)
         normaliser = brax.running_statistics.update(
             state.normaliser, flown.observation, pmap_axis_name=self._shards.axis
         )
@@ -112,12 +113,12 @@ class ProximalPolicyOptimization:
     def update(
         self, state: PpoState, keys: Sequence[Array], progress: Array, phase: Phase
     ) -> tuple[PpoState, dict[str, Array]]:
-        """`epochs` passes over the rollout in `minibatches` parts, the steps of an unroll together."""
-        ppo, count = self._config, self._count
-        rate = ppo.learning_rate * (1.0 + (ppo.learning_rate_final_ratio - 1.0) * progress)
+        """`EPOCHS` passes over the rollout in `minibatches` parts, the steps of an unroll together."""
+        ppo, count = self._config, self._environments.count
+        rate = ppo.learning_rate * (1.0 + (FINAL_RATE - 1.0) * progress)
         order_key, loss_key = jax.random.split(self._shards.own(keys[0]))
-        orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(order_key, ppo.epochs))
-        batches = orders.reshape(ppo.epochs * ppo.minibatches, -1)
+        orders = jax.vmap(lambda key: jax.random.permutation(key, count))(jax.random.split(order_key, EPOCHS))
+        batches = orders.reshape(EPOCHS * ppo.minibatches, -1)
 
         def loss(parameters: Any, batch: Any, key: Array) -> tuple[Array, dict[str, Array]]:
             return brax_ppo.losses.compute_ppo_loss(
@@ -128,9 +129,9 @@ class ProximalPolicyOptimization:
                 self._of_unrolls,
                 entropy_cost=ppo.entropy_cost,
                 discounting=ppo.discount,
-                reward_scaling=ppo.reward_scale,
-                gae_lambda=ppo.gae_lambda,
-                clipping_epsilon=ppo.clipping,
+                reward_scaling=REWARD_SCALE,
+                gae_lambda=GAE_LAMBDA,
+                clipping_epsilon=CLIPPING,
             )
 
         def one(number: Array, carry: Any) -> Any:
@@ -138,7 +139,7 @@ class ProximalPolicyOptimization:
             batch = jax.tree.map(lambda leaf: leaf[batches[number]], state.rollout)
             gradient, seen = jax.grad(loss, has_aux=True)(parameters, batch, jax.random.fold_in(loss_key, number))
             gradient = self._shards.mean(gradient)
-            gradient, _ = optax.clip_by_global_norm(ppo.max_grad_norm).update(gradient, optax.EmptyState())
+            gradient, _ = optax.clip_by_global_norm(MAX_GRAD_NORM).update(gradient, optax.EmptyState())
             direction, adam = ADAM.update(gradient, adam)
             parameters = jax.tree.map(lambda value, along: value - rate * along, parameters, direction)
             report = (seen["total_loss"], seen["policy_loss"], seen["v_loss"], seen["policy_dist_mean_std"])
@@ -152,8 +153,7 @@ class ProximalPolicyOptimization:
     def policy(self, state: PpoState) -> PolicyNetwork:
         """The policy, and what it knows of its observations."""
         mask = jnp.asarray(self._mask, jnp.float32)
-        kind = {"relu": PolicyNetwork, "swish": SwishNetwork}[self._config.activation]
-        kind = RecurrentNetwork if self._units else kind
+        kind = RecurrentNetwork if self._units else PolicyNetwork
         return kind(state.parameters.policy["params"], state.normaliser.mean, state.normaliser.std, mask)
 
     def partition(self, whole: Any, split: Any) -> PpoState:
@@ -162,13 +162,11 @@ class ProximalPolicyOptimization:
 
     def check_parts(self, parts: int) -> None:
         """Raise InputError unless environments and minibatches can be cut into `parts`."""
-        if (
-            self._config.num_envs % parts
-            or self._config.num_envs // parts * self._config.unrolls % self._config.minibatches
-        ):
+        count, batches = self._config.num_envs, self._config.minibatches
+        if count % (parts * batches):
             raise InputError(
-                f"ppo.num_envs = {self._config.num_envs} times ppo.unrolls = {self._config.unrolls} cannot be cut into "
-                f"{self._config.minibatches} minibatches on {parts} devices evenly; make it a multiple"
+                f"ppo.num_envs = {count} cannot be cut into {batches} minibatches on {parts} devices evenly; make it a "
+                f"multiple of {parts * batches}"
             )
 
 
@@ -185,12 +183,12 @@ def make_networks(config: Ppo, mask: Any, action_size: int, critic_mask: Any) ->
             len(mask),
             preprocess_observations_fn=policy,
             hidden_layer_sizes=config.policy_layers,
-            activation=getattr(jax.nn, config.activation),
+            activation=jax.nn.relu,
         ),
         value_network=brax.networks.make_value_network(
             len(mask),
             preprocess_observations_fn=value,
-            hidden_layer_sizes=config.value_layers,
+            hidden_layer_sizes=VALUE_LAYERS,
             activation=jax.nn.swish,
         ),
         parametric_action_distribution=distribution,

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 brax = import_brax_training()
 ADAM = optax.scale_by_adam()
+ALPHA_LEARNING_RATE = 1e-3  # Adam's, for the temperature's logarithm
+POLICY_EMA_RATE = 0.002  # of the exported running average of the policy
 
 
 class Learner(NamedTuple):
@@ -140,13 +142,13 @@ def make_update(
         policy, policy_adam = _descend(before.policy, mean(gradient), before.policy_adam, step)
         # d(alpha loss)/d(log alpha) of SAC's eq. 18: alpha (H - target).
         rise = 0.0 * alpha if config.alpha_fixed else alpha * (entropy - target_entropy)
-        log_alpha, alpha_adam = _descend(before.log_alpha, rise, before.alpha_adam, rate * config.alpha_learning_rate)
+        log_alpha, alpha_adam = _descend(before.log_alpha, rise, before.alpha_adam, rate * ALPHA_LEARNING_RATE)
         moved = learner._replace(
             policy=policy,
             log_alpha=log_alpha,
             policy_adam=policy_adam,
             alpha_adam=alpha_adam,
-            average=optax.incremental_update(policy, learner.average, config.policy_ema_rate),
+            average=optax.incremental_update(policy, learner.average, POLICY_EMA_RATE),
         )
         return moved, Losses(jnp.zeros(()), value, entropy)
 

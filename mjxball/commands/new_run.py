@@ -42,9 +42,6 @@ def new_run(options: argparse.Namespace, command: str) -> tuple[config.Config, d
     settings = cli.apply_config_flags(config.preset(name), options)
     if not 0 <= seed <= LARGEST_SEED:
         raise InputError(f"--seed must be between 0 and {LARGEST_SEED}, not {seed}")
-    for section in ALGORITHMS:
-        if (units := getattr(getattr(settings, section), "activation", "relu")) != "relu":
-            raise InputError(f"--{section}.activation {units}: policy files hold relu; see mjxball.train.train")
     called = options.env.rpartition(":")[2] if options.env else name
     out = output_directory(options.out or Path("runs") / f"{called}-{time.strftime('%Y%m%d-%H%M%S')}")
     standard_scenarios(settings)

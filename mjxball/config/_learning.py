@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from mjxball.config._leaf import setting
 
@@ -29,7 +28,6 @@ class Sac:
         False, "a state-value network with a slow copy gives the targets (the paper's eqs. 6-8), not slow Q networks"
     )
     learning_rate: float = setting(1e-3, "Adam's rate for policy and critics", above=0)
-    alpha_learning_rate: float = setting(1e-3, "Adam's rate for the temperature's logarithm", above=0)
     discount: float = setting(0.99, "gamma", low=0, high=0.99999)
     n_step: int = setting(1, "rewards summed before bootstrapping (n-step returns)", low=1, high=50)
     tau: float = setting(0.02, "rate of the slow copies that give the targets", above=0, high=1)
@@ -38,7 +36,6 @@ class Sac:
     target_entropy: float = setting(-0.5, "wanted entropy for each action dimension [nat]")
     reward_scale: float = setting(1.0, "factor on the reward inside the critic", above=0)
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
-    policy_ema_rate: float = setting(0.002, "rate of the exported running average of the policy", above=0, high=1)
     learning_rate_final_ratio: float = setting(
         0.1, "rate at the end of the run over the rate at its start", above=0, high=1
     )
@@ -51,24 +48,11 @@ class Ppo:
     total_steps: int = setting(4_000_000, "environment steps in all", low=1)
     num_envs: int = setting(512, "environments that are stepped at once", low=1)
     unroll_length: int = setting(20, "steps in a row whose advantages are estimated together", low=1)
-    unrolls: int = setting(1, "such rows of every environment between two updates", low=1)
-    epochs: int = setting(8, "passes over these steps in an update", low=1)
-    minibatches: int = setting(8, "parts of the unrolls that each pass is cut into", low=1)
+    minibatches: int = setting(8, "parts of the unrolls that each pass over them is cut into", low=1)
     policy_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the policy", low=1)
-    activation: Literal["relu", "swish"] = setting(
-        "relu", "units of the policy; policy files hold relu alone, swish is for `mjxball.train.train`"
-    )
-    value_layers: tuple[int, ...] = setting((64, 64), "hidden layers of the state value", low=1)
     learning_rate: float = setting(2e-3, "Adam's rate at the start", above=0)
-    learning_rate_final_ratio: float = setting(
-        0.02, "rate at the end of the run over the rate at its start", above=0, high=1
-    )
     discount: float = setting(0.97, "gamma", low=0, high=0.99999)
-    gae_lambda: float = setting(0.95, "lambda of the generalised advantage estimate", low=0, high=1)
-    clipping: float = setting(0.2, "largest change of an action's probability that is rewarded", above=0)
     entropy_cost: float = setting(0.0, "weight of the policy's entropy", low=0)
-    reward_scale: float = setting(0.02, "factor on the reward: the value's loss shares the gradient's norm", above=0)
-    max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
     num_evaluations: int = setting(5, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)
 
 
@@ -90,7 +74,6 @@ class Gradient:
     adam_betas: tuple[float, float] = setting(
         (0.9, 0.999), "what Adam keeps in a step of its means of gradients and of their squares", low=0, high=0.99999
     )
-    max_grad_norm: float = setting(1.0, "largest global norm of a gradient", above=0)
     gradient_decay: float = setting(
         1.0, "factor on the gradient that passes from a control step to the one before", above=0, high=1
     )

@@ -78,11 +78,9 @@ def _sac(config: Config) -> _Sizes:
 def _ppo(config: Config) -> _Sizes:
     ppo = config.ppo
     policy = _policy(config, ppo.policy_layers)
-    value = _weights(OBSERVATION_SIZE, ppo.value_layers, 1)
-    data = ppo.num_envs * ppo.unroll_length * ppo.unrolls * (ROW + 2 * config.follower.recurrent_units)
-    operations = 6.0 * ppo.total_steps * ppo.epochs * (policy + value)
+    data = ppo.num_envs * ppo.unroll_length * (ROW + 2 * config.follower.recurrent_units)
     rounds = max(ppo.total_steps // ppo.num_envs, 1)
-    return ppo.total_steps, rounds, 3 * (policy + value) + ppo.num_envs * STATE, data, operations
+    return ppo.total_steps, rounds, 3 * policy + ppo.num_envs * STATE, data, 6.0 * ppo.total_steps * policy
 
 
 def _gradient(config: Config) -> _Sizes:
@@ -115,8 +113,7 @@ def check(config: Config, algorithm: str, members: int) -> None:
 def _largest(config: Config, algorithm: str) -> str:
     """Names of the settings that make a run large."""
     own = getattr(config, algorithm)
-    layers = ("policy_layers", "critic_layers", "value_layers")
-    names = ("num_envs", "replay_size", "batch_size", "horizon", "unroll_length", "unrolls", *layers)
+    names = ("num_envs", "replay_size", "batch_size", "horizon", "unroll_length", "policy_layers", "critic_layers")
     return ", ".join(f"{algorithm}.{name}" for name in names if hasattr(own, name)) + " or --num-seeds"
 
 

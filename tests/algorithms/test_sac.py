@@ -62,13 +62,7 @@ def compiled(config: Sac, updates: int) -> Any:
     return jax.jit(run)
 
 
-TRACED = (
-    "target_entropy",
-    "tau",
-    "policy_ema_rate",
-    "learning_rate",
-    "alpha_learning_rate",
-)  # settings that differ between tests
+TRACED = ("target_entropy", "tau", "learning_rate")  # settings that differ between tests
 
 
 def one_update(rate: float = 1.0, config: Sac = ADAPTIVE, **changes: float) -> tuple[sac.Learner, sac.Learner, float]:
@@ -136,8 +130,9 @@ def test_the_critic_learns_from_the_slow_copy():
 
 
 def test_average_policy_moves_by_its_rate():
-    before, after, _ = one_update(policy_ema_rate=0.25)
-    expected = jax.tree.map(lambda new, old: 0.25 * new + 0.75 * old, after.policy, before.average)
+    before, after, _ = one_update()
+    rate = sac.POLICY_EMA_RATE
+    expected = jax.tree.map(lambda new, old: rate * new + (1 - rate) * old, after.policy, before.average)
     assert largest_difference(after.average, expected) < 2e-7  # float32, weights up to 1
     assert largest_difference(after.average, before.average) > 1e-4
 
@@ -145,11 +140,12 @@ def test_average_policy_moves_by_its_rate():
 @pytest.mark.parametrize("rate", [1.0, 0.5])
 def test_rate_scales_every_learning_rate(rate):
     """Adam's first step is the learning rate times the gradient's sign, for every parameter."""
-    before, after, _ = one_update(rate, learning_rate=1e-2, alpha_learning_rate=1e-3, target_entropy=-3.0)
+    before, after, _ = one_update(rate, learning_rate=1e-2, target_entropy=-3.0)
     for part in ("policy", "critic"):
         moved = largest_difference(getattr(after, part), getattr(before, part))
         assert moved == pytest.approx(rate * 1e-2, rel=1e-3)  # an ulp of a weight of 1 is 1e-5 of the step
-    assert float(before.log_alpha - after.log_alpha) == pytest.approx(rate * 1e-3, rel=1e-3)  # ulp of log 0.02: 2e-4
+    fallen = float(before.log_alpha - after.log_alpha)
+    assert fallen == pytest.approx(rate * sac.ALPHA_LEARNING_RATE, rel=1e-3)  # ulp of log 0.02: 2e-4
 
 
 @pytest.mark.parametrize("config", [SMALL, PAPER], ids=["twin critics", "state value"])
