@@ -21,6 +21,7 @@ from mjxball.policy.file import PolicyFile
 
 SMALL_RESPONSE = 1e-3  # to an impulse of 1, in deviations of observations and in actions: below that it is over
 MAX_GRAD_NORM = 1.0  # largest global norm of a gradient
+IMPULSE_RESPONSE_FROM = 0.75  # share of the gradient steps after which it begins to count
 LEAST_DEVIATION = 0.02  # of an observation: what hardly moves in the first flights is not blown up
 
 
@@ -86,7 +87,7 @@ class FirstOrderGradient:
         self._mask: Any = np.asarray(environments.policy_mask, np.float32)
         weight: Any = own.impulse_response  # no number where a sweep traces it
         self._responds = not (isinstance(weight, (int, float)) and weight == 0)
-        self._responds_from = round(own.impulse_response_from * own.gradient_steps)  # windows
+        self._responds_from = round(IMPULSE_RESPONSE_FROM * own.gradient_steps)  # windows
 
     def init(self, key: Array) -> GradientState:
         """A policy that adds hardly anything."""

@@ -108,7 +108,6 @@ def flight() -> Config:
             action_scale_vertical=0.8,
             observation_averages=(0.05, 0.2, 1.0),
             residual_on_pid=True,
-            washout_time=8.0,
             privileged_critic=True,
         ),
         scenario=ScenarioRanges(

@@ -86,10 +86,8 @@ class Gradient:
     impulse_response: float = setting(
         0.0,
         "weight of the logarithm of the closed loop's linearised answer to an impulse of a window's first action: it "
-        "is to die out also where errors are too small to cost anything; with it a gradient takes three times as long",
+        "is to die out also where errors are too small to cost anything; it counts in the last quarter of the "
+        "gradient steps, which take three times as long",
         low=0,
-    )
-    impulse_response_from: float = setting(
-        0.0, "share of the gradient steps after which impulse_response begins to count", low=0, high=1
     )
     num_evaluations: int = setting(1, "evaluations, each with a checkpoint, evenly over the run", low=1, high=50)

@@ -185,7 +185,6 @@ def _balance() -> Config:
             gradient_decay=0.98,
             # Circles of millimetres hardly cost anything: the last quarter damps what is infinitely small.
             impulse_response=0.02,
-            impulse_response_from=0.75,
         ),
     )
 
@@ -205,7 +204,6 @@ def _team() -> Config:
             team_sizes=(2, 3, 4, 6),
             cg_amplitude=(0.0, 0.3),
             cg_width=(0.0, 1.0),
-            cg_lissajous_probability=0.3,
             cg_waypoint_probability=0.2,
             object_mass=(0.3, 0.9),
             drone_mass_scale=(0.9, 1.1),
@@ -268,7 +266,6 @@ def _universal() -> Config:
             cg_speed=(0.1, 6.0),
             cg_amplitude=(0.0, 0.2),
             cg_width=(0.0, 1.0),
-            cg_lissajous_probability=0.3,
             cg_waypoint_probability=0.3,
             delay=(0.0, 0.05),
             estimator_drift=(0.0, 1.0),

@@ -42,7 +42,6 @@ RENAMED = {
     "follower.vertical_limit": "follower.action_scale_vertical",
     "follower.filters": "follower.observation_averages",
     "scenario.unknown_share": "scenario.unknown_mass_probability",
-    "follower.washout": "follower.washout_time",
     "follower.shares_integrals": "follower.residual_on_pid",
     "leader.level_gain": "leader.tilt_integral_gain",
     "leader.integral_band": "leader.integral_error_limit",
@@ -82,12 +81,16 @@ CONSTANT: dict[str, Any] = {
     "ppo.max_grad_norm": 1.0,
     "gradient.max_grad_norm": 1.0,
     "autopilot.sag": 0.0,
+    "scenario.cg_lissajous_probability": 0.3,
     "scenario.relay_probability": 0.0,
     "scenario.relay_rate": (5.0, 10.0),
     "scenario.relay_loss": (0.0, 0.0),
     "gradient.until_termination": False,
+    "gradient.impulse_response_from": 0.75,
     "follower.base": "pd",
     "follower.history": 1,
+    "follower.washout_time": 8.0,
+    "follower.washout": 8.0,
     "follower.differential_thrust_share": 0.0,
     "follower.load_by_lift": 0.0,
     "rigs.drone_mass": (0.03, 3.0),
@@ -109,6 +112,13 @@ CONSTANT: dict[str, Any] = {
     "rigs.unsaturated_tilt": 0.15,
     "rigs.authority": 0.15,
     "rigs.least_damping": 0.3,
+}
+# Of these, those that count for nothing where another setting is 0 or off: there files hold any value.
+SWITCH = {
+    "follower.washout_time": "follower.residual_on_pid",
+    "follower.washout": "follower.residual_on_pid",
+    "scenario.cg_lissajous_probability": "scenario.cg_width",
+    "gradient.impulse_response_from": "gradient.impulse_response",
 }
 # Settings of several numbers that were one number before.
 ONCE_ONE = ("gradient.windows_per_episode",)
@@ -145,7 +155,8 @@ def with_current_names(data: Any) -> Any:
             continue
         value = found[part].pop(name)
         if old in CONSTANT:
-            check_constant(old, value)
+            if old not in SWITCH or _is_on(found, SWITCH[old]):
+                check_constant(old, value)
             continue
         *way, new_name = RENAMED[old].split(".")
         place = _place(found, way)
@@ -155,6 +166,13 @@ def with_current_names(data: Any) -> Any:
             raise InputError(f"{RENAMED[old]} is given twice, also under its old name {old}")
         place[new_name] = value
     return found
+
+
+def _is_on(data: dict[str, Any], path: str) -> bool:
+    """Whether the nested `data` have a setting at `path` that is neither 0 nor off."""
+    part, _, name = path.partition(".")
+    value = data[part].get(name) if isinstance(data.get(part), dict) else None
+    return any(value) if isinstance(value, (list, tuple)) else bool(value)
 
 
 def _place(data: Any, way: Sequence[str]) -> Any:

@@ -107,13 +107,9 @@ class Follower:
     action_scale_tilt: float = setting(0.2, "roll and pitch at an action of 1 [rad]", above=0, high=1.2)
     action_scale_vertical: float = setting(2.0, "vertical acceleration at an action of 1 [m/s2]", above=0)
     residual_on_pid: bool = setting(
-        False, "a residual action is added to the leader's PID law, integrals included, not to its PD part alone"
-    )
-    washout_time: float = setting(
-        0.0,
-        "time constant of the high pass on a residual action, with follower.residual_on_pid: what lasts is the "
-        "integrals' part; 0: no high pass [s]",
-        low=0,
+        False,
+        "a residual action is added to the leader's PID law, integrals included, not to its PD part alone, behind a "
+        "high pass: what lasts is the integrals' part",
     )
     load_axis_only: bool = setting(
         False,
@@ -184,13 +180,10 @@ class ScenarioRanges:
     thrust_scale_common: Range = drawn((1.0, 1.0), "factor on both drones' rotor forces alike", above=0)
     inertia_scale: Range = drawn((1.0, 1.0), "one factor on the inertia of drones and object", above=0)
     cg_width: Range = drawn(
-        (0.0, 0.0), "in the plane: amplitude of the CG's second sine, across the first one, over that one's", low=0
-    )
-    cg_lissajous_probability: float = setting(
-        0.0,
-        "in the plane: probability that the second sine is twice as fast, else the path is an ellipse",
+        (0.0, 0.0),
+        "in the plane: amplitude of the CG's second sine, across the first one, over that one's; in three flights of "
+        "ten it is twice as fast, else the path is an ellipse",
         low=0,
-        high=1,
     )
     cg_waypoint_probability: float = setting(
         0.0, "probability that the CG moves between random waypoints instead of in a sine", low=0, high=1

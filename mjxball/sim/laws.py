@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 # Largest vertical acceleration by which the integral of the stick's angle lifts the drones apart [m/s2].
 MAX_LIFT_DIFFERENCE = 1.5
+WASHOUT_TIME = 8.0  # time constant of the high pass on what a network adds to both drones' PID law [s]
 
 
 class BodyState(NamedTuple):
@@ -72,7 +73,7 @@ class Laws:
     residual is on the PID law: two drones with integrals of their own wind up against each other, for only the
     whole lift and the whole moment show in the motion. The leader's PID is then both drones' base, and what keeps
     turning the stick is lifted away, one drone more, the other less, instead of being held by a lasting roll command.
-    Behind them stands the average (..., 3) of what the network adds to that base (`follower.washout_time`): it is taken
+    Behind them stands the average (..., 3) of what the network adds to that base (`WASHOUT_TIME`): it is taken
     off, for a lasting command of one drone is undone by the other's integrals and only costs both of them range.
     """
 
@@ -81,7 +82,6 @@ class Laws:
         self._limits = config.command.tilt_limit, config.command.vertical_limit
         self._on_pid = config.follower.residual_on_pid
         self._tilt_integral_gain = config.leader.tilt_integral_gain
-        self._washout = config.follower.washout_time
         self._axis = 0 if config.plant.cg_axis == "y" else 1  # roll or pitch, which the load turns
         # A leader at +y that lifts more rolls the stick up, one at +x pitches it down.
         self._lift_sign = (1.0, -1.0)[self._axis]
@@ -204,10 +204,10 @@ class Laws:
         most = MAX_LIFT_DIFFERENCE / self._tilt_integral_gain if self._tilt_integral_gain else 0.0
         level = clipped(integral[..., 3:4] + period * off, -most, most)
         average = integral[..., 4:]
-        if self._washout and follower_command is not None:
+        if follower_command is not None:
             # What was added is what was flown above the base, which is the leader's law, and what was taken off.
             base = self._with_lift_difference(self._pid_command(state, goal, integral), integral, -self._lift_sign)
-            average = average + period / self._washout * (follower_command - base)
+            average = average + period / WASHOUT_TIME * (follower_command - base)
         if on_pid is not None:
             level, average = level * on_pid, average * on_pid
         return xp.concat([own, level, average], axis=-1)

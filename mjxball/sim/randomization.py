@@ -33,6 +33,7 @@ DRAWN_BACK = 8  # times at most that a world's thrust is drawn back by three ten
 CEILING = float(crazyflie.THRUST_CEILING)
 MASS_CHANGE_TIME = (5.0, 15.0)  # [s]
 LOSS_TIME = (3.0, 15.0)  # [s]
+LISSAJOUS = 0.3  # probability that the CG's second sine is twice as fast, where it has one
 PLACES = 16  # random waypoints of a CG before it begins again
 
 
@@ -249,7 +250,7 @@ class ResetDistribution:
         scenario = self.config.scenario
         turn, wide, late, kind = jax.random.uniform(key, (4,))
         low, high = scenario.cg_width
-        ratio = jnp.where(kind < scenario.cg_lissajous_probability, 2.0, 1.0)
+        ratio = jnp.where(kind < (LISSAJOUS if high > 0 else 0.0), 2.0, 1.0)
         shape = PathShape(2 * jnp.pi * turn, low + (high - low) * wide, ratio, 2 * jnp.pi * late)
         # Of an ellipse the longer half axis, of a Lissajous curve no more than the corner of its box.
         w, across = shape.width**2, jnp.cos(2 * shape.lead)

@@ -233,15 +233,12 @@ def differences(recorded: Mapping[str, Any]) -> list[str]:
     return found
 
 
-UNSWEPT = ("gradient.impulse_response_from",)  # the program branches on it
 # Every real-valued setting of algorithm and reward, and the follower's action scales: those may be traced.
 SWEEPABLE = (
     *(
         path
         for path, value, _ in configs.leaves(Config())
-        if isinstance(value, float)
-        and path.startswith(("reward.", *(f"{name}." for name in ALGORITHMS)))
-        and path not in UNSWEPT
+        if isinstance(value, float) and path.startswith(("reward.", *(f"{name}." for name in ALGORITHMS)))
     ),
     "follower.action_scale_tilt",
     "follower.action_scale_vertical",

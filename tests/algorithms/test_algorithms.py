@@ -63,9 +63,9 @@ def gradient_of(
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """(start states (32, 2), loss, its gradient (1, 2)) of u = -gain x on 32 worlds, none of which begins anew.
 
-    `swept` settings are traced, as in a population.
+    `swept` settings are traced, as in a population. The window is the last one.
     """
-    settings = {"num_envs": 32, "windows_per_episode": (33,), "policy_layers": (), **settings}
+    settings = {"num_envs": 32, "windows_per_episode": (33,), "policy_layers": (), "gradient_steps": 1, **settings}
     environments = Environments(LinearQuadratic(), 32, Shards())
     states = environments.reset(jax.random.PRNGKey(0))
     kernel = jnp.concatenate([-jnp.asarray(gain.T, jnp.float32), jnp.zeros((2, 1))], axis=1)
@@ -152,8 +152,8 @@ def test_an_impulse_response_begins_to_count_late_in_one_branch_for_all_members(
     losses = [gradient_of(transport, gain, horizon=steps, impulse_response=weight)[1] for weight in (0.0, 0.3)]
     own = dataclasses.replace(
         transport.gradient,
-        **{"num_envs": 32, "windows_per_episode": (99,), "policy_layers": (), "horizon": steps},
-        **{"gradient_steps": 100, "impulse_response": 0.3, "impulse_response_from": 0.4},
+        **{"num_envs": 32, "windows_per_episode": (199,), "policy_layers": (), "horizon": steps},
+        **{"gradient_steps": 100, "impulse_response": 0.3},
     )
     environments = Environments(LinearQuadratic(), 32, Shards())
     algorithm = FirstOrderGradient(dataclasses.replace(transport, gradient=own), environments)
@@ -168,7 +168,7 @@ def test_an_impulse_response_begins_to_count_late_in_one_branch_for_all_members(
         return after.loss
 
     both = jax.vmap(loss)
-    for windows, wanted in ((39, losses[0]), (40, losses[1])):
+    for windows, wanted in ((74, losses[0]), (75, losses[1])):
         np.testing.assert_allclose(both(jnp.array([windows, windows])), wanted, rtol=1e-5)
     primitives = [str(equation.primitive) for equation in jax.make_jaxpr(both)(jnp.array([1, 1])).eqns]
     assert "cond" in primitives

@@ -137,7 +137,7 @@ def algorithm_of(name: str, transport: Config) -> tuple[Any, Environments]:
 def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent) -> None:
     """The loss beside flights, one with a small impulse of the first action: observations, actions, GRU and all."""
     worlds, steps, weight, small = 3, 6, 0.3, 2e-3
-    own = {"num_envs": worlds, "horizon": steps, "windows_per_episode": (99,)}
+    own = {"num_envs": worlds, "horizon": steps, "windows_per_episode": (99,), "gradient_steps": 1}
     env, network = TransportEnv(recurrent.config, "newton-euler"), recurrent.network
     key = jax.random.PRNGKey(2)
     with jax.default_matmul_precision("highest"):

@@ -336,6 +336,16 @@ class TestOldNames:
         with pytest.raises(InputError, match="no setting any more"):
             configs.from_dict(recorded)
 
+    def test_a_constant_counts_only_where_its_switch_is_on(self):
+        recorded = configs.to_dict(Config())
+        recorded["gradient"]["impulse_response_from"] = 0.0
+        assert configs.from_record(recorded) == Config()
+        recorded["gradient"]["impulse_response"] = 0.02
+        with pytest.raises(InputError, match="impulse_response_from is no setting any more"):
+            configs.from_record(recorded)
+        recorded["gradient"]["impulse_response_from"] = 0.75
+        assert configs.from_record(recorded).gradient.impulse_response == 0.02
+
     def test_a_network_stands_on_the_pd_law_alone(self):
         recorded = configs.to_dict(Config())
         recorded["follower"] |= {"base": "pd", "differential_thrust_share": 0.0}

@@ -9,7 +9,7 @@ import pytest
 
 from mjxball.config import PRESETS, Config, apply_overrides, preset
 from mjxball.control import rotations
-from mjxball.sim.laws import MAX_LIFT_DIFFERENCE, BodyState, Laws
+from mjxball.sim.laws import MAX_LIFT_DIFFERENCE, WASHOUT_TIME, BodyState, Laws
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 PERIOD = 0.01
@@ -62,12 +62,10 @@ class TestSharedIntegrals:
 
     def test_what_a_network_adds_for_ever_is_washed_out(self) -> None:
         """5 degrees of lasting roll command: e^-1 of it is left after the time constant, 2 % after four."""
-        config = preset("flight")
-        loop, integral = started(config)
+        loop, integral = started(preset("flight"))
         state, goal, added = body(), np.zeros(3), np.array([math.radians(5), 0.0, 0.0])
-        tau = config.follower.washout_time
         for share in (1, 3):
-            for _ in range(round(share * tau / PERIOD)):
+            for _ in range(round(share * WASHOUT_TIME / PERIOD)):
                 follower_command = loop.follower_command(added, integral)
                 integral = loop.integrate(integral, state, goal, PERIOD, follower_command=follower_command)
             left = loop.follower_command(added, integral)[0] / added[0]

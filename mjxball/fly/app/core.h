@@ -73,7 +73,7 @@ typedef struct {
     float mount_frame[2];  /* cosine and sine of the angle about body z by which the policy's axes are turned */
 #endif
     float carried[2];      /* mass that each believes it lifts [kg] */
-    float kp[3], kd[3], ki[3], band[3], lead, tilt_gain, washout; /* the leader's law, see sim/laws.py */
+    float kp[3], kd[3], ki[3], band[3], lead, tilt_gain; /* the leader's law, see sim/laws.py */
     int axis;              /* 0 roll, 1 pitch: what the load turns */
     float lift_sign;       /* of the axis: a leader that lifts more turns the stick up or down */
     int shares;            /* the follower's base is the leader's PID */

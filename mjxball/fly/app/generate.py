@@ -102,7 +102,6 @@ def rig_header(policy: PolicyFile, config: Config, int8: bool) -> str:
         "band": law.integral_error_limit,
         "lead": law.integral_lead_time,
         "tilt_gain": law.tilt_integral_gain,
-        "washout": config.follower.washout_time,
         "axis": axis,
         "lift_sign": (1.0, -1.0)[axis],
         "shares": int(config.follower.residual_on_pid),

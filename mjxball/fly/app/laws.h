@@ -7,6 +7,7 @@
 #include "rig.h"
 
 #define MAX_LIFT_DIFFERENCE 1.5f /* [m/s2] */
+#define WASHOUT_TIME 8.0f /* [s] */
 #define MOST_INTEGRAL 1000.0f    /* [m s] of the leader's error */
 
 /* Numbers. */
@@ -216,8 +217,7 @@ static bool fly_law(mjxball_app *app, const seen *one, const float *goal) {
             command[2] += lift(integral);
             clip_command(command);
             base[2] += lift(integral);
-            if (mjxball_rig.washout > 0)
-                for (int i = 0; i < 3; i++) integral[4 + i] += period / mjxball_rig.washout * (command[i] - base[i]);
+            for (int i = 0; i < 3; i++) integral[4 + i] += period / WASHOUT_TIME * (command[i] - base[i]);
         }
     }
 #else
