@@ -186,8 +186,12 @@ WRITERS = {".mcap": write_mcap, ".csv": write_csv, ".parquet": write_parquet}
 
 def main() -> int:
     """Record what comes on standard input in the file that is standard output; the exit code."""
+    return cli.run_command(_record)
+
+
+def _record() -> int:
     with open(0, "rb", buffering=0) as source, open(1, "wb") as target:
-        return cli.run_command(lambda: record_lines(source, target))
+        return record_lines(source, target)
 
 
 if __name__ == "__main__":

@@ -127,6 +127,18 @@ def test_a_killed_recorder_leaves_a_whole_file(log: Path, tmp_path: Path) -> Non
     assert (kinds.count("DataEnd"), kinds[-1]) == (1, "Footer")
 
 
+def test_a_recorder_on_a_full_disk_says_so() -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full here")
+    with full.open("wb") as out:
+        command = [sys.executable, "-m", "mjxball.fly.log_export"]
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": subprocess.PIPE}
+        done = subprocess.run(command, text=True, check=False, cwd=REPOSITORY, env=environment(), **streams)
+    assert done.returncode == 2
+    assert_one_line(done.stderr)
+
+
 WRITER = """
 import sys
 from pathlib import Path
