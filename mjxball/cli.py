@@ -322,8 +322,8 @@ def _with_plant(
     found: configs.PlantFile | None = None,
 ) -> configs.Config:
     """`mjxball.config.with_plant`; stderr says, a line each, what is assumed of a model and what of it is left out."""
-    if path is not None:
-        found = found or read_plant(path)
-        for line in found.assumed:
-            warn(f"{path.name}: {line}")
-    return configs.with_plant(config, path, flags, found)
+    found = found or (None if path is None else read_plant(path))
+    result = configs.with_plant(config, path, flags, found)
+    for line in found.assumed if found else ():
+        warn(f"{path.name if path else ''}: {line}")
+    return result

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.config._model_source import ROTOR, compiled, printable
+from mjxball.config._model_source import MAX_MODEL, ROTOR, compiled, printable
 from mjxball.errors import InputError
 from mjxball.files import read_text
 
-MAX_MODEL = 2**20  # bytes
 UPRIGHT = 1e-3  # [rad] that a rotor may lean
 WANTED = "expected rotors: <motor> on a <site> with gear 0 0 1 0 0 YAW"
 Vector = np.ndarray
@@ -68,13 +67,11 @@ def read_model(path: Path, rotors: Sequence[str] = ()) -> Model:
 class _Tree:
     """A compiled model at its start: the one tree of bodies that flies."""
 
-    def __init__(self, model: Any, is_urdf: bool, named: Sequence[str], path: Path):
+    def __init__(self, model: Any, data: Any, is_urdf: bool, named: Sequence[str], path: Path):
         import mujoco
 
-        self.m, self.d, self.mujoco = model, mujoco.MjData(model), mujoco
+        self.m, self.d, self.mujoco = model, data, mujoco
         self.is_urdf, self.named, self.beside = is_urdf, named, path.with_suffix(".toml").name
-        mujoco.mj_kinematics(model, self.d)
-        mujoco.mj_collision(model, self.d)
         self.root = self._root()
         self.turn = self.d.xmat[self.root].reshape(3, 3).T
         self.moments: set[int] = set()  # bodies that actuators turn without pushing

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
+from xml.parsers import expat
 
 from mjxball.errors import InputError
+from mjxball.files import read_text
 
 MODELS = (".xml", ".urdf")  # endings of the files
+MAX_MODEL = 2**20  # bytes of a model, and of one that it includes
 MAX_ASSET = 2**26  # bytes of a mesh or texture
+MAX_ELEMENTS = 5000  # of XML; MuJoCo takes seconds for more
+MAX_PIXELS = 2**22  # of a height field or texture
 LONGEST = 200  # characters of a name or a message that a sentence shows
 FIRST = re.compile(r"\ufeff?(?>\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*+<([\w:.-]+)", re.DOTALL)
+COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+COUNTS = re.compile(r"count|nrow|ncol|width|height|nsample|nkey|nuser\w*")  # attributes: how many there are
+FILE = re.compile(r"file(?:right|left|up|down|front|back)?")  # attributes of MJCF; URDF's shapes do not matter
 ROTOR = re.compile(r"prop|rotor|motor|thrust", re.IGNORECASE)  # in the name of a URDF's link
 
 
-def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, bool]:
-    """The `text` of the model `path` compiled, and whether it is a URDF; InputError for what does not compile.
+def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, bool]:
+    """(model, data at its start, whether it is a URDF) of the `text` in `path`; InputError for what does not compile.
 
     Of a URDF joints of links that `rotors` names are fixed; if it names none, of those that are called like rotors.
     """
@@ -28,6 +37,7 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, bool]
     if first not in ("mujoco", "robot"):
         begins = f"it begins with <{printable(first)}>" if first else "it is no XML"
         raise InputError(f"{begins}, expected <mujoco> (MJCF) or <robot> (URDF)")
+    _Check(path, text)
     warnings: list[str] = []
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(warnings.append)  # else they go to a file in the current directory
@@ -35,8 +45,10 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, bool]
         spec = mujoco.MjSpec.from_file(str(path))
         if first == "robot":
             _free(spec, rotors)
-        _check_assets(spec, path)
         model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
     except InputError:
         raise
     except Exception as error:  # whatever MuJoCo's parser, compiler and plug-ins raise
@@ -48,7 +60,7 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, bool]
         mujoco.set_mju_user_warning(before)
     if any("NaN" in warning for warning in warnings):
         raise InputError("a number of it is NaN, expected numbers")
-    return model, first == "robot"
+    return model, data, first == "robot"
 
 
 def _free(spec: Any, rotors: Collection[str]) -> None:
@@ -73,18 +85,67 @@ def _free(spec: Any, rotors: Collection[str]) -> None:
     base.add_freejoint()
 
 
-def _check_assets(spec: Any, path: Path) -> None:
-    for kind, folder, every in (
-        ("mesh", spec.meshdir, spec.meshes),
-        ("texture", spec.texturedir, spec.textures),
-        ("height field", spec.meshdir, spec.hfields),
-    ):
-        for asset in every:
-            file = path.parent / folder / asset.file
-            if asset.file and not file.is_file():
-                raise InputError(f"its {kind} {asset.file} is missing, expected at {file}")
-            if asset.file and file.stat().st_size > MAX_ASSET:
-                raise InputError(f"its {kind} {asset.file} is larger than {MAX_ASSET >> 20} MiB")
+class _Check:
+    """What the text of a model asks of MuJoCo, before MuJoCo reads it: InputError if that is too much.
+
+    Raised for elements, once repeated and included, beyond `MAX_ELEMENTS`, pictures beyond `MAX_PIXELS`, and files that
+    are missing, larger than they may be, or none, such as a pipe, for which MuJoCo would wait.
+    """
+
+    def __init__(self, path: Path, text: str):
+        self.folder, self.elements, self.times, self.read = path.parent, 0.0, [1.0], {path.name}
+        self.folders, self.files = {""}, list[tuple[str, str]]()
+        self._text(text)
+        for kind, name in self.files:
+            _file(f"its {kind}", name, [self.folder / folder / name for folder in self.folders], MAX_ASSET)
+
+    def _text(self, text: str) -> None:
+        parser = expat.ParserCreate()
+        parser.StartElementHandler, parser.EndElementHandler = self._begin, lambda name: self.times.pop()
+        try:
+            parser.Parse(COMMENT.sub("", text), True)  # MuJoCo allows -- in a comment
+        except expat.ExpatError as error:
+            raise InputError(f"it is no XML: {error}") from None
+
+    def _begin(self, name: str, given: dict[str, str]) -> None:
+        counts = [value for key, value in given.items() if COUNTS.fullmatch(key) or (name, key) == ("numeric", "size")]
+        size = math.prod(max(1.0, _number(word)) for value in counts for word in value.split())
+        if name in ("hfield", "texture") and size > MAX_PIXELS:
+            raise InputError(f"its {name} has {size:.3g} points, expected at most {MAX_PIXELS}")
+        self.elements += self.times[-1] * (1 if name in ("hfield", "texture") else size)
+        if self.elements > MAX_ELEMENTS:
+            raise InputError(f"it has more than {MAX_ELEMENTS} elements, repeated and included ones among them")
+        if name == "lengthrange":
+            raise InputError("it has <lengthrange>, expected none: its actuators are rotors")
+        self.times.append(self.times[-1] * (size if name == "replicate" else 1))
+        self.folders |= {given[key] for key in ("meshdir", "texturedir", "assetdir") if key in given}
+        for key, file in given.items():
+            if not file or not FILE.fullmatch(key):
+                continue
+            if name not in ("include", "model"):
+                self.files.append((name, file))
+            elif file not in self.read:
+                self.read.add(file)
+                _file(f"its {name}", file, [self.folder / file], MAX_MODEL)
+                self._text(read_text(self.folder / file, name, MAX_MODEL))
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:  # MuJoCo says so
+        return 1.0
+
+
+def _file(what: str, name: str, places: list[Path], limit: int) -> None:
+    """InputError if none of the `places` has `what` is called `name`, or it is no file of at most `limit` bytes."""
+    place = next((place for place in places if place.exists()), None)
+    if place is None:
+        raise InputError(f"{what} {printable(name)} is missing, expected at {places[-1]}")
+    if not place.is_file():
+        raise InputError(f"{what} {printable(name)} is no file")
+    if place.stat().st_size > limit:
+        raise InputError(f"{what} {printable(name)} is larger than {limit >> 20} MiB")
 
 
 def _is_rotor(name: str, rotors: Collection[str]) -> bool:
