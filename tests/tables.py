@@ -1,11 +1,16 @@
-"""Support: one test that loops over the rows of a table."""
+"""Support: one test that loops over the rows of a table, and numbers that a page says."""
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+import re
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
+
+from command_line import REPOSITORY
+
+NUMBER = r"(-?\d+(?: \d{3})*(?:\.\d+)?)"
 
 
 def rows(names: str | tuple[str, ...], table: Iterable[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -34,3 +39,17 @@ def rows(names: str | tuple[str, ...], table: Iterable[Any]) -> Callable[[Callab
         return loop
 
     return decorate
+
+
+def says(page: str, phrase: str, numbers: Sequence[float]) -> None:
+    """The `page` has this `phrase`, `numbers` in place of every #, rounded to its digits, and any text for ' … '."""
+    text = " ".join((REPOSITORY / page).read_text(encoding="utf-8").replace("**", "").split())
+    found = re.search(re.escape(phrase).replace(r"\#", NUMBER).replace(r"\ …\ ", ".*?"), text)
+    assert found, phrase
+    assert len(found.groups()) == len(numbers), numbers
+    assert all(map(is_rounded, found.groups(), numbers)), (found.groups(), numbers)
+
+
+def is_rounded(text: str, number: float) -> bool:
+    """Whether `text` is the `number`, rounded to its digits."""
+    return abs(float(text.replace(" ", "")) - number) <= 0.5001 * 10.0 ** -len(text.partition(".")[2])

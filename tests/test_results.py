@@ -1,4 +1,4 @@
-"""Numbers of docs/results.md, onboard.md and followers.md are those of the files that they name."""
+"""Measured numbers of the pages are those of the files that they name."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from command_line import REPOSITORY
-from tables import rows
+from tables import is_rounded, rows, says
 
 Numbers = list[Any]  # in the order of a row; None: never
 
@@ -37,6 +37,12 @@ def levels() -> Iterator[tuple[str, Numbers]]:
     for row, name in (("[peak]", "peak"), ("RMSE", "rmse"), ("smallest settling", "settling_time")):
         yield row, [own["reached"][name], len(own["levels"])]
     yield "beyond trim", [number for pair in own["beyond trim"] for number in pair]
+    best = measured("balance")["levels"]
+    for row, suite, level in (("peak at twice", "noise", "2"), ("peak in gusts", "gusts", "0.6 N")):
+        other, ours = (one(found, suite=suite, level=level) for found in (best, own["levels"]))
+        assert other["peak of"] in ("transport", "robust")
+        yield row, [1e3 * ours["peak"]]
+        says("docs/results.md", f"(`{other['peak of']}`: # mm)", [1e3 * other["peak"]])
 
 
 def seeds() -> Iterator[tuple[str, Numbers]]:
@@ -45,6 +51,8 @@ def seeds() -> Iterator[tuple[str, Numbers]]:
     flights = [flown for row in found for flown in row["flights"]]
     yield "failed", [max(flown["failed"] for flown in flights)]
     yield "99 % of", [1e3 * max(flown["99 %"] for flown in flights)]
+    stable, hovers = [row["hovers"][0][0] for row in found], found[0]["hovers"][0][1]
+    yield "stable hovers", [min(stable), hovers, stable.count(hovers)]
 
 
 def stability() -> Iterator[tuple[str, Numbers]]:
@@ -79,10 +87,18 @@ def rigs() -> Iterator[tuple[str, Numbers]]:
         peaks = [1e3 * row["peak_50"] for row in three]
         alone = ours["crashed_alone_flights"]
         yield f"{drones}", [*failed, alone, 100 * ours["met"], 100 * ours["sooner"], *peaks]
+    names, every = ("universal", "lqg-known-rig", "lqg-slow-known-rig"), found["all"]["universal"]
+    yield (
+        "all",
+        [3000 * every["failed"], 3000, 3000 * every["crashed_alone"], 100 * every["met"], 100 * every["sooner"]],
+    )
     for seed in ("5101", "5102"):
         every = measured("rigs_fresh")[f"seed {seed}"]["all"]
-        names = ("universal", "lqg-known-rig", "lqg-slow-known-rig")
-        yield f"300, seed {seed}", [100 * every[name]["met"] for name in names]
+        alone = 900 * every["universal"]["crashed_alone"]
+        yield f"300, seed {seed}", [*(100 * every[name]["met"] for name in names), alone, 900]
+    for drones, word in ((7, "seven"), (8, "eight")):
+        three = [one(measured("rigs_7_8")["rows"], drones=drones, follower=name) for name in names]
+        yield f"60 of {word}", [*(100 * row["met"] for row in three), three[0]["crashed_alone_flights"], 180]
 
 
 def minutes() -> Iterator[tuple[str, Numbers]]:
@@ -102,8 +118,12 @@ def minutes() -> Iterator[tuple[str, Numbers]]:
 
 def training() -> Iterator[tuple[str, Numbers]]:
     for place, name in (("one H200", "training_h200"), ("two cores: `train", "training_2_cores")):
-        (own,) = measured(name)["summary"]["ours"]
+        found = measured(name)["summary"]
+        (own,), brax = found["ours"], found["stock"][-1]
         yield place, [own["cold"], own["warm"], own["x_peak"], own["settling_time"]]
+        assert not brax["at the bar"]
+        steps = f"{round(brax['steps'], -3):,}".replace(",", " ")
+        yield f"Brax, {steps} steps", [brax["cold"], brax["x_peak"], brax["settling_time"]]
 
 
 def algorithms() -> Iterator[tuple[str, Numbers]]:
@@ -117,9 +137,24 @@ def algorithms() -> Iterator[tuple[str, Numbers]]:
             yield place, [own["cold"], own["warm"], *far, own["settling_time"], own["settling_time_worst"]]
 
 
+def trainers() -> Iterator[tuple[str, Numbers]]:
+    found = measured("foreign_trainers")["rows"]
+    for line, name in (
+        *(("SAC: `train.py", "train.py-sac"), ("SBX", "sbx-sac"), ("Stable-Baselines3 2", "sb3-sac")),
+        *(("Brax 0", "brax-sac"), ("PPO: `train.py", "train.py-ppo"), ("Stable-Baselines3 |", "sb3-ppo")),
+        ("Brax |", "brax-ppo"),
+    ):
+        own = one(found, trainer=name)
+        far = 1e3 * own["x_peak"]
+        yield line, [own["steps"], own["cpu_seconds"], own["return"], far, own["settling_time"]]
+    yield "copy", [one(found, trainer="copy")["return"]]
+
+
 def crazyflies() -> Iterator[tuple[str, Numbers]]:
     for row in measured("crazyflie")["flight"]:
         yield row["follower"], [row["crashes"], row["rmse"], row["rmse, worst of 99 %"]]
+    kept = {row["follower"]: row["kept"] * row["starts"] for row in measured("crazyflie")["stand"]}
+    says("docs/results.md", "On 100 random stands `stand` keeps # balls, `lqg` #", [kept["stand"], kept["lqg"]])
 
 
 def onboard() -> Iterator[tuple[str, Numbers]]:
@@ -140,6 +175,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Ten minutes": ("results", minutes),
     "Training time": ("results", training),
     "Training time ": ("results", algorithms),
+    "Training time  ": ("results", trainers),
     "Two Crazyflies": ("results", crazyflies),
     "Cost and tests": ("onboard", onboard),
 }
@@ -160,11 +196,10 @@ def test_a_table_is_that_of_its_file(section: str) -> None:
 
 def agree(line: str, numbers: Numbers) -> bool:
     """The row has these numbers, rounded to its digits, in this order; others may follow or stand before the first."""
-    cells = line.partition(" | ")[2]
-    shown = re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*\w)", cells)
-    return len(shown) >= len(numbers) and all(
-        abs(float(text) - number) <= 0.5001 * 10.0 ** -len(text.partition(".")[2]) if number is not None else True
-        for text, number in zip(shown, numbers, strict=False)
+    cells = re.sub(r"(?<=\d) (?=\d{3} )", "", line.partition(" | ")[2])
+    shown = re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.]*\w)", cells)
+    return len(shown) >= len([number for number in numbers if number is not None]) and all(
+        number is None or is_rounded(text, number) for text, number in zip(shown, numbers, strict=False)
     )
 
 
@@ -181,13 +216,42 @@ def test_what_was_flown_for_ten_minutes(policy: str) -> None:
         assert any(agree(f" | {number}", [peak]) for peak in peaks), (number, peaks)
 
 
-def test_hover_on_board() -> None:
-    text = (REPOSITORY / "docs" / "onboard.md").read_text()
-    said = re.search(r"within (\S+) mm rms on board.*? within (\S+) to (\S+) mm", text, flags=re.DOTALL)
-    assert said is not None
-    found = measured("onboard_flights")
-    hovers = [row for row in found["delay"] if row["policy"] == "flight"]
-    on_board = max(row["rmse"] for row in hovers if row["case"] != "laptop")
-    laptop = [row["rmse"] for row in hovers if row["case"] == "laptop"]
-    assert agree(" | " + " ".join(said.groups()), [on_board, min(laptop), max(laptop)])
-    assert f"Under {len({row['fault'] for row in found['faults']})} faults" in text
+def hovers(board: bool) -> list[float]:
+    rows = measured("onboard_flights")["delay"]
+    return [row["rmse"] for row in rows if row["policy"] == "flight" and (row["case"] != "laptop") is board]
+
+
+def rounding(pivot: bool) -> float:
+    own = [row for row in measured("engines")["rows"] if (row["stand"] == "pivot") is pivot]
+    return max(row[name] for row in own for name in row if "form" in name or "MJX" in name)
+
+
+def silent_uplink() -> Numbers:
+    own = [row for row in measured("fly_faults_virtual")["faults"] if row["fault"] == "uplink silent"]
+    return [max(row[name] for row in own) for name in ("height", "speed")]
+
+
+def drawn_apart() -> Numbers:
+    found = dict(minutes())
+    return [found[name][part] for name in ("team3", "team4", "team6") for part in (2, 1)]
+
+
+SAID: tuple[tuple[str, str, Callable[[], Numbers]], ...] = (
+    ("onboard", "within # mm rms on board", lambda: [max(hovers(True))]),
+    ("onboard", "within # to # mm", lambda: [min(hovers(False)), max(hovers(False))]),
+    ("onboard", "Under # faults", lambda: [len({row["fault"] for row in measured("onboard_flights")["faults"]})]),
+    (
+        "followers",
+        "tilts are # rad apart in `team3` (power # of hover's), # in `team4` (#), # in `team6` (#)",
+        drawn_apart,
+    ),
+    ("followers", "of `mpc` among some # sets", lambda: [measured("mpc_tuning")["sets"]]),
+    ("flying", "from # m they touch down at # m/s", silent_uplink),
+    ("model", "#e-13 relative; #e-12 on the pivot", lambda: [1e13 * rounding(False), 1e12 * rounding(True)]),
+    ("results", "the same # random episodes", lambda: [measured("foreign_trainers")["episodes"]]),
+)
+
+
+@rows("page, phrase, wanted", SAID)
+def test_prose_says_what_was_measured(page: str, phrase: str, wanted: Callable[[], Numbers]) -> None:
+    says(f"docs/{page}.md", phrase, wanted())
