@@ -1,17 +1,18 @@
 """All that a person looks at, in one run: a real browser and a real pseudo-terminal, as pictures and text in a folder.
 
-`python benchmarks/screens.py OUT [--only PART ...] [--site DIR]`
+`python benchmarks/screens.py OUT [--only PART ...] [--site DIR] [--before DIR]`
 
 Pages at 400 and 1300 pixels, light and dark: the viewer, recorded and live, the report, figures, a notebook, and
 TensorBoard, without which its tags are a text. Figures of flights, on the screen's style and on paper. Programs in
 terminals of 40, 80 and 130 columns, one that cannot go back on a line, and none at all. Exit code 1, with a line for
-each, if a page logs an error, makes one, fetches something from elsewhere or hangs out at the side, or if a terminal
-breaks a line.
+each, if a page logs an error, makes one, fetches something from elsewhere, hangs out at the side or folds code, or if a
+terminal breaks a line. `--before`: changes.html has what an earlier run, whose OUT is DIR, saw otherwise, side by side.
 """
 
 from __future__ import annotations
 
 import argparse
+import filecmp
 import importlib.util
 import itertools
 import re
@@ -33,6 +34,7 @@ BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
 WIDTHS, SCHEMES = (400, 1300), ("light", "dark")
 LONGEST = 600.0  # [s] that a program may take
 VARIABLES = {**environment(), "PYTHONPATH": str(ROOT)}
+TEXT: dict[str, Any] = {"env": VARIABLES, "text": True, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
 ENGINE = ("--physics", "newton-euler")
 FLY = ("-m", "mjxball.fly", "flight", "--rehearse", "--seconds", "2")
 FAULT = ("--fault", "silent:leader@4")
@@ -40,8 +42,7 @@ TRAIN = ("train.py", "paper", *ENGINE, "--sac.total_steps", "12000", "--sac.warm
 TRAIN = (*TRAIN, "--sac.replay_size", "12000", "--out", "run")
 VIEW, FLOWN = ("-m", "mjxball.view"), ("--omega", "0.62", "--amplitude", "0.1", "--seconds", "8", *ENGINE, "--out")
 PROGRAMS = {  # name: arguments of Python, in a folder of its own
-    "train-help": ("train.py", "--help"),
-    "train-preset-help": ("train.py", "balance", "--help"),
+    "train-help": ("train.py", "balance", "--help"),
     "eval-help": ("eval.py", "--help"),
     "fly-help": ("-m", "mjxball.fly", "--help"),
     "view-help": (*VIEW, "--help"),
@@ -60,7 +61,7 @@ outputs = [output for cell in book.cells for output in cell.get("outputs", ())]
 with open("notebook.html", "w") as page:
     for one in (output.get("data", {"text/plain": output.get("text")}) for output in outputs):
         picture = f'<img style="max-width: 100%" src="data:image/png;base64,{one.get("image/png")}">'
-        text = f'<pre style="white-space: pre-wrap">{html.escape(one["text/plain"])}</pre>'
+        text = f'<pre style="overflow-x: auto">{html.escape(one["text/plain"])}</pre>'
         page.write(one.get("text/html") or (picture if "image/png" in one else text))
 """
 TAGS = r"""
@@ -70,6 +71,7 @@ with open("tags.txt", "w") as out:
         tags = {tag.decode() for tag in re.findall(rb"(?:speed|exploring|update|evaluation)/\w+", path.read_bytes())}
         print(path.parent.name, *sorted(tags), sep="\n  ", file=out)
 """
+BOARD = ("-m", "tensorboard.main", "--logdir", "run", "--port", "0", "--load_fast=false")
 SERVER = "http"  # what it says that it serves is looked at
 # name: arguments of Python, in one folder for all; what is looked at then, files or a server; what must be made before
 SEEN: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
@@ -86,21 +88,17 @@ SEEN: dict[str, tuple[tuple[str, ...], str, tuple[str, ...]]] = {
     "figures": (("eval.py", "balance", "--figures", "all", *ENGINE, "--out", "figures"), "figures/*.html", ()),
     "notebook": (("-c", NOTEBOOK, str(ROOT / "docs/notebooks/first_follower.ipynb")), "notebook.html", ()),
     "training": (TRAIN, "run/eval/*.png", ()),
-    "tensorboard": (
-        ("-m", "tensorboard.main", "--logdir", "run", "--port", "0", "--load_fast=false"),
-        SERVER,
-        ("training",),
-    ),
+    "tensorboard": (BOARD, SERVER, ("training",)),
     "tags": (("-c", TAGS), "tags.txt", ("training",)),
 }
 
-# Lines of code and output that end beyond their block, and on a wide page what has more lines than its text.
+# Blocks of code and output whose lines are folded, or end beyond the block if it does not scroll or the page is wide.
 CUT = """blocks => blocks.filter(block => {
-  const { paddingTop, paddingBottom, lineHeight } = getComputedStyle(block);
-  const wide = innerWidth > 1000 && !block.closest('details');
+  const { paddingTop, paddingBottom, lineHeight, overflowX } = getComputedStyle(block);
+  const scrolls = overflowX === 'auto' && (innerWidth < 1000 || block.closest('details'));
   const lines = (block.clientHeight - parseFloat(paddingTop) - parseFloat(paddingBottom)) / parseFloat(lineHeight);
-  const broken = wide && Math.round(lines) > block.textContent.trimEnd().split('\\n').length;
-  return block.scrollWidth > block.clientWidth || broken;
+  const folded = Math.round(lines) > block.textContent.trimEnd().split('\\n').length;
+  return folded || (block.scrollWidth > block.clientWidth && !scrolls);
 }).map(block => block.textContent.split('\\n')[0])"""
 
 
@@ -109,19 +107,16 @@ def terminals(out: Path, only: list[str]) -> Iterator[str]:
     for name in chosen(PROGRAMS, only, "terminals"):
         for label, (columns, kind) in TERMINALS.items():
             with tempfile.TemporaryDirectory() as place:
-                if columns:
-                    seen = on_terminal(words(PROGRAMS[name]), columns, Path(place), kind)
-                    text, broken = f"{seen.text}\n", seen.wrapped
-                else:
-                    text, broken = piped(PROGRAMS[name], Path(place)), 0
-                    if "\x1b" in text:
-                        yield f"{name}, no terminal: it is sent escapes"
+                seen = on_terminal(words(PROGRAMS[name]), columns, Path(place), kind) if columns else None
+                text = piped(PROGRAMS[name], Path(place)) if seen is None else f"{seen.text}\n"
             (out / f"{name}-{label}.txt").write_text(text, encoding="utf-8")
             print(f"{name} in {label}: {len(text.splitlines())} lines", flush=True)
+            if seen is None and "\x1b" in text:
+                yield f"{name}, no terminal: it is sent escapes"
             if "error: " in text and name != "refused":
                 yield f"{name}, {label}: {text[text.index('error: ') :].splitlines()[0]}"
-            if broken:
-                yield f"{name}, {label} columns: {broken} lines are broken"
+            if seen is not None and seen.wrapped:
+                yield f"{name}, {label} columns: {seen.wrapped} lines are broken"
 
 
 def chosen(names: Iterable[str], only: list[str], kind: str) -> list[str]:
@@ -136,9 +131,8 @@ def words(arguments: tuple[str, ...]) -> list[str]:
 
 def piped(arguments: tuple[str, ...], place: Path) -> str:
     """What Python with `arguments` prints where there is no terminal."""
-    command: dict[str, Any] = {"cwd": place, "env": VARIABLES, "text": True, "timeout": LONGEST}
-    streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    return subprocess.run(words(arguments), check=False, **command, **streams).stdout
+    given = {"cwd": place, "timeout": LONGEST, "stdin": subprocess.DEVNULL, **TEXT}
+    return subprocess.run(words(arguments), check=False, **given).stdout
 
 
 def make(name: str, place: Path, made: set[str]) -> None:
@@ -164,7 +158,7 @@ def pages(out: Path, site: Path | None, only: list[str]) -> Iterator[str]:
         place, browser = Path(folder), play.chromium.launch(executable_path=program, args=["--no-sandbox"])
         for name in chosen(SEEN, only, "pages"):
             arguments, seen, _ = SEEN[name]
-            if arguments[1] == "tensorboard.main" and importlib.util.find_spec("tensorboard") is None:
+            if arguments == BOARD and importlib.util.find_spec("tensorboard") is None:
                 continue
             make(name, place, made)
             if seen == SERVER:
@@ -179,58 +173,64 @@ def pages(out: Path, site: Path | None, only: list[str]) -> Iterator[str]:
                 else:
                     shutil.copy(path, out / f"{name}-{path.name}")
         for path in sorted(site.resolve().rglob("*.html")) if site and chosen(["site"], only, "pages") else ():
-            yield from pictured(browser, f"site-{path.stem}", path.as_uri(), out)
+            name = "-".join(("site", *path.relative_to(site.resolve()).with_suffix("").parts))
+            yield from pictured(browser, name, path.as_uri(), out)
         browser.close()
 
 
 @contextmanager
 def serving(arguments: tuple[str, ...], place: Path) -> Iterator[str]:
     """The address at which Python with `arguments` says that it serves."""
-    streams: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    with subprocess.Popen(words(arguments), cwd=place, env=VARIABLES, text=True, **streams) as server:
+    with subprocess.Popen(words(arguments), cwd=place, stdin=subprocess.PIPE, **TEXT) as server:
         yield next(found[0] for line in server.stdout or () if (found := re.search(r"http://[^\s/]+/?", line)))
         server.terminate()
 
 
 def pictured(browser: Any, name: str, address: str, out: Path) -> Iterator[str]:
     """A page in every width and scheme, as pictures in `out`; yields what is wrong."""
+    own = ("data:", "file:", "blob:", "about:", *([address] if address.startswith(SERVER) else []))
     for width, scheme in itertools.product(WIDTHS, SCHEMES):
-        wrong = looked_at(browser, address, width, scheme, out / f"{name}-{width}-{scheme}.png")
+        tab = browser.new_page(viewport={"width": width, "height": 2400}, color_scheme=scheme)
+        wrong: list[str] = []
+        tab.on("pageerror", lambda error, to=wrong: to.append(str(error)))
+        tab.on("console", lambda message, to=wrong: to.append(message.text) if message.type == "error" else None)
+        tab.on("request", lambda one, to=wrong: None if one.url.startswith(own) else to.append(f"it fetches {one.url}"))
+        tab.goto(address)
+        tab.wait_for_timeout(5000 if address.startswith(SERVER) else 800)
+        tab.screenshot(path=out / f"{name}-{width}-{scheme}.png", full_page=True)
+        if (beyond := tab.evaluate("document.documentElement.scrollWidth") - width) > 0:
+            wrong.append(f"hangs out at the side by {beyond} px")
+        wrong += [f"a block is cut or folded: {text}" for text in tab.eval_on_selector_all("pre", CUT)]
+        tab.close()
         yield from (f"{name}, {width} px, {scheme}: {text}" for text in wrong)
     print(f"{name}: {len(WIDTHS) * len(SCHEMES)} pictures", flush=True)
 
 
-def looked_at(browser: Any, address: str, width: int, scheme: str, picture: Path) -> list[str]:
-    """What is wrong with the page at `address`; its picture is written."""
-    tab = browser.new_page(viewport={"width": width, "height": 2400}, color_scheme=scheme)
-    wrong: list[str] = []
-    own = ("data:", "file:", "blob:", "about:", *([address] if address.startswith(SERVER) else []))
-    tab.on("pageerror", lambda error: wrong.append(str(error)))
-    tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
-    tab.on("request", lambda one: None if one.url.startswith(own) else wrong.append(f"it fetches {one.url}"))
-    tab.goto(address)
-    tab.wait_for_timeout(5000 if address.startswith(SERVER) else 800)
-    tab.screenshot(path=picture)
-    beyond = tab.evaluate("document.documentElement.scrollWidth") - width
-    if beyond > 0:
-        wrong.append(f"hangs out at the side by {beyond} px")
-    wrong += [f"a block is cut or broken: {text}" for text in tab.eval_on_selector_all("pre", CUT)]
-    tab.close()
-    return wrong
+def compare(out: Path, before: Path) -> None:
+    """Write `changes.html`: pictures and texts that are not as they were in `before`, side by side."""
+    names = sorted(path.name for path in out.iterdir() if path.suffix in (".png", ".txt"))
+    _, other, missing = filecmp.cmpfiles(before, out, names, shallow=False)
+    with (out / "changes.html").open("w", encoding="utf-8") as page:
+        print("<style>iframe { width: 49%; height: 95vh }</style>", file=page)
+        for name in sorted(other + missing):
+            pair = ((place / name).resolve().as_uri() for place in (before, out))
+            print(f"<h2>{name}</h2>", *(f'<iframe src="{one}"></iframe>' for one in pair), file=page)
+    print(f"{len(other + missing)} of {len(names)} are not as in {before}: {page.name}")
 
 
 def main() -> int:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
-    known = "terminals, pages, site, or names of their parts"
-    parser.add_argument("--only", nargs="+", default=[], metavar="PART", help=known)
+    parser.add_argument("--only", nargs="+", default=[], metavar="PART", help="terminals, pages, site, or their parts")
+    parser.add_argument("--before", type=Path, metavar="DIR", help="OUT of an earlier run, to be shown beside this one")
     parser.add_argument("--site", type=Path, metavar="DIR", help="built documentation, see CONTRIBUTING.md")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     wrong = [*terminals(options.out, options.only), *pages(options.out, options.site, options.only)]
-    for line in wrong:
-        print(f"WRONG {line}")
+    sys.stdout.writelines(f"WRONG {line}\n" for line in wrong)
+    if options.before:
+        compare(options.out, options.before)
     print(f"{len(wrong)} faults; pictures and texts are in {options.out}")
     return 1 if wrong else 0
 

@@ -63,8 +63,8 @@ def lines(view: View, bounds: Limits, colour: bool = True, columns: int = 120) -
         low = drone.battery < bounds.battery + 0.1
         old = age > bounds.state_age / 2
         parts = [
-            (f"{name:8} ({x:+.2f}, {y:+.2f}, {z:+.2f}) m", ""),
-            (f"roll {roll:+5.1f} pitch {pitch:+5.1f} yaw {yaw:+5.1f}", ""),
+            (f"{name:8} ({x:+z.2f}, {y:+z.2f}, {z:+z.2f}) m", ""),
+            (f"roll {roll:+z5.1f} pitch {pitch:+z5.1f} yaw {yaw:+z5.1f}", ""),
             (f"{drone.battery:.2f} V", RED if low else ""),
             (f"state {1000 * age:4.0f} ms" if math.isfinite(age) else "state never", RED if old else ""),
             (f"thrust {sent.thrust:5d}", ""),

@@ -110,7 +110,7 @@ class Touchdown:
         if not math.isfinite(self.speed):
             return "no touchdown was seen"
         x, y = self.place
-        return f"{max(self.speed, 0.0):.2f} m/s, at ({x:+.2f}, {y:+.2f}) m from the start"
+        return f"{max(self.speed, 0.0):.2f} m/s, at ({x:+z.2f}, {y:+z.2f}) m from the start"
 
 
 class Ending:

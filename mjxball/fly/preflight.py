@@ -191,7 +191,7 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
             Check(f"{link.name} battery", state.battery > bounds.battery, f"{state.battery:.2f} V"),
             Check(f"{link.name} firmware", can and not refusal, refusal or ("can fly" if can else "cannot arm")),
             Check(f"{link.name} level", tilt <= required.tilt, f"{math.degrees(tilt):.1f} degrees"),
-            Check(f"{link.name} heading", abs(yaw) <= required.yaw, f"{math.degrees(yaw):.0f} degrees from +x"),
+            Check(f"{link.name} heading", abs(yaw) <= required.yaw, f"{math.degrees(yaw):z.0f} degrees from +x"),
         ]
         checks += gravity_checks(link, state, required)
     return [*checks, heading_check(states, required), stick_check(states, rig, bounds, required)]
@@ -203,7 +203,7 @@ YAW_COST = 6  # [mm] of hover error for each degree between both yaws: 29 mm for
 def heading_check(states: Sequence[DroneState], required: Preflight) -> Check:
     """Whether both drones, which one stick holds, measure one yaw; the difference is the frames' or the bodies'."""
     beside = math.degrees(math.remainder(yaw_of(states[0]) - yaw_of(states[1]), 2 * math.pi))
-    text = f"leader {beside:+.1f} degrees from the follower; each one costs {YAW_COST:g} mm of hover error"
+    text = f"leader {beside:+z.1f} degrees from the follower; each one costs {YAW_COST:g} mm of hover error"
     return Check("headings", abs(beside) <= math.degrees(required.apart), text)
 
 
