@@ -24,6 +24,7 @@ from mjxball.fly.limits import Limits, Times
 from mjxball.fly.mocap_supervision import MocapLimits
 from mjxball.fly.twin.conditions import Battery
 from mjxball.fly.twin.coupled import WORN_SAG
+from mjxball.physics import engine
 from mjxball.plant import plant_parameters
 from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.policy import container, file
@@ -46,6 +47,7 @@ TWO, OWN, ADDED, DRAWN = REFERENCE.plant, REFERENCE.command, preset("transport")
 KP = [float(gain) for gain in plant_parameters(TWO, REFERENCE.attitude).gains.kp]
 WN = REFERENCE.attitude.natural_frequency
 TILT = 0.2 * 9.81 * 0.05 / KP[1]  # [rad] of a command that holds 0.2 kg 5 cm off
+TEAM, PLATE = (plant_setup(Path(name)).plant for name in ("team3", "plate4"))
 WIDE = apply_overrides(REFERENCE, {"plant.cg_axis": "xy", "plant.object_size": (0.34, 0.3, 0.05)})
 REACH = [100 * largest_amplitude(one, 0.2, 0.0, (0.0, 1.0)) for one in (WIDE.plant, WIDE)]
 FULL = float(motors.force(motors.MOTORS["2.1"], np.array(crazyflie.FULL), 3.0 - WORN_SAG))
@@ -140,6 +142,9 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
     ),
     "docs/model": (
         ("(+#, 0, 0) m, follower at $r_f$ = (−#, 0, 0) m", *2 * (TWO.drones[0].mount[0],)),
+        ("`team6` | # kg each, rotors of # N", TEAM.drones[0].mass, TEAM.rotor_force_max),
+        ("carrier # kg per drone | # kg per", TEAM.carrier_mass / TEAM.count, TEAM.object_mass / TEAM.count),
+        ("a free ball of # kg, rim at # m", PLATE.object_mass * PLATE.moving_fraction, PLATE.ball_stop),
         ("arm $L$ = # m, $M_i$ = # m", TWO.arm, TWO.yaw_per_thrust),
         ("(#, #, #)·10⁻³ kg m²", *(1e3 * one for one in TWO.drones[0].inertia)),
         ("box of # × # × # m", *TWO.object_size),
@@ -161,6 +166,7 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
         (r"in the last # s: … \ge #$ s [m]", metrics.NEVER_WITHIN, metrics.STEADY_AFTER),
         ("within # % of 0 or … the first # steps", 100 * metrics.AT_LIMIT_WITHIN, metrics.PAPER_STEPS),
         ("is # mm in positions and the object's error, # deg in angles, # m/s and # rad/s in rates", *NOISE),
+        ("exceeds # m or the body rates # rad/s", engine.MAX_POSITION, engine.MAX_RATE),
         ("correlation time of # s … At most # rows a run", disturbances.GUST_TIME, loop.CHUNKS),
     ),
     "docs/policy-file": (
