@@ -80,9 +80,8 @@ def page(entries: list[dict[str, Any]]) -> str:
         )
         parts.append("|---|---|---|---|---|---|---|---|---|---|")
         for entry in rows:
-            for condition in CONDITIONS:
-                made = f"{entry['date']}, {entry['commit'][:7]}" if condition == CONDITIONS[0] else ""
-                called = f"`{entry['follower']}`" if condition == CONDITIONS[0] else ""
+            beside = ((f"`{entry['follower']}`", entry["date"]), ("", entry["commit"][:7]))
+            for condition, (called, made) in zip(CONDITIONS, beside, strict=True):
                 shown = " | ".join(cells(entry["tracks"][name][condition]))
                 parts.append(f"| {called} | {condition} | {shown} | {made} |")
         parts.append("")
