@@ -93,11 +93,13 @@ class _Check:
     """
 
     def __init__(self, path: Path, text: str):
-        self.folder, self.elements, self.times, self.read = path.parent, 0.0, [1.0], {path.name}
-        self.folders, self.files = {""}, list[tuple[str, str]]()
+        self.elements, self.attached, self.largest, self.times = 0.0, 0.0, 0.0, [1.0]
+        self.read, self.parents, self.folders = {path.name}, [path.parent], [""]
+        self.files: list[tuple[str, str]] = []
         self._text(text)
+        self._count(self.attached * self.largest)
         for kind, name in self.files:
-            _file(f"its {kind}", name, [self.folder / folder / name for folder in self.folders], MAX_ASSET)
+            self._file(kind, name, MAX_ASSET)
 
     def _text(self, text: str) -> None:
         parser = expat.ParserCreate()
@@ -110,24 +112,51 @@ class _Check:
     def _begin(self, name: str, given: dict[str, str]) -> None:
         counts = [value for key, value in given.items() if COUNTS.fullmatch(key) or (name, key) == ("numeric", "size")]
         size = math.prod(max(1.0, _number(word)) for value in counts for word in value.split())
-        if name in ("hfield", "texture") and size > MAX_PIXELS:
-            raise InputError(f"its {name} has {size:.3g} points, expected at most {MAX_PIXELS}")
-        self.elements += self.times[-1] * (1 if name in ("hfield", "texture") else size)
-        if self.elements > MAX_ELEMENTS:
-            raise InputError(f"it has more than {MAX_ELEMENTS} elements, repeated and included ones among them")
+        if name in ("hfield", "texture"):
+            if size > MAX_PIXELS:
+                raise InputError(f"its {name} has {size:.3g} points, expected at most {MAX_PIXELS}")
+            size = 1.0
         if name == "lengthrange":
             raise InputError("it has <lengthrange>, expected none: its actuators are rotors")
+        self._count(self.times[-1] * size)
+        self.attached += self.times[-1] * (name == "attach")
         self.times.append(self.times[-1] * (size if name == "replicate" else 1))
-        self.folders |= {given[key] for key in ("meshdir", "texturedir", "assetdir") if key in given}
-        for key, file in given.items():
-            if not file or not FILE.fullmatch(key):
-                continue
+        self.folders += [given[key] for key in ("meshdir", "texturedir", "assetdir") if key in given]
+        for file in (file for key, file in given.items() if file and FILE.fullmatch(key)):
             if name not in ("include", "model"):
                 self.files.append((name, file))
             elif file not in self.read:
-                self.read.add(file)
-                _file(f"its {name}", file, [self.folder / file], MAX_MODEL)
-                self._text(read_text(self.folder / file, name, MAX_MODEL))
+                self._model(name, file)
+
+    def _model(self, kind: str, name: str) -> None:
+        """One that is included, or attached where <attach> says."""
+        place, before = self._file(kind, name, MAX_MODEL), self.elements
+        self.read.add(name)
+        self.parents.append(place.parent)
+        self._text(read_text(place, kind, MAX_MODEL))
+        if kind == "model":
+            self.largest = max(self.largest, self.elements - before)
+
+    def _count(self, elements: float) -> None:
+        self.elements += elements
+        if self.elements > MAX_ELEMENTS:
+            raise InputError(f"it has more than {MAX_ELEMENTS} elements, repeated and included ones among them")
+
+    def _file(self, kind: str, name: str, limit: int) -> Path:
+        """Where the file `name` of at most `limit` bytes is, with its folders or, as for `strippath`, without."""
+        names = (name, Path(name).name)
+        places = [
+            parent / folder / one for parent in self.parents for folder in reversed(self.folders) for one in names
+        ]
+        place = next((place for place in places if place.exists()), None)
+        what = f"its {kind} {printable(name)}"
+        if place is None:
+            raise InputError(f"{what} is missing, expected at {places[0]}")
+        if not place.is_file():
+            raise InputError(f"{what} is no file")
+        if place.stat().st_size > limit:
+            raise InputError(f"{what} is larger than {limit >> 20} MiB")
+        return place
 
 
 def _number(word: str) -> float:
@@ -135,17 +164,6 @@ def _number(word: str) -> float:
         return float(word)
     except ValueError:  # MuJoCo says so
         return 1.0
-
-
-def _file(what: str, name: str, places: list[Path], limit: int) -> None:
-    """InputError if none of the `places` has `what` is called `name`, or it is no file of at most `limit` bytes."""
-    place = next((place for place in places if place.exists()), None)
-    if place is None:
-        raise InputError(f"{what} {printable(name)} is missing, expected at {places[-1]}")
-    if not place.is_file():
-        raise InputError(f"{what} {printable(name)} is no file")
-    if place.stat().st_size > limit:
-        raise InputError(f"{what} {printable(name)} is larger than {limit >> 20} MiB")
 
 
 def _is_rotor(name: str, rotors: Collection[str]) -> bool:

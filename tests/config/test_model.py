@@ -354,6 +354,29 @@ def test_mistakes_are_refused_in_one_sentence(mistake: str, tmp_path: Path, caps
     assert not out.exists()
 
 
+def test_files_of_a_model_are_found_where_mujoco_finds_them(tmp_path: Path) -> None:
+    """Included beside the file that includes, meshes of an attached model in its own folder, or by `strippath`."""
+    parts, shape = tmp_path / "parts", "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+    (parts / "meshes").mkdir(parents=True)
+    (parts / "meshes" / "frame.obj").write_text(shape)
+    mesh = '<geom type="mesh" mesh="m" contype="0" conaffinity="0" mass="0"/>'
+    head = '<compiler meshdir="meshes"/><asset><mesh name="m" file="frame.obj"/></asset>'
+    (parts / "one.xml").write_text(
+        f'<mujoco model="one">{head}<worldbody><body name="b">{mesh}</body></worldbody></mujoco>'
+    )
+    (parts / "outer.xml").write_text('<mujoco><include file="inner.xml"/></mujoco>')
+    (parts / "inner.xml").write_text("<mujoco><worldbody/></mujoco>")
+    attached = changed(INERTIAL, f'{INERTIAL}<attach model="one" body="b" prefix="p"/>')
+    asked = '<include file="parts/outer.xml"/><asset><model name="one" file="parts/one.xml"/></asset><worldbody>'
+    own = '<compiler strippath="true" meshdir="parts/meshes"/><asset><mesh file="away/frame.obj"/></asset><worldbody>'
+    text = changed("<worldbody>", asked, attached)
+    assert plant_setup(written(tmp_path, text)).plant.drones[0].mass == pytest.approx(1.2)
+    assert plant_setup(written(tmp_path, changed("<worldbody>", own))).plant.arm == pytest.approx(0.15)
+    many = changed("<attach", 2000 * '<attach model="one" body="b" prefix="q"/>' + "<attach", text)
+    with pytest.raises(InputError, match="more than 5000 elements"):
+        plant_setup(written(tmp_path, many))
+
+
 def test_half_models_are_read_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut anywhere, and with numbers that are none, a model makes a plant or one sentence; MuJoCo leaves no file."""
     monkeypatch.chdir(tmp_path)
