@@ -211,7 +211,7 @@ def compare(out: Path, before: Path) -> None:
     names = sorted(path.name for path in out.iterdir() if path.suffix in (".png", ".txt"))
     _, other, missing = filecmp.cmpfiles(before, out, names, shallow=False)
     with (out / "changes.html").open("w", encoding="utf-8") as page:
-        print("<style>iframe { width: 49%; height: 95vh }</style>", file=page)
+        print("<style>iframe { width: 49%; height: 75vh; zoom: 0.6 }</style>", file=page)
         for name in sorted(other + missing):
             pair = ((place / name).resolve().as_uri() for place in (before, out))
             print(f"<h2>{name}</h2>", *(f'<iframe src="{one}"></iframe>' for one in pair), file=page)
