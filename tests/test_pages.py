@@ -137,7 +137,7 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
         ("descending for # s | stop: zeros for # s", C["DESCEND_TIME"] / 1e3, C["STOP_TIME"] / 1e3),
         ("not up # s after … within # m, # m/s", C["LIFT_TIME"] / 1e3, C["MOST_PLACE"], C["MOST_SPEED"]),
         (" # rad/s, length² … above 0 up to # V", C["MOST_RATE"], C["MOST_VOLTAGE"]),
-        ("has # kB, about # hundred packets", UPLOAD / 1e3, UPLOAD / protocol.CHUNK / 100),
+        ("has # kB, about # packets", UPLOAD / 1e3, round(UPLOAD / protocol.CHUNK, -2)),
         ("within # degrees, thrust # to #", DEG * C["SENT_TILT"], C["FLOOR"], C["CEILING"]),
     ),
     "docs/model": (
