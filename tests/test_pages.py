@@ -32,7 +32,9 @@ from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.rig.attitude import axes
 from mjxball.rig.margins import REQUIREMENTS as NEED
 from mjxball.sim import disturbances
+from mjxball.sim.rigs import HELD_OUT_RIGS
 from mjxball.train import lock, loop
+from mjxball.train.program import EVALUATION_SECONDS
 from mjxball.view import live
 
 DEG = 180 / math.pi
@@ -57,6 +59,14 @@ APP = "".join(path.read_text() for path in sorted((REPOSITORY / "mjxball/fly/app
 C = {name: float(value) for name, value in re.findall(r"#define (\w+) ([\d.e-]+)[fu]?\b", APP)}
 
 
+def script(name: str) -> dict[str, float]:
+    """Numbers that a benchmark names at its head, several in a line."""
+    text = (REPOSITORY / "benchmarks" / f"{name}.py").read_text()
+    lines = re.findall(r"^([A-Z]+(?:, [A-Z]+)*) = ([\d.]+(?:, [\d.]+)*)(?=$|  #)", text, flags=re.MULTILINE)
+    pairs = [pair for names, numbers in lines for pair in zip(names.split(", "), numbers.split(", "), strict=True)]
+    return {name: float(number) for name, number in pairs}
+
+
 def weights(name: str) -> list[int]:
     """Recurrent units, units of the layer, and all numbers of a shipped policy."""
     with np.load(REPOSITORY / "policies" / f"{name}.npz") as found:
@@ -64,17 +74,27 @@ def weights(name: str) -> list[int]:
         return [len(found["gru_recurrent"]), len(found["bias_0"]), sum(sizes)]
 
 
+STEADY, RIGS, CELLS = script("horizon"), script("rigs"), script("cells")
 UPLOAD = len(weight_bytes(file.load_file(file.shipped_policy("flight"))))
 UNITS = [*weights("balance")[:2], *weights("universal")[:2]]
 SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its numbers, and these
     "README": (("a recurrent network of # numbers", weights("balance")[2]),),
     "docs/followers": (
         ("has # recurrent units and a layer of #, `universal` # and #", *UNITS),
+        ("at most # times those of its first minute and # mm", STEADY["GROWTH"], 1e3 * STEADY["SLACK"]),
+        ("limit in less than # % of the time", 100 * STEADY["LIMITED"]),
         ("(# ms; # ms for", 1e3 * REFERENCE.timing.control_period, 1e3 * FLIGHT.timing.control_period),
     ),
     "docs/gym": (("`truncated` after # steps", REFERENCE.timing.episode_steps),),
-    "docs/training": (("the lock's age: # s … needs # GB of address", lock.STALE, xla.ADDRESS_SPACE / 1e9),),
+    "docs/training": (
+        ("the lock's age: # s … needs # GB of address", lock.STALE, xla.ADDRESS_SPACE / 1e9),
+        ("`mjxball.sim.rigs.held_out` has # rigs", HELD_OUT_RIGS),
+    ),
     "docs/view": (("when nothing new came for # s", live.SILENCE),),
+    "docs/results": (
+        ("at most # % and # mm above (of longer", 100 * RIGS["LATER"] - 100, 1e3 * RIGS["MORE"]),
+        ("mass is believed to be # kg", CELLS["BELIEVED"]),
+    ),
     "docs/howto/own-model": (
         ("of a single one: # to # … more than # elements", 2, MOST_DRONES, _model_source.MAX_ELEMENTS),
         ("of more than # points", _model_source.MAX_PIXELS),
@@ -168,6 +188,7 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
         ("is # mm in positions and the object's error, # deg in angles, # m/s and # rad/s in rates", *NOISE),
         ("exceeds # m or the body rates # rad/s", engine.MAX_POSITION, engine.MAX_RATE),
         ("correlation time of # s … At most # rows a run", disturbances.GUST_TIME, loop.CHUNKS),
+        ("Columns with `eval_` are of # s evaluations", EVALUATION_SECONDS),
     ),
     "docs/policy-file": (
         ("over # m and of its rate over # m/s", follower_law.NEAR_ERROR, follower_law.NEAR_ERROR_RATE),
