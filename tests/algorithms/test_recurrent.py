@@ -133,6 +133,14 @@ def algorithm_of(name: str, transport: Config) -> tuple[Any, Environments]:
     return kind(dataclasses.replace(transport, **{part: own}), environments), environments
 
 
+def test_a_gradient_passes_what_is_remembered_whole_and_the_rest_decayed(transport: Config) -> None:
+    config = with_settings(transport, gradient={"gradient_decay": 0.9, "state_gradient_clip": 0.0})
+    environments = Environments(Recalling(), 4, Shards())
+    damped, states = FirstOrderGradient(config, environments)._damped, environments.reset(jax.random.key(0))
+    slope = jax.grad(lambda obs: damped(states.replace(obs=obs)).obs.sum())(states.obs)
+    np.testing.assert_allclose(slope, np.broadcast_to([0.9] * 2 + [1.0] * UNITS, slope.shape), rtol=1e-6)
+
+
 @pytest.mark.release
 def test_the_impulse_response_is_what_a_small_impulse_does(recurrent: Recurrent) -> None:
     """The loss beside flights, one with a small impulse of the first action: observations, actions, GRU and all."""
