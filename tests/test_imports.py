@@ -226,6 +226,17 @@ def test_the_flight_path_loads_no_jax_in_truth() -> None:
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.parametrize("name", ["commands.train", "commands.evaluate", "fly.main", "view.main", "export"])
+def test_a_command_line_is_read_without_what_computes(name: str) -> None:
+    """Help and refusals come at once: JAX alone takes half a second."""
+    heavy = "{'jax', 'mujoco', 'scipy.stats', 'matplotlib'}"
+    script = f"import sys, mjxball.{name}\nprint(sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment(), cwd=REPOSITORY
+    )
+    assert done.stdout.strip() == "[]"
+
+
 class TestTheReader:
     """The reader sees what it must see: each fault is planted in a small package and found."""
 

@@ -14,9 +14,6 @@ from pathlib import Path
 
 from mjxball import cli, config
 from mjxball.baselines import BASELINES, LAWS, SUITE_BASELINES
-from mjxball.bench.entry import run as run_entry
-from mjxball.bench.entry import table as table_of
-from mjxball.bench.followers import entrant
 from mjxball.bench.tracks import TRACKS
 from mjxball.commands.flight_log import evaluate_log
 from mjxball.commands.scenarios import SCENARIO_FLAGS, native_scenarios, scenarios_of, setup_of
@@ -199,6 +196,10 @@ def _entry(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     if options.out is None or options.out.suffix != ".json":
         raise InputError("--benchmark needs --out FILE.json, where the entry is written")
     cli.output_file(options.out, ".json")
+    from mjxball.bench.entry import run as run_entry
+    from mjxball.bench.entry import table as table_of
+    from mjxball.bench.followers import entrant
+
     name, make = entrant(options.benchmark)
     found = run_entry(name, make, options.tracks or (), options.draw or 0, _clock())
     known = {"command": shlex.join(["python", "eval.py", *arguments]), "commit": commit(), "versions": versions()}

@@ -11,7 +11,6 @@ from mjxball.baselines import LAWS, make_baseline
 from mjxball.config import Config
 from mjxball.control.followers import Baseline, Follower
 from mjxball.errors import FOREIGN, InputError, said
-from mjxball.train.extensions import find
 
 Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
 
@@ -24,6 +23,8 @@ def find_follower(text: str, flag: str) -> tuple[str, Make]:
     """
     if text in LAWS or ":" not in text:
         return text, lambda config: make_baseline(text, config)
+    from mjxball.train.extensions import find  # with JAX
+
     made, name = find(text, flag), text.rpartition(":")[2]
     return name, lambda config: _outside(name, made, config)
 
