@@ -90,8 +90,9 @@ LONGEST = (
 def pytest_configure(config: pytest.Config) -> None:
     """With `--dist loadfile`, files begin in the order of `pytest_collection_modifyitems`."""
     config.option.loadscopereorder = False
-    if config.option.markexpr == "slow":  # what is for a release is for that alone, also in a file of the second tier
-        config.option.markexpr = "slow and not release"
+    asked = config.option.markexpr  # what is for a release is for that alone, also in a file of the second tier
+    if asked and "release" not in asked:
+        config.option.markexpr = f"({asked}) and not release"
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -30,7 +30,7 @@ from mjxball import config as configs
 from mjxball.commands import evaluate, train
 from mjxball.fly import main as fly
 from mjxball.policy.file import shipped_policy
-from mjxball.rig import gains, identify
+from mjxball.rig import design, gains, identify
 from mjxball.view import main as view
 
 SECONDS, MEMORY = 20.0, 3.0e9  # [s] of a line, [bytes] resident, at most
@@ -223,6 +223,7 @@ def programs() -> list[Program]:
         Program("fly", module("fly"), (flight, "--rehearse", "--seconds", "2"), fly.make_parser(), text),
         Program("export", module("export"), (balance, "out.npz"), parser_in(export.main), text),
         Program("gains", module("rig.gains"), ("--out", "gains.json"), gains.parser(), text),
+        Program("design", module("rig.design"), ("--plant", "team3"), design.parser(), text),
         Program("identify", module("rig.identify"), ("flight.jsonl", "--out", "plant.json"), identify.parser(), text),
     ]
 

@@ -39,7 +39,7 @@ def test_every_command_has_many_lines() -> None:
     assert len(cases) >= 250
     assert len({(case.program, case.flaw) for case in cases}) == len(cases)
     count = Counter(case.program for case in cases)
-    assert set(count) == {"train", "eval", "view", "fly", "export", "gains", "identify"}
+    assert set(count) == {"train", "eval", "view", "fly", "export", "gains", "design", "identify"}
     assert min(count[name] for name in ("train", "eval", "view", "fly")) > 40
 
 
@@ -53,6 +53,7 @@ def test_some_of_its_lines_are_refused_well() -> None:
         "fly": "--gains empty",
         "export": "policy: noise",
         "gains": "gains.json exists",
+        "design": "--plant alone",
         "identify": "log: a directory",
     }
     found = [case for case in hostile_lines.every_case() if wanted.get(case.program) == case.flaw]
@@ -62,7 +63,7 @@ def test_some_of_its_lines_are_refused_well() -> None:
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("program", ["train", "eval", "view", "fly", "export", "gains", "identify"])
+@pytest.mark.parametrize("program", ["train", "eval", "view", "fly", "export", "gains", "design", "identify"])
 def test_every_line_is_refused_well(program: str) -> None:
     lines = [case for case in hostile_lines.every_case() if case.program == program]
     wrong = {case.flaw: found for case in lines if (found := hostile_lines.run(case, hostile_lines.SECONDS)["wrong"])}

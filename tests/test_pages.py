@@ -97,7 +97,7 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
     ),
     "docs/howto/own-model": (
         ("of a single one: # to # … more than # elements", 2, MOST_DRONES, _model_source.MAX_ELEMENTS),
-        ("of more than # points", _model_source.MAX_PIXELS),
+        ("textures of more than # × # points", *2 * (math.sqrt(_model_source.MAX_PIXELS),)),
     ),
     "docs/crazyflie": (
         ("deck: # g; thrust upgrade # g; brushless with guards # g", *GRAMS),

@@ -48,9 +48,8 @@ class World:
     config: Config
     scenarios: tuple[Pair, ...]
     references: tuple[Callable[[Config], Baseline], ...]
-    reference_scenarios: tuple[
-        Scenario, ...
-    ] = ()  # what the references fly where the entrant is told less: undisturbed, disturbed
+    # What the references fly where the entrant is told less: undisturbed, disturbed.
+    reference_scenarios: tuple[Scenario, ...] = ()
     length: float = 1.0  # factor on bars in metres
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import struct
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -16,11 +17,11 @@ MODELS = (".xml", ".urdf")  # endings of the files
 MAX_MODEL = 2**20  # bytes of a model, and of one that it includes
 MAX_ASSET = 2**26  # bytes of a mesh or texture
 MAX_ELEMENTS = 5000  # of XML; MuJoCo takes seconds for more
-MAX_PIXELS = 2**22  # of a height field or texture
+MAX_PIXELS = 2**22  # of all height fields and textures of a model
 LONGEST = 200  # characters of a name or a message that a sentence shows
 FIRST = re.compile(r"\ufeff?(?>\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*+<([\w:.-]+)", re.DOTALL)
 COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
-COUNTS = re.compile(r"count|nrow|ncol|width|height|nsample|nkey|nuser\w*")  # attributes: how many there are
+COUNTS = re.compile(r"count|nrow|ncol|nsample|nkey|nuser\w*")  # attributes: how many there are
 FILE = re.compile(r"file(?:right|left|up|down|front|back)?")  # attributes of MJCF; URDF's shapes do not matter
 ROTOR = re.compile(r"prop|rotor|motor|thrust", re.IGNORECASE)  # in the name of a URDF's link
 
@@ -88,13 +89,16 @@ def _free(spec: Any, rotors: Collection[str]) -> None:
 class _Check:
     """What the text of a model asks of MuJoCo, before MuJoCo reads it: InputError if that is too much.
 
-    Raised for elements, once repeated and included, beyond `MAX_ELEMENTS`, pictures beyond `MAX_PIXELS`, and files that
-    are missing, larger than they may be, or none, such as a pipe, for which MuJoCo would wait.
+    Raised for elements, once repeated, included and attached, beyond `MAX_ELEMENTS`, pictures beyond `MAX_PIXELS`, and
+    files that are missing, larger than they may be, or none, such as a pipe, for which MuJoCo would wait.
     """
 
-    def __init__(self, path: Path, text: str):
-        self.elements, self.attached, self.largest, self.times = 0.0, 0.0, 0.0, [1.0]
-        self.read, self.parents, self.folders = {path.name}, [path.parent], [""]
+    def __init__(self, path: Path, text: str, around: _Check | None = None):
+        """`around`: of the model to which that in `path` may be attached."""
+        self.elements, self.attached, self.largest, self.points, self.times = 0.0, 0.0, 0.0, 0.0, [1.0]
+        self.read, self.parents, self.folders = {path.resolve()}, [path.parent], [""]
+        self.parents += around.parents if around else []
+        self.models: dict[Path, float] = around.models if around else {}  # elements of those that may be attached
         self.files: list[tuple[str, str]] = []
         self._text(text)
         self._count(self.attached * self.largest)
@@ -105,18 +109,19 @@ class _Check:
         parser = expat.ParserCreate()
         parser.StartElementHandler, parser.EndElementHandler = self._begin, lambda name: self.times.pop()
         try:
-            parser.Parse(COMMENT.sub("", text), True)  # MuJoCo allows -- in a comment
+            # MuJoCo allows -- in a comment, and blanks before the declaration.
+            parser.Parse(COMMENT.sub("", text).lstrip("\ufeff \t\r\n"), True)
         except expat.ExpatError as error:
-            raise InputError(f"it is no XML: {error}") from None
+            raise InputError(f"it is no well-formed XML: {error}") from None
 
     def _begin(self, name: str, given: dict[str, str]) -> None:
-        counts = [value for key, value in given.items() if COUNTS.fullmatch(key) or (name, key) == ("numeric", "size")]
+        sizes = {"numeric": ("size",), "texture": ("width", "height")}.get(name, ())
+        counts = [value for key, value in given.items() if COUNTS.fullmatch(key) or key in sizes]
         size = math.prod(max(1.0, _number(word)) for value in counts for word in value.split())
         if name in ("hfield", "texture"):
-            if size > MAX_PIXELS:
-                raise InputError(f"its {name} has {size:.3g} points, expected at most {MAX_PIXELS}")
+            self._picture(name, size)
             size = 1.0
-        if name == "lengthrange":
+        if name == "lengthrange" and given.get("mode") != "none":
             raise InputError("it has <lengthrange>, expected none: its actuators are rotors")
         self._count(self.times[-1] * size)
         self.attached += self.times[-1] * (name == "attach")
@@ -125,17 +130,28 @@ class _Check:
         for file in (file for key, file in given.items() if file and FILE.fullmatch(key)):
             if name not in ("include", "model"):
                 self.files.append((name, file))
-            elif file not in self.read:
-                self._model(name, file)
+                continue
+            place = self._file(name, file, MAX_MODEL)
+            if name == "model":
+                self._model(place)
+            elif place.resolve() not in self.read:
+                self.read.add(place.resolve())
+                self.parents.append(place.parent)
+                self._text(read_text(place, name, MAX_MODEL))
 
-    def _model(self, kind: str, name: str) -> None:
-        """One that is included, or attached where <attach> says."""
-        place, before = self._file(kind, name, MAX_MODEL), self.elements
-        self.read.add(name)
-        self.parents.append(place.parent)
-        self._text(read_text(place, kind, MAX_MODEL))
-        if kind == "model":
-            self.largest = max(self.largest, self.elements - before)
+    def _model(self, place: Path) -> None:
+        """One that is attached where <attach> says."""
+        if place.resolve() not in self.models:
+            self.models[place.resolve()] = math.inf  # attached in itself
+            self.models[place.resolve()] = _Check(place, read_text(place, "model", MAX_MODEL), self).elements
+        elements = self.models[place.resolve()]
+        self._count(elements)
+        self.largest = max(self.largest, elements)
+
+    def _picture(self, kind: str, points: float) -> None:
+        self.points += points
+        if self.points > MAX_PIXELS:
+            raise InputError(f"with its {kind} it has {self.points:.3g} points, expected at most {MAX_PIXELS}")
 
     def _count(self, elements: float) -> None:
         self.elements += elements
@@ -156,6 +172,9 @@ class _Check:
             raise InputError(f"{what} is no file")
         if place.stat().st_size > limit:
             raise InputError(f"{what} is larger than {limit >> 20} MiB")
+        if place.suffix.lower() == ".png":
+            with place.open("rb") as stream:
+                self._picture(kind, math.prod(struct.unpack(">II", stream.read(24).ljust(24, b"\0")[16:])))
         return place
 
 

@@ -119,6 +119,7 @@ SWITCH = {
     "follower.washout": "follower.residual_on_pid",
     "scenario.cg_lissajous_probability": "scenario.cg_width",
     "gradient.impulse_response_from": "gradient.impulse_response",
+    **{path: "rigs.number" for path in CONSTANT if path.startswith("rigs.")},
 }
 # Settings of several numbers that were one number before.
 ONCE_ONE = ("gradient.windows_per_episode",)
@@ -193,4 +194,5 @@ def check_constant(path: str, value: Any) -> None:
     wanted = CONSTANT[path]
     value = tuple(value) if isinstance(value, list) else value
     if value != wanted:
-        raise InputError(f"{path} is no setting any more: it is {wanted!r}, and cannot be {value!r}")
+        where = f" where {SWITCH[path]} is not 0" if path in SWITCH else ""
+        raise InputError(f"{path} is no setting any more: it is {wanted!r}{where}, and cannot be {value!r}")

@@ -27,9 +27,8 @@ class Variant:
     team: str = ""  # preset whose plant it flies; empty: the command's
     drones: int = 0  # of a ring of that many; 0: the preset's plant
     rig: int | None = None  # number of a held-out rig of so many drones, in place of a ring
-    design_settings: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # of a team, settings that its followers are made for
+    # Of a team, settings that its followers are made for.
+    design_settings: Mapping[str, Any] = field(default_factory=dict)
     scatter: float = 0.0  # of a team, every drone's numbers are drawn within this share of those that followers know
 
     @property

@@ -76,11 +76,19 @@ def _sac(config: Config) -> _Sizes:
 
 
 def _ppo(config: Config) -> _Sizes:
+    from mjxball.algorithms.ppo import EPOCHS, VALUE_LAYERS  # with Brax
+
     ppo = config.ppo
-    policy = _policy(config, ppo.policy_layers)
+    policy, value = _policy(config, ppo.policy_layers), _policy(config, VALUE_LAYERS)
     data = ppo.num_envs * ppo.unroll_length * (ROW + 2 * config.follower.recurrent_units)
     rounds = max(ppo.total_steps // ppo.num_envs, 1)
-    return ppo.total_steps, rounds, 3 * policy + ppo.num_envs * STATE, data, 6.0 * ppo.total_steps * policy
+    return (
+        ppo.total_steps,
+        rounds,
+        3 * (policy + value) + ppo.num_envs * STATE,
+        data,
+        6.0 * ppo.total_steps * EPOCHS * (policy + value),
+    )
 
 
 def _gradient(config: Config) -> _Sizes:

@@ -257,6 +257,8 @@ def check_sweep(sweep: Any, members: int, config: Config, where: str) -> dict[st
         raise InputError(f"{where} must hold an object of settings")
     for given, values in sweep.items():
         name = configs.current_name(given)
+        if given in configs.CONSTANT:
+            raise InputError(f"{where}: {given} is no setting any more: it is {configs.CONSTANT[given]!r}")
         if name not in SWEEPABLE:
             raise InputError(f"{where}: {given!r} cannot differ between members; {', '.join(SWEEPABLE)} can")
         if not isinstance(values, list) or len(values) != members:

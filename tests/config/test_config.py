@@ -346,6 +346,25 @@ class TestOldNames:
         recorded["gradient"]["impulse_response_from"] = 0.75
         assert configs.from_record(recorded).gradient.impulse_response == 0.02
 
+    @rows(
+        ("preset", "path"),
+        [
+            ("flight", "follower.washout_time"),
+            ("team", "scenario.cg_lissajous_probability"),
+            ("universal", "rigs.fade"),
+        ],
+    )
+    def test_what_a_switch_turns_on_has_its_value(self, preset, path):
+        section, name = path.split(".")
+        for kind, refused in ((preset, True), ("transport", False)):
+            recorded = configs.to_dict(configs.preset(kind))
+            recorded[section][name] = 0.125
+            if refused:
+                with pytest.raises(InputError, match=f"{name} is no setting any more"):
+                    configs.from_record(recorded)
+            else:
+                assert configs.from_record(recorded) == configs.preset(kind)
+
     def test_a_network_stands_on_the_pd_law_alone(self):
         recorded = configs.to_dict(Config())
         recorded["follower"] |= {"base": "pd", "differential_thrust_share": 0.0}

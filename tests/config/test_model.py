@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -230,7 +231,7 @@ LEVER = f'<body name="lever"><joint name="elbow" axis="0 1 0"/>{INERTIAL}</body>
 REFUSED = {
     "no XML": ("drone", "it is no XML, expected <mujoco>"),
     "another XML": ("<html></html>", "begins with <html>, expected <mujoco>"),
-    "half a model": (DRONE[:300], "it is no XML: "),
+    "half a model": (DRONE[:300], "it is no well-formed XML: "),
     "too long": (DRONE + " " * 2**20, "is larger than 1 MiB"),
     "an include that there is not": ('<mujoco><include file="frame.xml"/></mujoco>', "frame.xml"),
     "an include that is a pipe": ('<mujoco><include file="pipe"/></mujoco>', "its include pipe is no file"),
@@ -239,7 +240,14 @@ REFUSED = {
     "repeated": (in_world(f'{50 * MANY}<geom size="0.1"/>{50 * "</replicate>"}'), "it has more than 5000 elements"),
     "a crowd": (in_world(2000 * '<body><geom size="1" pos="0 0 -9"/></body>'), "MuJoCo does not compile it: "),
     "numbers": (changed("<worldbody>", '<custom><numeric name="n" size="9999"/></custom><worldbody>'), "5000 elements"),
-    "a field": (asset('<hfield name="h" nrow="9999" ncol="999" size="1 1 1 1"/>'), "its hfield has 9.99e+06 points"),
+    "a field": (
+        asset('<hfield name="h" nrow="9999" ncol="999" size="1 1 1 1"/>'),
+        "with its hfield it has 9.99e+06 points",
+    ),
+    "many fields": (
+        asset("".join(f'<hfield name="h{n}" nrow="999" ncol="999" size="1 1 1 1"/>' for n in range(9))),
+        "with its hfield it has 4.99e+06 points",
+    ),
     "endless lengths": (
         changed("<worldbody>", "<compiler><lengthrange/></compiler><worldbody>"),
         "it has <lengthrange>",
@@ -375,6 +383,30 @@ def test_files_of_a_model_are_found_where_mujoco_finds_them(tmp_path: Path) -> N
     many = changed("<attach", 2000 * '<attach model="one" body="b" prefix="q"/>' + "<attach", text)
     with pytest.raises(InputError, match="more than 5000 elements"):
         plant_setup(written(tmp_path, many))
+    assert plant_setup(written(tmp_path, f"\n{text}")).plant == plant_setup(written(tmp_path, text)).plant
+
+
+def test_models_that_hold_models_are_counted_with_all_they_hold(tmp_path: Path) -> None:
+    """Each attaches the next 14 times: MuJoCo would take 2 GB. Nor is one read that attaches itself."""
+    for number in range(5):
+        attach = "".join(f'<frame><attach model="m" body="b" prefix="p{k}"/></frame>' for k in range(14))
+        held = f'<asset><model name="m" file="{number + 1}.xml"/></asset>' if number < 4 else ""
+        body = f'<worldbody><body name="b">{attach if number < 4 else ""}</body></worldbody>'
+        (tmp_path / f"{number}.xml").write_text(f'<mujoco model="m">{held}{body}</mujoco>')
+    asked = '<asset><model name="m" file="{}"/></asset><worldbody>'
+    for first in ("0.xml", "drone.xml"):
+        text = changed(INERTIAL, f'{INERTIAL}<attach model="m" body="b" prefix="p"/>')
+        text = changed("<worldbody>", asked.format(first), text)
+        (tmp_path / "drone.xml").write_text(text)
+        with pytest.raises(InputError, match="more than 5000 elements"):
+            plant_setup(written(tmp_path, text))
+
+
+def test_a_picture_counts_by_its_points(tmp_path: Path) -> None:
+    size = struct.pack(">II", 8000, 8000)
+    (tmp_path / "sky.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + size)
+    with pytest.raises(InputError, match=r"with its texture it has 6.4e\+07 points"):
+        plant_setup(written(tmp_path, asset('<texture name="t" type="2d" file="sky.png"/>')))
 
 
 def test_half_models_are_read_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
