@@ -197,9 +197,10 @@ def test_a_table_is_that_of_its_file(section: str) -> None:
 def agree(line: str, numbers: Numbers) -> bool:
     """The row has these numbers, rounded to its digits, in this order; others may follow or stand before the first."""
     cells = re.sub(r"(?<=\d) (?=\d{3} )", "", line.partition(" | ")[2])
-    shown = re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?(?![\w.]*\w)", cells)
-    return len(shown) >= len([number for number in numbers if number is not None]) and all(
-        number is None or is_rounded(text, number) for text, number in zip(shown, numbers, strict=False)
+    shown = re.findall(r"(?<![\w.])(?:-?\d+(?:\.\d+)?(?![\w.]*\w)|never|failed)", cells)
+    return len(shown) >= len(numbers) and all(
+        text in ("never", "failed") if number is None else text[0] not in "nf" and is_rounded(text, number)
+        for text, number in zip(shown, numbers, strict=False)
     )
 
 
