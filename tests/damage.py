@@ -53,6 +53,7 @@ FIELDS = {  # of a zip: where numbers stand behind each signature
 }
 NAMES = ("../../x.npy", "/etc/x.npy", "é\u202e.npy", "a\nb.npy", "a\0b.npy", "card", "weight_0.npy.npy", ".npy", "a/")
 events: list[str] = []  # forbidden ones, as Python's audit hook tells them
+sys.addaudithook(lambda event, _: events.append(event) if event in FORBIDDEN else None)
 
 
 class Explosive:
@@ -302,11 +303,6 @@ class Count:
     faults: int = 0
     longest: float = 0.0  # [s]
     memory: float = 0.0  # [MiB] most of any file
-
-
-def watch() -> None:
-    """Note forbidden events from now on."""
-    sys.addaudithook(lambda event, _: events.append(event) if event in FORBIDDEN else None)
 
 
 @contextmanager
