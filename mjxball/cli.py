@@ -324,6 +324,6 @@ def _with_plant(
     """`mjxball.config.with_plant`; stderr says, a line each, what is assumed of a model and what of it is left out."""
     found = found or (None if path is None else read_plant(path))
     result = configs.with_plant(config, path, flags, found)
-    for line in found.assumed if found else ():
-        warn(f"{path.name if path else ''}: {line}")
+    for line in found.assumed if found and path else ():
+        warn(f"{path.name}: {line}")
     return result
