@@ -324,6 +324,7 @@ def _with_plant(
     """`mjxball.config.with_plant`; stderr says, a line each, what is assumed of a model and what of it is left out."""
     found = found or (None if path is None else read_plant(path))
     result = configs.with_plant(config, path, flags, found)
-    for line in found.assumed if found and path else ():
-        warn(f"{path.name}: {line}")
+    if path is not None and found is not None:
+        for line in found.assumed:
+            warn(f"{path.name}: {line}")
     return result
