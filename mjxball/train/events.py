@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -57,7 +58,7 @@ class Events:
     """One run in TensorBoard, written anew into its directory: what an earlier process wrote there goes."""
 
     def __init__(self, run: Path, session: Session, named: Mapping[str, str], points: Iterable[Point] = ()):
-        """`named`: tag of each column; a column without one, and an empty value, is left out."""
+        """`named`: tag of each column; a column without one, and a value that is empty or not finite, is left out."""
         place = run / EVENTS / session.name
         place.mkdir(parents=True, exist_ok=True)
         for older in place.glob("events.out.tfevents.*"):
@@ -76,7 +77,7 @@ class Events:
     def add(self, point: Point) -> None:
         """Add the values of one step."""
         for name, value in point.values.items():
-            if name in self._tags and value is not None:
+            if name in self._tags and value is not None and math.isfinite(value):
                 summary = self._parts.summary.scalar(self._tags[name], value)
                 self._write(point.at, step=point.step, summary=summary)
 

@@ -30,7 +30,7 @@ TRAIN = shlex.join([sys.executable, "tests/short_train.py"])
 FIRST_EVALUATION = 2 * STEPS  # after which the run would save by itself
 MEMBERS = [*tiny(sac__total_steps=2 * FIRST_EVALUATION, sac__num_evaluations=2), "--num-seeds", "2"]
 
-pytestmark = pytest.mark.release
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

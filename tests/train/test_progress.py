@@ -95,6 +95,18 @@ def test_tags_are_in_groups() -> None:
     }
 
 
+def test_a_value_that_is_none_has_no_point(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The peak of flights that all failed is not a number; tensorboardX warns of such."""
+    progress = Progress(tmp_path / METRICS, columns((), (), ["peak"]), 500, stream=io.StringIO())
+    progress.show(row(100) | {"eval_return": -1.0, "eval_peak": float("nan")})
+    progress.close()
+    assert {tag for tag, _, _ in points(tmp_path)} == {
+        *("speed/seconds", "speed/rate", "exploring/episode_return", "evaluation/return")
+    }
+    assert not caplog.records
+    assert read_rows(tmp_path / METRICS)[0]["eval_peak"] == "nan"
+
+
 def test_a_run_is_called_after_preset_and_seed_and_names_its_hyperparameters(tmp_path: Path) -> None:
     config = apply_overrides(preset("transport"), {"sac.learning_rate": 0.125, "scenario.cg_speed": (0.5, 1.0)})
     own = session(config, 3, 1, {"physics": "mjx"})
