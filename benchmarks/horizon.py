@@ -64,7 +64,7 @@ def own_plants(path: Path) -> Iterator[tuple[str, Config]]:
 
 def own_scenarios(setup: Config, seconds: float) -> list[Scenario]:
     """The plant's reference load at rest, and moving at each of `SPEEDS`; a rolling ball from its start."""
-    reference = dataclasses.replace(standard_scenarios(setup)[-1], seconds=seconds)
+    reference = dataclasses.replace(standard_scenarios(setup)[0], seconds=seconds)
     if setup.motion.kind == "rolling" or not reference.amplitude:
         return [reference]
     return [

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Write docs/leaderboard.md from the entries in benchmarks/leaderboard/.
 
-`python docs/leaderboard.py [FILE]`; entries of another version are refused.
+`python docs/leaderboard.py [FILE]`; an entry of another version, of other flights or of changed sources is refused.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from mjxball.bench import NAME, VERSION
 from mjxball.bench.entry import cells, read_entry
 from mjxball.bench.score import CONDITIONS
 from mjxball.bench.tracks import FLIGHTS, SECONDS, TRACKS
+from mjxball.cli import run_command
 
 REPOSITORY = Path(__file__).parents[1]
 ENTRIES, PAGE = REPOSITORY / "benchmarks" / "leaderboard", REPOSITORY / "docs" / "leaderboard.md"
@@ -40,7 +41,7 @@ are in `policies/archive/`.
 `ppo` or `gradient` comes to within a minute and a half on two cores. `brax-*`, `sb3-*` and `sbx-sac` are Brax's,
 Stable-Baselines3's and SBX's own SAC and PPO, of seed 0, in the same environment for as many steps: `python
 benchmarks/foreign_trainers.py sb3-sac sb3-sac.npz`. Their returns and CPU seconds: [other
-trainers](results.md#other-trainers). `balance-memoryless` is `balance` without its GRU and its last action, 219 CPU
+trainers](gym.md#other-trainers). `balance-memoryless` is `balance` without its GRU and its last action, 219 CPU
 seconds of `python train.py balance --algorithm gradient --follower.recurrent_units 0 --follower.previous_action false
 --gradient.policy_layers 64,64 --gradient.gradient_steps 500 --gradient.num_envs 64`. `memoryless` is a [classical
 law](followers.md). `raptor` is two policies of [RAPTOR](https://arxiv.org/abs/2509.11481), which command the rotors of
@@ -97,4 +98,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_command(main))

@@ -15,7 +15,7 @@ from mjxball.train import processes
 
 def one_second(settings: Config) -> tuple[Scenario, ...]:
     """The reference scenario, cut short."""
-    return (dataclasses.replace(standard_scenarios(settings)[-1], seconds=1.0),)
+    return (dataclasses.replace(standard_scenarios(settings)[0], seconds=1.0),)
 
 
 if __name__ == "__main__":

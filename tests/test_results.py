@@ -175,7 +175,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, Numbers]]]]] = {
     "Ten minutes": ("results", minutes),
     "Training time": ("results", training),
     "Training time ": ("results", algorithms),
-    "Training time  ": ("results", trainers),
+    "Other trainers": ("gym", trainers),
     "Two Crazyflies": ("results", crazyflies),
     "Cost and tests": ("onboard", onboard),
 }
@@ -249,7 +249,7 @@ SAID: tuple[tuple[str, str, Callable[[], Numbers]], ...] = (
     ("followers", "of `mpc` among some # sets", lambda: [measured("mpc_tuning")["sets"]]),
     ("flying", "from # m they touch down at # m/s", silent_uplink),
     ("model", "#e-13 relative; #e-12 on the pivot", lambda: [1e13 * rounding(False), 1e12 * rounding(True)]),
-    ("results", "the same # random episodes", lambda: [measured("foreign_trainers")["episodes"]]),
+    ("gym", "the same # random episodes", lambda: [measured("foreign_trainers")["episodes"]]),
 )
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import datetime
+import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,13 +12,19 @@ from typing import Any
 from mjxball.bench import NAME, VERSION
 from mjxball.bench.followers import Make
 from mjxball.bench.score import CONDITIONS, measure, worlds_of
-from mjxball.bench.tracks import TRACKS
+from mjxball.bench.tracks import FLIGHTS, TRACKS
 from mjxball.errors import InputError
 from mjxball.files import read_text
 from mjxball.reading import parse_json
 
 HEADS = ["track", "", "met %", "95 %", "failed %", "settle s", "90 % peak mm", "limit %", "change mrad"]
-KEYS = {"benchmark", "version", "draw", "follower", "date", "command", "commit", "versions", "tracks", "not_flown"}
+# Of an entry, beside the benchmark and its version.
+KINDS = {
+    **{"draw": int, "follower": str, "date": str, "command": str, "commit": str},
+    **{"versions": dict, "tracks": dict, "not_flown": dict},
+}
+SHARES = ("met", "low", "high", "failed")  # of one condition's numbers
+NUMBERS = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
 
 
 def run(
@@ -49,7 +57,10 @@ def run(
 
 
 def read_entry(path: Path) -> dict[str, Any]:
-    """An entry of this version; InputError with one sentence for anything else."""
+    """An entry that the leaderboard can show: of this version, all published flights of a track, from a commit.
+
+    InputError with one sentence for anything else.
+    """
     try:
         entry = parse_json(read_text(path, "entry"))
     except ValueError:
@@ -57,13 +68,40 @@ def read_entry(path: Path) -> dict[str, Any]:
     if not isinstance(entry, dict) or entry.get("benchmark") != NAME:
         raise InputError(f"{path} is no entry of {NAME}")
     other = entry.get("version")
-    if other != VERSION:
+    if other != VERSION or isinstance(other, bool):
         raise InputError(f"entry {path} is of version {other!r} of {NAME}, and this is version {VERSION}")
-    missing = sorted(KEYS - set(entry))
-    tracks = entry.get("tracks")
-    if missing or not isinstance(tracks, dict) or not all(set(CONDITIONS) <= set(one) for one in tracks.values()):
-        raise InputError(f"entry {path} is not whole: {', '.join(missing) or 'tracks'} is missing")
+    if missing := sorted(set(KINDS) - set(entry)):
+        raise InputError(f"entry {path} is not whole: {', '.join(missing)} is missing")
+    for name, kind in KINDS.items():
+        if type(entry[name]) is not kind:
+            raise InputError(f"entry {path} has {name} {entry[name]!r}, which is no {kind.__name__}")
+    if not re.fullmatch(r"[\w.:+-]+", entry["follower"]) or not re.fullmatch(r"\d{4}-\d\d-\d\d", entry["date"]):
+        raise InputError(f"entry {path} has no name of one word as follower, or no date as 2026-01-31")
+    for track, found in entry["tracks"].items():
+        for condition in CONDITIONS:
+            if track not in TRACKS or not isinstance(found, dict) or not _measured(found.get(condition)):
+                raise InputError(
+                    f"entry {path} has no numbers of a track as this version has them: {track} {condition}"
+                )
+            flown = found[condition]["flights"]
+            if flown != FLIGHTS or entry["draw"] != 0:
+                raise InputError(
+                    f"entry {path} is of {flown} flights of draw {entry['draw']}; ranked are {FLIGHTS} of draw 0"
+                )
+    if not re.fullmatch(r"[0-9a-f]{7,40}", entry["commit"]):
+        raise InputError(f"entry {path} is of commit {entry['commit']!r}; fly it from a clean checkout of one")
     return entry
+
+
+def _measured(numbers: Any) -> bool:
+    """Whether these are one condition's numbers, as `score.summary` has them."""
+    if not isinstance(numbers, dict) or set(numbers) != NUMBERS or type(numbers["flights"]) is not int:
+        return False
+    shares = [numbers[name] for name in SHARES]
+    return all(type(one) in (int, float) and 0 <= one <= 1 for one in shares) and all(
+        numbers[name] is None or (type(numbers[name]) in (int, float) and 0 <= numbers[name] < math.inf)
+        for name in NUMBERS
+    )
 
 
 def table(entry: dict[str, Any]) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import statistics
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,14 @@ from mjxball.control.observation import OBSERVATION_SIZE
 from mjxball.errors import InputError, said
 from mjxball.evaluate.followers import Make, answered, find_follower
 from mjxball.evaluate.policies import load_policy
-from mjxball.policy import Policy, policy_path
+from mjxball.policy import Policy, policy_path, shipped_policies
 
 __all__ = ["Make", "checked", "entrant"]
 
-SLOWEST = 0.020  # [s] that a call for one flight may take, in the median
+SLOWEST = 0.020  # [s] that a call for one flight may take, in the median of CALLS that follow each other
 CALLS = 20
-INPUTS = {"observation", "memory", "start"}
+TYPES = {"observation": "tensor(float)", "memory": "tensor(float)", "start": "tensor(bool)"}  # of inputs
+UNRANKED = {"oracle", "lqg-known-failures", "stay", "random"}  # told what no follower can know, or no laws
 
 
 def entrant(text: str) -> tuple[str, Make]:
@@ -38,8 +39,9 @@ def entrant(text: str) -> tuple[str, Make]:
         session = _session(path)
         return path.stem, lambda config: OnnxFollower(path.stem, session)
     if text not in LAWS and ":" not in text:
+        names = [*(shipped.stem for shipped in shipped_policies()), *(name for name in LAWS if name not in UNRANKED)]
         raise InputError(
-            f"--benchmark takes a file .npz or .onnx, package.module:Class, or one of {', '.join(LAWS)}, not {text!r}"
+            f"--benchmark takes a file .npz or .onnx, package.module:Class, or one of {', '.join(names)}, not {text!r}"
         )
     return find_follower(text, "--benchmark")
 
@@ -66,47 +68,58 @@ class OnnxFollower:
             given["memory"] = np.zeros((len(rows), size), np.float32) if self._memory is None else self._memory
             given["start"] = np.full((len(rows), 1), fresh)
         wanted = ["command", "next_memory"] if self._remembers else ["command"]
-        command, *memory = self._session.run(wanted, given)
+        try:
+            command, *memory = self._session.run(wanted, given)
+        except Exception as error:  # whatever the runtime raises for a model that cannot be computed
+            raise InputError(f"follower {self.name} raised {said(error)}") from None
         self._memory = memory[0] if memory else None
-        return np.asarray(command, float).reshape(*np.shape(observation)[:-1], 3)
+        return answered(self.name, command, rows).reshape(*np.shape(observation)[:-1], 3)
 
 
 def _session(path: Path) -> Any:
     try:
         import onnxruntime  # type: ignore[import-untyped]
     except ImportError:
-        raise InputError("an ONNX follower needs onnxruntime: pip install onnxruntime") from None
+        raise InputError("an ONNX follower needs onnxruntime; pip install 'mjxball[onnx]'") from None
     if not path.is_file():
         raise InputError(f"there is no file {path}")
     try:
         session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     except Exception as error:  # whatever the runtime raises for a file that is no model
         raise InputError(f"{path} is no ONNX model: {said(error)}") from None
-    inputs, outputs = ({one.name for one in part} for part in (session.get_inputs(), session.get_outputs()))
+    inputs = {one.name: one for one in session.get_inputs()}
+    outputs = {one.name for one in session.get_outputs()}
     wanted = {"command", "next_memory"} if "memory" in inputs else {"command"}
-    if "observation" not in inputs or not inputs <= INPUTS or not wanted <= outputs:
+    if "observation" not in inputs or not set(inputs) <= set(TYPES) or not wanted <= outputs:
         raise InputError(
             f"{path} has inputs {', '.join(sorted(inputs))} and outputs {', '.join(sorted(outputs))}; wanted are "
             "observation, with a memory also memory and start, and command, with a memory also next_memory"
         )
-    size = next(one.shape[-1] for one in session.get_inputs() if one.name == "observation")
-    if size != OBSERVATION_SIZE:
-        raise InputError(f"{path} takes observations of {size} numbers, not {OBSERVATION_SIZE}")
+    for name, one in inputs.items():
+        width = {"observation": OBSERVATION_SIZE, "start": 1}.get(name, one.shape[-1] if one.shape else None)
+        rows, *rest = one.shape or [None]
+        if one.type != TYPES[name] or isinstance(rows, int) or rest != [width] or not isinstance(width, int):
+            raise InputError(
+                f"{path} takes {name} as {one.type} of shape {one.shape}; wanted is {TYPES[name]} of shape "
+                f"['flights', {width if isinstance(width, int) else 'a number'}], for any number of flights"
+            )
     return session
 
 
-def checked(make: Make, config: Config) -> Follower:
-    """`make(config)`, after calls for a flight at rest. InputError if a call takes too long or answers no command."""
+def checked(make: Make, config: Config, calls: int = CALLS) -> Follower:
+    """`make(config)`, after `calls` for a flight at rest. InputError if they take too long or answer no command."""
     follower, count = make(config), len(config.plant.followers)
     shape = (1, OBSERVATION_SIZE) if count == 1 else (1, count, OBSERVATION_SIZE)
-    observation, taken = np.zeros(shape), []
+    observation, taken = np.zeros(shape), deque[float](maxlen=CALLS)
     follower.reset()
-    for _ in range(CALLS):
+    for _ in range(calls):
         begun = time.perf_counter()
         answered(follower.name, follower(observation), observation)
         taken.append(time.perf_counter() - begun)
+        slow = [one for one in taken if one > SLOWEST]
+        if len(slow) > CALLS // 2:
+            raise InputError(
+                f"follower {follower.name} takes {1e3 * min(slow):.0f} ms a call; at most {1e3 * SLOWEST:.0f} ms"
+            )
     follower.reset()
-    middle = statistics.median(taken)
-    if middle > SLOWEST:
-        raise InputError(f"follower {follower.name} takes {1e3 * middle:.0f} ms a call; at most {1e3 * SLOWEST:.0f} ms")
     return follower

@@ -73,7 +73,9 @@ def measure(track: str, draw: int, make: Make, progress: Callable[[str], None]) 
     flown: list[Metrics] = []
     met: list[bool] = []
     worlds = worlds_of(track, draw)
-    entrants = [checked(make, world.config) for world in worlds]  # all refusals before the first flight
+    # All refusals before the first flight; with the first plant as many calls as a flight has.
+    whole = round(worlds[0].scenarios[0][0].seconds / worlds[0].config.timing.control_period)
+    entrants = [checked(make, world.config, *[] if number else [whole]) for number, world in enumerate(worlds)]
     for number, (world, follower) in enumerate(zip(worlds, entrants, strict=True)):
         progress(f"{track}: {number + 1}/{len(worlds)}")
         (mine,) = fly(world, [follower], [one for pair in world.scenarios for one in pair])

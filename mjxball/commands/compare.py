@@ -22,7 +22,7 @@ def compare_members(settings: config.Config, out: Path, origin: dict[str, Any]) 
     from mjxball.train.curves import POLICIES, draw_members
 
     policies = [load_policy(path, settings) for path in sorted((out / POLICIES).glob("*.npz"), key=_seed_of)]
-    reference = standard_scenarios(settings)[-1]
+    reference = standard_scenarios(settings)[0]
     results = fly_scenarios(settings, policies, [reference], origin["physics"])
     print(table(results, reference))
     compared = ("rmse", "settling_time", "x_peak", "overshoot")
@@ -77,10 +77,10 @@ def compare(settings: config.Config, physics: str, out: Path, policy: Path) -> i
     scenarios = standard_scenarios(settings)
     trained = load_policy(policy, settings)
     results = fly_scenarios(settings, [make_baseline("copy", settings), trained], scenarios, physics)
-    print(table(results, scenarios[-1]))
+    print(table(results, scenarios[0]))
     write_results(results, out / "eval")
     reference = next(
-        result for result in results if result.follower == trained.name and result.scenario == scenarios[-1]
+        result for result in results if result.follower == trained.name and result.scenario == scenarios[0]
     )
     misses = check_bounds(trained, reference.metrics)
     verdict = "meets the bounds of its card" if not misses else f"misses its bounds: {'; '.join(misses)}"

@@ -291,7 +291,7 @@ def _compare(groups: Sequence[Group], options: argparse.Namespace, command: str)
             print(f"\n{group.setup.preset}: its own plant and scenarios")  # noqa: T201
         if options.plant or group.setup.plant != config.Plant():
             print(rig_line(group.setup, max(scenario.mass for scenario in group.scenarios)))  # noqa: T201
-        print(table(results, standard_scenarios(group.setup)[-1]))  # noqa: T201
+        print(table(results, standard_scenarios(group.setup)[0]))  # noqa: T201
         if not number or groups[0].asked:  # without arguments the JSON is about the paper's plant alone
             every += results
         if options.out:
@@ -398,7 +398,7 @@ def _check(setup: config.Config, policies: Sequence[Policy], results: Sequence[R
     """Hold every policy against its card on the reference scenario, flown anew if the results lack it."""
     own = setup.autopilot.kind != "ideal" or setup.plant != config.Plant()
     plain = setup if own else dataclasses.replace(setup, attitude=config.Attitude(), motion=config.Motion())
-    reference = standard_scenarios(plain)[-1]
+    reference = standard_scenarios(plain)[0]
     known = {result.follower: result for result in results if result.scenario == reference} if plain == setup else {}
     missing = [policy for policy in policies if policy.name not in known]
     if missing:

@@ -57,19 +57,19 @@ def scenarios_of(options: argparse.Namespace, setup: config.Config) -> Sequence[
         return standard_scenarios(setup)
     if not (given or options.policies or options.followers):
         return STANDARD
-    reference = standard_scenarios(setup)[-1]
+    reference = standard_scenarios(setup)[0]
     ball = reference.ball_start if options.rolling is None else options.rolling
     return _asked(options, setup, reference, ball_start=ball, path=reference.path)
 
 
 def native_scenarios(options: argparse.Namespace, setup: config.Config) -> Sequence[Scenario]:
-    """The standard scenarios of a Crazyflies' plant, or the last one changed as the flags say."""
+    """The standard scenarios of a Crazyflies' plant, or the first one changed as the flags say."""
     standard = standard_scenarios(setup)
     if not _given(options):
-        return standard[-1:] if options.policies or options.followers else standard
+        return standard[:1] if options.policies or options.followers else standard
     if options.waveform or options.rolling is not None:
         raise InputError("--waveform and --rolling are for the paper's plant; a rig's motion stands in its card")
-    return _asked(options, setup, standard[-1], ball_start=standard[-1].ball_start)
+    return _asked(options, setup, standard[0], ball_start=standard[0].ball_start)
 
 
 def _given(options: argparse.Namespace) -> bool:

@@ -12,6 +12,7 @@ from mjxball.config import Config
 from mjxball.control.followers import Baseline, Follower
 from mjxball.errors import FOREIGN, InputError, said
 
+LARGEST = 1e9  # of a command, in rad and m/s^2; the square of what is larger is soon no number
 Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
 
 
@@ -66,7 +67,7 @@ class OutsideLaw:
 
 
 def _outside(name: str, made: Any, config: Config) -> Follower:
-    found = _guarded(name, made, config)
+    found = _guarded(f"{name}(config)", made, config)
     if all(callable(getattr(found, part, None)) for part in ("start", "step")):
         return Baseline(OutsideLaw(name, found), config)
     if callable(found) and callable(getattr(found, "reset", None)):
@@ -88,12 +89,15 @@ def _guarded(name: str, function: Any, *arguments: Any) -> Any:
 def answered(name: str, command: Any, observation: Any) -> np.ndarray:
     """`command` (..., 3) of follower `name` to `observation` (..., 18); InputError if it is none."""
     try:
-        command = np.asarray(command, float)
+        array = np.asarray(command)
+        if np.iscomplexobj(array):
+            raise TypeError
+        command = array.astype(float)
     except FOREIGN:
-        raise InputError(f"follower {name} answered {type(command).__name__}, no array of numbers") from None
+        raise InputError(f"follower {name} answered {type(command).__name__}, no array of real numbers") from None
     wanted = (*np.shape(observation)[:-1], 3)
     if command.shape != wanted:
         raise InputError(f"follower {name} answered shape {command.shape} where {wanted} was wanted")
-    if not np.isfinite(command).all():
-        raise InputError(f"follower {name} answered a number that is not finite")
+    if not (np.abs(command) <= LARGEST).all():
+        raise InputError(f"follower {name} answered a number that is not finite, or larger than {LARGEST:g}")
     return command

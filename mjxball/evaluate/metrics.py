@@ -217,7 +217,7 @@ def rotor_limits(plant: Plant, scenarios: Sequence[Scenario]) -> np.ndarray:
 
 
 def measure(
-    flight: Trajectory, termination_distance: float, rotor_force_max: Array | float = 5.5, leader: int = 0
+    flight: Trajectory, termination_distance: float = 2.5, rotor_force_max: Array | float = 5.5, leader: int = 0
 ) -> Metrics:
     """Metrics of one recorded flight (no batch axis)."""
     return measure_batch(flight.batched(), termination_distance, rotor_force_max, leader)[0]

@@ -22,7 +22,7 @@ class Point(NamedTuple):
     """What there is to say at one step."""
 
     step: int
-    values: Mapping[str, float]  # by column of metrics.csv or members.csv
+    values: Mapping[str, float | None]  # by column of metrics.csv or members.csv
     at: float  # [s] by the clock
 
 

@@ -218,10 +218,10 @@ def _flown(source: str, changes: Mapping[str, Any], physics: str, plant: Path | 
         native = native_config(file)
         if native is not None and plant is None:
             setup = native
-        seconds = tuples.get("seconds", standard_scenarios(setup)[-1].seconds)
+        seconds = tuples.get("seconds", standard_scenarios(setup)[0].seconds)
         follower = load_policy(file, setup, seconds=seconds)
         follower.name = path.name if path.is_dir() else follower.name
-    scenario = dataclasses.replace(standard_scenarios(setup)[-1], **tuples)
+    scenario = dataclasses.replace(standard_scenarios(setup)[0], **tuples)
     if "mass" in changes:
         configs.check_lift(setup, changes["mass"])
     flown = simulate(setup, follower, scenario, physics)

@@ -18,6 +18,7 @@ from mjxball.baselines import make_baseline
 from mjxball.bench import followers, score
 from mjxball.bench.entry import read_entry, run
 from mjxball.bench.tracks import MARGIN, TRACKS, World
+from mjxball.cli import run_command
 from mjxball.commands.evaluate import main
 from mjxball.evaluate.metrics import measure
 from mjxball.export import main as export
@@ -58,10 +59,20 @@ class Shape(Good):
 class Words(Good):
     def __call__(self, observation): return "level"
 class Slow(Good):
+    after = 0
     def __call__(self, observation):
         import time
-        time.sleep(0.03)
+        self.calls += 1
+        time.sleep(0.03 if self.calls > self.after else 0.0)
         return super().__call__(observation)
+class SlowLater(Slow):
+    after = 40
+class Complex(Good):
+    def __call__(self, observation): return 1j * super().__call__(observation)
+class Huge(Good):
+    def __call__(self, observation): return 1e200 + super().__call__(observation)
+class Arguments(Good):
+    def __init__(self, gain, limit): pass
 class Nothing:
     def __init__(self, config): pass
 """
@@ -70,8 +81,12 @@ REFUSED = {
     "bad:Nan": "Nan answered a number that is not finite",
     "bad:Late": "Late answered a number that is not finite",
     "bad:Shape": "Shape answered shape (3,) where (1, 3) was wanted",
-    "bad:Words": "Words answered str, no array of numbers",
+    "bad:Words": "Words answered str, no array of real numbers",
+    "bad:Complex": "Complex answered ndarray, no array of real numbers",
+    "bad:Huge": "Huge answered a number that is not finite, or larger than 1e+09",
+    "bad:Arguments": "Arguments(config) raised TypeError",
     "bad:Slow": "ms a call; at most 20 ms",
+    "bad:SlowLater": "ms a call; at most 20 ms",
     "bad:Nothing": "neither start and step",
     "bad:Gone": "bad has no Gone",
     "nowhere:Gone": "no module nowhere",
@@ -209,7 +224,7 @@ def test_an_onnx_file_of_a_policy_comes_to_what_the_policy_does(short: Path):
 @pytest.mark.parametrize("name", ["bad:Good", "bad:Law"])
 def test_a_follower_from_outside_gets_an_entry(short: Path, name: str):
     assert main(["--benchmark", name, "--tracks", "pair", "--draw", "2", "--out", "entry.json"]) == 0
-    entry = read_entry(short / "entry.json")
+    entry = json.loads((short / "entry.json").read_text())
     assert (entry["draw"], entry["follower"], list(entry["tracks"])) == (2, name.partition(":")[2], ["pair"])
     assert entry["command"].startswith("python eval.py --benchmark")
 
@@ -235,34 +250,125 @@ def test_arguments_that_do_not_fit(short: Path, capsys: pytest.CaptureFixture[st
     refused(capsys, arguments, said)
 
 
-def test_an_onnx_file_with_other_inputs_is_refused(short: Path, capsys: pytest.CaptureFixture[str]):
+def linear(path: str, observation: tuple[int, list[Any]], command: list[Any], names: tuple[str, str]) -> None:
+    """An ONNX file of zeros: `observation` is (type, shape) of its input, `command` the shape of its output."""
     import onnx
-    from onnx import TensorProto, helper
+    from onnx import helper
 
-    value = [helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", 3]) for name in ("x", "y")]
-    graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "other", value[:1], value[1:])
+    kind, shape = observation
+    weight = helper.make_tensor("weight", kind, [shape[-1], command[-1]], np.zeros(shape[-1] * command[-1]).tolist())
+    node = helper.make_node("MatMul", [names[0], "weight"], [names[1]])
+    inputs, outputs = (
+        [helper.make_tensor_value_info(name, kind, one)] for name, one in zip(names, (shape, command), strict=True)
+    )
+    graph = helper.make_graph([node], "linear", inputs, outputs, [weight])
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
     model.ir_version = 8
-    onnx.save(model, "other.onnx")
-    arguments = ["--benchmark", "other.onnx", "--tracks", "pair", "--out", "entry.json"]
-    refused(capsys, arguments, "other.onnx has inputs x and outputs y")
+    onnx.save(model, path)
+
+
+OWN = ("observation", "command")
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
-    [({"version": 2}, "of version 2"), ({"benchmark": "other"}, "is no entry"), ({"tracks": 3}, "is not whole")],
+    ("model", "said"),
+    [
+        ((1, ["n", 18], ["n", 3], ("x", "y")), "has inputs x and outputs y"),
+        ((1, ["n", 12], ["n", 3], OWN), "shape ['n', 12]; wanted is tensor(float) of shape ['flights', 18]"),
+        ((11, ["n", 18], ["n", 3], OWN), "takes observation as tensor(double)"),
+        ((1, [1, "n", 18], [1, "n", 3], OWN), "of shape [1, 'n', 18]"),
+        ((1, [1, 18], [1, 3], OWN), "of shape [1, 18]"),
+        ((1, ["n", 18], ["n", 4], OWN), "answered shape (1, 4) where (1, 3) was wanted"),
+    ],
 )
-def test_an_entry_of_another_benchmark_is_refused(tmp_path: Path, change: dict[str, Any], said: str):
-    known = json.loads(next((REPOSITORY / "benchmarks" / "leaderboard").glob("*.json")).read_text())
+def test_an_onnx_file_with_other_inputs_is_refused(
+    short: Path, capsys: pytest.CaptureFixture[str], model: tuple[int, list[Any], list[Any], tuple[str, str]], said: str
+):
+    kind, observation, command, names = model
+    linear("other.onnx", (kind, observation), command, names)
+    refused(capsys, ["--benchmark", "other.onnx", "--tracks", "pair", "--out", "entry.json"], said)
+    assert not (short / "entry.json").exists()
+
+
+def known_entry() -> dict[str, Any]:
+    return json.loads((REPOSITORY / "benchmarks" / "leaderboard" / "copy.json").read_text())
+
+
+def with_numbers(**changed: Any) -> dict[str, Any]:
+    """Tracks of an entry, one of them with other numbers."""
+    tracks = known_entry()["tracks"]
+    tracks["pair"]["disturbed"] |= changed
+    return tracks
+
+
+OTHERS = {
+    "of version 2": {"version": 2},
+    "of version True": {"version": True},
+    "is no entry": {"benchmark": "other"},
+    "tracks 3, which is no dict": {"tracks": 3},
+    "commit None, which is no str": {"commit": None},
+    "date 20261128, which is no str": {"date": 20261128},
+    "no date as 2026-01-31": {"date": "yesterday"},
+    "no name of one word": {"follower": "a | b"},
+    "moon undisturbed": {"tracks": {"moon": {}}},
+    "pair disturbed": {"tracks": with_numbers(met="all")},
+    "pair undisturbed": {"tracks": {"pair": {"disturbed": 3}}},
+    "of 120 flights of draw 9; ranked": {"draw": 9},
+    "of 5 flights of draw 0; ranked": {"tracks": with_numbers(flights=5)},
+    "from a clean checkout": {"commit": "93771579971e-dirty"},
+}
+
+
+@pytest.mark.parametrize("said", OTHERS)
+def test_an_entry_of_another_benchmark_is_refused(tmp_path: Path, said: str):
     path = tmp_path / "entry.json"
-    path.write_text(json.dumps({**known, **change}))
-    with pytest.raises(followers.InputError, match=said):
+    path.write_text(json.dumps({**known_entry(), **OTHERS[said]}))
+    with pytest.raises(followers.InputError, match=re.escape(said)):
         read_entry(path)
 
 
-def test_the_page_is_that_of_the_entries(tmp_path: Path):
+def test_a_share_that_is_none_is_refused(tmp_path: Path):
+    path = tmp_path / "entry.json"
+    for met in (50, float("nan"), -0.1, True):
+        path.write_text(json.dumps({**known_entry(), "tracks": with_numbers(met=met)}))
+        with pytest.raises(followers.InputError):
+            read_entry(path)
+
+
+def test_a_page_with_another_entry_is_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    page = leaderboard()
+    (tmp_path / "two.json").write_text(json.dumps({**known_entry(), "version": 2}))
+    page.ENTRIES, page.PAGE = tmp_path, tmp_path / "page.md"
+    assert run_command(page.main) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("two.json is of version 2 of mjxball-bench, and this is version 1")
+    assert not page.PAGE.exists()
+
+
+def leaderboard() -> Any:
+    """The module that makes the page."""
     spec = importlib.util.spec_from_file_location("leaderboard", REPOSITORY / "docs" / "leaderboard.py")
     page = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(page)
+    return page
+
+
+def test_the_page_is_that_of_the_entries():
+    page = leaderboard()
     entries = [read_entry(path) for path in sorted(page.ENTRIES.glob("*.json"))]
     assert page.page(entries) == page.PAGE.read_text()
+
+
+TIERS = {track: pytest.mark.slow if track == "pair" else pytest.mark.release for track in TRACKS}
+
+
+@pytest.mark.parametrize("track", [pytest.param(track, marks=mark) for track, mark in TIERS.items()])
+def test_references_come_to_what_their_entries_say(track: str):
+    """Flights, references, what is met and what is measured: whatever of them changes is another version."""
+    name = "lqg" if track == "crazyflie" else "lqg-slow"
+    entry = json.loads((REPOSITORY / "benchmarks" / "leaderboard" / f"{name}.json").read_text())
+    found = run(name, lambda config: make_baseline(name, config), [track], 0)["tracks"][track]
+    for condition in score.CONDITIONS:
+        wanted = entry["tracks"][track][condition]
+        assert found[condition]["met"] == wanted["met"]
+        assert found[condition] == pytest.approx(wanted, rel=1e-3)

@@ -138,7 +138,7 @@ def test_the_policy_for_any_rig_flies_them(name: str, tmp_path: Path) -> None:
     text = {"drone": DRONE, "mirrored": mirrored, "urdf": models.urdf(), "rig": models.rig()}[name]
     setup = plant_setup(written(tmp_path, text, name=f"model.{'urdf' if name == 'urdf' else 'xml'}"))
     flight = simulate(
-        setup, load_policy(shipped_policy("universal"), setup), standard_scenarios(setup)[-1], "newton-euler"
+        setup, load_policy(shipped_policy("universal"), setup), standard_scenarios(setup)[0], "newton-euler"
     )
     found = measure(flight, setup.scenario.termination_distance)
     assert not found.failed

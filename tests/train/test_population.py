@@ -151,7 +151,7 @@ def test_population_run_exports_every_member_and_the_best(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     """Judged by one flight that is just long enough for peaks."""
-    shortened = lambda settings: (dataclasses.replace(standard_scenarios(settings)[-1], seconds=21.0),)  # noqa: E731
+    shortened = lambda settings: (dataclasses.replace(standard_scenarios(settings)[0], seconds=21.0),)  # noqa: E731
     monkeypatch.setattr("mjxball.commands.compare.standard_scenarios", shortened)
     out, sweep = tmp_path / "run", tmp_path / "sweep.json"
     sweep.write_text(json.dumps({"follower.action_scale_tilt": [0.1, 0.2]}))
