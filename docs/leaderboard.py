@@ -59,8 +59,8 @@ with a rotor at its limit, rms change of commands from step to step. A dash: nev
 python eval.py --benchmark my_policy.npz --out my_policy.json
 ```
 
-`my_policy.npz` may be an ONNX file with the inputs of [our exports](policy-file.md#export), or `module:Class`
-([your own follower](howto/own-baseline.md)). A track takes up to ten minutes on two cores; `--tracks pair` flies one. A
+`my_policy.npz` may be an ONNX file with the inputs of [our exports](policy-file.md#export) (extra `onnx`), or
+`module:Class` ([your own follower](howto/own-baseline.md)). A track takes up to ten minutes on two cores; `--tracks pair` flies one. A
 track whose plants the follower refuses is left out. Add the file to `benchmarks/leaderboard/`, run
 `python docs/leaderboard.py`, and open a pull request. We repeat it with `--draw`, on flights that nobody has seen.
 """

@@ -34,7 +34,7 @@ def entrant(text: str) -> tuple[str, Make]:
     path = policy_path(text)
     if path.suffix == ".npz":
         Policy.load(path)  # refused at once where it is none
-        return path.stem, lambda config: load_policy(path, config)
+        return path.stem, lambda config: _loaded(path, config)
     if path.suffix == ".onnx":
         session = _session(path)
         return path.stem, lambda config: OnnxFollower(path.stem, session)
@@ -44,6 +44,14 @@ def entrant(text: str) -> tuple[str, Make]:
             f"--benchmark takes a file .npz or .onnx, package.module:Class, or one of {', '.join(names)}, not {text!r}"
         )
     return find_follower(text, "--benchmark")
+
+
+def _loaded(path: Path, config: Config) -> Policy:
+    """The policy; why it does not fly is said without the place of its file, since an entry keeps that."""
+    try:
+        return load_policy(path, config)
+    except InputError as error:
+        raise InputError(str(error).replace(str(path), path.name)) from None
 
 
 class OnnxFollower:

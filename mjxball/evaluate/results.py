@@ -136,7 +136,8 @@ def table(results: Sequence[Result], reference: Scenario) -> str:
 def _legend(reference: Scenario, motion: str) -> str:
     sine = f"omega {reference.omega:g}, ampl. {reference.amplitude:g}, " if motion == "sine" else ""
     return (
-        "x-peak is the largest |error along x| from 20 s on; - says that there is none; "
+        "x-peak is the largest |error along x| from 20 s on; act.err how far commands are from the leader's, rms; "
+        "limit the time with a rotor at its limit; - says that there is none; "
         f"{MARK} the reference scenario, which is {sine}mass {reference.mass:g}"
     )
 

@@ -148,12 +148,13 @@ class Progress:
         return [f"{row['steps'] / self._total:.0%}", f"{minutes}:{seconds:02d} left", f"{row['rate'] / 1e3:.1f} k/s"]
 
     def _summary(self, row: Row) -> list[str]:
-        """The return and the first metrics behind it, of the evaluation or exploring."""
+        """The return and the first metrics behind it, of the evaluation or exploring, as far as there are any yet."""
         evaluated = "eval_return" in row
         chosen = [name for name in self._names if name.startswith("eval_") == evaluated and name not in COMMON]
         first, *rest = chosen[:3] if evaluated else ["episode_return", *chosen[:2]]
         said = {first: first} | {name: name.removeprefix("eval_") for name in rest}
-        return [f"{text.replace('_', ' ')} {_number(row.get(name))}" for name, text in said.items()]
+        found = {text: row.get(name) for name, text in said.items()}
+        return [f"{text.replace('_', ' ')} {value:.4g}" for text, value in found.items() if value is not None]
 
     def end_status(self) -> None:
         """Take the status away: what comes is said line by line."""
@@ -172,10 +173,6 @@ def _point(row: Mapping[str, str], began: float) -> Point:
     """A row of `metrics.csv` of a run that began then [s]."""
     numbers = {name: float(text) for name, text in row.items() if text}
     return Point(int(row["steps"]), numbers, began + numbers["seconds"])
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
 
 
 def _rows_until(path: Path, names: Sequence[str], steps: int) -> list[dict[str, str]]:
