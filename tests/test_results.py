@@ -27,7 +27,7 @@ def cells() -> Iterator[tuple[str, Numbers]]:
     found = measured("balance_cells")["summaries"]
     wheres = [f"mass known, {kind}" for kind in ("undisturbed", "noise and 40 ms")]
     wheres += [f"mass unknown, {kind}, trimmed by the follower alone" for kind in ("undisturbed", "noise and 40 ms")]
-    for name in ("balance", "sac", "mpc", "pid", "observer", "lqg-offset-free", "copy"):
+    for name in ("balance", "sac", "mpc", "lqg-slow", "pid", "observer", "lqg-offset-free", "copy"):
         own = [one(found, where=where, policy=name) for where in wheres]
         yield name, [number for row in own for number in (row["all four"], 1e3 * row["median peaks"]["policy"])]
 
