@@ -25,7 +25,7 @@ condition. A flight is **met** if it does not fail and is as good as the best cl
 its peak after 20 s is at most 3 mm larger, it settles (2 %) at most 10 % or 0.1 s later, and it overshoots by at most
 1 % more. The best is taken in each number apart, of `lqg`, `lqg-slow` and `lqg-offset-free` in the same flight; of
 random rigs, of the two LQGs that are told the rig; of Crazyflies, of `lqg`, which so
-meets all of its own. Every load leaves 15 % of the rotors.
+meets all of its own. Every load leaves a [margin](model.md#what-can-be-trimmed) of 15 %.
 
 | track | plant and flights | disturbed |
 |---|---|---|

@@ -50,7 +50,11 @@ def folded(text: str, columns: int) -> str:
 
 
 def fitted_to(stream: TextIO | None, text: str) -> str:
-    """`text` for `stream`: `folded` if that is a terminal. Of a stream that is closed the program has None."""
+    """`text` for `stream`, letters that do not print as blanks, `folded` if that is a terminal.
+
+    Of a stream that is closed the program has None.
+    """
+    text = "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
     return folded(text, columns_of(stream)) if stream and stream.isatty() else text
 
 

@@ -29,6 +29,7 @@ from mjxball.view.main import main as view
 
 PARTS = ("mjxball", "policies", "docs", "tests", "benchmarks")
 FILES = ("*.toml", "*.md", "*.py", "*.cff", "LICENSE", "MANIFEST.in", "constraints.txt")
+KINDS = set(".c .css .csv .gif .h .ipynb .json .md .npz .png .py .svg .toml .txt".split())
 BUILD = "import sys; from setuptools import build_meta; getattr(build_meta, f'build_{sys.argv.pop()}')(sys.argv.pop())"
 
 
@@ -175,6 +176,10 @@ def test_the_sdist_builds_the_same_wheel(built: Path, wheel: Path, tmp_path: Pat
     subprocess.run(command, check=True, cwd=tree, capture_output=True, timeout=120)
     assert contents(tmp_path / wheel.name) == contents(wheel)
     assert {"CHANGELOG.md", "CITATION.cff", "constraints.txt"} <= {path.name for path in tree.iterdir()}
+    # What the pages and tests of it read: nothing of a kind that the repository keeps is left out.
+    for part in ("docs", "tests", "benchmarks", "policies"):
+        there = {path.relative_to(REPOSITORY) for path in (REPOSITORY / part).rglob("*.*") if path.suffix in KINDS}
+        assert there <= {path.relative_to(tree) for path in (tree / part).rglob("*")}
 
 
 def test_a_source_tree_finds_the_policies_beside_it() -> None:

@@ -49,9 +49,7 @@ def tracks_of(name: str) -> dict[str, Any]:
 
 def test_the_table_of_followers_is_the_leaderboards() -> None:
     """Every row, from the entry that the page shows."""
-    rows = re.findall(
-        r"^\**`([\w-]+)`.*? \| (.+?) \| (.+?) \| (.+?) \| (.+?) \| (.+)$", README, flags=re.MULTILINE
-    )
+    rows = re.findall(r"^\**`([\w-]+)`.*? \| (.+?) \| (.+?) \| (.+?) \| (.+?) \| (.+)$", README, flags=re.MULTILINE)
     assert {"copy", "adaptive", "pid", "observer", "lqg-offset-free", "mpc", "sac", "balance"} <= {
         row[0] for row in rows
     }

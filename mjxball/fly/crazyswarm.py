@@ -24,6 +24,7 @@ LARGEST, MOST_ALIASES = 2**20, 20  # [bytes]; of a file
 WRITTEN = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
 OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
 MERGE = "tag:yaml.org,2002:merge"  # the key <<
+VERSIONS = (1, 2, 3)  # of the file
 NEAR = 0.1  # [m] that a start may be beside the mount
 
 
@@ -98,6 +99,11 @@ def read_pair(path: Path, leader: str | None = None, follower: str | None = None
         if _enabled(one, f"{path}: robot {name}")
         and _type(one, types, f"{path}: robot {name}").get("connection") != "none"
     }
+    if odd := [name for name in flying if not name.isprintable()]:
+        raise InputError(f"{path}: the name {odd[0][:60]!r} of a robot cannot be printed")
+    version = data.get("fileversion", VERSIONS[-1])
+    if type(version) is not int or version not in VERSIONS:
+        raise InputError(f"{path}: fileversion {str(version)[:60]} is none of {', '.join(map(str, VERSIONS))}")
     names, chosen = _choose(path, list(flying), [leader, follower])
     found = [_robot(f"{path}: robot {name}", name, flying[name], types, data) for name in names]
     if found[0].uri.casefold() == found[1].uri.casefold():
@@ -226,7 +232,7 @@ def _place(value: Any, where: str) -> np.ndarray | None:
 def _number(value: Any, where: str) -> float:
     """YAML 1.1 takes 1e-3, which has no point, for a text; Crazyswarm2's own file has it."""
     try:
-        number = float(value) if isinstance(value, str | int | float) else math.nan
+        number = float(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else math.nan
     except (ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):

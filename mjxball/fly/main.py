@@ -227,6 +227,8 @@ def check_log(log: Path, viewed: bool) -> None:
     """Raise InputError if the new file `log` cannot be written, or is to be `viewed` and cannot."""
     if log.exists():
         raise InputError(f"log file {log} exists; choose another name")
+    if log.suffix not in (".jsonl", ".mcap"):
+        raise InputError(f"log file {log} must end in .jsonl or .mcap; mjxball.export makes other formats of it")
     if not log.absolute().parent.is_dir():
         raise InputError(f"the directory of log file {log} does not exist")
     if log.suffix == ".mcap" and importlib.util.find_spec("mcap_ros2") is None:

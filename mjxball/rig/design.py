@@ -34,9 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _design(options: argparse.Namespace) -> int:
-    settings = cli.plant_setup(options.plant)
     if options.out:
         cli.output_file(options.out, ".svg")
+    settings = cli.plant_setup(options.plant)
     held = balanced(settings)
     for line in report(settings, held):
         say(line)
@@ -65,7 +65,7 @@ def report(settings: Config, held: float) -> list[str]:
     loads = (f"{heaviest_object(settings, part * limit):.3g} kg at {part * limit:.3g} m" for part in SHARES)
     return [
         f"{plant.count} drones, {total_mass(plant):.4g} kg in all: hovering takes {share:.0%} of the rotors' force",
-        f"the rig {can} from O, with {settings.scenario.trim_margin:.0%} of what rotors and commands reach left",
+        f"the rig {can} from O, and keeps {settings.scenario.trim_margin:.0%} of what hovering leaves of rotors and commands",
         f"the heaviest object that it balances, by the distance of its CG from O along {axis}: {', '.join(loads)}",
     ]
 

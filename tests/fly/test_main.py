@@ -37,6 +37,8 @@ REFUSALS = [
     ([TRANSPORT, *URIS, "--goal", "0", "0", "inf"], "--goal must be"),
     ([TRANSPORT, *URIS, "--goal", "1.4", "0", "0.4"], "beyond the fence"),
     ([TRANSPORT, *URIS, "--log", TRANSPORT], "choose another name"),
+    ([TRANSPORT, *URIS, "--log", "flight.parquet"], "must end in .jsonl or .mcap"),
+    ([TRANSPORT, *URIS, "--log", "flight.MCAP"], "must end in .jsonl or .mcap"),
     ([TRANSPORT, *URIS, "--log", "/no/such/place/log.jsonl"], "does not exist"),
     ([TRANSPORT, *URIS, "--loss", "0.1"], "--loss is for --rehearse only"),
     ([TRANSPORT, "--rehearse", "--loss", "2"], "--loss must be 0 to 1"),
