@@ -35,8 +35,8 @@ meets all of its own. Every load leaves a [margin](model.md#what-can-be-trimmed)
 | any rig | rigs that no training draws, masses and thrusts not as believed | noise, 20 ms |
 | two Crazyflies | simulated 2.1 with a ball, masses and thrusts off | noise / 2, drift, 30 ms, the radio's resolution |
 
-`balance`, `sac`, `universal`, `flight` and `paper` are [shipped](followers.md#trained), `transport` and `robust`
-are in `policies/archive/`.
+`balance`, `sac`, `universal`, `flight` and `paper` are [shipped](followers.md#trained). `transport` (of the preset
+`transport-large`, 2 million steps) and `robust` are in `policies/archive/`.
 `transport-sac`, `-ppo` and `-gradient` are what `python train.py transport --physics newton-euler --algorithm sac`,
 `ppo` or `gradient` comes to within a minute and a half on two cores. `brax-*`, `sb3-*` and `sbx-sac` are Brax's,
 Stable-Baselines3's and SBX's own SAC and PPO, of seed 0, in the same environment for as many steps: `python
@@ -60,8 +60,8 @@ python eval.py --benchmark my_policy.npz --out my_policy.json
 ```
 
 `my_policy.npz` may be an ONNX file with the inputs of [our exports](policy-file.md#export) (extra `onnx`), or
-`module:Class` ([your own follower](howto/own-baseline.md)). A track takes up to ten minutes on two cores; `--tracks pair` flies one. A
-track whose plants the follower refuses is left out. Add the file to `benchmarks/leaderboard/`, run
+`module:Class` ([your own follower](howto/own-baseline.md)). A track takes up to ten minutes on two cores; `--tracks
+pair` flies one. A track whose plants the follower refuses is left out. Add the file to `benchmarks/leaderboard/`, run
 `python docs/leaderboard.py`, and open a pull request. We repeat it with `--draw`, on flights that nobody has seen.
 """
 

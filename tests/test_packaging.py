@@ -29,7 +29,10 @@ from mjxball.view.main import main as view
 
 PARTS = ("mjxball", "policies", "docs", "tests", "benchmarks")
 FILES = ("*.toml", "*.md", "*.py", "*.cff", "LICENSE", "MANIFEST.in", "constraints.txt")
-KINDS = set(".c .css .csv .gif .h .ipynb .json .md .npz .png .py .svg .toml .txt".split())
+KINDS = {
+    *(".c", ".css", ".csv", ".gif", ".h", ".ipynb", ".json"),
+    *(".md", ".npz", ".png", ".py", ".svg", ".toml", ".txt"),
+}
 BUILD = "import sys; from setuptools import build_meta; getattr(build_meta, f'build_{sys.argv.pop()}')(sys.argv.pop())"
 
 

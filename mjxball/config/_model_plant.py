@@ -91,7 +91,7 @@ def plant_of(model: Model, said: Mapping[str, Any], count: int | None) -> tuple[
     _assume_load(drones, model, settings)
     if not any(path.startswith(("attitude.", "autopilot.", "leader.")) for path in said):
         settings.lines.append("assumed attitude and leader: loop and gains of the preset")
-    return settings.found, settings.lines
+    return settings.found, sorted(settings.lines, key=lambda line: line.startswith("warning"))  # these are read last
 
 
 class _Cross(NamedTuple):
@@ -136,7 +136,9 @@ def _numbers(drone: ModelDrone, layout: str, settings: _Settings) -> dict[str, A
             turned += math.pi / 2 if spins[0] < 0 else 0.0
         else:
             signs = " ".join("+" if spin > 0 else "-" for spin in spins)
-            settings.lines.append(f"assumed yaw gears of {_name(drone)} + - + -: around it they go {signs}")
+            settings.lines.append(
+                f"warning: yaw gears of {_name(drone)} go {signs} around it, and are taken to go + - + -"
+            )
     turned = (turned + math.pi / 2) % math.pi - math.pi / 2
     turned = 0.0 if abs(turned) < 1e-9 else turned
     c, s = math.cos(turned), math.sin(turned)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -42,7 +44,7 @@ class Outside:
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """See `Follower.__call__`; InputError if it raises, or answers what is no command."""
-        return answered(self.name, _guarded(self.name, self._answer, observation), observation)
+        return answered(self.name, _guarded(self.name, self._answer, observation, given=observation), observation)
 
 
 class OutsideLaw:
@@ -54,11 +56,11 @@ class OutsideLaw:
 
     def start(self, observation: Any) -> Any:
         """See `Law.start`."""
-        return _guarded(self.name, self._law.start, observation)
+        return _guarded(self.name, self._law.start, observation, given=observation)
 
     def step(self, state: Any, observation: Any, privileged: Any) -> Any:
         """See `Law.step`."""
-        answer = _guarded(self.name, self._law.step, state, observation, privileged)
+        answer = _guarded(self.name, self._law.step, state, observation, privileged, given=observation)
         if not isinstance(answer, tuple) or len(answer) != 2:
             raise InputError(
                 f"follower {self.name} answered {type(answer).__name__}; a law's step gives (state, command)"
@@ -77,13 +79,16 @@ def _outside(name: str, made: Any, config: Config) -> Follower:
     )
 
 
-def _guarded(name: str, function: Any, *arguments: Any) -> Any:
+def _guarded(name: str, function: Any, *arguments: Any, given: Any = None) -> Any:
     try:
         return function(*arguments)
     except InputError:
         raise
     except FOREIGN as error:  # whatever somebody else's code raises
-        raise InputError(f"follower {name} raised {said(error)}") from None
+        *_, last = traceback.extract_tb(error.__traceback__)
+        observed = "" if given is None else f", given observations of shape {np.shape(given)}"
+        where = f"in {Path(last.filename).name} line {last.lineno}"
+        raise InputError(f"follower {name} raised {said(error)}, {where}{observed}") from None
 
 
 def answered(name: str, command: Any, observation: Any) -> np.ndarray:

@@ -65,7 +65,7 @@ def report(settings: Config, held: float) -> list[str]:
     loads = (f"{heaviest_object(settings, part * limit):.3g} kg at {part * limit:.3g} m" for part in SHARES)
     return [
         f"{plant.count} drones, {total_mass(plant):.4g} kg in all: hovering takes {share:.0%} of the rotors' force",
-        f"the rig {can} from O, and keeps {settings.scenario.trim_margin:.0%} of what hovering leaves of rotors and commands",
+        f"the rig {can} from O, keeping {settings.scenario.trim_margin:.0%} of what hovering leaves",
         f"the heaviest object that it balances, by the distance of its CG from O along {axis}: {', '.join(loads)}",
     ]
 

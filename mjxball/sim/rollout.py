@@ -182,6 +182,9 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
     parts = [slice(end - len(part), end) for end, (_, part) in zip(ends, flights, strict=True)]
     followers = [follower for follower, _ in flights]
     for follower in followers:
+        if hasattr(follower, "step") and not hasattr(follower, "reset"):
+            name = type(follower).__name__
+            raise InputError(f"{name} is a law; mjxball.control.followers.Baseline({name}(config), config) flies it")
         follower.reset()
 
     told = any(isinstance(follower, Baseline) for follower in followers)

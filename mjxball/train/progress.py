@@ -145,7 +145,11 @@ class Progress:
         """Share of the steps that are done, time left, and steps per second."""
         left = max(self._total - row["steps"], 0) * self._members / max(row["rate"], 1e-9) - since
         minutes, seconds = divmod(max(int(left), 0), 60)
-        return [f"{row['steps'] / self._total:.0%}", f"{minutes}:{seconds:02d} left", f"{row['rate'] / 1e3:.1f} k/s"]
+        return [
+            f"{min(row['steps'] / self._total, 1.0):.0%}",
+            f"{minutes}:{seconds:02d} left",
+            f"{row['rate'] / 1e3:.1f} k/s",
+        ]
 
     def _summary(self, row: Row) -> list[str]:
         """The return and the first metrics behind it, of the evaluation or exploring, as far as there are any yet."""

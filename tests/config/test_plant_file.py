@@ -106,7 +106,11 @@ REFUSED = {
     "no setting of a plant": ("[sac]\nalpha = 1", "may set"),
     "unknown base": ('base = "team5"', "base must be one of"),
     "unknown preset": ('preset = "nobody"\n' + RING, "is none of"),
-    "unknown key": (RING.replace("carrier_mass", "carrier_weight"), "plant.carrier_weight is not a setting"),
+    "unknown key": (
+        RING.replace("carrier_mass", "carrier_weight"),
+        "plant.carrier_weight is not a setting; `train.py --help all` lists them",
+    ),
+    "misspelt key": (RING.replace("carrier_mass", "carier_mass"), "setting (did you mean plant.carrier_mass?)"),
     "unknown table": ("[wings]\n" + RING, "not wings"),
     "mass beyond all floats": (RING + f"mass = 1{'0' * 400}", "is not finite"),
     "object_mass beyond all floats": (RING.replace("[plant]", f"[plant]\ngravity = 1{'0' * 400}", 1), "is not finite"),
