@@ -97,7 +97,9 @@ def _settings(path: Path, values: dict[str, Any]) -> PlantFile:
     settings = dict(_flat(values))
     for name in (*settings, *values):  # tables without settings are in `values` alone
         if name.partition(".")[0] not in PLANT_PARTS or (name in PLANT_PARTS and name in settings):
-            raise InputError(f"plant file {path} may set {', '.join(PLANT_PARTS)}, not {name}")
+            raise InputError(
+                f"plant file {path} may set {', '.join(PLANT_PARTS)}, beside a model drones and rotors, not {name}"
+            )
     return PlantFile(preset, settings)
 
 
@@ -133,6 +135,14 @@ def _check_inertias(plant: Plant) -> None:
             raise InputError(f"{name} {inertia!r} is that of no body: one number is larger than the sum of the others")
 
 
+def _called(source: Path) -> str:
+    """A plant file, or a model with the file beside it."""
+    beside = source.with_suffix(".toml")
+    if source.suffix.lower() not in MODELS:
+        return f"plant file {source}"
+    return f"model {source} with {beside.name}" if beside.exists() else f"model {source}"
+
+
 def with_plant(
     config: Config, source: Path | str | None, flags: Mapping[str, str] | None = None, found: PlantFile | None = None
 ) -> Config:
@@ -160,4 +170,4 @@ def with_plant(
         text = str(error)
         if source is None or text.startswith(("plant file", "model", "--")):
             raise
-        raise InputError(f"plant file {source}{' with these flags' if flags else ''}: {text}") from None
+        raise InputError(f"{_called(Path(source))}{' with these flags' if flags else ''}: {text}") from None
