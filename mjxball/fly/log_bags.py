@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.errors import InputError, said
-from mjxball.fly.log_sources import HEADER, RECORD, TOPICS, Series
+from mjxball.fly.log_sources import HEADER, RECORD, TOPICS, VARIABLES, WIDTHS, Series
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
 BAGS = (".mcap", ".db3")
@@ -114,6 +114,7 @@ def _contents(path: Path, reader: Any) -> Found:
         now = received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
         apart.setdefault(topic, []).append((received - now) * 1e-9)
         for quantity, numbers in values.items():
+            _check_width(path, topic, quantity, len(numbers))
             times, rows = found.setdefault((drone, quantity, topic), ([], []))
             times.append((now - reader.start_time) * 1e-9)
             rows.append(numbers)
@@ -139,6 +140,13 @@ def _parts(path: Path, reader: Any, topics: set[str]) -> Iterator[tuple[str, int
             ) from None
         for drone, header, values in parts:
             yield topic, received, drone or _last(topic.rpartition("/")[0]), header, values
+
+
+def _check_width(path: Path, topic: str, quantity: str, found: int) -> None:
+    if found != WIDTHS[quantity]:
+        variables = [name for name, one in VARIABLES.items() if one.quantity == quantity]
+        own = [name for name in variables if name.startswith(f"{_last(topic)}.")]
+        raise InputError(f"bag {path}: {topic} has {found} values; expected {', '.join(own)}")
 
 
 def _check_clocks(path: Path, apart: dict[str, list[float]]) -> None:

@@ -10,10 +10,8 @@ import numpy as np
 
 from mjxball.errors import InputError
 from mjxball.fly.limits import NAMES
-from mjxball.fly.log_sources import VARIABLES, Samples, Series
+from mjxball.fly.log_sources import VARIABLES, WIDTHS, Samples, Series
 from mjxball.reading import check_times
-
-WIDTHS = {"position": 3, "quaternion": 4, "velocity": 3, "rates": 3, "sent": 4, "battery": 1}
 
 
 def read_cfclient(path: Path) -> Series:

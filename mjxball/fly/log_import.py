@@ -41,6 +41,14 @@ def is_foreign(path: Path) -> bool:
     return path.is_dir() or path.suffix in (*BAGS, ".csv")
 
 
+def is_recording(path: Path) -> bool:
+    """Whether `path` is a bag, or a folder that is one or has cfclient's two."""
+    if not path.is_dir():
+        return path.suffix in BAGS
+    names = ("metadata.yaml", *NAMES)
+    return any((path / name).exists() for name in names) or any(one.suffix in BAGS for one in path.iterdir())
+
+
 def read(path: Path, remark: Callable[[str], None], assumed: Config | None = None) -> bytes | list[Record]:
     """The lines of a log of ours in the bag `path`, or records made of what another program recorded there.
 

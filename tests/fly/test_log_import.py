@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +95,9 @@ def test_a_bag_of_crazyswarm2(
     """Its names are sorted the other way round than its drones stand. A file in it without its folder does as well."""
     bag = write_bag(tmp_path / "bag", records, sqlite=sqlite, odometry=odometry)
     (file,) = (one for one in bag.iterdir() if one.suffix != ".yaml")
-    for path in (bag, file):
+    for number, path in enumerate((bag, file)):
+        assert call(export, [path, table := tmp_path / f"{number}.csv"]) == 0
+        assert table.read_text().count("\n") == 1 + len(flight.time)
         again = read_recording(path)
         known = MEASURED if odometry else ("time", "position", "quaternion", "sent")
         for name in known:
@@ -270,6 +274,29 @@ def test_bad_input_is_refused_in_one_sentence(
     assert call(evaluate.main, ["--flight", exported, "--plant", "crazyflie", "--out", tmp_path / "drawn"]) == 2
     assert "says which rig flew: drop --plant" in capsys.readouterr().err
     assert not (tmp_path / "drawn").exists()
+
+
+@pytest.mark.parametrize(
+    ("rates", "found"), [(lambda _: 0, 0), (lambda _: 2, 2), (lambda _: 4, 4), (lambda number: 3 - (number > 30), 2)]
+)
+def test_rates_of_another_width_are_refused(rates: Callable[[int], int], found: int, tmp_path: Path, capsys) -> None:
+    """A custom topic has the variables that its user named; all programs say which ones are expected."""
+    bag = write_bag(tmp_path / "bag", turning(np.full(50, 0.3)), odometry=True, rates=rates)
+    assert_refused(bag, rf"/cf(7|231)/gyro has {found} values; expected gyro\.x, gyro\.y, gyro\.z$", tmp_path, capsys)
+
+
+def assert_refused(path: Path, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """All that reads a recording says the one sentence `reason`, a regular expression, and writes nothing."""
+    for main, arguments in (
+        (evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]),
+        (identify.main, [path, "--out", tmp_path / "drawn.json"]),
+        (export, [path, tmp_path / "drawn.csv"]),
+    ):
+        assert call(main, arguments) == 2, path
+        errors = capsys.readouterr().err
+        assert re.search(reason, errors.strip()), errors
+        assert_one_line(errors)
+    assert not list(tmp_path.glob("drawn*"))
 
 
 def moved(record: Record) -> DroneState:
