@@ -23,6 +23,7 @@ from mjxball.fly import flight_log
 from mjxball.fly.log_schema import Record, StatePacket
 from mjxball.fly.packets import DroneState
 from mjxball.fly.recording import Recording, read_recording
+from mjxball.plotting import pyplot
 from mjxball.rig import identify
 from mjxball.rig.log import read_log
 
@@ -105,6 +106,35 @@ def test_a_bag_of_crazyswarm2(
         assert "cf7 is taken for the leader" in " ".join(again.remarks)
         assert ("differences of its poses" in " ".join(again.remarks)) is not odometry
         assert len(read_log(path).setpoints) > 100
+
+
+@pytest.mark.parametrize("ours", [False, True])
+def test_a_figure_has_what_a_recording_has(
+    ours: bool, log: Path, records: list[Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No panel and no entry of the legend is empty; the CG, which no log has, is called assumed."""
+    path = log if ours else write_bag(tmp_path / "bag", records, odometry=True)
+    panels: dict[str, int] = {}
+    legend: list[str] = []
+
+    def keep(figure: Any) -> None:
+        assert all(np.isfinite(line.get_ydata()).any() for panel in figure.axes for line in panel.lines)
+        panels.update({panel.get_ylabel(): len(panel.lines) for panel in figure.axes})
+        legend.extend(text.get_text() for text in figure.legends[0].get_texts())
+        assert "assumed: CG" in figure.legends[0].get_title().get_text()
+
+    monkeypatch.setattr(pyplot(), "close", keep)
+    assert call(evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]) == 0
+    monkeypatch.undo()
+    pyplot().close("all")
+    motion = ["x [m]", "y [m]", "z [m]"]
+    commands = ["roll command [deg]", "pitch command [deg]", "vertical command [m/s²]"]
+    if ours:
+        assert [*panels] == [*motion, "distance to goal [mm]", "assumed CG offset [m]", *commands]
+        assert {"goal", "thin: leader"} < {*legend}
+    else:
+        assert panels == {**dict.fromkeys(motion, 2), "assumed CG offset [m]": 1}
+        assert legend == ["an unknown follower, flown", "the same, simulated"]
 
 
 def test_messages_of_ours_without_the_lines(exported: Path, flight: Recording, tmp_path: Path) -> None:
