@@ -38,6 +38,9 @@ def _read_csv(file: Path) -> dict[str, Samples]:
         if rows and len(rows[-1]) < len(head):
             rows.pop()  # cfclient was ended while it wrote
         try:
+            for number, row in enumerate(rows, start=1):
+                if len(row) != len(head):
+                    raise ValueError(f"row {number} has {len(row)} values; expected {len(head)}")
             table = np.array(rows, float).reshape(-1, len(head))
             if len(table) < 2:
                 raise ValueError("it holds fewer than two rows")

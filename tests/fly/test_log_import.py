@@ -234,13 +234,16 @@ def test_an_mcap_file_that_is_cut_is_read_as_far_as_it_goes(records: list[Record
     bag = in_chunks(write_bag(tmp_path / "bag", records) / "bag.mcap", tmp_path / "chunks.mcap")
     size, counts = bag.stat().st_size, []
     whole = sum(one["kind"] == "state" for one in flight_log.read(bag))
+    folder = tmp_path / "bag"
     for share in np.linspace(0.3, 0.999, 15):
-        cut = truncated(bag, round(share * size), tmp_path / "cut.mcap")
+        cut = truncated(bag, round(share * size), folder / "bag.mcap")
         with pytest.raises(ReaderError):
             McapReader(cut).open()
         told: list[str] = []
-        counts.append(sum(one["kind"] == "state" for one in flight_log.read(cut, told.append)))
-        assert "cut short" in told[0]
+        numbers = [sum(one["kind"] == "state" for one in flight_log.read(one, told.append)) for one in (cut, folder)]
+        assert numbers[0] == numbers[1]
+        assert told[0] == next(text for text in told[1:] if "cut short" in text)
+        counts.append(numbers[0])
     assert counts == sorted(counts)
     assert 0 < counts[0] < counts[-1] == whole
     with pytest.raises(InputError, match=r"bag .* is empty: it holds no message"):
@@ -263,6 +266,7 @@ def test_bad_input_is_refused_in_one_sentence(
     (tmp_path / "text.mcap").write_text("an MCAP file?")
     (tmp_path / "none.mcap").write_bytes(b"")
     (tmp_path / "void.mcap").write_bytes(bag_of_nothing())
+    truncated(tmp_path / "void.mcap", 20, tmp_path / "head.mcap")
     (tmp_path / "noise.db3").write_bytes(bytes(range(256)))
     (tmp_path / "one.csv").write_text("Timestamp,pm.vbat\n1,3.9\n")
     half = write_cfclient(tmp_path / "half", turn, {"leader": 0, "follower": 0})
@@ -273,6 +277,9 @@ def test_bad_input_is_refused_in_one_sentence(
     next((less / "leader").glob("target*")).unlink()
     two = write_cfclient(tmp_path / "back", turn, {"leader": 0, "follower": 0})
     (two / "leader" / "more.csv").write_text("Timestamp,pm.vbat\n20,3.9\n10,3.9\n")
+    short = write_cfclient(tmp_path / "short", turn, {"leader": 0, "follower": 0})
+    gyro = next((short / "leader").glob("turning*"))
+    gyro.write_text(re.sub(r"^(200,.*),.*$", r"\1", gyro.read_text(), flags=re.MULTILINE))
     cases = [
         (write_bag(tmp_path / "idle", turn, commands=False), "holds 0 drones with poses and setpoints; expected two"),
         (write_bag(tmp_path / "other", turn, pose="Pose"), "found /cf231/cmd_vel_legacy (geometry_msgs/Twist)"),
@@ -283,10 +290,16 @@ def test_bad_input_is_refused_in_one_sentence(
         (tmp_path / "text.mcap", "begins with b'an MCAP '; expected an MCAP file"),
         (tmp_path / "none.mcap", "is empty; expected an MCAP file"),
         (tmp_path / "void.mcap", "is empty: it holds no message"),
+        (tmp_path / "head.mcap", "head.mcap ends, or is damaged, within its header; expected a whole one"),
         (tmp_path / "noise.db3", "cannot be read"),
         (tmp_path / "gone.mcap", "does not exist; expected a rosbag2"),
-        (tmp_path / "one.csv", "is of one drone; expected the folder"),
+        (
+            tmp_path / "one.csv",
+            "an export of ours is not read back; expected its .jsonl or .mcap, or of cfclient the folder",
+        ),
         (half, "follower holds no .csv"),
+        (ours / "leader", "expected a rosbag2 file or folder, or cfclient's leader and follower"),
+        (short, "cannot be used: row 21 has 4 values; expected 5"),
         (ours, "begins with 'time,phase'; expected cfclient's Timestamp"),
         (less, "leader has no sent; expected all numbers of it of ctrltarget.roll"),
         (two, "row 2: the time goes back by 0.01 s"),
@@ -313,6 +326,41 @@ def test_rates_of_another_width_are_refused(rates: Callable[[int], int], found: 
     """A custom topic has the variables that its user named; all programs say which ones are expected."""
     bag = write_bag(tmp_path / "bag", turning(np.full(50, 0.3)), odometry=True, rates=rates)
     assert_refused(bag, rf"/cf(7|231)/gyro has {found} values; expected gyro\.x, gyro\.y, gyro\.z$", tmp_path, capsys)
+
+
+def test_bags_with_metadata_or_numbers_that_are_none_are_refused(tmp_path: Path, capsys) -> None:
+    def changed(drone: str, number: int, **fields: Any) -> list[Record]:
+        raw = turn[number]["raw"]
+        own = {"raw": raw._replace(state=raw.state._replace(**fields))}
+        assert turn[number]["drone"] == drone
+        return [{**one, **own} if k == number else one for k, one in enumerate(turn)]
+
+    def later(seconds: float, *drones: str | None) -> list[Record]:
+        return [{**one, "t": one["t"] + seconds * (one.get("drone") in drones)} for one in turn]
+
+    turn = turning(np.full(50, 0.3))
+    nan = np.full(3, np.nan)
+    sent = [{**one, "sent": one["sent"] * np.nan} if "sent" in one else one for one in turn]
+    bags = {
+        "no place": (changed("leader", 30, position=nan), "position of cf7 is not finite in 1 of 50 rows; expected"),
+        "no rate": (changed("follower", 31, rates=nan), "body rate of cf231 is not finite in 1 of 50 rows; expected"),
+        "no order": (sent, r"setpoint of cf(7|231) is not finite in 50 of 50 rows; expected finite numbers"),
+        "one state": ([*turn[:2], *turn[2::3]], r"position of cf(7|231) is there once; expected it twice or more"),
+        "late": (
+            later(9, "leader", "follower"),
+            r"of cf(7|231) begins at 9\.0 s, .* ends at 0\.5 s; expected them to ov",
+        ),
+        "late pair": (
+            later(9, "follower"),
+            r"of cf231 begins at 9\.0 s, .* of cf7 ends at 0\.5 s; expected them to ov",
+        ),
+    }
+    for name, (records, reason) in bags.items():
+        assert_refused(write_bag(tmp_path / name, records, odometry=True), reason, tmp_path, capsys)
+    bag = write_bag(tmp_path / "version", turn)
+    metadata = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(re.sub("version: 9", "version: x", metadata))
+    assert_refused(bag, r"has a metadata\.yaml with a value of another type; expected the one that", tmp_path, capsys)
 
 
 def assert_refused(path: Path, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
