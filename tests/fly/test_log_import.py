@@ -193,6 +193,8 @@ def test_cfclient_s_two_clocks_are_brought_together(tmp_path: Path) -> None:
     tick = next(one for one in found if one["kind"] == "tick")
     np.testing.assert_allclose(tick["sent"], [[1.0, 2.0, 3.0, 4e4]] * 2)
     assert any("its" not in text and "-847.5" in text for text in told)
+    assert call(export, [path, tmp_path / "flight.csv"]) == 0
+    assert (tmp_path / "flight.csv").read_text().startswith("time,phase,")
 
 
 def test_cfclient_s_drones_on_two_sticks_are_refused(tmp_path: Path) -> None:
