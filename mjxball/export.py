@@ -2,7 +2,8 @@
 
 Of a policy file, or a run's newest checkpoint, OUT ends in .npz (policy file), .onnx (ONNX model) or .h (C99 header);
 see docs/policy-file.md. With --crazyflie it is a new directory of apps for both drones; see docs/onboard.md. Of a
-flight log, .jsonl or .mcap, it ends in .mcap (ROS 2 messages), .csv or .parquet; see docs/flight-log.md.
+flight log, .jsonl, a bag or cfclient's folder, it ends in .mcap (ROS 2 messages; of .jsonl alone), .csv or .parquet;
+see docs/flight-log.md.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line of `python -m mjxball.export`."""
     about, formats = __doc__.split("\n\n")
     parser = make_parser("python -m mjxball.export", about, epilog=formats)
-    about_source = "policy file, name of a shipped one, run directory of train.py, or flight log"
+    about_source = "policy file, name of a shipped one, run directory of train.py, flight log, or bag"
     parser.add_argument("source", metavar="POLICY|RUN|LOG", type=policy_path, help=about_source)
     parser.add_argument("out", metavar="OUT", type=Path, help="file to write, whose ending says what; must not exist")
     parser.add_argument("--crazyflie", action="store_true", help="OUT is a directory: apps for a pair of Crazyflies")
@@ -136,7 +137,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
 
     def command() -> int:
-        if options.source.suffix in (".jsonl", ".mcap"):
+        from mjxball.fly.log_import import is_recording
+
+        if options.source.suffix == ".jsonl" or is_recording(options.source):
             if options.crazyflie or options.int8 or options.plant or options.drone is not None:
                 raise InputError("a flight log takes no other flag")
             for remark in export_log(options.source, options.out):

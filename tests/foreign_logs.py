@@ -6,7 +6,7 @@ Types, topics and signs are those of Crazyswarm2's server in C++ and of cfclient
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,12 @@ def write_bag(
     pose: str = "PoseStamped",
     commands: bool = True,
     late: int = 0,
+    rates: Callable[[int], int] = lambda number: 3,
 ) -> Path:
-    """The new folder `path` of a bag: poses or `odometry`, rates, battery and setpoints; received `late` [ns]."""
+    """The new folder `path` of a bag: poses or `odometry`, rates, battery and setpoints; received `late` [ns].
+
+    Message `number` of `odometry`'s rates has `rates(number)` values.
+    """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -51,7 +55,7 @@ def write_bag(
                 channels[topic] = writer.add_connection(topic, kind, typestore=store)
             writer.write(channels[topic], time + late, store.serialize_cdr(message, kind))
 
-        for record in records:
+        for number, record in enumerate(records):
             time = START + round(record["t"] * 1e9)
             stamp = make("builtin_interfaces/Time", *divmod(time, 10**9))
             header = make("std_msgs/Header", stamp, "world")
@@ -74,8 +78,8 @@ def write_bag(
                     make("geometry_msgs/TwistWithCovariance", moving, np.zeros(36)),
                 )
                 put(f"/{drone}/odom", time, make("nav_msgs/Odometry", header, drone, *parts))
-                rates = np.degrees(state.rates).astype(np.float32)
-                put(f"/{drone}/gyro", time, make("crazyflie_interfaces/LogDataGeneric", header, 0, rates))
+                values = np.resize(np.degrees(state.rates), rates(number)).astype(np.float32)
+                put(f"/{drone}/gyro", time, make("crazyflie_interfaces/LogDataGeneric", header, 0, values))
                 put(f"/{drone}/status", time, make("crazyflie_interfaces/Status", header, 0, state.battery, 0))
             elif pose == "PoseStamped":
                 put(f"/{drone}/pose", time, make("geometry_msgs/PoseStamped", header, placed))

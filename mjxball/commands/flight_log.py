@@ -11,7 +11,7 @@ from mjxball import cli
 from mjxball.control import rotations
 from mjxball.errors import InputError
 from mjxball.evaluate.metrics import measure, rotor_limits
-from mjxball.evaluate.plots import draw_flights
+from mjxball.evaluate.plots import PANELS, draw_flights
 from mjxball.evaluate.results import Result, scenario_title
 from mjxball.fly.log_import import UNKNOWN
 from mjxball.fly.recording import Recording, fly_again, read_recording
@@ -23,6 +23,7 @@ from mjxball.terminal import warn
 
 MOMENTS = (1.0, 2.0, 5.0, 10.0)  # [s] after the motors first turned
 DIVERGED = 0.25  # [m] of difference from which on the open-loop simulation is not drawn
+ASSUMED = tuple((kind, index, f"assumed {text}" if kind == "cg_offset" else text) for kind, index, text in PANELS)
 
 
 def evaluate_log(path: Path, out: Path, look: str = "screen", plant: Path | None = None) -> int:
@@ -82,12 +83,12 @@ def trajectory_of(recording: Recording) -> Trajectory:
 def draw(recorded: Result, simulated: Result, guided: int, out: Path) -> Path:
     """Draw a recorded flight, and the simulated one until it is `DIVERGED`, into `out`; return the file.
 
-    The goal is drawn for the first `guided` rows.
+    The goal is drawn for the first `guided` rows. The log does not tell the object's mass and CG: they are assumed.
     """
     out.mkdir(parents=True, exist_ok=True)
     both = [without_goal(recorded, guided), _cut(without_goal(simulated, guided), valid_rows(recorded, simulated))]
     path = out / f"flight.{'png' if file_format() == 'svg' else file_format()}"
-    draw_flights(both, scenario_title(recorded), path)
+    draw_flights(both, f"assumed: {scenario_title(recorded)}", path, ASSUMED)
     return path
 
 

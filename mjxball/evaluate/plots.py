@@ -154,11 +154,17 @@ def heat_maps(scores: Sequence[Score]) -> str:
 def draw_flights(
     results: Sequence[Result], title: str, path: Path, panels: Sequence[tuple[str, int | None, str]] = PANELS
 ) -> None:
-    """Draw all followers of one scenario over time, one of `PANELS` below the other: see `_draw_panel`."""
+    """Draw all followers of one scenario over time, one of `PANELS` below the other.
+
+    Position with the goal dotted, distance, CG offset (y dotted), or commands, the leader's thin. A panel or a curve
+    without a finite number is left out.
+    """
     plt = pyplot()
+    panels = [panel for panel in panels if any(_is_known(_values(one.flight, *panel[:2])) for one in results)]
     wide = 7.5 if file_format() == "svg" else plt.rcParams["figure.figsize"][0]
     size = wide, 1.0 + len(panels) * (0.5 + 0.14 * wide)
-    figure, axes = plt.subplots(len(panels), 1, sharex=True, figsize=size, layout="constrained")
+    figure, grid = plt.subplots(len(panels), 1, sharex=True, figsize=size, layout="constrained", squeeze=False)
+    axes = grid[:, 0]
     looks = follower_styles(result.follower for result in results)
     for axis, panel in zip(axes, panels, strict=True):
         _draw_panel(axis, results, looks, *panel)
@@ -168,32 +174,51 @@ def draw_flights(
     save(figure, path)
 
 
+def _is_known(values: np.ndarray) -> bool:
+    return bool(np.isfinite(values).any())
+
+
+def _values(flight: Trajectory, kind: str, index: int | None) -> np.ndarray:
+    """(curves, T) what a panel shows of `flight`; of commands the leader's is the last."""
+    if kind == "position":
+        return flight.position[None, :, index]
+    if kind == "error":
+        return distance(flight)[None]
+    if kind == "cg_offset":
+        return flight.cg_offset.reshape(len(flight.time), -1).T
+    values = np.vstack([of_followers(flight, index or 0), flight.leader_command[None, :, index]])
+    return values if index == 2 else np.degrees(values)
+
+
 def _draw_panel(
     axis: Any, results: Sequence[Result], looks: dict[str, dict[str, Any]], kind: str, index: int | None, label: str
 ) -> None:
-    """Position with the goal dotted, distance, CG offset (y dotted), or commands, the leader's thin."""
     time = results[0].flight.time
+
+    def plot(values: np.ndarray, **given: Any) -> None:
+        if _is_known(values):
+            axis.plot(time, values, **given)
+
     if kind == "position":
-        axis.plot(time, results[0].flight.target[:, index], color=INK, linestyle=":", linewidth=1, label="goal")
+        plot(results[0].flight.target[:, index], color=INK, linestyle=":", linewidth=1, label="goal")
     for number, result in enumerate(results):
-        flight, look = result.flight, line(looks[result.follower])
-        if kind == "position":
-            axis.plot(time, flight.position[:, index], label=result.follower, **look)
-        elif kind == "error":
-            axis.plot(time, distance(flight), **look)
-        elif kind == "cg_offset":
-            if number and np.array_equal(flight.cg_offset, results[0].flight.cg_offset):
+        curves, look = _values(result.flight, kind, index), line(looks[result.follower])
+        if kind == "cg_offset":
+            if number and np.array_equal(result.flight.cg_offset, results[0].flight.cg_offset):
                 continue
             shade = look["color"] if number else INK
-            for along, dash, letter in zip(flight.cg_offset.reshape(len(time), -1).T, CG_STYLES, "xy", strict=False):
-                shown = f"CG along {letter}" if flight.cg_offset.ndim > 1 and not number else None
-                axis.plot(time, along, color=shade, linewidth=1.2, linestyle=dash, label=shown)
-        else:
-            factor = 1.0 if index == 2 else 57.29577951308232
-            for followed in of_followers(flight, index or 0):
-                axis.plot(time, factor * followed, **look)
-            thin = {**look, "linewidth": max(0.5, 0.4 * look["linewidth"]), "label": None if number else "thin: leader"}
-            axis.plot(time, factor * flight.leader_command[:, index], **thin)
+            for along, dash, letter in zip(curves, CG_STYLES, "xy", strict=False):
+                shown = f"CG along {letter}" if len(curves) > 1 and not number else None
+                plot(along, color=shade, linewidth=1.2, linestyle=dash, label=shown)
+            continue
+        *followed, last = curves
+        for values in followed:
+            plot(values, **look)
+        if kind == "position":
+            look["label"] = result.follower
+        elif kind == "command":
+            look |= {"linewidth": max(0.5, 0.4 * look["linewidth"]), "label": None if number else "thin: leader"}
+        plot(last, **look)
     if kind == "error":
         logarithmic(axis)
     low, high = axis.get_ylim()

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.errors import InputError, said
-from mjxball.fly.log_sources import HEADER, RECORD, TOPICS, Series
+from mjxball.fly.log_sources import HEADER, RECORD, TOPICS, VARIABLES, WIDTHS, Series
 
 MAGIC = b"\x89MCAP0\r\n"  # first and last bytes of an MCAP file
 BAGS = (".mcap", ".db3")
@@ -43,16 +43,23 @@ def read_bag(path: Path, remark: Callable[[str], None]) -> Found:
         except InputError:
             raise
         except Exception as error:  # of any of the libraries that read it
+            if "Invalid bag metadata" in str(error):
+                raise InputError(
+                    f"bag {path} has a metadata.yaml with a value of another type; expected the one that rosbag2 wrote"
+                ) from None
             raise InputError(f"bag {path} cannot be read: {said(error)}") from None
 
 
 def _files(path: Path) -> list[Path]:
-    if path.is_file() or (path / "metadata.yaml").is_file():
+    """The bag `path` itself, or the files of a folder that has no metadata, or one for files that are not whole."""
+    if path.is_file():
         return [path]
     found = sorted(one for one in path.iterdir() if one.suffix in BAGS and one.is_file()) if path.is_dir() else []
+    if (path / "metadata.yaml").is_file() and all(one.suffix != ".mcap" or _ends(one) for one in found):
+        return [path]
     if not found:
         what = "is a folder without metadata.yaml, .mcap or .db3" if path.exists() else "does not exist"
-        raise InputError(f"bag {path} {what}; expected a rosbag2 file or folder")
+        raise InputError(f"bag {path} {what}; expected a rosbag2 file or folder, or cfclient's leader and follower")
     return found
 
 
@@ -65,27 +72,38 @@ def _whole(path: Path, spare: Path, remark: Callable[[str], None]) -> Path:
         if begin != MAGIC:
             what = "is empty" if not begin else f"begins with {begin!r}"
             raise InputError(f"bag {path} {what}; expected an MCAP file, which begins with {MAGIC!r}")
-        stream.seek(-len(MAGIC), 2)
-        if stream.tell() and stream.read() == MAGIC:
-            return path
+    if _ends(path):
+        return path
     copy = spare / path.name
     remark(f"it is cut short, without a footer: {_copy_sound(path, copy)} messages are whole")
     return copy
 
 
+def _ends(path: Path) -> bool:
+    """Whether the MCAP file `path` has an end."""
+    with path.open("rb") as stream:
+        size = stream.seek(0, 2)
+        stream.seek(max(0, size - len(MAGIC)))
+        return size > len(MAGIC) and stream.read() == MAGIC
+
+
 def _copy_sound(path: Path, copy: Path) -> int:
-    """Write what comes before the first damage of the MCAP file `path` to the new file `copy`; how many messages."""
+    """Write what comes before the first damage of the MCAP file `path` to the new file `copy`; how many messages.
+
+    Raises InputError: not even the header does.
+    """
     from mcap.records import Channel, Header, Message, Schema
     from mcap.stream_reader import StreamReader
     from mcap.writer import Writer
 
-    count, schemas, channels = 0, {0: 0}, dict[int, int]()
+    count, schemas, channels, begun = 0, {0: 0}, dict[int, int](), False
     with path.open("rb") as stream, copy.open("xb") as target:
         writer = Writer(target)
         with contextlib.suppress(Exception):  # whatever a record raises that is not whole
             for one in StreamReader(stream, validate_crcs=True).records:
                 if isinstance(one, Header):
                     writer.start(one.profile)
+                    begun = True
                 elif isinstance(one, Schema):
                     schemas[one.id] = writer.register_schema(one.name, one.encoding, one.data)
                 elif isinstance(one, Channel):
@@ -94,6 +112,8 @@ def _copy_sound(path: Path, copy: Path) -> int:
                 elif isinstance(one, Message):
                     writer.add_message(channels[one.channel_id], one.log_time, one.data, one.publish_time)
                     count += 1
+        if not begun:
+            raise InputError(f"bag {path} ends, or is damaged, within its header; expected a whole one, and messages")
         writer.finish()
     return count
 
@@ -114,6 +134,7 @@ def _contents(path: Path, reader: Any) -> Found:
         now = received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
         apart.setdefault(topic, []).append((received - now) * 1e-9)
         for quantity, numbers in values.items():
+            _check_width(path, topic, quantity, len(numbers))
             times, rows = found.setdefault((drone, quantity, topic), ([], []))
             times.append((now - reader.start_time) * 1e-9)
             rows.append(numbers)
@@ -139,6 +160,13 @@ def _parts(path: Path, reader: Any, topics: set[str]) -> Iterator[tuple[str, int
             ) from None
         for drone, header, values in parts:
             yield topic, received, drone or _last(topic.rpartition("/")[0]), header, values
+
+
+def _check_width(path: Path, topic: str, quantity: str, found: int) -> None:
+    if found != WIDTHS[quantity]:
+        variables = [name for name, one in VARIABLES.items() if one.quantity == quantity]
+        own = [name for name in variables if name.startswith(f"{_last(topic)}.")]
+        raise InputError(f"bag {path}: {topic} has {found} values; expected {', '.join(own)}")
 
 
 def _check_clocks(path: Path, apart: dict[str, list[float]]) -> None:

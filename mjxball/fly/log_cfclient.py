@@ -10,10 +10,8 @@ import numpy as np
 
 from mjxball.errors import InputError
 from mjxball.fly.limits import NAMES
-from mjxball.fly.log_sources import VARIABLES, Samples, Series
+from mjxball.fly.log_sources import VARIABLES, WIDTHS, Samples, Series
 from mjxball.reading import check_times
-
-WIDTHS = {"position": 3, "quaternion": 4, "velocity": 3, "rates": 3, "sent": 4, "battery": 1}
 
 
 def read_cfclient(path: Path) -> Series:
@@ -40,6 +38,9 @@ def _read_csv(file: Path) -> dict[str, Samples]:
         if rows and len(rows[-1]) < len(head):
             rows.pop()  # cfclient was ended while it wrote
         try:
+            for number, row in enumerate(rows, start=1):
+                if len(row) != len(head):
+                    raise ValueError(f"row {number} has {len(row)} values; expected {len(head)}")
             table = np.array(rows, float).reshape(-1, len(head))
             if len(table) < 2:
                 raise ValueError("it holds fewer than two rows")

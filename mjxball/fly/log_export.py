@@ -24,6 +24,7 @@ from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.fly import flight_log
 from mjxball.fly.limits import NAMES
+from mjxball.fly.log_import import is_foreign
 from mjxball.fly.log_schema import Record
 from mjxball.fly.log_sources import HEADER, RECORD
 from mjxball.fly.messages import Encoder
@@ -93,8 +94,8 @@ class Recorder(Encoder):
 
 def write_mcap(path: Path, log: Path) -> list[str]:
     """Write the flight log `log` as the MCAP file `path`; returns what a reader should know. Raises InputError."""
-    if log.suffix == ".mcap":
-        raise InputError(f"{log} is an MCAP file already")
+    if is_foreign(log):
+        raise InputError(f"{log} is not converted to .mcap; expected a flight log of JSON lines, .jsonl")
     remarks: list[str] = []
     stream = io.BytesIO()
     recorder = Recorder(stream)

@@ -41,6 +41,14 @@ def is_foreign(path: Path) -> bool:
     return path.is_dir() or path.suffix in (*BAGS, ".csv")
 
 
+def is_recording(path: Path) -> bool:
+    """Whether `path` is a bag, or a folder that is one or has cfclient's two."""
+    if not path.is_dir():
+        return path.suffix in BAGS
+    names = ("metadata.yaml", *NAMES)
+    return any((path / name).exists() for name in names) or any(one.suffix in BAGS for one in path.iterdir())
+
+
 def read(path: Path, remark: Callable[[str], None], assumed: Config | None = None) -> bytes | list[Record]:
     """The lines of a log of ours in the bag `path`, or records made of what another program recorded there.
 
@@ -50,7 +58,8 @@ def read(path: Path, remark: Callable[[str], None], assumed: Config | None = Non
     config = configs.preset("flight") if assumed is None else assumed
     if path.suffix == ".csv":
         raise InputError(
-            f"{path} is of one drone; expected the folder of leader and follower, each with its .csv files"
+            f"{path} is CSV, and an export of ours is not read back; expected its .jsonl or .mcap, or of cfclient the "
+            "folder of leader and follower"
         )
     if path.is_dir() and any((path / name).is_dir() for name in NAMES):
         pair = _of_cfclient(path, remark)
@@ -80,7 +89,9 @@ def _of_cfclient(path: Path, remark: Callable[[str], None]) -> list[Drone]:
             "two drones on one stick"
         )
     remark(f"the follower's clock is put {late:+.3f} s to the leader's, where their rates agree")
-    return [pair[0], {name: (times + late, rows) for name, (times, rows) in pair[1].items()}]
+    pair[1] = {name: (times + late, rows) for name, (times, rows) in pair[1].items()}
+    _check_overlap(path, dict(zip(NAMES, pair, strict=True)))
+    return pair
 
 
 def _lag(one: Samples, other: Samples) -> tuple[float, float]:
@@ -105,13 +116,16 @@ def _of_bag(path: Path, found: Found, rig: Rig, remark: Callable[[str], None]) -
     for name, own in whole.items():
         _check(path, own, name)
     if whole.keys() >= set(NAMES):
-        return [whole[name] for name in NAMES]
+        whole = {name: whole[name] for name in NAMES}
     if len(whole) != 2:
         names = [f"/DRONE/{last} ({TOPICS[last].type})" for last in ("pose", "odom", "cmd_vel_legacy")]
         raise InputError(
             f"bag {path} holds {len(whole)} drones with poses and setpoints; expected two, each with {names[0]} or "
             f"{names[1]}, and {names[2]}; found {found.has}"
         )
+    _check_overlap(path, whole)
+    if whole.keys() == set(NAMES):
+        return [*whole.values()]
     (one, first), (other, second) = whole.items()
     apart = _from_each_other(first, second)
     sides = [float(np.linalg.norm(sign * apart - rig.span)) for sign in (1.0, -1.0)]
@@ -153,17 +167,39 @@ def _attitude(time: np.ndarray, own: Drone) -> np.ndarray:
 def _check(path: Path, own: Drone, name: str) -> None:
     """Raise InputError if a series is too short or too long, not of finite numbers, or its attitudes are none."""
     for quantity, (time, rows) in own.items():
-        if len(time) < 2 or not (quantity == "battery" or np.isfinite(rows).all()):
-            raise InputError(
-                f"{path}: the {name}'s {quantity} has {len(time)} rows; expected two or more of finite numbers"
-            )
+        what = f"{path}: {_called(quantity)} of {name}"
+        if len(time) < 2:
+            raise InputError(f"{what} is there once; expected it twice or more")
+        lost = np.count_nonzero(~np.isfinite(rows).all(axis=1))
+        if lost and quantity != "battery":
+            raise InputError(f"{what} is not finite in {lost} of {len(time)} rows; expected finite numbers")
         if time[-1] - time[0] > LONGEST:
             span = f"{time[-1] - time[0]:.3g} s"
-            raise InputError(f"{path}: the {name}'s {quantity} goes on for {span}; expected {LONGEST:g} s or less")
+            raise InputError(f"{what} goes on for {span}; expected {LONGEST:g} s or less")
     lengths = np.linalg.norm(own["quaternion"][1], axis=1)
     worst = lengths[np.abs(lengths - 1).argmax()]
     if abs(worst - 1) > UNEVEN:
-        raise InputError(f"{path}: the {name} has a quaternion of length {worst:.2g}; expected 1")
+        raise InputError(f"{path}: {name} has a quaternion of length {worst:.2g}; expected 1")
+
+
+def _called(quantity: str) -> str:
+    return {"sent": "setpoint", "along": "velocity", "rates": "body rate"}.get(quantity, quantity)
+
+
+def _check_overlap(path: Path, pair: dict[str, Drone]) -> None:
+    """Raise InputError if there is no time at which all that is known of both drones was recorded."""
+    spans = {
+        f"{_called(quantity)} of {name}": (time[0], time[-1])
+        for name, own in pair.items()
+        for quantity, (time, _) in own.items()
+        if quantity != "battery"
+    }
+    late, early = max(spans, key=lambda one: spans[one][0]), min(spans, key=lambda one: spans[one][1])
+    if spans[late][0] >= spans[early][1]:
+        raise InputError(
+            f"{path}: {late} begins at {spans[late][0]:.1f} s, and {early} ends at {spans[early][1]:.1f} s; expected "
+            "them to overlap"
+        )
 
 
 def _states(own: Drone, name: str, remark: Callable[[str], None]) -> list[tuple[float, DroneState]]:

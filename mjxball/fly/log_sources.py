@@ -14,6 +14,7 @@ RADIAN = math.pi / 180  # of a degree
 Samples = tuple[np.ndarray, np.ndarray]  # (n,) [s], (n, k)
 Series = dict[str, dict[str, Samples]]  # by drone and quantity
 Part = tuple[str, Any, dict[str, Any]]  # drone, "": the topic's; header or None; values by quantity
+WIDTHS = {"position": 3, "quaternion": 4, "velocity": 3, "along": 3, "rates": 3, "sent": 4, "battery": 1}
 
 
 class Topic(NamedTuple):

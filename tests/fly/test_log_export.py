@@ -200,7 +200,7 @@ def test_refusals(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ([log, tmp_path / "new.csv", "--int8"], "takes no other flag"),
         ([tmp_path / "noise.jsonl", tmp_path / "new.mcap"], "noise.jsonl"),
         ([tmp_path / "none.jsonl", tmp_path / "new.mcap"], "none.jsonl"),
-        ([tmp_path / "old.mcap", tmp_path / "new.mcap"], "is an MCAP file already"),
+        ([tmp_path / "old.mcap", tmp_path / "new.mcap"], "old.mcap is not converted to .mcap; expected a flight log"),
         ([clock(log, tmp_path / "late.jsonl", "1e300"), tmp_path / "new.mcap"], "none that a bag can hold"),
         ([clock(log, tmp_path / "early.jsonl", "-1e9"), tmp_path / "new.mcap"], "none that a bag can hold"),
     ]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ from mjxball.fly import flight_log
 from mjxball.fly.log_schema import Record, StatePacket
 from mjxball.fly.packets import DroneState
 from mjxball.fly.recording import Recording, read_recording
+from mjxball.plotting import pyplot
 from mjxball.rig import identify
 from mjxball.rig.log import read_log
 
@@ -93,7 +96,9 @@ def test_a_bag_of_crazyswarm2(
     """Its names are sorted the other way round than its drones stand. A file in it without its folder does as well."""
     bag = write_bag(tmp_path / "bag", records, sqlite=sqlite, odometry=odometry)
     (file,) = (one for one in bag.iterdir() if one.suffix != ".yaml")
-    for path in (bag, file):
+    for number, path in enumerate((bag, file)):
+        assert call(export, [path, table := tmp_path / f"{number}.csv"]) == 0
+        assert table.read_text().count("\n") == 1 + len(flight.time)
         again = read_recording(path)
         known = MEASURED if odometry else ("time", "position", "quaternion", "sent")
         for name in known:
@@ -101,6 +106,35 @@ def test_a_bag_of_crazyswarm2(
         assert "cf7 is taken for the leader" in " ".join(again.remarks)
         assert ("differences of its poses" in " ".join(again.remarks)) is not odometry
         assert len(read_log(path).setpoints) > 100
+
+
+@pytest.mark.parametrize("ours", [False, True])
+def test_a_figure_has_what_a_recording_has(
+    ours: bool, log: Path, records: list[Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No panel and no entry of the legend is empty; the CG, which no log has, is called assumed."""
+    path = log if ours else write_bag(tmp_path / "bag", records, odometry=True)
+    panels: dict[str, int] = {}
+    legend: list[str] = []
+
+    def keep(figure: Any) -> None:
+        assert all(np.isfinite(line.get_ydata()).any() for panel in figure.axes for line in panel.lines)
+        panels.update({panel.get_ylabel(): len(panel.lines) for panel in figure.axes})
+        legend.extend(text.get_text() for text in figure.legends[0].get_texts())
+        assert "assumed: CG" in figure.legends[0].get_title().get_text()
+
+    monkeypatch.setattr(pyplot(), "close", keep)
+    assert call(evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]) == 0
+    monkeypatch.undo()
+    pyplot().close("all")
+    motion = ["x [m]", "y [m]", "z [m]"]
+    commands = ["roll command [deg]", "pitch command [deg]", "vertical command [m/s²]"]
+    if ours:
+        assert [*panels] == [*motion, "distance to goal [mm]", "assumed CG offset [m]", *commands]
+        assert {"goal", "thin: leader"} < {*legend}
+    else:
+        assert panels == {**dict.fromkeys(motion, 2), "assumed CG offset [m]": 1}
+        assert legend == ["an unknown follower, flown", "the same, simulated"]
 
 
 def test_messages_of_ours_without_the_lines(exported: Path, flight: Recording, tmp_path: Path) -> None:
@@ -159,6 +193,8 @@ def test_cfclient_s_two_clocks_are_brought_together(tmp_path: Path) -> None:
     tick = next(one for one in found if one["kind"] == "tick")
     np.testing.assert_allclose(tick["sent"], [[1.0, 2.0, 3.0, 4e4]] * 2)
     assert any("its" not in text and "-847.5" in text for text in told)
+    assert call(export, [path, tmp_path / "flight.csv"]) == 0
+    assert (tmp_path / "flight.csv").read_text().startswith("time,phase,")
 
 
 def test_cfclient_s_drones_on_two_sticks_are_refused(tmp_path: Path) -> None:
@@ -200,13 +236,16 @@ def test_an_mcap_file_that_is_cut_is_read_as_far_as_it_goes(records: list[Record
     bag = in_chunks(write_bag(tmp_path / "bag", records) / "bag.mcap", tmp_path / "chunks.mcap")
     size, counts = bag.stat().st_size, []
     whole = sum(one["kind"] == "state" for one in flight_log.read(bag))
+    folder = tmp_path / "bag"
     for share in np.linspace(0.3, 0.999, 15):
-        cut = truncated(bag, round(share * size), tmp_path / "cut.mcap")
+        cut = truncated(bag, round(share * size), folder / "bag.mcap")
         with pytest.raises(ReaderError):
             McapReader(cut).open()
         told: list[str] = []
-        counts.append(sum(one["kind"] == "state" for one in flight_log.read(cut, told.append)))
-        assert "cut short" in told[0]
+        numbers = [sum(one["kind"] == "state" for one in flight_log.read(one, told.append)) for one in (cut, folder)]
+        assert numbers[0] == numbers[1]
+        assert told[0] == next(text for text in told[1:] if "cut short" in text)
+        counts.append(numbers[0])
     assert counts == sorted(counts)
     assert 0 < counts[0] < counts[-1] == whole
     with pytest.raises(InputError, match=r"bag .* is empty: it holds no message"):
@@ -229,6 +268,7 @@ def test_bad_input_is_refused_in_one_sentence(
     (tmp_path / "text.mcap").write_text("an MCAP file?")
     (tmp_path / "none.mcap").write_bytes(b"")
     (tmp_path / "void.mcap").write_bytes(bag_of_nothing())
+    truncated(tmp_path / "void.mcap", 20, tmp_path / "head.mcap")
     (tmp_path / "noise.db3").write_bytes(bytes(range(256)))
     (tmp_path / "one.csv").write_text("Timestamp,pm.vbat\n1,3.9\n")
     half = write_cfclient(tmp_path / "half", turn, {"leader": 0, "follower": 0})
@@ -239,6 +279,9 @@ def test_bad_input_is_refused_in_one_sentence(
     next((less / "leader").glob("target*")).unlink()
     two = write_cfclient(tmp_path / "back", turn, {"leader": 0, "follower": 0})
     (two / "leader" / "more.csv").write_text("Timestamp,pm.vbat\n20,3.9\n10,3.9\n")
+    short = write_cfclient(tmp_path / "short", turn, {"leader": 0, "follower": 0})
+    gyro = next((short / "leader").glob("turning*"))
+    gyro.write_text(re.sub(r"^(200,.*),.*$", r"\1", gyro.read_text(), flags=re.MULTILINE))
     cases = [
         (write_bag(tmp_path / "idle", turn, commands=False), "holds 0 drones with poses and setpoints; expected two"),
         (write_bag(tmp_path / "other", turn, pose="Pose"), "found /cf231/cmd_vel_legacy (geometry_msgs/Twist)"),
@@ -249,10 +292,16 @@ def test_bad_input_is_refused_in_one_sentence(
         (tmp_path / "text.mcap", "begins with b'an MCAP '; expected an MCAP file"),
         (tmp_path / "none.mcap", "is empty; expected an MCAP file"),
         (tmp_path / "void.mcap", "is empty: it holds no message"),
+        (tmp_path / "head.mcap", "head.mcap ends, or is damaged, within its header; expected a whole one"),
         (tmp_path / "noise.db3", "cannot be read"),
         (tmp_path / "gone.mcap", "does not exist; expected a rosbag2"),
-        (tmp_path / "one.csv", "is of one drone; expected the folder"),
+        (
+            tmp_path / "one.csv",
+            "an export of ours is not read back; expected its .jsonl or .mcap, or of cfclient the folder",
+        ),
         (half, "follower holds no .csv"),
+        (ours / "leader", "expected a rosbag2 file or folder, or cfclient's leader and follower"),
+        (short, "cannot be used: row 21 has 4 values; expected 5"),
         (ours, "begins with 'time,phase'; expected cfclient's Timestamp"),
         (less, "leader has no sent; expected all numbers of it of ctrltarget.roll"),
         (two, "row 2: the time goes back by 0.01 s"),
@@ -270,6 +319,64 @@ def test_bad_input_is_refused_in_one_sentence(
     assert call(evaluate.main, ["--flight", exported, "--plant", "crazyflie", "--out", tmp_path / "drawn"]) == 2
     assert "says which rig flew: drop --plant" in capsys.readouterr().err
     assert not (tmp_path / "drawn").exists()
+
+
+@pytest.mark.parametrize(
+    ("rates", "found"), [(lambda _: 0, 0), (lambda _: 2, 2), (lambda _: 4, 4), (lambda number: 3 - (number > 30), 2)]
+)
+def test_rates_of_another_width_are_refused(rates: Callable[[int], int], found: int, tmp_path: Path, capsys) -> None:
+    """A custom topic has the variables that its user named; all programs say which ones are expected."""
+    bag = write_bag(tmp_path / "bag", turning(np.full(50, 0.3)), odometry=True, rates=rates)
+    assert_refused(bag, rf"/cf(7|231)/gyro has {found} values; expected gyro\.x, gyro\.y, gyro\.z$", tmp_path, capsys)
+
+
+def test_bags_with_metadata_or_numbers_that_are_none_are_refused(tmp_path: Path, capsys) -> None:
+    def changed(drone: str, number: int, **fields: Any) -> list[Record]:
+        raw = turn[number]["raw"]
+        own = {"raw": raw._replace(state=raw.state._replace(**fields))}
+        assert turn[number]["drone"] == drone
+        return [{**one, **own} if k == number else one for k, one in enumerate(turn)]
+
+    def later(seconds: float, *drones: str | None) -> list[Record]:
+        return [{**one, "t": one["t"] + seconds * (one.get("drone") in drones)} for one in turn]
+
+    turn = turning(np.full(50, 0.3))
+    nan = np.full(3, np.nan)
+    sent = [{**one, "sent": one["sent"] * np.nan} if "sent" in one else one for one in turn]
+    bags = {
+        "no place": (changed("leader", 30, position=nan), "position of cf7 is not finite in 1 of 50 rows; expected"),
+        "no rate": (changed("follower", 31, rates=nan), "body rate of cf231 is not finite in 1 of 50 rows; expected"),
+        "no order": (sent, r"setpoint of cf(7|231) is not finite in 50 of 50 rows; expected finite numbers"),
+        "one state": ([*turn[:2], *turn[2::3]], r"position of cf(7|231) is there once; expected it twice or more"),
+        "late": (
+            later(9, "leader", "follower"),
+            r"of cf(7|231) begins at 9\.0 s, .* ends at 0\.5 s; expected them to ov",
+        ),
+        "late pair": (
+            later(9, "follower"),
+            r"of cf231 begins at 9\.0 s, .* of cf7 ends at 0\.5 s; expected them to ov",
+        ),
+    }
+    for name, (records, reason) in bags.items():
+        assert_refused(write_bag(tmp_path / name, records, odometry=True), reason, tmp_path, capsys)
+    bag = write_bag(tmp_path / "version", turn)
+    metadata = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(re.sub("version: 9", "version: x", metadata))
+    assert_refused(bag, r"has a metadata\.yaml with a value of another type; expected the one that", tmp_path, capsys)
+
+
+def assert_refused(path: Path, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """All that reads a recording says the one sentence `reason`, a regular expression, and writes nothing."""
+    for main, arguments in (
+        (evaluate.main, ["--flight", path, "--out", tmp_path / "drawn"]),
+        (identify.main, [path, "--out", tmp_path / "drawn.json"]),
+        (export, [path, tmp_path / "drawn.csv"]),
+    ):
+        assert call(main, arguments) == 2, path
+        errors = capsys.readouterr().err
+        assert re.search(reason, errors.strip()), errors
+        assert_one_line(errors)
+    assert not list(tmp_path.glob("drawn*"))
 
 
 def moved(record: Record) -> DroneState:
