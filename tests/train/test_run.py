@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from types import SimpleNamespace
 
@@ -17,9 +16,9 @@ def test_a_second_sigterm_leaves_the_time_to_save() -> None:
     with graceful_interrupt(SimpleNamespace(say=said.append, end_status=lambda: None)) as stop:
         stop.begun = True
         for _ in range(2):
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
         assert stop.requested
         assert len(said) == 1
         with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGTERM) is before
