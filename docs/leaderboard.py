@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Write docs/leaderboard.md from the entries in benchmarks/leaderboard/.
 
-`python docs/leaderboard.py [FILE]`; an entry of another version, of other flights or of changed sources is refused.
+`python docs/leaderboard.py [FILE.md]`; an entry of another version, of other flights or of changed sources is refused.
 """
 
 from __future__ import annotations
@@ -14,7 +14,9 @@ from mjxball.bench import NAME, VERSION
 from mjxball.bench.entry import cells, read_entry
 from mjxball.bench.score import CONDITIONS
 from mjxball.bench.tracks import FLIGHTS, SECONDS, TRACKS
-from mjxball.cli import run_command
+from mjxball.cli import make_parser, run_command
+from mjxball.errors import InputError
+from mjxball.files import write_whole
 
 REPOSITORY = Path(__file__).parents[1]
 ENTRIES, PAGE = REPOSITORY / "benchmarks" / "leaderboard", REPOSITORY / "docs" / "leaderboard.md"
@@ -89,11 +91,18 @@ def page(entries: list[dict[str, Any]]) -> str:
     return "\n".join(parts)
 
 
-def main() -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Write the page."""
+    parser = make_parser("python docs/leaderboard.py", "Write the leaderboard's page from its entries.")
+    parser.add_argument("out", nargs="?", type=Path, default=PAGE, metavar="FILE.md")
+    out = parser.parse_args(arguments).out
+    if out.suffix != ".md":
+        raise InputError(f"the page is a file .md, not {out}")
     entries = [read_entry(path) for path in sorted(ENTRIES.glob("*.json"))]
-    out = Path(sys.argv[1]) if len(sys.argv) > 1 else PAGE
-    out.write_text(page(entries))
+    names = [entry["follower"] for entry in entries]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"two entries are of {twice[0]}")
+    write_whole(out, page(entries))
     return 0
 
 

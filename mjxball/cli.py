@@ -195,7 +195,7 @@ def run_command(command: Callable[[], int]) -> int:
             sys.stdout.flush()
         return code
     except InputError as error:
-        warn(f"error: {error}")
+        warn(f"error: {' '.join(str(error).splitlines())}")
         return 2
     except OSError as error:
         where = error.filename or "standard output or a file"

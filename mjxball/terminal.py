@@ -10,6 +10,7 @@ import os
 import re
 import sys
 import textwrap
+import unicodedata
 from collections.abc import Callable, Sequence
 from typing import Any, TextIO
 
@@ -49,13 +50,23 @@ def folded(text: str, columns: int) -> str:
     return textwrap.fill(text, columns, break_on_hyphens=False).replace("\xa0", " ")
 
 
+TURNS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")  # of the direction of what follows
+
+
 def fitted_to(stream: TextIO | None, text: str) -> str:
-    """`text` for `stream`, letters that do not print as blanks, `folded` if that is a terminal.
+    """`text` for `stream`, blanks for what steers a terminal or turns a line, `folded` if that is a terminal.
 
     Of a stream that is closed the program has None.
     """
-    text = "".join(letter if letter.isprintable() or letter == "\n" else " " for letter in text)
+    text = "".join(letter if _prints(letter) else " " for letter in text)
     return folded(text, columns_of(stream)) if stream and stream.isatty() else text
+
+
+def _prints(letter: str) -> bool:
+    """Letters, blanks, joiners and the end of a line do; controls, line separators and turns of direction do not."""
+    if letter.isprintable() or letter == "\n":
+        return True
+    return unicodedata.category(letter) in ("Cf", "Zs") and unicodedata.bidirectional(letter) not in TURNS
 
 
 def say(text: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ KINDS = {
     **{"draw": int, "follower": str, "date": str, "command": str, "commit": str},
     **{"versions": dict, "tracks": dict, "not_flown": dict},
 }
+LARGEST = 1e9  # of any number
 SHARES = ("met", "low", "high", "failed")  # of one condition's numbers
 NUMBERS = {"flights", *SHARES, "settling_50", "peak_90", "rotors_at_limit", "command_change"}
 
@@ -61,47 +61,68 @@ def read_entry(path: Path) -> dict[str, Any]:
 
     InputError with one sentence for anything else.
     """
+    text = read_text(path, "entry")
     try:
-        entry = parse_json(read_text(path, "entry"))
-    except ValueError:
+        entry = parse_json(text)
+    except (ValueError, RecursionError):
         raise InputError(f"entry {path} is no JSON") from None
     if not isinstance(entry, dict) or entry.get("benchmark") != NAME:
         raise InputError(f"{path} is no entry of {NAME}")
     other = entry.get("version")
     if other != VERSION or isinstance(other, bool):
         raise InputError(f"entry {path} is of version {other!r} of {NAME}, and this is version {VERSION}")
+    _check_kinds(path, entry)
+    if not re.fullmatch(r"[\w.:+-]+", entry["follower"]) or not _is_date(entry["date"]):
+        raise InputError(f"entry {path} has no name of one word as follower, or no date as 2026-01-31")
+    if not entry["tracks"] or set(entry["tracks"]) & set(entry["not_flown"]):
+        raise InputError(f"entry {path} has no track, or one that was flown and not flown")
+    for track, found in entry["tracks"].items():
+        for condition in CONDITIONS:
+            if track not in TRACKS or not isinstance(found, dict) or not _measured(found.get(condition)):
+                raise InputError(f"entry {path} has no numbers as this version has them of track {track}, {condition}")
+    flown = {found[condition]["flights"] for found in entry["tracks"].values() for condition in CONDITIONS}
+    if flown != {FLIGHTS} or entry["draw"] != 0:
+        counts = ", ".join(map(str, sorted(flown)))
+        raise InputError(f"entry {path} is of {counts} flights of draw {entry['draw']}; ranked are {FLIGHTS} of draw 0")
+    if not re.fullmatch(r"[0-9a-f]{7,40}", entry["commit"]):
+        raise InputError(f"entry {path} is of commit {entry['commit']!r}; fly it from a clean checkout of one")
+    return entry
+
+
+def _check_kinds(path: Path, entry: dict[str, Any]) -> None:
     if missing := sorted(set(KINDS) - set(entry)):
         raise InputError(f"entry {path} is not whole: {', '.join(missing)} is missing")
     for name, kind in KINDS.items():
         if type(entry[name]) is not kind:
             raise InputError(f"entry {path} has {name} {entry[name]!r}, which is no {kind.__name__}")
-    if not re.fullmatch(r"[\w.:+-]+", entry["follower"]) or not re.fullmatch(r"\d{4}-\d\d-\d\d", entry["date"]):
-        raise InputError(f"entry {path} has no name of one word as follower, or no date as 2026-01-31")
-    for track, found in entry["tracks"].items():
-        for condition in CONDITIONS:
-            if track not in TRACKS or not isinstance(found, dict) or not _measured(found.get(condition)):
-                raise InputError(
-                    f"entry {path} has no numbers of a track as this version has them: {track} {condition}"
-                )
-            flown = found[condition]["flights"]
-            if flown != FLIGHTS or entry["draw"] != 0:
-                raise InputError(
-                    f"entry {path} is of {flown} flights of draw {entry['draw']}; ranked are {FLIGHTS} of draw 0"
-                )
-    if not re.fullmatch(r"[0-9a-f]{7,40}", entry["commit"]):
-        raise InputError(f"entry {path} is of commit {entry['commit']!r}; fly it from a clean checkout of one")
-    return entry
 
 
 def _measured(numbers: Any) -> bool:
     """Whether these are one condition's numbers, as `score.summary` has them."""
     if not isinstance(numbers, dict) or set(numbers) != NUMBERS or type(numbers["flights"]) is not int:
         return False
-    shares = [numbers[name] for name in SHARES]
-    return all(type(one) in (int, float) and 0 <= one <= 1 for one in shares) and all(
-        numbers[name] is None or (type(numbers[name]) in (int, float) and 0 <= numbers[name] < math.inf)
-        for name in NUMBERS
+    if not all(numbers[name] is None or type(numbers[name]) in (int, float) for name in NUMBERS):
+        return False
+    if any(numbers[name] is None for name in SHARES):
+        return False
+    low, met, high, failed = (numbers[name] for name in ("low", "met", "high", "failed"))
+    limit = numbers["rotors_at_limit"] or 0
+    return (
+        0 <= low <= met <= high <= 1
+        and failed >= 0
+        and met + failed <= 1 + 1e-9
+        and 0 <= limit <= 1
+        and all(0 <= (numbers[name] or 0) < LARGEST for name in NUMBERS)
     )
+
+
+def _is_date(text: str) -> bool:
+    """Whether it is a day that has been, as 2026-01-31."""
+    try:
+        day = datetime.date.fromisoformat(text)
+    except ValueError:
+        return False
+    return day.isoformat() == text and day <= datetime.datetime.now(datetime.UTC).date() + datetime.timedelta(days=1)
 
 
 def table(entry: dict[str, Any]) -> str:

@@ -92,13 +92,16 @@ def _session(path: Path) -> Any:
     if not path.is_file():
         raise InputError(f"there is no file {path}")
     try:
-        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 4  # what it raises says it all
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # whatever the runtime raises for a file that is no model
         raise InputError(f"{path} is no ONNX model: {said(error)}") from None
     inputs = {one.name: one for one in session.get_inputs()}
     outputs = {one.name for one in session.get_outputs()}
     wanted = {"command", "next_memory"} if "memory" in inputs else {"command"}
-    if "observation" not in inputs or not set(inputs) <= set(TYPES) or not wanted <= outputs:
+    paired = ("memory" in inputs) == ("start" in inputs)
+    if "observation" not in inputs or not set(inputs) <= set(TYPES) or not wanted <= outputs or not paired:
         raise InputError(
             f"{path} has inputs {', '.join(sorted(inputs))} and outputs {', '.join(sorted(outputs))}; wanted are "
             "observation, with a memory also memory and start, and command, with a memory also next_memory"

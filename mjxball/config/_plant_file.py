@@ -94,7 +94,10 @@ def _settings(path: Path, values: dict[str, Any]) -> PlantFile:
     preset = values.pop("preset", None)
     if preset is not None and not isinstance(preset, str):
         raise InputError(f"plant file {path}: preset must be the name of one, not {preset!r}")
-    settings = dict(_flat(values))
+    try:
+        settings = dict(_flat(values))
+    except RecursionError:
+        raise InputError(f"plant file {path} has tables that are nested too deeply") from None
     for name in (*settings, *values):  # tables without settings are in `values` alone
         if name.partition(".")[0] not in PLANT_PARTS or (name in PLANT_PARTS and name in settings):
             raise InputError(

@@ -143,7 +143,7 @@ def from_dict(data: Any, kind: type = Config, path: str = "") -> Any:
     missing = sorted(set(names) - set(data))
     if unknown or missing:
         where = f" in {path}" if path else ""
-        spelt = [f"unknown {name}{_near(name, names)}" for name in unknown]
+        spelt = [f"unknown {str(name)[:60]}{_near(str(name)[:60], names)}" for name in unknown[:MAX_LISTED]]
         what = ", ".join(spelt + [f"missing {name}" for name in missing][:MAX_LISTED])
         raise InputError(f"configuration does not fit this version{where}: {what}")
     values = {}

@@ -15,6 +15,7 @@ from mjxball.control.followers import Baseline, Follower
 from mjxball.errors import FOREIGN, InputError, said
 
 LARGEST = 1e9  # of a command, in rad and m/s^2; the square of what is larger is soon no number
+PACKAGE = Path(__file__).parents[1]
 Make = Callable[[Config], Follower]  # InputError if the follower does not fly that plant
 
 
@@ -44,7 +45,8 @@ class Outside:
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """See `Follower.__call__`; InputError if it raises, or answers what is no command."""
-        return answered(self.name, _guarded(self.name, self._answer, observation, given=observation), observation)
+        own = np.array(observation)  # which it may write to
+        return answered(self.name, _guarded(self.name, self._answer, own, given=observation), observation)
 
 
 class OutsideLaw:
@@ -52,7 +54,7 @@ class OutsideLaw:
 
     def __init__(self, name: str, law: Any):
         self.name, self._law = name, law
-        self.needs_privileged = bool(getattr(law, "needs_privileged", False))
+        self.needs_privileged = bool(_guarded(name, getattr, law, "needs_privileged", False))
 
     def start(self, observation: Any) -> Any:
         """See `Law.start`."""
@@ -70,9 +72,10 @@ class OutsideLaw:
 
 def _outside(name: str, made: Any, config: Config) -> Follower:
     found = _guarded(f"{name}(config)", made, config)
-    if all(callable(getattr(found, part, None)) for part in ("start", "step")):
+    has = {part for part in ("start", "step", "reset") if callable(_guarded(name, getattr, found, part, None))}
+    if has >= {"start", "step"}:
         return Baseline(OutsideLaw(name, found), config)
-    if callable(found) and callable(getattr(found, "reset", None)):
+    if callable(found) and "reset" in has:
         return Outside(name, found)
     raise InputError(
         f"follower {name} has neither start and step nor reset and __call__; see docs/howto/own-baseline.md"
@@ -85,19 +88,25 @@ def _guarded(name: str, function: Any, *arguments: Any, given: Any = None) -> An
     except InputError:
         raise
     except FOREIGN as error:  # whatever somebody else's code raises
-        *_, last = traceback.extract_tb(error.__traceback__)
+        frames = [one for one in traceback.extract_tb(error.__traceback__) if not _is_ours(one.filename)]
+        where = f", in {Path(frames[-1].filename).name} line {frames[-1].lineno}" if frames else ""
         observed = "" if given is None else f", given observations of shape {np.shape(given)}"
-        where = f"in {Path(last.filename).name} line {last.lineno}"
-        raise InputError(f"follower {name} raised {said(error)}, {where}{observed}") from None
+        raise InputError(f"follower {name} raised {said(error)}{where}{observed}") from None
+
+
+def _is_ours(file: str) -> bool:
+    """Whether a source file is mjxball's or an installed library's, not the user's."""
+    return Path(file).is_relative_to(PACKAGE) or "site-packages" in file
 
 
 def answered(name: str, command: Any, observation: Any) -> np.ndarray:
     """`command` (..., 3) of follower `name` to `observation` (..., 18); InputError if it is none."""
     try:
         array = np.asarray(command)
-        if np.iscomplexobj(array):
+        if array.dtype.kind not in "biufO":
             raise TypeError
-        command = array.astype(float)
+        with np.errstate(all="ignore"):
+            command = array.astype(float)
     except FOREIGN:
         raise InputError(f"follower {name} answered {type(command).__name__}, no array of real numbers") from None
     wanted = (*np.shape(observation)[:-1], 3)

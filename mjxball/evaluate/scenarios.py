@@ -64,8 +64,8 @@ def rig_line(settings: Config, mass: float | None = None) -> str:
     trimmed = f"CG trimmed up to {offset:.3g} m" if offset >= 0 else "CG not trimmed even at O"
     return (
         f"rig: {plant.count} drones, {total_mass(plant, mass):.4g} kg with an object of {mass:g} kg, "
-        f"thrust over weight {thrust_over_weight(plant, mass):.3g}, {trimmed} with {margin:.0%} of what rotors "
-        f"and commands reach left; so it can hover objects of up to {heaviest:.3g} kg, "
+        f"thrust over weight {thrust_over_weight(plant, mass):.3g}, {trimmed} keeping {margin:.0%} of what "
+        f"hovering leaves; so it can hover objects of up to {heaviest:.3g} kg, "
         f"{reference.amplitude:g} m off"
     )
 

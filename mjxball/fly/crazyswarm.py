@@ -93,17 +93,17 @@ def read_pair(path: Path, leader: str | None = None, follower: str | None = None
     data = _mapping(_parsed(path), f"{path}", needed=True)
     robots = _mapping(data.get("robots"), f"{path}: robots", needed=True)
     types = _mapping(data.get("robot_types"), f"{path}: robot_types", needed=True)
+    if odd := [str(name) for name in robots if not (str(name).isprintable() and str(name).strip())]:
+        raise InputError(f"{path}: the name {odd[0][:60]!r} of a robot cannot be printed")
     flying = {
         str(name): one
         for name, one in ((name, _mapping(value, f"{path}: robot {name}")) for name, value in robots.items())
         if _enabled(one, f"{path}: robot {name}")
         and _type(one, types, f"{path}: robot {name}").get("connection") != "none"
     }
-    if odd := [name for name in flying if not name.isprintable()]:
-        raise InputError(f"{path}: the name {odd[0][:60]!r} of a robot cannot be printed")
     version = data.get("fileversion", VERSIONS[-1])
     if type(version) is not int or version not in VERSIONS:
-        raise InputError(f"{path}: fileversion {str(version)[:60]} is none of {', '.join(map(str, VERSIONS))}")
+        raise InputError(f"{path}: fileversion {version!r:.60} is none of {', '.join(map(str, VERSIONS))}")
     names, chosen = _choose(path, list(flying), [leader, follower])
     found = [_robot(f"{path}: robot {name}", name, flying[name], types, data) for name in names]
     if found[0].uri.casefold() == found[1].uri.casefold():

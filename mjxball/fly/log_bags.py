@@ -54,6 +54,9 @@ def _files(path: Path) -> list[Path]:
     """The bag `path` itself, or the files of a folder that has no metadata, or one for files that are not whole."""
     if path.is_file():
         return [path]
+    inside = [path, *path.iterdir()] if path.is_dir() else [path]
+    if odd := [one for one in inside if one.exists() and not one.is_file() and not one.is_dir()]:
+        raise InputError(f"bag {odd[0]} is no regular file")
     found = sorted(one for one in path.iterdir() if one.suffix in BAGS and one.is_file()) if path.is_dir() else []
     if (path / "metadata.yaml").is_file() and all(one.suffix != ".mcap" or _ends(one) for one in found):
         return [path]

@@ -26,7 +26,13 @@ def _columns(folder: Path) -> dict[str, Samples]:
     files = sorted(file for file in folder.glob("*.csv") if file.is_file())
     if not files:
         raise InputError(f"{folder} holds no .csv; expected the files that cfclient wrote of this drone")
-    return {name: samples for file in files for name, samples in _read_csv(file).items()}
+    found: dict[str, Samples] = {}
+    for file in files:
+        own = _read_csv(file)
+        if twice := sorted(own.keys() & found.keys()):
+            raise InputError(f"{twice[0]} stands in {file} and in another file of {folder}; expected one recording")
+        found |= own
+    return found
 
 
 def _read_csv(file: Path) -> dict[str, Samples]:
@@ -35,6 +41,8 @@ def _read_csv(file: Path) -> dict[str, Samples]:
             head, *rows = list(csv.reader(stream)) or [[]]
         if head[:1] != ["Timestamp"]:
             raise InputError(f"{file} begins with {','.join(head)[:40]!r}; expected cfclient's Timestamp and variables")
+        if twice := [name for name in head if head.count(name) > 1]:
+            raise InputError(f"{file} has two columns {twice[0]}; expected one")
         if rows and len(rows[-1]) < len(head):
             rows.pop()  # cfclient was ended while it wrote
         try:
@@ -63,5 +71,7 @@ def _joined(columns: dict[str, Samples]) -> dict[str, Samples]:
         own = [parts[quantity, place] for place in range(width) if (quantity, place) in parts]
         if len(own) == width:
             time = own[0][0]
+            if any(one[0][0] >= time[-1] or one[0][-1] <= time[0] for one in own):
+                raise InputError(f"numbers of one {quantity} were recorded at different times; expected one recording")
             joined[quantity] = time, np.column_stack([np.interp(time, one[0], one[1][:, 0]) for one in own])
     return joined

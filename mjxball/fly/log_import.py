@@ -45,6 +45,8 @@ def is_recording(path: Path) -> bool:
     """Whether `path` is a bag, or a folder that is one or has cfclient's two."""
     if not path.is_dir():
         return path.suffix in BAGS
+    if (path / "config.json").exists():
+        return False  # a run of train.py
     names = ("metadata.yaml", *NAMES)
     return any((path / name).exists() for name in names) or any(one.suffix in BAGS for one in path.iterdir())
 

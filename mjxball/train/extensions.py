@@ -58,9 +58,12 @@ def find(name: str, flag: str) -> Any:
         ) from None
     except FOREIGN as error:
         raise InputError(f"{flag} {name}: importing {module} raised {said(error)}; mend that module") from None
-    if not hasattr(found, attribute):
-        raise InputError(f"{flag} {name}: {module} has no {attribute}; check the name behind the colon")
-    named = getattr(found, attribute)
+    try:
+        named = getattr(found, attribute)
+    except AttributeError:
+        raise InputError(f"{flag} {name}: {module} has no {attribute}; check the name behind the colon") from None
+    except FOREIGN as error:
+        raise InputError(f"{flag} {name}: {module}.{attribute} raised {said(error)}; mend that module") from None
     if flag in ARGUMENTS:
         _check_callable(flag, f"{flag} {name}", named)
     return named

@@ -71,6 +71,13 @@ class Complex(Good):
     def __call__(self, observation): return 1j * super().__call__(observation)
 class Huge(Good):
     def __call__(self, observation): return 1e200 + super().__call__(observation)
+class Text(Good):
+    def __call__(self, observation): return [["1", "2", "3"]]
+class Untraced(Good):
+    def __call__(self, observation): return np.linalg.inv(np.zeros((2, 2)))
+class Property(Good):
+    @property
+    def start(self): raise KeyError("gone")
 class Arguments(Good):
     def __init__(self, gain, limit): pass
 class Nothing:
@@ -84,6 +91,9 @@ REFUSED = {
     "bad:Words": "Words answered str, no array of real numbers",
     "bad:Complex": "Complex answered ndarray, no array of real numbers",
     "bad:Huge": "Huge answered a number that is not finite, or larger than 1e+09",
+    "bad:Text": "Text answered list, no array of real numbers",
+    "bad:Untraced": "Singular matrix, in bad.py line",
+    "bad:Property": "Property raised KeyError: 'gone', in bad.py line",
     "bad:Arguments": "Arguments(config) raised TypeError",
     "bad:Slow": "ms a call; at most 20 ms",
     "bad:SlowLater": "ms a call; at most 20 ms",
@@ -310,11 +320,12 @@ OTHERS = {
     "date 20261128, which is no str": {"date": 20261128},
     "no date as 2026-01-31": {"date": "yesterday"},
     "no name of one word": {"follower": "a | b"},
-    "moon undisturbed": {"tracks": {"moon": {}}},
-    "pair disturbed": {"tracks": with_numbers(met="all")},
-    "pair undisturbed": {"tracks": {"pair": {"disturbed": 3}}},
+    "of track moon, undisturbed": {"tracks": {"moon": {}}},
+    "of track pair, disturbed": {"tracks": with_numbers(met="all")},
+    "of track pair, undisturbed": {"tracks": {"pair": {"disturbed": 3}}},
+    "was flown and not flown": {"tracks": {}},
     "of 120 flights of draw 9; ranked": {"draw": 9},
-    "of 5 flights of draw 0; ranked": {"tracks": with_numbers(flights=5)},
+    "of 5, 120 flights of draw 0; ranked": {"tracks": with_numbers(flights=5)},
     "from a clean checkout": {"commit": "93771579971e-dirty"},
 }
 
@@ -329,20 +340,36 @@ def test_an_entry_of_another_benchmark_is_refused(tmp_path: Path, said: str):
 
 def test_a_share_that_is_none_is_refused(tmp_path: Path):
     path = tmp_path / "entry.json"
-    for met in (50, float("nan"), -0.1, True):
-        path.write_text(json.dumps({**known_entry(), "tracks": with_numbers(met=met)}))
+    impossible = [{"met": met} for met in (50, float("nan"), -0.1, True, 0.5)]
+    impossible += [{"failed": 1.5}, {"rotors_at_limit": 5}, {"settling_50": 10**400}, {"low": 0.5}]
+    for changed in impossible:
+        path.write_text(json.dumps({**known_entry(), "tracks": with_numbers(**changed)}))
         with pytest.raises(followers.InputError):
             read_entry(path)
+    for date in ("9999-99-99", "9999-12-31"):
+        path.write_text(json.dumps({**known_entry(), "date": date}))
+        with pytest.raises(followers.InputError, match="no date as 2026-01-31"):
+            read_entry(path)
+    path.write_text("[" * 100_000)
+    with pytest.raises(followers.InputError, match="no JSON"):
+        read_entry(path)
 
 
 def test_a_page_with_another_entry_is_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     page = leaderboard()
-    (tmp_path / "two.json").write_text(json.dumps({**known_entry(), "version": 2}))
-    page.ENTRIES, page.PAGE = tmp_path, tmp_path / "page.md"
-    assert run_command(page.main) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("two.json is of version 2 of mjxball-bench, and this is version 1")
-    assert not page.PAGE.exists()
+    page.ENTRIES, out = tmp_path, tmp_path / "page.md"
+    (tmp_path / "one.json").write_text(json.dumps(known_entry()))
+    for name, change, said in (
+        ("two", {"version": 2}, "two.json is of version 2 of mjxball-bench, and this is version 1"),
+        ("two", {}, "two entries are of copy"),
+    ):
+        (tmp_path / f"{name}.json").write_text(json.dumps({**known_entry(), **change}))
+        assert run_command(lambda: page.main([str(out)])) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.endswith(said)
+        assert not out.exists()
+    assert run_command(lambda: page.main([str(tmp_path / "one.json")])) == 2
+    assert json.loads((tmp_path / "one.json").read_text()) == known_entry()
 
 
 def leaderboard() -> Any:

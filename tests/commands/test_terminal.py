@@ -184,6 +184,12 @@ def test_a_sentence_breaks_between_words_behind_columns_too() -> None:
     ]
 
 
+def test_what_steers_a_terminal_is_blank() -> None:
+    """Joiners of letters and blanks that do not break stay; turns of the direction and line separators do not."""
+    text = "a\x1b[31mb\u202ec\u2028d\x85e\nf\u200dg\u00a0h\u0627"
+    assert terminal.fitted_to(None, text) == "a [31mb c d e\nf\u200dg\u00a0h\u0627"
+
+
 def test_a_closed_stream_is_no_fault(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Of one that the caller closed Python has None."""
     monkeypatch.setattr(sys, "stderr", None)

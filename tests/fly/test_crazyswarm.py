@@ -145,7 +145,7 @@ def test_swapped_places_are_refused(tmp_path: Path) -> None:
         (changed(["all", "firmware_params"], [1]), "firmware_params of all must be a mapping"),
         (changed(["all", "firmware_params", "locSrv", "extPosStdDev"], True), "finite number, not True"),
         (changed(["fileversion"], 99), "fileversion 99 is none of 1, 2, 3"),
-        (changed(["fileversion"], "three"), "fileversion three is none of 1, 2, 3"),
+        (changed(["fileversion"], "three"), "fileversion 'three' is none of 1, 2, 3"),
         (FILE.replace("cf5:", '"cf\\e[31m5":'), "the name 'cf\\x1b[31m5' of a robot cannot be printed"),
         (FILE.replace("type: cf21", 'type: "cf\\e[31m"'), "type cf [31m is not in robot_types"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from mjxball.control.rotations import quaternion_from_euler
 from mjxball.errors import InputError
 from mjxball.export import main as export
 from mjxball.fly import flight_log
+from mjxball.fly.log_import import is_recording
 from mjxball.fly.log_schema import Record, StatePacket
 from mjxball.fly.packets import DroneState
 from mjxball.fly.recording import Recording, read_recording
@@ -377,6 +379,24 @@ def assert_refused(path: Path, reason: str, tmp_path: Path, capsys: pytest.Captu
         assert re.search(reason, errors.strip()), errors
         assert_one_line(errors)
     assert not list(tmp_path.glob("drawn*"))
+
+
+def test_pipes_and_second_recordings_are_refused(records: list[Record], tmp_path: Path, capsys) -> None:
+    pipe, twice = tmp_path / "pipe", tmp_path / "twice"
+    write_bag(pipe, records)
+    os.mkfifo(pipe / "more.mcap")
+    assert_refused(pipe, "more.mcap is no regular file", tmp_path, capsys)
+    write_cfclient(twice, records, {"leader": 3.0, "follower": 77.0})
+    first = next((twice / "leader").glob("*.csv"))
+    shutil.copy(first, first.with_name("again.csv"))
+    assert_refused(twice, "in another file of", tmp_path, capsys)
+
+
+def test_a_run_with_a_bag_in_it_is_a_run(tmp_path: Path) -> None:
+    (tmp_path / "flight.mcap").touch()
+    assert is_recording(tmp_path)
+    (tmp_path / "config.json").touch()
+    assert not is_recording(tmp_path)
 
 
 def moved(record: Record) -> DroneState:
