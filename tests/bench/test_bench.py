@@ -346,7 +346,7 @@ def test_a_share_that_is_none_is_refused(tmp_path: Path):
         path.write_text(json.dumps({**known_entry(), "tracks": with_numbers(**changed)}))
         with pytest.raises(followers.InputError):
             read_entry(path)
-    for date in ("9999-99-99", "9999-12-31"):
+    for date in ("9999-99-99", "2026-1-1", "20260101"):
         path.write_text(json.dumps({**known_entry(), "date": date}))
         with pytest.raises(followers.InputError, match="no date as 2026-01-31"):
             read_entry(path)
