@@ -128,6 +128,11 @@ def test_what_is_said_of_commands_is_the_leaderboards() -> None:
     ]
 
 
+def test_what_the_first_training_meets_is_the_leaderboards() -> None:
+    share = tracks_of("transport-sac")["pair"]["undisturbed"]["met"]
+    assert f"(`transport`; {100 * share:.0f} % met)" in README
+
+
 def test_the_table_is_read() -> None:
     assert len(ROWS) >= 10
     assert {extra for _, _, extra in ROWS} >= {"none", "train", "fly", "gym", "onnx"}

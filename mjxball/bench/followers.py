@@ -38,6 +38,8 @@ def entrant(text: str) -> tuple[str, Make]:
     if path.suffix == ".onnx":
         session = _session(path)
         return path.stem, lambda config: OnnxFollower(path.stem, session)
+    if text in UNRANKED:
+        raise InputError(f"{text} is not ranked: it is told what no follower can know, or is no law")
     if text not in LAWS and ":" not in text:
         names = [*(shipped.stem for shipped in shipped_policies()), *(name for name in LAWS if name not in UNRANKED)]
         raise InputError(

@@ -19,7 +19,7 @@ def read_cfclient(path: Path) -> Series:
 
     The times of each drone are those of its own clock. Raises InputError: there are none, or they are damaged.
     """
-    return {name: _joined(_columns(path / name)) for name in NAMES}
+    return {name: _joined(path / name, _columns(path / name)) for name in NAMES}
 
 
 def _columns(folder: Path) -> dict[str, Samples]:
@@ -60,7 +60,7 @@ def _read_csv(file: Path) -> dict[str, Samples]:
     raise InputError(f"{file} is no text; expected cfclient's CSV")
 
 
-def _joined(columns: dict[str, Samples]) -> dict[str, Samples]:
+def _joined(folder: Path, columns: dict[str, Samples]) -> dict[str, Samples]:
     """Quantities of which every number is there, at the times of their first one."""
     parts: dict[tuple[str, int], Samples] = {}
     for name, one in VARIABLES.items():
@@ -72,6 +72,6 @@ def _joined(columns: dict[str, Samples]) -> dict[str, Samples]:
         if len(own) == width:
             time = own[0][0]
             if any(one[0][0] >= time[-1] or one[0][-1] <= time[0] for one in own):
-                raise InputError(f"numbers of one {quantity} were recorded at different times; expected one recording")
+                raise InputError(f"{folder} has numbers of one {quantity} from different times; expected one recording")
             joined[quantity] = time, np.column_stack([np.interp(time, one[0], one[1][:, 0]) for one in own])
     return joined

@@ -104,6 +104,8 @@ REFUSED = {
     "gone.onnx": "no file gone.onnx",
     "text.onnx": "is no ONNX model",
     "lqgg": "--benchmark takes a file",
+    "oracle": "oracle is not ranked",
+    "random": "random is not ranked",
 }
 
 
