@@ -18,14 +18,14 @@ from mjxball.fly import packets
 from mjxball.fly.app.protocol import APP_VARIABLES, Reply, reply_of, sample_of
 from mjxball.fly.connection import PORT, Deadlines, Element, Identity, LinkError, Parameters, connect
 from mjxball.fly.packets import Packet, PacketError
-from mjxball.fly.process import bounded
+from mjxball.fly.process import bounded, wait_until
 from mjxball.fly.telemetry import HealthSample, Note, SensedSample, Telemetry
 
 Variable = tuple[str, str | None]  # name and type of a log variable; None: as the firmware has it
 PROTOCOL = 12  # CRTP version with a supervisor port
 LOG_PORT, LOG_DATA = 5, 2
 DEADLINES = Deadlines()
-ATTEMPTS, REPEAT = 8, 0.25  # of a packet of an upload, and how long each answer may take [s]
+ATTEMPTS, REPEAT = 8, 0.25  # of a request, and how long each answer may take [s]
 QUIET = 0.1  # [s] without anything to send, after which a ping goes out
 REVISION = ("firmware.revision0", "firmware.revision1", "firmware.modified")
 
@@ -105,25 +105,33 @@ class Link:
         return None if found is None else Element(found.ident, found.pytype, found.access == found.RO_ACCESS)
 
     def start_states(self) -> None:
-        """Have state, what is sensed and health sent at 100, 50, 20 Hz; wait for the first state. Raises LinkError."""
-        block = self._log_block("state", packets.STATE_VARIABLES, 10)
+        """Have state, what is sensed, health sent at 100, 50, 20 Hz; wait for the first of each. Raises LinkError."""
+        block = self._log_block("newest", packets.STATE_VARIABLES, 10)
         self._block = block.id
         self._crazyflie.add_header_callback(self._receive, LOG_PORT, LOG_DATA)
         health = self._log_block("health", self._health_variables(), 50)
         health.data_received_cb.add_callback(lambda stamp, values, config: self._take_health(values))
         sensed = self._log_block("sensed", self._listed(packets.SENSED), 20)
         sensed.data_received_cb.add_callback(lambda stamp, values, config: self._take_sensed(values, stamp))
-        blocks = [block, health, sensed]
+        blocks = [block, health, *([sensed] if sensed.variables else [])]
         if self._crazyflie.log.toc.get_element_by_complete_name(APP_VARIABLES[0][0]) is not None:
             blocks.append(self._log_block("app", APP_VARIABLES, 20))
             blocks[-1].data_received_cb.add_callback(lambda stamp, values, config: self._take_app(values))
-        for one in blocks:
-            self._ask(one.start)
+        self._start(blocks, lambda title: getattr(self.telemetry, title) is not None)
+
+    def _start(self, blocks: Sequence[Any], came: Callable[[str], bool]) -> None:
+        """Start log `blocks` and wait until `came` holds for the title of each. Raises LinkError if one stays silent.
+
+        A firmware drops requests while its queue is full and cflib does not repeat them: a silent block is made anew.
+        """
         deadline = time.monotonic() + self._deadlines.first_state
-        while self.telemetry.newest is None or self.telemetry.health is None:
+        while silent := [one for one in blocks if not came(one.name)]:
             if time.monotonic() > deadline:
-                raise LinkError(f"the {self.name} sends no state within {self._deadlines.first_state:g} s")
-            time.sleep(0.01)
+                names, limit = ", ".join(one.name for one in silent[0].variables), self._deadlines.first_state
+                raise LinkError(f"the {self.name} does not send {names} within {limit:g} s")
+            for one in silent:
+                self._ask(one.delete if one.added else one.start)
+            wait_until(lambda: all(came(one.name) for one in blocks), REPEAT)
 
     def _listed(self, variables: Iterable[Variable]) -> list[Variable]:
         """Those of `variables` that the firmware lists."""
@@ -142,18 +150,12 @@ class Link:
         listed = self._listed([(name, None) for name in names])
         if not listed:
             return {}
-        block, values, came = self._log_block("once", listed, 100), dict[str, float](), threading.Event()
-
-        def take(stamp: int, data: Mapping[str, float], config: Any) -> None:
-            values.update(data)
-            came.set()
-
-        block.data_received_cb.add_callback(take)
-        self._ask(block.start)
-        arrived = came.wait(self._deadlines.first_state)
-        self._ask(block.delete)
-        if not arrived:
-            raise LinkError(f"the {self.name} does not send {', '.join(name for name, _ in listed)}")
+        block, values = self._log_block("once", listed, 100), dict[str, float]()
+        block.data_received_cb.add_callback(lambda stamp, data, config: values.update(data))
+        try:
+            self._start([block], lambda _: bool(values))
+        finally:
+            self._ask(block.delete)
         return values
 
     def write_parameters(self, values: Mapping[str, float], check: bool = True) -> None:

@@ -79,6 +79,34 @@ def test_log_variables_are_read_once(link: Link) -> None:
     assert link.read_logs(["lighthouse.status"]) == {}
 
 
+def test_log_requests_that_a_firmware_drops_are_repeated(
+    monkeypatch: pytest.MonkeyPatch, links: Callable[..., Link]
+) -> None:
+    """Real firmware under load: 3 of 9 flights ended with "sends no state", since one request had been dropped.
+
+    A request to make, extend or start a block is lost once; one of each twice; all of them, for good.
+    """
+    for commands, times in (({6}, 1), ({7}, 1), ({3}, 1), ({3, 6}, 2), ({3, 6}, 10**6)):
+        with Twin(StandIn()) as twin:
+            receive, left = twin.drones[0].receive, [times]
+
+            def lossy(datagram: bytes, now: float, receive=receive, left=left, commands=commands) -> None:  # type: ignore[no-untyped-def]
+                if datagram[0] & 0xF3 == 0x51 and datagram[1] in commands and left[0]:
+                    left[0] -= 1
+                else:
+                    receive(datagram, now)
+
+            monkeypatch.setattr(twin.drones[0], "receive", lossy)
+            link = links(twin.uris[0], dataclasses.replace(SHORT, connect=10.0, first_state=2.0, parameter=3.0))
+            link.open()
+            if times > 10:
+                with pytest.raises(LinkError, match="does not send stateEstimateZ.x"):
+                    link.start_states()
+            else:
+                link.start_states()
+                assert link.read_logs(["pm.vbat"]).keys() == {"pm.vbat"}
+
+
 def test_states_arrive_and_are_young(link: Link) -> None:
     before = link.telemetry.received
     assert wait_for(lambda: link.telemetry.received >= before + 50)
