@@ -14,6 +14,7 @@ PORT, CHANNEL = 13, 2  # the firmware's channel for apps
 BEAT_SIZE, REPLY_SIZE = 44, 8
 CHUNK = 24  # bytes of weights in a packet
 GROUP = "mjxb"
+CONTROLLER, PID, OUT_OF_TREE = "stabilizer.controller", 1, 6  # the firmware hands an app the state as the last alone
 # Names behind the group, with their types, in the order of glue.c; read-only ones are marked.
 PARAMETERS = (
     *((f"{what}{axis}", "float", False) for what in ("goal", "mount") for axis in "XYZ"),

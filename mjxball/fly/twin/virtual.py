@@ -191,7 +191,7 @@ class VirtualTwin:
         self._onboard = cores is not None
         stand, times = self.config.plant.stand != "free", times_of(self.config)
         settings = settings or FlightSettings(seconds=2.0, stand=stand, times=times)
-        limits = positioning.system_of(self.drones[0].peer.values).widen(settings.limits)
+        limits = positioning.system_of(self.drones[0].peer.values.defaults).widen(settings.limits)
         self.settings = dataclasses.replace(settings, motor=motor_of(self.config), limits=limits)
         if self._onboard:
             self.settings = app_flight.settings_of(self.settings)
