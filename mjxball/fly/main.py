@@ -41,6 +41,7 @@ from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
+from mjxball.fly.twin.drone import ACTED
 from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.reading import parse_json
@@ -329,6 +330,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if options.onboard:
             setup, settings = on_board(options, setup, settings)
+        if options.rehearse and (kept := sorted({*more[0], *more[1]} - ACTED)):
+            terminal.say(f"the twin keeps what it does not act on, so this does not show its effect: {', '.join(kept)}")
         for text in swarm.describe(rig) if swarm is not None else []:
             terminal.say(text)
         with contextlib.ExitStack() as stack:
@@ -337,7 +340,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 flags = [*rehearsed_options(options), *twin_options(options)]
                 failure = "the twin did not start; are the ports of --leader and --follower free?"
                 twin = stack.enter_context(Child(["mjxball.fly.twin", *flags], failure))
-                uris = tuple(parse_json(twin.line)["uris"])
+                uris, setup = tuple(parse_json(twin.line)["uris"]), replace(setup, twin=True)
             if capture is not None:
                 setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
             if options.view is not None and log is not None:

@@ -44,6 +44,7 @@ class Phase(enum.IntEnum):
     STOP = 6
 
 
+CANNOT_FLY = "the firmware cannot fly"
 # The sentence of every `mjxball_cause`, in its order.
 CAUSES = (
     "good",
@@ -60,7 +61,7 @@ CAUSES = (
     "the estimator's position cannot be trusted",
     "beyond the fence",
     "tilted beyond the limit",
-    "the firmware cannot fly",
+    CANNOT_FLY,
     "thrust at its bound for too long",
     "the law comes late",
     "the phase lasted too long",

@@ -58,7 +58,8 @@ class TwinDrone:
             self._written,
             functools.partial(self._pair.receive_pose, self.number),
             self.app,
-            ({ESTIMATOR: KALMAN} if self._pair.surroundings.deck else {}) | dict(self._deck.parameters if self._deck else {}),
+            ({ESTIMATOR: KALMAN} if self._pair.surroundings.deck else {})
+            | dict(self._deck.parameters if self._deck else {}),
         )
 
     def _new_app(self) -> App | None:

@@ -38,7 +38,6 @@ EMERGENCY, KEEPALIVE, POSE, POSES = 3, 4, 8, 9  # kinds of generic localization 
 Pose = Callable[[np.ndarray, "np.ndarray | None"], None]
 
 
-
 def header(port: int, channel: int) -> int:
     """First byte of a packet."""
     return port << 4 | 0x0C | channel
