@@ -6,6 +6,7 @@ import functools
 import heapq
 import itertools
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from mjxball.fly.twin.conditions import BodyFault, DroneFaults, LinkFaults, What
 from mjxball.fly.twin.firmware import Firmware, Motors, Order
 from mjxball.fly.twin.logs import Readings, Snapshot
 from mjxball.fly.twin.pair import Modes, Pair, PairState
-from mjxball.fly.twin.parameters import CONTROLLERS, ESTIMATOR, KALMAN, OF_APP
+from mjxball.fly.twin.parameters import CONTROLLERS, ESTIMATOR, KALMAN, OF_APP, PARAMETERS
 from mjxball.fly.twin.positioning import DECKS
 from mjxball.fly.twin.protocol import Peer
 
@@ -33,6 +34,11 @@ SUPERVISOR = {
 }
 # Parameters on which the twin acts; all others it only keeps.
 ACTED = avionics.ACTED | SUPERVISOR.keys() | {CONTROLLER} | {one.name for one in OF_APP if not one.read_only}
+
+
+def only_kept(names: Iterable[str]) -> list[str]:
+    """Those of `names` that the twin has and does not act on."""
+    return sorted({one.name for one in PARAMETERS}.intersection(names) - ACTED)
 
 
 class TwinDrone:

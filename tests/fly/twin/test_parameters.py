@@ -18,12 +18,13 @@ from mjxball.fly.app_flight import check_ready
 from mjxball.fly.connection import LinkError
 from mjxball.fly.link import Link
 from mjxball.fly.main import main as fly
+from mjxball.fly.mocap import Mocap, MocapSettings
 from mjxball.fly.twin import virtual
 from mjxball.fly.twin.conditions import DELIVERED, DRONES, POSITIONING, Conditions, Surroundings
 from mjxball.fly.twin.coupled import CoupledPair
 from mjxball.fly.twin.drone import ACTED, TwinDrone
 from mjxball.fly.twin.firmware import Motors
-from mjxball.fly.twin.logs import LOG_VARIABLES
+from mjxball.fly.twin.logs import GROUPS, LOG_VARIABLES
 from mjxball.fly.twin.parameters import OF_APP, PARAMETERS
 from mjxball.fly.twin.virtual import VirtualTwin
 from mjxball.policy import Policy
@@ -79,18 +80,24 @@ class Recorder(Link):
 @needs_gcc
 @pytest.mark.clock
 def test_the_twin_has_all_that_a_flight_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The names are those of flights: on board, and with each positioning system; with cameras in its own test."""
+    """The names are those that flights ask for, on board, with each positioning system, and with cameras."""
     asked = Recorder.asked = set[str]()
     monkeypatch.setattr(session, "Link", Recorder)
     flags = [["--onboard"], ["--twin-positioning", "lighthouse"], ["--twin-positioning", "loco"]]
     for more in flags:
-        assert fly([str(shipped_policy("flight")), "--rehearse", "--seconds", "0.5", *more]) == 0, more
+        assert fly([str(shipped_policy("flight")), "--rehearse", "--dry-run", "--seconds", "0.2", *more]) < 2, more
+    asked |= Mocap.parameters(SimpleNamespace(settings=MocapSettings("mock"))).keys()  # type: ignore[arg-type]
     listed = {one.name for one in (*PARAMETERS, *OF_APP)} | {name for name, _ in LOG_VARIABLES}
     listed |= {f"{GROUP}.{name}" for name, _ in LOGGED}
     assert asked <= listed
     assert {CONTROLLER, "stabilizer.estimator", "kalman.resetEstimation", "deck.bcDWM1000", "pm.vbatMV"} <= asked
     assert {"mjxb.goalX", "lighthouse.bsReceive", "tdoaEngine.stEst", "motor.m1", "acc.x"} <= asked
     assert len(asked) > 80
+    drones = [drone_with(positioning=system) for system in POSITIONING]
+    for name in asked.intersection(name for name, _ in LOG_VARIABLES):  # and none that it lists is only a 0
+        group, _, own = name.partition(".")
+        known = [drone._snapshot(drone._pair.start()) for drone in drones]
+        assert any(name in one.deck or own in GROUPS.get(group, lambda _: {})(one) for one in known), name
 
 
 def test_a_name_that_the_twin_lacks_ends_a_rehearsal() -> None:
