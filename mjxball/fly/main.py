@@ -41,7 +41,6 @@ from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
-from mjxball.fly.twin.drone import only_kept
 from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 from mjxball.reading import parse_json
@@ -330,8 +329,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if options.onboard:
             setup, settings = on_board(options, setup, settings)
-        if options.rehearse and (kept := only_kept((*more[0], *more[1]))):
-            terminal.say(f"the twin does not act on {', '.join(kept)}: this rehearsal does not show what they do")
         for text in swarm.describe(rig) if swarm is not None else []:
             terminal.say(text)
         with contextlib.ExitStack() as stack:

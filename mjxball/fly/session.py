@@ -32,6 +32,7 @@ from mjxball.fly.process import Metronome, Timing, together, urgent
 from mjxball.fly.setpoints import CurveName, Variants
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
+from mjxball.fly.twin.drone import only_kept
 from mjxball.fly.watchdog import NOTHING, Watchdog
 
 SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
@@ -68,6 +69,8 @@ def fly(
     header |= {"mocap": str(setup.mocap.settings)} if setup.mocap else {}
     header |= {"config": configs.to_dict(setup.controller.config), "gains": gains_to_json((gains[0], gains[1]))}
     header |= {"curve": setup.curve}
+    if setup.twin and (kept := only_kept(name for own in gains for name in own)):
+        _say(f"the twin does not act on {', '.join(kept)}: this rehearsal does not show what they do")
     before = sys.getswitchinterval()
     with Journal(log, **header) as journal:
         links = [Link(uri, name, journal.note, twin=setup.twin) for uri, name in zip(uris, NAMES, strict=True)]
