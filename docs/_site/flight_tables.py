@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import statistics
@@ -19,6 +20,7 @@ from mjxball.fly.packets import THRUST_CEILING, THRUST_FLOOR
 from mjxball.fly.setpoints import CommandMap
 from mjxball.fly.supervisor import TRANSITIONS, Event, State
 from mjxball.fly.twin.conditions import Conditions
+from mjxball.fly.twin.drone import ACTED
 from mjxball.policy import Policy
 from mjxball.policy.file import shipped_policy
 
@@ -96,6 +98,14 @@ def bounds() -> str:
         "no good pose of a drone (motion capture)": f"{MocapLimits().lost:g} s",
     }
     return "\n".join(["| bound | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+
+
+def parameters() -> str:
+    """The parameters on which the twin acts, by group."""
+    lines = ["| group | on which the twin acts |", "|---|---|"]
+    for group, names in itertools.groupby(sorted(ACTED), lambda name: name.partition(".")[0]):
+        lines.append(f"| `{group}` | {', '.join(name.partition('.')[2] for name in names)} |")
+    return "\n".join(lines)
 
 
 def loads() -> str:

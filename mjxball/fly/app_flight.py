@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjxball.errors import InputError
-from mjxball.fly.app.protocol import GROUP, AppSample, Phase, order, reason, upload
+from mjxball.fly.app.protocol import CANNOT_FLY, GROUP, AppSample, Phase, order, reason, upload
 from mjxball.fly.connection import LinkError
 from mjxball.fly.flight import Flight
-from mjxball.fly.limits import NAMES, FlightSettings
+from mjxball.fly.limits import NAMES, Check, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.monitor import UplinkWatch, tilt_angle
 from mjxball.fly.packets import ZERO, Setpoint
@@ -37,19 +37,19 @@ class Apps:
     period: int  # of its law [ms]
     upload: tuple[bytes, int] | None = None  # weights and key, to be put into the follower
 
-    def check(self, links: Sequence[Link], say: Callable[[str], None]) -> None:
-        """Upload weights if wanted, and see that both drones carry the apps of this policy. Raises InputError."""
-        for number, link in enumerate(links):
-            found = self._read(link, ("role", "period"))
-            if int(found["role"]) != number:
-                raise InputError(f"the {link.name} carries the app of the {NAMES[1 - number]}; exchange the URIs")
-            if int(found["period"]) != self.period:
-                own = f"the app of the {link.name} has a period of {found['period']:.0f} ms"
-                raise InputError(f"{own}, and {self.name} one of {self.period} ms")
-        follower = links[1]
+    def check(self, number: int, link: Link, say: Callable[[str], None]) -> None:
+        """See that drone `number` carries its app of this policy; upload weights if wanted. Raises InputError."""
+        found = self._read(link, ("role", "period"))
+        if int(found["role"]) != number:
+            raise InputError(f"the {link.name} carries the app of the {NAMES[1 - number]}; exchange the URIs")
+        if int(found["period"]) != self.period:
+            own = f"the app of the {link.name} has a period of {found['period']:.0f} ms"
+            raise InputError(f"{own}, and {self.name} one of {self.period} ms")
+        if number == 0:
+            return
         if self.upload is not None:
-            send_weights(follower, *self.upload, say)
-        ident = int(self._read(follower, ("ident",))["ident"])
+            send_weights(link, *self.upload, say)
+        ident = int(self._read(link, ("ident",))["ident"])
         if ident not in self.idents:
             raise InputError(
                 f"the follower carries another policy than {self.name}: export it with --crazyflie and flash it"
@@ -65,6 +65,14 @@ class Apps:
                 raise
             raise InputError(f"the {link.name} has no app on board: see docs/onboard.md") from None
         return {name.removeprefix(f"{GROUP}."): value for name, value in found.items()}
+
+
+def check_ready(link: Link) -> Check:
+    """Whether the app would begin a flight; that the firmware cannot fly yet is the firmware's check."""
+    app = link.telemetry.app
+    refusal = None if app is None else reason(app.refusal)
+    ready = refusal in (reason(0), CANNOT_FLY)
+    return Check(f"{link.name} app", ready, "ready" if ready else refusal or "it logs nothing")
 
 
 def send_weights(link: Link, weights: bytes, key: int, say: Callable[[str], None]) -> None:

@@ -33,14 +33,15 @@ REVISION = ("firmware.revision0", "firmware.revision1", "firmware.modified")
 class Link:
     """One drone: newest state, newest setpoint out, parameters. `send` and `command` never block."""
 
-    def __init__(self, uri: str, name: str, note: Note, deadlines: Deadlines = DEADLINES):
+    def __init__(self, uri: str, name: str, note: Note, deadlines: Deadlines = DEADLINES, twin: bool = False):
+        """Of the drone `name` at `uri`. Firmwares differ in what they list; a `twin` must list all it is asked for."""
         self.uri, self.name = uri, name
         self.telemetry = Telemetry()
         self.lost: str | None = None  # why, once the link has ended
         self.overwritten = self.sent = 0
         self.identity = Identity()
         self.busy: bool | str = False  # with `write_later`: True while writing, else why it failed
-        self._note, self._deadlines = note, deadlines
+        self._note, self._deadlines, self._twin = note, deadlines, twin
         self._wake = threading.Condition()
         self._setpoint: Packet | None = None
         self._pose: Packet | None = None
@@ -101,8 +102,15 @@ class Link:
             raise LinkError(f"{self.name} speaks protocol {spoken}, {PROTOCOL} is needed; update its firmware")
 
     def _element(self, name: str) -> Element | None:
-        found = self._crazyflie.param.toc.get_element_by_complete_name(name)
+        found = self._find(self._crazyflie.param, name)
         return None if found is None else Element(found.ident, found.pytype, found.access == found.RO_ACCESS)
+
+    def _find(self, table: Any, name: str) -> Any:
+        """The entry of `name`, None if the firmware lists none. Raises LinkError for a twin that lacks it."""
+        found = table.toc.get_element_by_complete_name(name)
+        if found is None and self._twin:
+            raise LinkError(f"the twin has no {name}, which this flight asks the {self.name} for; a rehearsal needs it")
+        return found
 
     def start_states(self) -> None:
         """Have state, what is sensed, health sent at 100, 50, 20 Hz; wait for the first of each. Raises LinkError."""
@@ -135,8 +143,8 @@ class Link:
 
     def _listed(self, variables: Iterable[Variable]) -> list[Variable]:
         """Those of `variables` that the firmware lists."""
-        find = self._crazyflie.log.toc.get_element_by_complete_name
-        return [(name, kind) for name, kind in variables if find(name) is not None]
+        table = self._crazyflie.log
+        return [(name, kind) for name, kind in variables if self._find(table, name) is not None]
 
     def _health_variables(self) -> list[Variable]:
         motors = next((names for names in packets.MOTORS if len(self._listed(names)) == len(names)), ())

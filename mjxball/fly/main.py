@@ -337,7 +337,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 flags = [*rehearsed_options(options), *twin_options(options)]
                 failure = "the twin did not start; are the ports of --leader and --follower free?"
                 twin = stack.enter_context(Child(["mjxball.fly.twin", *flags], failure))
-                uris = tuple(parse_json(twin.line)["uris"])
+                uris, setup = tuple(parse_json(twin.line)["uris"]), replace(setup, twin=True)
             if capture is not None:
                 setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
             if options.view is not None and log is not None:

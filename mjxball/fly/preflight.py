@@ -17,11 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from mjxball.control import motors, rotations
-from mjxball.control.crazyflie import PairGains, read_pair_gains
+from mjxball.control.crazyflie import Gains, PairGains, read_pair_gains
 from mjxball.control.motors import Motor
 from mjxball.errors import InputError
 from mjxball.files import read_text
 from mjxball.fly import packets, positioning
+from mjxball.fly.app.protocol import CONTROLLER, OUT_OF_TREE, PID
 from mjxball.fly.connection import LinkError
 from mjxball.fly.limits import NAMES, Check, Limits
 from mjxball.fly.link import Link
@@ -33,8 +34,6 @@ from mjxball.fly.setpoints import CURVE_NAMES, CurveName, Variant, Variants
 from mjxball.fly.supervisor import Event, Fault
 from mjxball.fly.telemetry import DroneLink, Note, Rig, yaw_of
 from mjxball.reading import parse_json
-
-CONTROLLER, PID = "stabilizer.controller", 1.0  # other programs leave another one, until the drone is switched off
 
 
 @dataclass(frozen=True)
@@ -72,26 +71,36 @@ def read_gains(path: Path) -> PairGains:
         ) from None
 
 
+def parameters_of(gains: Gains, on_board: bool) -> Gains:
+    """What a flight writes to a drone: its gains and the controller, which another program or flight may have changed.
+
+    `on_board` it is the app's own: the firmware hands an app the state under no other one.
+    """
+    return {**gains, CONTROLLER: float(OUT_OF_TREE if on_board else PID)}
+
+
 def prepare(
     links: Sequence[Link],
     variants: Sequence[Variants],
     required: Preflight,
     say: Callable[[str], None],
     mocap: Mocap | None = None,
+    check_app: Callable[[int, Link], None] | None = None,
 ) -> list[CurveName]:
-    """Open both links at once, write each drone's gains, start the states, reset the estimators. Raises LinkError.
+    """Open both links at once, write each drone's gains, start the states, reset the estimators. Raises InputError.
 
     Returns the force curves that the firmwares' versions promise, whose gains were written. With `mocap`, poses go to
-    each drone from before its estimator is reset.
+    each drone from before its estimator is reset. `check_app` refuses a drone without the app of a flight on board.
     """
     curves: dict[str, CurveName] = {}
 
     def one(link: Link, own: Variants) -> None:
         link.open(say)
         check_kind(link, required, mocap is not None)
+        if check_app is not None:
+            check_app(links.index(link), link)
         curves[link.name] = promised_curve(link, own)
-        link.write_parameters(own[curves[link.name]].gains)
-        link.write_parameters(dict.fromkeys(link.parameters.listed([CONTROLLER]), PID))
+        link.write_parameters(parameters_of(own[curves[link.name]].gains, check_app is not None))
         if mocap is not None:
             link.write_parameters(mocap.parameters())
             mocap.feed(links.index(link), link)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import sys
 import time
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.errors import InputError
 from mjxball.fly import packets, positioning
-from mjxball.fly.app_flight import Apps, OnboardFlight
+from mjxball.fly.app_flight import Apps, OnboardFlight, check_ready
 from mjxball.fly.card import Controller
 from mjxball.fly.connection import LinkError
 from mjxball.fly.display import Display, listening
@@ -31,6 +32,7 @@ from mjxball.fly.process import Metronome, Timing, together, urgent
 from mjxball.fly.setpoints import CurveName, Variants
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
+from mjxball.fly.twin.drone import only_kept
 from mjxball.fly.watchdog import NOTHING, Watchdog
 
 SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
@@ -47,6 +49,7 @@ class FlightSetup:
     preflight: Preflight
     mocap: Mocap | None = None  # ready; the caller ends it
     apps: Apps | None = None  # on board, if the laws are to run there
+    twin: bool = False  # of our own, which must have all that a flight asks a drone for
 
 
 def fly(
@@ -66,9 +69,11 @@ def fly(
     header |= {"mocap": str(setup.mocap.settings)} if setup.mocap else {}
     header |= {"config": configs.to_dict(setup.controller.config), "gains": gains_to_json((gains[0], gains[1]))}
     header |= {"curve": setup.curve}
+    if setup.twin and (kept := only_kept(name for own in gains for name in own)):
+        _say(f"the twin does not act on {', '.join(kept)}: this rehearsal does not show what they do")
     before = sys.getswitchinterval()
     with Journal(log, **header) as journal:
-        links = [Link(uri, name, journal.note) for uri, name in zip(uris, NAMES, strict=True)]
+        links = [Link(uri, name, journal.note, twin=setup.twin) for uri, name in zip(uris, NAMES, strict=True)]
         try:
             sys.setswitchinterval(SWITCH_INTERVAL)
             # Apps land by themselves: nobody else must take their place.
@@ -77,14 +82,13 @@ def fly(
                 journal.note("priority", granted=priority)
                 if setup.mocap is not None:
                     setup.mocap.note = journal.note
-                curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap)
+                check_app = None if setup.apps is None else functools.partial(setup.apps.check, say=_say)
+                curves = prepare(links, setup.variants, setup.preflight, _say, setup.mocap, check_app)
                 if setup.mocap is None:
                     system = positioning.common(links)
                     if setup.apps is not None and system.noise:
                         raise LinkError(f"apps on board descend at the variance of {system.name}: leave --onboard out")
                     settings = dataclasses.replace(settings, limits=system.widen(settings.limits))
-                if setup.apps is not None:
-                    setup.apps.check(links, _say)
                 pair = (links, setup.controller, setup.variants, curves, setup.rig)
                 kind = Flight if setup.apps is None else OnboardFlight
                 flight = kind(*pair, settings, journal.note, watchdog, setup.mocap)
@@ -152,6 +156,7 @@ def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings
     else:
         checks += setup.mocap.checks()
         setup.mocap.guarding = True
+    checks += [] if setup.apps is None else map(check_ready, links)
     for one in checks:
         journal.note("check", name=one.name, passed=one.passed, found=one.found)
         _say(f"{'good' if one.passed else 'BAD '}  {one.name}: {one.found}")

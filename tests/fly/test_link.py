@@ -175,16 +175,10 @@ def test_parameters_that_cannot_be_written_are_named(link: Link, name: str, valu
         link.write_parameters({name: value})
 
 
-def test_a_parameter_that_does_not_stick_is_found(twin: Twin, link: Link) -> None:
-    values = twin.drones[0].peer.values
-
-    class Stubborn(dict):  # acknowledges the write and keeps the old value
-        def __setitem__(self, key: str, value: float) -> None:
-            pass
-
-    twin.drones[0].peer.values = Stubborn(values)
-    with pytest.raises(LinkError, match="reads 250"):
-        link.write_parameters({"pid_rate.roll_kp": 100.0})
+def test_a_parameter_that_does_not_stick_is_found(link: Link) -> None:
+    """The firmware of no app keeps its controller if it is asked for that of an app."""
+    with pytest.raises(LinkError, match=r"stabilizer\.controller of the leader reads 1 after 6 was written"):
+        link.write_parameters({"stabilizer.controller": 6.0})
 
 
 def test_a_parameter_that_is_never_confirmed_has_a_deadline(twin: Twin, link: Link) -> None:

@@ -14,6 +14,7 @@ import pytest
 from tables import rows
 
 from mjxball.control import rotations
+from mjxball.errors import InputError
 from mjxball.fly.connection import READ, Deadlines, Element, Identity, LinkError, Parameters, connect
 from mjxball.fly.limits import Limits
 from mjxball.fly.packets import DroneState, Health, Packet, Sensed
@@ -40,6 +41,7 @@ class Drone:
     def __init__(self, name: str = "leader", estimator: float = KALMAN, device: str = "Crazyflie 2.1"):
         self.name, self.identity = name, Identity(12, "2026.08", device)
         self.values = {"stabilizer.estimator": estimator, "kalman.resetEstimation": 0.0, "pid_rate.roll_kp": 250.0}
+        self.values["stabilizer.controller"] = 2.0  # Crazyswarm2's, which takes none of the gains
         self.names = list(self.values)
         self.events: list[str] = []
         self.parameters = Parameters(name, self._find, self._answer, wait=0.5)
@@ -114,19 +116,28 @@ def test_gains_and_poses_come_before_the_reset(measured: bool) -> None:
     for number, drone in enumerate(drones):
         poses = ["stabilizer.estimator = 2", f"poses of {number}"] if measured else []
         assert drone.events[:-1] == [
-            *("open", "pid_rate.roll_kp = 100", *poses, "states", "kalman.resetEstimation = 1"),
+            *("open", "pid_rate.roll_kp = 100", "stabilizer.controller = 1"),
+            *(*poses, "states", "kalman.resetEstimation = 1"),
         ]
         assert drone.values["stabilizer.estimator"] == KALMAN
 
 
 def test_another_programs_controller_is_replaced() -> None:
-    """Crazyswarm2 flies with the Mellinger controller, which takes none of the gains."""
-    drones = [Drone("leader"), Drone("follower")]
-    for drone in drones:
-        drone.values["stabilizer.controller"] = 2.0
-        drone.names.append("stabilizer.controller")
-    prepare(drones, [OWN, OWN], ASKED, print)
-    assert [drone.values["stabilizer.controller"] for drone in drones] == [1.0, 1.0]
+    """By the PID for the laptop's laws, and by the app's own, which is handed the state, for laws on board."""
+    for on_board, wanted in ((False, 1.0), (True, 6.0)):
+        drones = [Drone("leader"), Drone("follower")]
+        prepare(drones, [OWN, OWN], ASKED, print, None, (lambda number, link: None) if on_board else None)
+        assert [drone.values["stabilizer.controller"] for drone in drones] == [wanted, wanted]
+
+
+def test_a_drone_without_an_app_is_refused_before_anything_is_written() -> None:
+    def refuse(number: int, link: Drone) -> None:
+        raise InputError("no app")
+
+    drone = Drone()
+    with pytest.raises(InputError, match="no app"):
+        prepare([drone], [OWN], ASKED, print, None, refuse)
+    assert drone.events == ["open"]
 
 
 def test_gains_for_another_firmware_are_refused() -> None:

@@ -195,7 +195,7 @@ static void supervise(mjxball_app *app, uint8_t fault, const seen *one, const mj
     const uint8_t order = laptop_is_heard(app) ? app->order : MJXBALL_IDLE;
     wish to = {app->phase, app->cause};
     if (app->phase == MJXBALL_IDLE) {
-        app->refusal = order == MJXBALL_SPIN ? refusal_of(app, fault, state) : app->refusal;
+        app->refusal = refusal_of(app, fault, state);
         if (order == MJXBALL_SPIN && !app->refusal) enter(app, MJXBALL_SPIN, MJXBALL_ASKED, map);
         return;
     }

@@ -130,9 +130,10 @@ static void receive(uint32_t now) {
 
 static void say(void) {
     static uint8_t phase, refusal;
-    if (core.refusal != refusal && core.refusal) DEBUG_PRINT("refused: %s\n", mjxball_text(core.refusal));
+    const uint8_t refused = core.order == MJXBALL_SPIN ? core.refusal : MJXBALL_GOOD; /* before, nobody asks */
+    if (refused != refusal && refused) DEBUG_PRINT("refused: %s\n", mjxball_text(refused));
     if (core.phase != phase) DEBUG_PRINT("phase %d: %s\n", core.phase, mjxball_text(core.cause));
-    refusal = core.refusal;
+    refusal = refused;
     phase = core.phase;
 }
 
@@ -195,7 +196,7 @@ PARAM_GROUP_STOP(mjxb)
 LOG_GROUP_START(mjxb)
 LOG_ADD(LOG_UINT8, phase, &core.phase)        /* see core.h */
 LOG_ADD(LOG_UINT8, cause, &core.cause)        /* of the phase */
-LOG_ADD(LOG_UINT8, refusal, &core.refusal)    /* why it did not start */
+LOG_ADD(LOG_UINT8, refusal, &core.refusal)    /* why it would not start */
 LOG_ADD(LOG_UINT8, copying, &core.copying)    /* 1: the copying law flies */
 LOG_ADD(LOG_FLOAT, late, &core.late)          /* late ticks, lately */
 LOG_ADD(LOG_UINT32, used, &used)              /* time of a tick [us] */

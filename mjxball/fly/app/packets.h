@@ -123,7 +123,6 @@ int mjxball_laptop(mjxball_app *app, const uint8_t *data, int size, uint32_t now
     if (size < 1 || data[0] < 2 || data[0] > 4) return 0;
     reply[0] = data[0];
     reply[1] = take(app, data, size, memory);
-    if (reply[1]) app->refusal = reply[1];
     received = app->upload.received;
     reply[2] = reply[3] = 0;
     copy(reply + 4, &received, 4);

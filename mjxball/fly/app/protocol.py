@@ -14,6 +14,7 @@ PORT, CHANNEL = 13, 2  # the firmware's channel for apps
 BEAT_SIZE, REPLY_SIZE = 44, 8
 CHUNK = 24  # bytes of weights in a packet
 GROUP = "mjxb"
+CONTROLLER, PID, OUT_OF_TREE = "stabilizer.controller", 1, 6  # the firmware hands an app the state as the last alone
 # Names behind the group, with their types, in the order of glue.c; read-only ones are marked.
 PARAMETERS = (
     *((f"{what}{axis}", "float", False) for what in ("goal", "mount") for axis in "XYZ"),
@@ -43,6 +44,7 @@ class Phase(enum.IntEnum):
     STOP = 6
 
 
+CANNOT_FLY = "the firmware cannot fly"
 # The sentence of every `mjxball_cause`, in its order.
 CAUSES = (
     "good",
@@ -59,7 +61,7 @@ CAUSES = (
     "the estimator's position cannot be trusted",
     "beyond the fence",
     "tilted beyond the limit",
-    "the firmware cannot fly",
+    CANNOT_FLY,
     "thrust at its bound for too long",
     "the law comes late",
     "the phase lasted too long",

@@ -6,6 +6,7 @@ Written from the facts of bitcraze/crazyflie-firmware 2026.08. Times in seconds 
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -123,6 +124,7 @@ class Supervisor:
         self.armed = self.crashed = self.emergency = self.tumbled = False
         self.stopped = 0.0  # parameter stabilizer.stop: an emergency as long as it is not 0
         self.tumble_check = 1.0
+        self.crash_force = 0.0  # [g] beyond 1 g at which it counts as tumbled; 0: none
         self.keepalive: float | None = None
         self.preflight_time, self.landed_time = PREFLIGHT_TIME, LANDED_TIME
         self._thrust_time: float | None = None
@@ -199,6 +201,8 @@ class Supervisor:
             self.armed = True
 
     def _tumbling(self, now: float, x: float, y: float, z: float) -> bool:
+        if 0 < self.crash_force < abs(math.hypot(x, y, z) - 1.0):
+            return True
         if abs(x) < FREE_FALL and abs(y) < FREE_FALL and abs(z) < FREE_FALL:
             self._tumble_time = None
         if z >= TILTED:

@@ -12,7 +12,8 @@ from mjxball.control.crazyflie import PARAMETERS, gains_of, with_gains
 from mjxball.fly.twin.conditions import OLDER_FORCE, Battery, DroneKind, Surroundings
 from mjxball.fly.twin.estimators import Complementary, Imu, Kalman, euler_of
 from mjxball.fly.twin.pair import RUNNING, Modes, Report, remembered
-from mjxball.fly.twin.positioning import Deck, positioning_of
+from mjxball.fly.twin.parameters import COMPLEMENTARY, ESTIMATOR, KALMAN
+from mjxball.fly.twin.positioning import SWITCHES, Deck, positioning_of
 
 TAKEN = 0.01  # share of the measured voltage that the firmware's low-pass filter takes, 1000 times a second
 FIRST = 4.2  # [V] that the filter starts from
@@ -69,7 +70,11 @@ class Power:
 TICK = 2  # [ms] of the cascade
 PREDICTION = 10  # [ms] of the Kalman filter
 AIR = 4  # [ms] of the complementary filter
-COMPLEMENTARY, KALMAN = 1, 2  # numbers of the parameter stabilizer.estimator
+# Parameters that change what `Onboard` does, each with the place of what it sets.
+INITIAL = {f"kalman.initial{axis}": place for place, axis in enumerate("XYZ")}
+DEVIATIONS = {"locSrv.extPosStdDev": 0, "locSrv.extQuatStdDev": 1}
+RESET, IDLE = "kalman.resetEstimation", "powerDist.idleThrust"
+ACTED = frozenset({*PARAMETERS, *INITIAL, *DEVIATIONS, *SWITCHES, RESET, IDLE, ESTIMATOR})
 
 
 class Onboard:
@@ -111,22 +116,22 @@ class Onboard:
     # What the laptop sends.
 
     def set_parameter(self, drone: int, name: str, value: float) -> None:
-        """A parameter was written; those that do not matter here are ignored."""
+        """A parameter was written; those that are not in `ACTED` do not matter here."""
         if name in PARAMETERS:
             self._autopilots[drone] = with_gains(self._autopilots[drone], {name: value})
             self._arrange_gains()
-        elif name == "kalman.resetEstimation" and value:
+        elif name == RESET and value:
             self._resets.add(drone)
-        elif name == "stabilizer.estimator":
+        elif name == ESTIMATOR:
             self._switch(drone, int(value))
-        elif name.startswith("kalman.initial") and name[-1] in "XYZ":
-            self.initial[drone, "XYZ".index(name[-1])] = value
-        elif name == "powerDist.idleThrust" and not self.kind.auto_arm:
+        elif name in INITIAL:
+            self.initial[drone, INITIAL[name]] = value
+        elif name == IDLE and not self.kind.auto_arm:
             self.idle[drone] = value
-        elif name == "locSrv.extPosStdDev":
-            self.deviations[drone][0] = max(value, 1e-6)
-        elif name == "locSrv.extQuatStdDev":
-            self.deviations[drone][1] = max(value, 1e-6)
+        elif name in DEVIATIONS:
+            self.deviations[drone][DEVIATIONS[name]] = max(value, 1e-6)
+        elif name in SWITCHES:
+            self.positioning[drone].switch(name, value)
 
     def receive_pose(self, drone: int, position: np.ndarray, quaternion: np.ndarray | None) -> None:
         """A pose from outside; only the Kalman filter takes it."""
@@ -139,8 +144,7 @@ class Onboard:
             self._look(drone)
 
     def _switch(self, drone: int, kind: int) -> None:
-        kind = {0: KALMAN if self.surroundings.deck else COMPLEMENTARY}.get(kind, kind)
-        if kind in (COMPLEMENTARY, KALMAN) and kind != self.estimators[drone]:
+        if kind != self.estimators[drone]:
             self.estimators[drone] = kind
             if kind == KALMAN:
                 self.filters[drone].reset()

@@ -6,17 +6,19 @@ import functools
 import heapq
 import itertools
 import math
+from collections.abc import Iterable
 
 import numpy as np
 
 from mjxball.fly.app.host import App, Library, State
-from mjxball.fly.app.protocol import GROUP
-from mjxball.fly.packets import Setpoint
-from mjxball.fly.twin import protocol
+from mjxball.fly.app.protocol import CONTROLLER, GROUP, OUT_OF_TREE, PID
+from mjxball.fly.packets import ZERO, Setpoint
+from mjxball.fly.twin import avionics
 from mjxball.fly.twin.conditions import BodyFault, DroneFaults, LinkFaults, What
 from mjxball.fly.twin.firmware import Firmware, Motors, Order
 from mjxball.fly.twin.logs import Readings, Snapshot
 from mjxball.fly.twin.pair import Modes, Pair, PairState
+from mjxball.fly.twin.parameters import CONTROLLERS, ESTIMATOR, KALMAN, OF_APP, PARAMETERS
 from mjxball.fly.twin.positioning import DECKS
 from mjxball.fly.twin.protocol import Peer
 
@@ -27,8 +29,16 @@ SUPERVISOR = {
     "supervisor.prefltTimeout": ("preflight_time", 1e-3),
     "supervisor.landedTimeout": ("landed_time", 1e-3),
     "supervisor.tmblChckEn": ("tumble_check", 1.0),
+    "supervisor.crashDetectGs": ("crash_force", 1.0),
     "stabilizer.stop": ("stopped", 1.0),
 }
+# Parameters on which the twin acts; all others it only keeps.
+ACTED = avionics.ACTED | SUPERVISOR.keys() | {CONTROLLER} | {one.name for one in OF_APP if not one.read_only}
+
+
+def only_kept(names: Iterable[str]) -> list[str]:
+    """Those of `names` that the twin has and does not act on."""
+    return sorted({one.name for one in PARAMETERS}.intersection(names) - ACTED)
 
 
 class TwinDrone:
@@ -39,7 +49,6 @@ class TwinDrone:
         self._pair, self.number = pair, number
         self._random = np.random.default_rng([pair.surroundings.seed, number])
         self.firmware = Firmware(pair.kind, phase=float(self._random.random()))
-        self._estimator = 2 if pair.surroundings.deck else 1
         self._core = core
         self._deck = DECKS.get(pair.surroundings.positioning)
         self.app = self._new_app()
@@ -48,21 +57,21 @@ class TwinDrone:
         self.up, self.down = Channel(self._random), Channel(self._random)
         self._now = self._stamp = self._booted = 0.0  # [s]
         self._readings: Readings | None = None
-        self._estimated = 0  # [ms] of the estimate that an app sees
 
     def _new_peer(self) -> Peer:
         return Peer(
             self.firmware,
             self._written,
             functools.partial(self._pair.receive_pose, self.number),
-            self._estimator,
             self.app,
-            None if self._deck is None else self._deck.parameters,
+            ({ESTIMATOR: KALMAN} if self._pair.surroundings.deck else {})
+            | dict(self._deck.parameters if self._deck else {}),
         )
 
     def _new_app(self) -> App | None:
         self.beat = b""  # heartbeat that is on its way to the other drone
         self._ticks, self._next_tick, self._app_ran = 0, 0.0, False
+        self._handed = State()  # by the app's own controller, which alone is given the estimate
         return None if self._core is None else App(self._core, self.number)
 
     def _written(self, name: str, value: float) -> None:
@@ -71,7 +80,19 @@ class TwinDrone:
             setattr(self.firmware.supervisor, field, value * factor)
         if self.app is not None and name.startswith(f"{GROUP}."):
             self.app.set(name.removeprefix(f"{GROUP}."), value)
+        if name == CONTROLLER:
+            self._say_controller(int(value))
         self._pair.set_parameter(self.number, name, value)
+
+    @property
+    def controller(self) -> int:
+        """Number of the controller in use."""
+        return int(self.peer.values[CONTROLLER])
+
+    def _say_controller(self, number: int) -> None:
+        self.peer.tell(f"CONTROLLER: Using {CONTROLLERS[number]} ({number}) controller")
+        if number not in (PID, OUT_OF_TREE):
+            self.peer.tell("TWIN: it has no such controller, motors stay off")
 
     def receive(self, datagram: bytes, now: float) -> None:
         """A datagram came from the laptop."""
@@ -120,6 +141,8 @@ class TwinDrone:
         before = self.firmware.supervisor
         acceleration = (report.acceleration[mine] / GRAVITY).tolist()
         order = self.firmware.step(now, acceleration, report.pwm[mine].tolist(), hung, wrong.restarts)
+        if self.controller not in (PID, OUT_OF_TREE):
+            order = self.firmware.order = Order(ZERO, Motors.OFF)
         if self.firmware.supervisor is not before:
             self._forget(now)
         if not wrong.clock_stopped:
@@ -137,14 +160,13 @@ class TwinDrone:
             return
         self._next_tick = max(self._next_tick, now - 1e-9) + self.app.period / 1000
         seen = self._readings.snapshot if self.faults.frozen and self._readings else self._snapshot(state)
-        report, mine, estimate = seen.report, self.number, State()
-        estimate.position[:], estimate.velocity[:] = seen.position.tolist(), report.velocity[mine].tolist()
-        estimate.quaternion[:], estimate.rates[:] = report.quaternion[mine].tolist(), report.rates[mine].tolist()
+        report, mine, estimate, clock = seen.report, self.number, self._handed, round(1000 * now)
+        if self.controller == OUT_OF_TREE and not self.faults.stabilizer_dead:
+            estimate.position[:], estimate.velocity[:] = seen.position.tolist(), report.velocity[mine].tolist()
+            estimate.quaternion[:], estimate.rates[:] = report.quaternion[mine].tolist(), report.rates[mine].tolist()
+            estimate.time = clock
         estimate.variance[:] = report.variance[mine][:3].tolist()
-        estimate.voltage = seen.voltage
-        clock = round(1000 * now)
-        self._estimated = self._estimated if self.faults.stabilizer_dead else clock
-        estimate.time, estimate.can_fly = self._estimated, self.firmware.supervisor.can_fly
+        estimate.voltage, estimate.can_fly = seen.voltage, self.firmware.supervisor.can_fly
         wanted = self.app.tick(estimate, clock)
         if wanted.active:
             self.firmware.commander.from_app(Setpoint(wanted.roll, wanted.pitch, 0.0, int(wanted.thrust)), now)
@@ -196,7 +218,7 @@ class TwinDrone:
         self.peer = self._new_peer()
         self._booted = now
         self.faults = DroneFaults()
-        for name, value in protocol.defaults_of(self.firmware.kind, self._estimator).items():
+        for name, value in self.peer.values.defaults.items():
             self._pair.set_parameter(self.number, name, value)
         self._pair.set_parameter(self.number, "kalman.resetEstimation", 1.0)
 

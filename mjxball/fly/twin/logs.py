@@ -26,7 +26,7 @@ LOG_CODES = dict(LOG_TYPES.values())
 
 
 def listed(table: str) -> list[dict[str, str]]:
-    """Rows of `names.csv` in the order of the firmware's own table "log" or "param", or of what decks add to it."""
+    """Rows of `names.csv` in the order of the firmware's own table "log" or "param", with what its deck drivers add."""
     with Path(__file__).with_name("names.csv").open(encoding="utf-8", newline="") as file:
         return [row for row in csv.DictReader(file) if row["table"] == table]
 
@@ -40,7 +40,6 @@ def item(type_byte: int, name: str) -> bytes:
 LOG_VARIABLES: tuple[tuple[str, str], ...] = tuple((row["name"], row["type"]) for row in listed("log"))
 OF_APP = tuple((f"{GROUP}.{name}", kind) for name, kind in LOGGED)
 KNOWN = LOG_VARIABLES + OF_APP  # those of the app are listed by a drone that has one
-OF_DECKS = tuple((row["name"], row["type"]) for row in listed("deck log"))
 
 
 class Snapshot(NamedTuple):

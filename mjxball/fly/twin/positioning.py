@@ -33,8 +33,14 @@ Pose = tuple[np.ndarray, np.ndarray]  # position (3,) [m], quaternion (4,)
 POSITION_NOISE, ATTITUDE_NOISE = 3e-4, 1e-3  # of motion capture: standard deviations [m, rad]
 
 
+# Parameters of decks, each with the value at which nothing reaches the filter.
+SWITCHES = {"lighthouse.fwdToEstimator": 0.0, "loco.fwdToEstimator": 0.0, "motion.disable": 1.0}
+
+
 class Positioning:
     """Motion capture of one drone: whole poses; and of every system, when it measures and its faults."""
+
+    switched_by = ""  # which of `SWITCHES`
 
     def __init__(self, surroundings: Surroundings, random: np.random.Generator, phase: int):
         """`phase` [ms] of its first pose: the systems of two drones do not measure at the same moment."""
@@ -43,6 +49,7 @@ class Positioning:
         self._phase = phase * self._every // 2
         self._loss = surroundings.pose_loss
         self._lost = not surroundings.deck
+        self._off = False  # by a parameter of the deck
         self._frozen = np.zeros(7, bool)  # of x, y, z and the quaternion
         self._repeats = 1  # poses in a row that are one
         self._offset, self._count = np.zeros(3), 0
@@ -62,10 +69,15 @@ class Positioning:
             case "jump":
                 self._offset = np.array([0.0, 0.0, value])
 
+    def switch(self, name: str, value: float) -> None:
+        """A parameter of `SWITCHES` was written; it matters to its own deck alone."""
+        if name == self.switched_by:
+            self._off = value == SWITCHES[name]
+
     def due(self, step: int) -> bool:
         """True if a measurement comes at millisecond `step`."""
         return (
-            not self._lost
+            not (self._lost or self._off)
             and (step + self._phase) % self._every == 0
             and not (self._loss and self._random.random() < self._loss)
         )
@@ -124,7 +136,7 @@ class Deck(Positioning):
 class Lighthouse(Deck):
     """See the module."""
 
-    period = 20
+    period, switched_by = 20, "lighthouse.fwdToEstimator"
     parameters: ClassVar = {"deck.bcLighthouse4": 1.0}
     logged: ClassVar = {f"lighthouse.bs{name}": 0b11 for name in ("Receive", "Active", "GeoVal", "CalVal", "CalCon")}
     DISTORTION, JITTER, YAW_JITTER = 0.01, 1e-3, 0.01  # [1], [m], [rad]
@@ -157,8 +169,8 @@ class Lighthouse(Deck):
 class Loco(Deck):
     """See the module."""
 
-    period = 5  # in which two packets come
-    parameters: ClassVar = {"deck.bcLoco": 1.0}
+    period, switched_by = 5, "loco.fwdToEstimator"  # two packets come in a period
+    parameters: ClassVar = {"deck.bcLoco": 1.0, "deck.bcDWM1000": 1.0}
     logged: ClassVar = {"loco.mode": 3, "ranging.state": 0, "tdoaEngine.stEst": 340.0}
     ANCHORS = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-2.0, 2.0) for z in (0.2, 2.5)])  # [m]
     LOST, BIAS, JITTER = 0.15, 0.054, 0.10  # share of packets, [m], [m]
@@ -186,7 +198,7 @@ class Loco(Deck):
 class Flow(Deck):
     """See the module."""
 
-    period = 12
+    period, switched_by = 12, "motion.disable"
     parameters: ClassVar = {"deck.bcFlow2": 1.0}
     PIXELS, APERTURE, COUNTS = 35.0, 0.71674, 10.0  # of the camera: [pixels], [rad], counts a pixel
     DEVIATION, HEIGHT = 2.0, 2.5e-3  # [counts], [m]

@@ -8,31 +8,25 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.control.crazyflie import STOCK, gains_of
 from mjxball.fly import packets
 from mjxball.fly.app.host import App
-from mjxball.fly.app.protocol import GROUP
-from mjxball.fly.app.protocol import PARAMETERS as APP_PARAMETERS
 from mjxball.fly.packets import PacketError
-from mjxball.fly.twin.conditions import DroneKind
 from mjxball.fly.twin.firmware import Firmware
 from mjxball.fly.twin.logs import (
     LOG_TYPES,
     LOG_VARIABLES,
     MAX_BLOCKS,
     MAX_VARIABLES,
-    OF_DECKS,
+    OF_APP,
     UNKNOWN,
     Blocks,
     Readings,
     item,
-    listed,
 )
-from mjxball.fly.twin.logs import OF_APP as LOGGED_BY_APP
+from mjxball.fly.twin.parameters import Parameter, Values
 
 VERSION = 12
 MAX_DATA = 30
@@ -40,92 +34,8 @@ GREETING = b"Bitcraze Crazyflie".ljust(30, b"\0")
 CONSOLE, PARAM, COMMANDER, MEMORY, LOG, LOCALIZATION, GENERIC, SUPERVISOR = 0, 2, 3, 4, 5, 6, 7, 9
 PLATFORM, LINK = 13, 15
 ADDRESS = 0xE7  # last byte of the radio's, by which packed poses are told apart
-# Parameters that the firmware sets to 0 by itself, within a millisecond or so: no radio reads them back sooner.
-CLEARED = {"kalman.resetEstimation", "supervisor.infdmp", "syslink.probe", "system.taskDump", "system.storageStats"}
-CLEARED |= {"health.startPropTest", "health.startBatTest"}
 EMERGENCY, KEEPALIVE, POSE, POSES = 3, 4, 8, 9  # kinds of generic localization packets
 Pose = Callable[[np.ndarray, "np.ndarray | None"], None]
-
-
-PARAM_TYPES = {"uint8_t": (8, "B"), "uint16_t": (9, "H"), "uint32_t": (10, "I"), "int8_t": (0, "b")}
-PARAM_TYPES |= {"int16_t": (1, "h"), "int32_t": (2, "i"), "float": (6, "f")}
-READ_ONLY, EXTENDED = 0x40, 0x10
-DEFAULTS = {
-    **gains_of(STOCK),
-    "firmware.revision0": float(0x20260800),
-    "kalman.attitudeRev": 0.001,
-    "kalman.mNBaro": 2.0,
-    "kalman.mNGyro_rollpitch": 0.1,
-    "kalman.mNGyro_yaw": 0.1,
-    "kalman.maxPos": 100.0,
-    "kalman.maxVel": 10.0,
-    "kalman.pNAcc_xy": 0.5,
-    "kalman.pNAcc_z": 1.0,
-    "lighthouse.fwdToEstimator": 1.0,
-    "loco.fwdToEstimator": 1.0,
-    "locSrv.extPosStdDev": 0.01,
-    "locSrv.extQuatStdDev": 4.5e-3,
-    "pm.criticalLowVoltage": 3.0,
-    "pm.lowVoltage": 3.2,
-    "stabilizer.controller": 1.0,
-    "stabilizer.estimator": 2.0,
-    "supervisor.landedTimeout": 3000.0,
-    "supervisor.prefltTimeout": 30000.0,
-    "supervisor.spinupTimeout": 2000.0,
-    "supervisor.tmblChckEn": 1.0,
-    "system.selftestPassed": 1.0,
-    "flightmode.stabModeRoll": 1.0,
-    "flightmode.stabModePitch": 1.0,
-    "flightmode.yawMode": 2.0,
-}
-
-
-class Parameter(NamedTuple):
-    """One parameter of the firmware."""
-
-    name: str  # "group.name"
-    kind: str  # a key of PARAM_TYPES
-    default: float
-    read_only: bool = False
-    persistent: bool = False
-
-    @property
-    def type_byte(self) -> int:
-        """The byte that describes it in the table of contents."""
-        return PARAM_TYPES[self.kind][0] | READ_ONLY * self.read_only | EXTENDED * self.persistent
-
-    def pack(self, value: float) -> bytes:
-        """`value` as bytes of its type."""
-        return struct.pack("<" + PARAM_TYPES[self.kind][1], value if self.kind == "float" else int(value))
-
-    def unpack(self, data: bytes) -> float:
-        """Value in `data`; raises struct.error for a wrong length."""
-        return float(struct.unpack("<" + PARAM_TYPES[self.kind][1], data)[0])
-
-
-def _parameters(table: str) -> tuple[Parameter, ...]:
-    return tuple(
-        Parameter(row["name"], row["type"], DEFAULTS.get(row["name"], 0.0), row["access"] == "r", row["access"] == "p")
-        for row in listed(table)
-    )
-
-
-PARAMETERS = _parameters("param")
-DECK_PARAMETERS = _parameters("deck param")
-OF_APP = tuple(Parameter(f"{GROUP}.{name}", kind, 0.0, read_only) for name, kind, read_only in APP_PARAMETERS)
-
-
-def defaults_of(kind: DroneKind, estimator: int) -> dict[str, float]:
-    """Values that the parameters of a drone of a `kind` have after boot; `estimator` is what its decks ask for."""
-    values = {parameter.name: parameter.default for parameter in PARAMETERS}
-    values["stabilizer.estimator"] = float(estimator)
-    values["powerDist.idleThrust"] = float(kind.idle)
-    if kind.motor == "brushless":
-        values["pm.lowVoltage"] = 3.35
-    for axis in ("roll", "pitch"):
-        values[f"pid_rate.{axis}_kp"] = kind.rate_gain
-        values[f"pid_rate.{axis}_ki"] = 2 * kind.rate_gain
-    return values
 
 
 def header(port: int, channel: int) -> int:
@@ -141,26 +51,19 @@ class Peer:
         firmware: Firmware,
         on_parameter: Callable[[str, float], None] = lambda name, value: None,
         on_pose: Pose = lambda position, quaternion: None,
-        estimator: int = 2,
         app: App | None = None,
         decks: Mapping[str, float] | None = None,
     ):
-        """`estimator` is what the drone's decks ask for: 1 complementary, 2 Kalman; `app`: what runs beside it.
-
-        With `decks` it lists what positioning decks have: values of those parameters that are not 0.
-        """
+        """`app`: what runs beside it; `decks`: parameters whose values after boot are those of its decks."""
         self.firmware, self._app = firmware, app
-        self.values = defaults_of(firmware.kind, estimator)
-        none: tuple[Any, ...] = ()
-        more = (none if app is None else OF_APP) + (none if decks is None else DECK_PARAMETERS)
-        self.parameters = PARAMETERS + more
-        self.values |= {one.name: one.default for one in more} | dict(decks or {})
+        self.values = Values(firmware.kind, on_parameter, decks, None if app is None else app.parameters)
+        self.parameters = self.values.listed
         parameters = [item(one.type_byte, one.name) for one in self.parameters]
-        known = LOG_VARIABLES + (none if app is None else LOGGED_BY_APP) + (none if decks is None else OF_DECKS)
+        known = LOG_VARIABLES + (() if app is None else OF_APP)
         variables = [item(LOG_TYPES[kind][0], name) for name, kind in known]
         self.logs = Blocks(known)
-        self._estimator = estimator
-        self._on_parameter, self._on_pose = on_parameter, on_pose
+        self._told = b""  # text for the console that was not sent yet
+        self._on_pose = on_pose
         self._handlers: dict[tuple[int, int], Callable[[bytes, float], list[bytes] | None]] = {
             (LINK, 0): lambda data, now: [data],
             (LINK, 1): lambda data, now: [GREETING] if data[:1] == b"\0" else [],
@@ -194,7 +97,16 @@ class Peer:
         handler = self._handlers.get((port, channel))
         if handler is None:
             return []
-        return [bytes([header(port, channel)]) + answer for answer in handler(datagram[1:], now) or ()]
+        answers = [bytes([header(port, channel)]) + answer for answer in handler(datagram[1:], now) or ()]
+        return answers + self._console()
+
+    def tell(self, text: str) -> None:
+        """Have a line `text` go out on the console with the next answer."""
+        self._told += text.encode() + b"\n"
+
+    def _console(self) -> list[bytes]:
+        told, self._told = self._told, b""
+        return [bytes([header(CONSOLE, 0)]) + told[at : at + MAX_DATA] for at in range(0, len(told), MAX_DATA)]
 
     def log_data(self, readings: Readings | Mapping[str, float], now: float) -> list[bytes]:
         """The datagrams of all log blocks that are due at `now`."""
@@ -235,8 +147,6 @@ class Peer:
         known = self._parameter(data)
         if known is None:
             return [data[:2] + bytes([UNKNOWN])] if len(data) >= 2 else []
-        if self._app is not None:
-            self.values |= {f"{GROUP}.{name}": value for name, value in self._app.parameters().items()}
         return [data[:2] + b"\0" + known.pack(self.values[known.name])]
 
     def _write_parameter(self, data: bytes, now: float) -> list[bytes]:
@@ -249,10 +159,7 @@ class Peer:
             value = known.unpack(data[2:])
         except struct.error:
             return []
-        self.values[known.name] = 0.0 if known.name in CLEARED else value
-        if known.name == "stabilizer.estimator" and value not in (1, 2):
-            self.values[known.name] = float(self._estimator)
-        self._on_parameter(known.name, value)
+        self.values.write(known.name, value)
         return [data[:2] + known.pack(value)]
 
     def _parameter_extra(self, data: bytes, now: float) -> list[bytes]:
@@ -261,8 +168,7 @@ class Peer:
             return [data[:3] + bytes([UNKNOWN])] if len(data) >= 3 else []
         if data[0] == 0x07:
             return [data[:3] + bytes([0, int(known.persistent)])]
-        default = defaults_of(self.firmware.kind, self._estimator).get(known.name, known.default)
-        return [data[:3] + b"\0" + known.pack(default)] if data[0] == 0x08 else []
+        return [data[:3] + b"\0" + known.pack(self.values.defaults[known.name])] if data[0] == 0x08 else []
 
     def _setpoint(self, data: bytes, now: float) -> None:
         if len(data) == packets.SETPOINT_SIZE:

@@ -23,6 +23,7 @@ from mjxball.fly.flight import Flight
 from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.monitor import down_reason, tilt_angle
 from mjxball.fly.packets import Packet
+from mjxball.fly.preflight import parameters_of
 from mjxball.fly.setpoints import CURVE_NAMES, CommandMap, CurveName, Variant, Variants
 from mjxball.fly.supervisor import State, Supervisor
 from mjxball.fly.telemetry import HealthSample, Note, Rig, SensedSample, Telemetry
@@ -191,7 +192,7 @@ class VirtualTwin:
         self._onboard = cores is not None
         stand, times = self.config.plant.stand != "free", times_of(self.config)
         settings = settings or FlightSettings(seconds=2.0, stand=stand, times=times)
-        limits = positioning.system_of(self.drones[0].peer.values).widen(settings.limits)
+        limits = positioning.system_of(self.drones[0].peer.values.defaults).widen(settings.limits)
         self.settings = dataclasses.replace(settings, motor=motor_of(self.config), limits=limits)
         if self._onboard:
             self.settings = app_flight.settings_of(self.settings)
@@ -207,7 +208,7 @@ class VirtualTwin:
         self.flight = kind(self.links, controller, self.variants, curves, self.rig, self.settings, self.log.note)
         for link, own in zip(self.links, self.variants, strict=True):
             link.telemetry = Telemetry()
-            link.write_parameters(own[curve].gains)
+            link.write_parameters(parameters_of(own[curve].gains, self._onboard))
             link.write_parameters({"kalman.resetEstimation": 1.0})
             link.start_states()
         self.advance(max(settle, 4 * STEP) + 2 * self.pair.surroundings.delay)

@@ -20,6 +20,7 @@ from mjxball.fly.app.host import App, compile_pair
 from mjxball.fly.app.protocol import CAUSES, Phase
 from mjxball.fly.app_flight import Apps, send_weights
 from mjxball.fly.connection import LinkError
+from mjxball.fly.limits import NAMES
 from mjxball.fly.main import main as fly
 from mjxball.fly.packets import Packet
 from mjxball.fly.telemetry import Rig
@@ -136,7 +137,12 @@ class FakeLink:
 def test_the_laptop_refuses_other_apps():
     apps, said = Apps("flight", (11, 12), 10), list[str]()
     good = ({"role": 0, "period": 10}, {"role": 1, "period": 10, "ident": 12})
-    apps.check([FakeLink("leader", **good[0]), FakeLink("follower", **good[1])], said.append)  # type: ignore[list-item]
+
+    def check(*values: dict[str, float]) -> None:
+        for number, name in enumerate(NAMES):
+            apps.check(number, FakeLink(name, **values[number]), said.append)  # type: ignore[arg-type]
+
+    check(*good)
     assert said == ["on board: flight, 8 bit weights"]
     for leader, follower, text in (
         ({}, good[1], "the leader has no app on board"),
@@ -145,7 +151,7 @@ def test_the_laptop_refuses_other_apps():
         (good[0], {**good[1], "ident": 13}, "the follower carries another policy than flight"),
     ):
         with pytest.raises(InputError, match=text):
-            apps.check([FakeLink("leader", **leader), FakeLink("follower", **follower)], said.append)  # type: ignore[list-item]
+            check(leader, follower)
 
 
 def test_flags_that_contradict_onboard_are_refused(capsys: pytest.CaptureFixture):

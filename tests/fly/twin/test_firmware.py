@@ -11,7 +11,7 @@ from twin_peer import ask, written
 
 from mjxball.fly import packets
 from mjxball.fly.packets import ARMED, AUTO_ARMED, CAN_ARM, CAN_FLY, CRASHED, FLYING, LOCKED, TUMBLED, ZERO, Setpoint
-from mjxball.fly.twin import logs, protocol
+from mjxball.fly.twin import logs
 from mjxball.fly.twin.arming import PERIOD, Phase
 from mjxball.fly.twin.conditions import (
     DELIVERED,
@@ -25,6 +25,7 @@ from mjxball.fly.twin.conditions import (
 )
 from mjxball.fly.twin.drone import TwinDrone, advance
 from mjxball.fly.twin.firmware import BOOT_TIME, Firmware, Motors, Order
+from mjxball.fly.twin.parameters import PARAMETERS
 from mjxball.fly.twin.physics import StandIn
 from mjxball.fly.twin.protocol import Peer, header
 
@@ -85,7 +86,8 @@ def test_row_reset_estimation_clears_itself() -> None:
     peer = Peer(Firmware())
     assert written(peer, "kalman.resetEstimation", 1, 1.0) == 0
     assert written(peer, "pid_attitude.roll_kp", 4.5, 1.0) == 4.5
-    assert written(peer, "stabilizer.estimator", 0, 1.0) == 2  # automatic: what the decks ask for
+    kalman = Peer(Firmware(), decks={"stabilizer.estimator": 2})
+    assert [written(kalman, "stabilizer.estimator", value, 1.0) for value in (2, 9, 0)] == [2, 2, 1]  # 0: the default
 
 
 # Row: flying.
@@ -412,12 +414,12 @@ def test_rows_of_faults_end_with_motors_off() -> None:
 
 
 def test_row_tables_have_the_real_size() -> None:
-    assert (len(protocol.PARAMETERS), len(logs.LOG_VARIABLES)) == (240, 355)
+    assert (len(PARAMETERS), len(logs.LOG_VARIABLES)) == (240 + 8, 355 + 8)  # the real firmware's, and its decks'
     variables = [logs.item(logs.LOG_TYPES[kind][0], name) for name, kind in logs.LOG_VARIABLES]
-    for items in ([logs.item(one.type_byte, one.name) for one in protocol.PARAMETERS], variables):
+    for items in ([logs.item(one.type_byte, one.name) for one in PARAMETERS], variables):
         assert len(set(items)) == len(items)
         assert max(map(len, items)) + 3 <= 30  # one packet each
-    by_name = {parameter.name: parameter for parameter in protocol.PARAMETERS}
+    by_name = {parameter.name: parameter for parameter in PARAMETERS}
     for name, kind in (("stabilizer.estimator", "uint8_t"), ("powerDist.idleThrust", "uint32_t")):
         assert by_name[name].kind == kind
     logged = dict(logs.LOG_VARIABLES)
@@ -435,7 +437,7 @@ def test_row_what_it_says_of_itself() -> None:
         assert ask(peer, 13, 1, b"\0") == [b"\0" + struct.pack("<i", 12)]
         assert ask(peer, 13, 1, b"\1") == [b"\x012026.08"]
         assert ask(peer, 13, 1, b"\2") == [b"\2" + device]
-    assert Peer(Firmware(), estimator=1).values["stabilizer.estimator"] == 1
+    assert Peer(Firmware()).values["stabilizer.estimator"] == 1
     assert Peer(Firmware(BRUSHLESS)).values["powerDist.idleThrust"] == 7000
 
 
@@ -456,7 +458,7 @@ def test_limits_of_the_log() -> None:
 
 def test_parameters_that_cannot_be_written() -> None:
     peer = Peer(Firmware())
-    names = [parameter.name for parameter in protocol.PARAMETERS]
+    names = [parameter.name for parameter in PARAMETERS]
     fixed = names.index("firmware.revision0").to_bytes(2, "little")
     assert ask(peer, 2, 2, fixed + b"\0\0\0\0") == []  # read-only: no answer
     assert ask(peer, 2, 2, b"\xff\xff\0") == [b"\xff\xff\x02"]

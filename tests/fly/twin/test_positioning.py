@@ -85,7 +85,7 @@ def test_a_drone_lists_the_deck_that_it_has(system: str) -> None:
     config = configs.preset("flight")
     around = Surroundings(positioning=system)
     drone = TwinDrone(CoupledPair(config, Conditions(config.plant.object_mass), DELIVERED, around), 0)
-    assert system_of(drone.peer.values).name.lower() == {"mocap": "unknown"}.get(system, system)
+    assert system_of(drone.peer.values.defaults).name.lower() == {"mocap": "unknown"}.get(system, system)
 
 
 @pytest.mark.parametrize("flags", ["--twin-deck no", "--twin-pose-hz 50"])

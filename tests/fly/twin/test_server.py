@@ -14,8 +14,9 @@ from mjxball.control import rotations
 from mjxball.fly import packets
 from mjxball.fly.packets import Setpoint
 from mjxball.fly.process import wait_until
-from mjxball.fly.twin import logs, protocol
+from mjxball.fly.twin import logs
 from mjxball.fly.twin.pair import RUNNING, Modes, PairState
+from mjxball.fly.twin.parameters import PARAMETERS
 from mjxball.fly.twin.physics import StandIn
 from mjxball.fly.twin.server import HOST, Twin
 
@@ -64,12 +65,13 @@ def test_cflib_finds_every_table_entry(flown: tuple[Twin, Told, Any]) -> None:
     assert crazyflie.platform.get_protocol_version() == 12
     for name, kind in logs.LOG_VARIABLES:
         assert crazyflie.log.toc.get_element_by_complete_name(name).ctype == kind
-    for parameter in protocol.PARAMETERS:
+    booted = flown[0].drones[0].peer.values.defaults
+    for parameter in PARAMETERS:
         element = crazyflie.param.toc.get_element_by_complete_name(parameter.name)
         assert element.ctype == parameter.kind
         assert element.is_persistent() == parameter.persistent
         assert (element.access == element.RO_ACCESS) == parameter.read_only
-        assert float(crazyflie.param.get_value(parameter.name)) == pytest.approx(parameter.default)
+        assert float(crazyflie.param.get_value(parameter.name)) == pytest.approx(booted[parameter.name], rel=1e-6)
 
 
 def test_a_parameter_is_written_read_back_and_reaches_the_physics(flown: tuple[Twin, Told, Any]) -> None:
