@@ -20,9 +20,7 @@ static float clip(float value, float low, float high) {
 
 /* By their bits, which are in the order of values: false for NaN, too. */
 static bool within(const float *values, int count, float limit) {
-    for (int k = 0; k < count; k++)
-        if (mjxball_bits(values + k) > mjxball_bits(&limit)) return false;
-    return true;
+    return mjxball_most(values, count) <= mjxball_most(&limit, 1);
 }
 
 static float root(float x) {

@@ -46,20 +46,25 @@ typedef MJXBALL_REAL mjxball_real;
 static inline void mjxball_copy(mjxball_real *to, const mjxball_real *from, int count) {{
     for (int i = 0; i < count; i++) to[i] = from[i];
 }}
-/* The bits of the absolute value as float, which are in the order of values; from 0x7F800000 on it is not finite. The
- * memory is volatile because a compiler that is told of finite numbers only drops what it could follow. */
-static inline unsigned mjxball_bits(const mjxball_real *value) {{
-    volatile union {{
-        float value;
-        unsigned bits;
-    }} one;
-    one.value = (float)*value;
-    return one.bits & 0x7FFFFFFFu;
+/* The bits of the largest absolute value as float; bits are in the order of values, from 0x7F800000 on not finite. The
+ * result is volatile, so that a compiler that is told of finite numbers only cannot know anything of it. */
+static inline unsigned mjxball_most(const mjxball_real *values, int count) {{
+    volatile unsigned most;
+    unsigned found = 0;
+    for (int i = 0; i < count; i++) {{
+        union {{
+            float value;
+            unsigned bits;
+        }} one;
+        one.value = (float)values[i];
+        one.bits &= 0x7FFFFFFFu;
+        if (one.bits > found) found = one.bits;
+    }}
+    most = found;
+    return most;
 }}
 static inline int mjxball_are_finite(const mjxball_real *values, int count) {{
-    int finite = 1;
-    for (int i = 0; i < count; i++) finite &= mjxball_bits(values + i) < 0x7F800000u;
-    return finite;
+    return mjxball_most(values, count) < 0x7F800000u;
 }}
 /* Whether the absolute sum is below `MJXBALL_LARGEST`: of numbers that are not finite it is not. */
 static inline int mjxball_is_sound(const mjxball_real *values, int count) {{
@@ -157,15 +162,16 @@ static inline int16_t mjxball_whole(mjxball_real value) {
 }
 
 /* Values as 16 bit numbers of the step that is returned: the largest of them takes the whole range; zeros up to
- * `stride`. Of every four the middle ones change places, as `mjxball_products` wants them. */
+ * `stride`. Of every four the middle ones change places, as `mjxball_products` wants them. The step is 0, and nothing is
+ * written, if one of the values is not finite. */
 static inline mjxball_real mjxball_steps(const mjxball_real *from, int count, int stride, int16_t *to) {
-    mjxball_real largest = (mjxball_real)1e-30, per_step;
-    int k = 0;
-    for (; k < count; k++) {
-        mjxball_real size = from[k] < 0 ? -from[k] : from[k];
-        if (size > largest) largest = size;
-    }
-    per_step = 32767 / largest;
+    const union {
+        unsigned bits;
+        float value;
+    } most = {mjxball_most(from, count)};
+    const mjxball_real largest = most.value > 1e-30f ? most.value : 1e-30f, per_step = 32767 / largest;
+    int k;
+    if (most.bits >= 0x7F800000u) return 0;
     for (k = stride - 8; k < stride; k++) to[k] = 0;
     for (k = 0; k < (count & ~3); k += 4) {
         to[k] = mjxball_whole(from[k] * per_step);
@@ -205,9 +211,8 @@ static inline int32_t mjxball_products(const int8_t *weight, const int16_t *step
 static inline int mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
     int stride, const mjxball_real *from, mjxball_real *to) {
     int16_t steps[MJXBALL_MOST_INPUTS + 7];
-    mjxball_real size;
-    if (!mjxball_are_finite(from, inputs)) return 0;
-    size = mjxball_steps(from, inputs, stride, steps);
+    const mjxball_real size = mjxball_steps(from, inputs, stride, steps);
+    if (size <= 0) return 0;
     for (int row = 0; row < outputs; row += 4, weight += 4 * stride) {
         int32_t a = 0, b = 0, c = 0, d = 0;
         for (int k = 0; k < stride; k += 8) {
