@@ -15,7 +15,7 @@ Array: TypeAlias = Any
 def real_numbers(given: Any, what: str) -> np.ndarray:
     """`given` from outside as an array of real numbers; InputError, which begins with `what`, for anything else.
 
-    NumPy makes numbers of much: it takes the value below a mask, drops imaginary parts, reads words, truths and objects.
+    NumPy makes numbers of much: it takes what a mask hides, drops imaginary parts, reads words, truths and objects.
     """
     if _has_mask(given):
         raise InputError(f"{what} must be real numbers, and some are masked: fill them in, or leave it out")

@@ -154,8 +154,8 @@ def test_compilers_that_are_told_of_finite_numbers_only_remove_no_guard(int8: bo
         wild.bits = BITS;
         if (n++ & 1) first.memory[n * {size // 40} + 1] = wild.value;"""
     steps = np.repeat(observations(20), 2, axis=0)
-    for own in compilers():
-        own += ["-DMJXBALL_REAL=double"] if "-Ofast" in own else []
+    for compiler in compilers():
+        own = [*compiler, *(["-DMJXBALL_REAL=double"] if "-Ofast" in compiler else [])]
         calm = assert_leaves_no_trace(tmp_path, own)
         np.testing.assert_allclose(calm, wanted, rtol=0, atol=2e-3 if int8 else 2e-5)  # steps of 8 bits, floats
         for bits in ("0x7FC00000u", "0x7F800000u", "0xFF800000u"):  # NaN, infinity, minus infinity

@@ -56,7 +56,7 @@ def walk(steps: int, count: int) -> np.ndarray:
 
 @rows("name", POLICIES)
 def test_an_observation_that_cannot_be_leaves_no_trace(name: str):
-    """At a start and between sound ones: that row says so and is level, and flies on as without; others notice nothing."""
+    """At a start and between sound ones: its row says so, is level, and flies on as without; others notice nothing."""
     contents, bad = contents_of(name), np.arange(2 * len(SPOILT)) % 2 == 0
     model, alone = Model(contents), Policy(contents, name)
     for count in (1, 4):

@@ -136,8 +136,8 @@ LAYER = """
         d += s; \\
     } while (0)
 
-/* to = weight from + bias, where a bias of 0 is none; 0 and nothing of it if `from` is not finite. Rows are filled up to
- * a multiple of four. Sums over even and odd inputs round less than one long sum. */
+/* to = weight from + bias, where a bias of 0 is none. Rows are filled up to a multiple of four. Sums over even and odd
+ * inputs round less than one long sum. False, and nothing is written, if `from` is not finite. */
 static inline int mjxball_layer(
     const float *weight, const float *bias, int inputs, int outputs, const mjxball_real *from, mjxball_real *to) {
     if (!mjxball_are_finite(from, inputs)) return 0;
@@ -162,8 +162,8 @@ static inline int16_t mjxball_whole(mjxball_real value) {
 }
 
 /* Values as 16 bit numbers of the step that is returned: the largest of them takes the whole range; zeros up to
- * `stride`. Of every four the middle ones change places, as `mjxball_products` wants them. The step is 0, and nothing is
- * written, if one of the values is not finite. */
+ * `stride`. Of every four the middle ones change places, as `mjxball_products` wants them. 0, and nothing is written,
+ * if one of the values is not finite. */
 static inline mjxball_real mjxball_steps(const mjxball_real *from, int count, int stride, int16_t *to) {
     const union {
         unsigned bits;
@@ -206,8 +206,8 @@ static inline int32_t mjxball_products(const int8_t *weight, const int16_t *step
 #endif
 
 /* to = step weight from + bias of whole numbers, where a bias of 0 is none: rows of `stride` weights, of which `inputs`
- * are not 0, four rows at once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four. 0 and
- * nothing of it if `from` is not finite. */
+ * are not 0, four rows at once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four.
+ * False, and nothing is written, if `from` is not finite. */
 static inline int mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
     int stride, const mjxball_real *from, mjxball_real *to) {
     int16_t steps[MJXBALL_MOST_INPUTS + 7];
