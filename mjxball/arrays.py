@@ -4,5 +4,31 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
+import numpy as np
+
+from mjxball.errors import FOREIGN, InputError, said
+
 # No type checker has a name for what they share. Shapes stand in annotations, `Float[Array, "... 3"]`, or docstrings.
 Array: TypeAlias = Any
+
+
+def real_numbers(given: Any, what: str) -> np.ndarray:
+    """`given` from outside as an array of real numbers; InputError, which begins with `what`, for anything else.
+
+    NumPy makes numbers of much: it takes what a mask hides, drops imaginary parts, reads words, truths and objects.
+    """
+    if _has_mask(given):
+        raise InputError(f"{what} must be real numbers, and some are masked: fill them in, or leave it out")
+    try:
+        array = np.asarray(given)
+    except FOREIGN as error:  # ragged lists, and whatever somebody else's arrays raise
+        raise InputError(f"{what} must be real numbers, and is no array of them: {said(error)}") from None
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{what} must be real numbers, not {array.dtype}")
+    return array
+
+
+def _has_mask(given: Any) -> bool:
+    if isinstance(given, (list, tuple)):
+        return any(map(_has_mask, given))
+    return isinstance(given, np.ma.MaskedArray)

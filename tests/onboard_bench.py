@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import shutil
+import subprocess
+import types
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import pytest
 
 import onboard
 from mjxball.export import in_team
-from mjxball.fly.app import protocol
+from mjxball.fly.app import host, protocol
 from mjxball.fly.app.host import App, Library, State, compile_pair
 from mjxball.fly.app.protocol import CAUSES, Phase
 from mjxball.fly.telemetry import ObjectState, Rig
@@ -43,6 +45,26 @@ def in_pair(policy: PolicyFile) -> PolicyFile:
 def cores_of(name: str = "flight") -> tuple[Library, Library]:
     """Leader and follower, compiled once a process."""
     return compile_pair(policy_of(name), name)
+
+
+def compilers() -> list[list[str]]:
+    """The C compilers of this computer, each told in several ways that numbers are finite."""
+    ways = (["-Ofast"], ["-O2", "-ffast-math"], ["-Os", "-ffinite-math-only"], ["-O0", "-ffinite-math-only"])
+    return [[one, *way] for one in ("gcc", "clang") if shutil.which(one) for way in ways]
+
+
+def cores_by(compiler: list[str], name: str = "flight") -> tuple[Library, Library]:
+    """Likewise, compiled by `compiler`. Linked without its flags: they would round small numbers in this process."""
+
+    def link(command: list[str], **given: Any) -> Any:
+        step = [*compiler, "-std=c11", "-fPIC", *(one for one in command if one.startswith("-D")), "-c", "host.c"]
+        subprocess.run([*step, "-o", "host.o"], cwd=given["cwd"], check=True)
+        out = command[command.index("-o") + 1]
+        return subprocess.run([compiler[0], "-shared", "-o", out, "host.o"], cwd=given["cwd"], check=True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host, "subprocess", types.SimpleNamespace(run=link))
+        return compile_pair(policy_of(name), name)
 
 
 class Bench:

@@ -17,7 +17,8 @@ from command_line import REPOSITORY, environment
 
 # Floor by floor: a part imports itself and what stands on lower floors, never a neighbour or what is above.
 FLOORS = (
-    {"arrays", "errors", "reading", "pictures", "terminal"},
+    {"errors"},
+    {"arrays", "reading", "pictures", "terminal"},
     {"files"},
     {"config"},
     {"xla"},

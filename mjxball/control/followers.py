@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from threading import get_ident
+import weakref
+from threading import Thread, current_thread
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, real_numbers
 from mjxball.config import Config
 from mjxball.control.observation import OBSERVATION, OBSERVATION_SIZE, copy_command
 from mjxball.errors import InputError
@@ -67,10 +68,7 @@ def checked_observation(observation: Array) -> np.ndarray:
     Real numbers, finite, their absolute sum below `LARGEST`. A follower that filters what it sees would otherwise
     remember one such number for the rest of the flight.
     """
-    given = np.asarray(observation)
-    if given.dtype.kind not in "fiu" or isinstance(observation, np.ma.MaskedArray):
-        kind = "masked numbers" if given.dtype.kind in "fiu" else given.dtype
-        raise InputError(f"an observation is of {OBSERVATION_SIZE} real numbers, not of {kind}")
+    given = real_numbers(observation, "an observation")
     if given.shape[-1:] != (OBSERVATION_SIZE,):
         raise InputError(f"observation must have {OBSERVATION_SIZE} numbers last, not shape {given.shape}")
     seen = given.astype(np.float64)
@@ -88,19 +86,38 @@ def checked_observation(observation: Array) -> np.ndarray:
     return seen
 
 
+def checked_command(name: str, command: Any, observation: np.ndarray) -> np.ndarray:
+    """`command` (..., 3) of follower `name` to `observation` (..., 18) as float64; InputError if it is none."""
+    array, wanted = real_numbers(command, f"the answer of follower {name}"), (*observation.shape[:-1], 3)
+    if array.shape != wanted:
+        raise InputError(f"follower {name} answered shape {array.shape} where {wanted} was wanted")
+    return array.astype(np.float64)
+
+
+def check_batch(name: str, remembered: tuple[int, ...], observation: np.ndarray) -> None:
+    """Raise InputError unless `observation` (..., 18) is of the flights of shape `remembered` (...) of `name`."""
+    if observation.shape[:-1] != remembered:
+        wanted = (*remembered, OBSERVATION_SIZE)
+        raise InputError(
+            f"follower {name} flies on observations of shape {wanted}, not {observation.shape}; reset it before others"
+        )
+
+
 class OneThread:
     """The thread whose flight a follower remembers: the first that calls it after a reset.
 
-    Two threads that call one follower by turns would each be answered from a mixture of both flights.
+    Two threads that call one follower by turns would each be answered from a mixture of both flights. A thread is known
+    by its object: its number is given to a later one when it has ended.
     """
 
     def __init__(self) -> None:
-        self._of: dict[str, int] = {}
+        self._of: dict[str, weakref.ref[Thread]] = {}
 
     def check(self, name: str) -> None:
         """Raise RuntimeError if another thread has called follower `name` since its last reset."""
-        here = get_ident()
-        if self._of.setdefault("flight", here) != here:  # atomic, so that of two first callers one is refused
+        here = current_thread()
+        first = self._of.setdefault("flight", weakref.ref(here))  # atomic, so that of two first callers one is refused
+        if first() is not here:
             raise RuntimeError(
                 f"follower {name} remembers a flight of another thread: give every thread its own (copy.copy), "
                 "reset it between flights, or keep the memory yourself (.law, which is pure)"
@@ -126,6 +143,7 @@ class Baseline:
         self.privileged: PrivilegedInfo | None = None
         self._believed_mass = config.plant.object_mass
         self._state: Any = None
+        self._batch: tuple[int, ...] = ()  # shape of the flights in `_state`
         self._thread = OneThread()
 
     def reset(self) -> None:
@@ -141,9 +159,10 @@ class Baseline:
         """See `Follower.__call__`. Raises InputError if the law needs `privileged` and it is not set."""
         observation = checked_observation(observation)
         if self._state is None:
-            self._state = self.law.start(observation)
+            self._state, self._batch = self.law.start(observation), observation.shape[:-1]
         if not isinstance(self._state, tuple) or self._state:
             self._thread.check(self.name)
+            check_batch(self.name, self._batch, observation)
         privileged = self.privileged or self._nominal(observation)
         self._state, command = self.law.step(self._state, observation, privileged)
         return command

@@ -11,7 +11,7 @@ import numpy as np
 
 from mjxball.baselines import LAWS, make_baseline
 from mjxball.config import Config
-from mjxball.control.followers import Baseline, Follower
+from mjxball.control.followers import Baseline, Follower, checked_command
 from mjxball.errors import FOREIGN, InputError, said
 
 LARGEST = 1e9  # of a command, in rad and m/s^2; the square of what is larger is soon no number
@@ -99,19 +99,9 @@ def _is_ours(file: str) -> bool:
     return Path(file).is_relative_to(PACKAGE) or "site-packages" in file
 
 
-def answered(name: str, command: Any, observation: Any) -> np.ndarray:
-    """`command` (..., 3) of follower `name` to `observation` (..., 18); InputError if it is none."""
-    try:
-        array = np.asarray(command)
-        if array.dtype.kind not in "biufO":
-            raise TypeError
-        with np.errstate(all="ignore"):
-            command = array.astype(float)
-    except FOREIGN:
-        raise InputError(f"follower {name} answered {type(command).__name__}, no array of real numbers") from None
-    wanted = (*np.shape(observation)[:-1], 3)
-    if command.shape != wanted:
-        raise InputError(f"follower {name} answered shape {command.shape} where {wanted} was wanted")
-    if not (np.abs(command) <= LARGEST).all():
+def answered(name: str, command: Any, observation: np.ndarray) -> np.ndarray:
+    """`checked_command` of follower `name`; InputError also if it is not finite, or beyond `LARGEST`."""
+    found = checked_command(name, command, observation)
+    if not (np.abs(found) <= LARGEST).all():
         raise InputError(f"follower {name} answered a number that is not finite, or larger than {LARGEST:g}")
-    return command
+    return found

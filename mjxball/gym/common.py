@@ -14,7 +14,7 @@ import numpy as np
 from jax._src import xla_bridge  # whether a device has been made: nothing public says it
 
 from mjxball import config as configs
-from mjxball.arrays import Array
+from mjxball.arrays import Array, real_numbers
 from mjxball.config import Config
 from mjxball.control.observation import ACTION_SIZE
 from mjxball.env import TransportEnv
@@ -101,10 +101,8 @@ def checked_action(action: Array, shape: tuple[int, ...] | None) -> np.ndarray:
 
     Raises InputError unless it is finite and of `shape`, and of real numbers.
     """
-    given = np.asarray(action)
-    if given.dtype.kind not in "fiu":
-        found = f"{given.dtype} of shape {given.shape}"
-    elif given.shape != shape:
+    given = real_numbers(action, f"an action of shape {shape}")
+    if given.shape != shape:
         found = f"of shape {given.shape}"
     elif not np.isfinite(given).all():
         found = f"of shape {given.shape} with {given[~np.isfinite(given)][0]} in it"

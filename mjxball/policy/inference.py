@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.arrays import Array
+from mjxball.arrays import Array, real_numbers
 from mjxball.config import Plant
 from mjxball.control import observation as layout
 from mjxball.control.follower_law import FollowerLaw
-from mjxball.control.followers import OneThread, checked_observation
+from mjxball.control.followers import OneThread, check_batch, checked_observation
 from mjxball.control.geometry import team_geometry
 from mjxball.control.network import Network
 from mjxball.errors import InputError
@@ -160,6 +160,8 @@ class Policy:
             if alone is not None:
                 return alone
         law, memory = self.law, self.memory if remembers else None
+        if memory is not None:
+            check_batch(self.name, memory.shape[:-1], observation)
         with np.errstate(all="ignore"):  # what is not finite is refused below
             action, command, memory = law.answer(law.start(observation) if memory is None else memory, observation)
         if not math.isfinite(float(command.sum()) + float(memory.sum())):
@@ -185,9 +187,9 @@ class Policy:
 
     def _checked(self, memory: Array) -> Array:
         """A copy of `memory`, or InputError unless it is one that this policy may have."""
-        given, size = np.asarray(memory), self._law.size
-        if given.dtype.kind not in "fiu" or given.shape[-1:] != (size,):
-            raise InputError(f"policy {self.name} remembers {size} numbers, not {given.dtype} of shape {given.shape}")
+        given, size = real_numbers(memory, f"a memory of policy {self.name}"), self._law.size
+        if given.shape[-1:] != (size,):
+            raise InputError(f"policy {self.name} remembers {size} numbers, not an array of shape {given.shape}")
         with np.errstate(over="ignore"):
             own = np.array(given, self._dtype)
         if not np.isfinite(own).all():
@@ -212,8 +214,15 @@ class NetworkLaw:
         self._geometry = policy._geometry
 
     def start(self, observation: Array) -> Array:
-        """Memory at the start of a flight whose first observation is `observation` (..., 18)."""
-        return self._law.start(observation, _geometry_for(self.name, self._law, self._geometry))
+        """Memory at the start of a flight whose first observation is `observation` (..., 18).
+
+        Raises InputError if it has not been told its team, or of another number of followers.
+        """
+        geometry = _geometry_for(self.name, self._law, self._geometry)
+        if geometry is not None and geometry.ndim > 1 and observation.shape[-2:-1] != geometry.shape[:1]:
+            told = f"policy {self.name} was told of {len(geometry)} followers (Policy.join)"
+            raise InputError(f"{told}, and an observation of shape {observation.shape} is not of so many")
+        return self._law.start(observation, geometry)
 
     def hidden(self, memory: Array) -> Array:
         """State (..., H) of the network's GRU in `memory` (..., m)."""

@@ -13,7 +13,7 @@ import numpy as np
 from mjxball import pictures
 from mjxball.config import Config, Plant, follow_plant, preset, replace, validate
 from mjxball.control import rotations
-from mjxball.control.followers import Baseline, Follower, PrivilegedInfo
+from mjxball.control.followers import Baseline, Follower, PrivilegedInfo, checked_command
 from mjxball.control.observation import mount_angles
 from mjxball.errors import InputError
 from mjxball.physics import newton_euler
@@ -194,7 +194,8 @@ def _together(config: Config, flights: Flights) -> tuple[list[Scenario], Act]:
         for follower, part in zip(followers, parts, strict=True):
             if isinstance(follower, Baseline):
                 follower.privileged = PrivilegedInfo(*(None if leaf is None else leaf[part] for leaf in known))
-            commands.append(np.asarray(follower(observation[part]), float))
+            seen = observation[part]
+            commands.append(checked_command(getattr(follower, "name", type(follower).__name__), follower(seen), seen))
         return np.concatenate(commands)
 
     return scenarios, act

@@ -73,6 +73,10 @@ class Huge(Good):
     def __call__(self, observation): return 1e200 + super().__call__(observation)
 class Text(Good):
     def __call__(self, observation): return [["1", "2", "3"]]
+class Masked(Good):
+    def __call__(self, observation): return np.ma.masked_less(super().__call__(observation), 1.0)
+class Truths(Good):
+    def __call__(self, observation): return super().__call__(observation) == 0
 class Untraced(Good):
     def __call__(self, observation): return np.linalg.inv(np.zeros((2, 2)))
 class Property(Good):
@@ -88,10 +92,12 @@ REFUSED = {
     "bad:Nan": "Nan answered a number that is not finite",
     "bad:Late": "Late answered a number that is not finite",
     "bad:Shape": "Shape answered shape (3,) where (1, 3) was wanted",
-    "bad:Words": "Words answered str, no array of real numbers",
-    "bad:Complex": "Complex answered ndarray, no array of real numbers",
+    "bad:Words": "the answer of follower Words must be real numbers, not <U5",
+    "bad:Complex": "the answer of follower Complex must be real numbers, not complex128",
     "bad:Huge": "Huge answered a number that is not finite, or larger than 1e+09",
-    "bad:Text": "Text answered list, no array of real numbers",
+    "bad:Text": "the answer of follower Text must be real numbers, not <U1",
+    "bad:Masked": "the answer of follower Masked must be real numbers, and some are masked",
+    "bad:Truths": "the answer of follower Truths must be real numbers, not bool",
     "bad:Untraced": "Singular matrix, in bad.py line",
     "bad:Property": "Property raised KeyError: 'gone', in bad.py line",
     "bad:Arguments": "Arguments(config) raised TypeError",

@@ -179,6 +179,10 @@ NO_ACTIONS = {
     "words": (np.full(3, "0.5"), "<U3"),
     "dates": (np.full(3, np.datetime64("2026-01-01")), "datetime64"),
     "nothing": (None, "object"),
+    "what is masked": (np.ma.array(OUTSIDE, mask=[0, 1, 0]), "masked"),
+    "what is masked, in a list": ([0.0, np.ma.masked, 0.0], "masked"),
+    "truths": (np.full(3, True), "bool"),
+    "a ragged list": ([[0.0], [0.0], [0.0, 0.0]], "no array"),
 }
 
 
@@ -191,8 +195,8 @@ def test_actions_are_clipped_to_the_box_and_refused_unless_they_are_finite(short
         for action in (OUTSIDE, CLIPPED):
             env.reset(seed=3)
             for bad, named in NO_ACTIONS.values():
-                both = np.stack([bad, bad]) if env is vector and np.shape(bad) == (3,) else bad
-                with pytest.raises(InputError, match=re.escape(f"of shape {shape}, ") + ".*" + named):
+                both = [bad, bad] if env is vector and getattr(bad, "shape", ()) == (3,) else bad
+                with pytest.raises(InputError, match=re.escape(f"of shape {shape}") + ".*" + named):
                     env.step(both)
             found.append([env.step(np.broadcast_to(action, shape))[:2] for _ in range(3)])
         for one, other in zip(*found, strict=True):

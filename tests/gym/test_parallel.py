@@ -157,8 +157,9 @@ def test_what_makes_no_sense_is_refused(team: Config):
     env.reset(seed=0)
     with pytest.raises(ValueError, match="follower_1"):
         env.step({"follower_1": np.zeros(3)})
-    for bad, named in ((np.full(3, np.nan), "nan"), (np.zeros((1, 3)), r"\(1, 3\)"), (np.full(3, "1"), "<U1")):
-        with pytest.raises(InputError, match=r"of shape \(3,\), not .*" + named):
+    bads = ((np.full(3, np.nan), "nan"), (np.zeros((1, 3)), r"\(1, 3\)"), (np.full(3, "1"), "<U1"))
+    for bad, named in (*bads, (np.ma.array(np.zeros(3), mask=[0, 1, 0]), "masked")):
+        with pytest.raises(InputError, match=r"of shape \(3,\).*" + named):
             env.step(dict.fromkeys(env.agents, bad))
     for kind in (FollowerEnv, PlaygroundEnv):
         with pytest.raises(InputError, match=r"mjxball\.gym\.parallel"):

@@ -16,6 +16,7 @@ from command_line import assert_one_line, call, listing, load_arrays, run, write
 from conftest import Trained
 from onboard_bench import needs_gcc
 
+from mjxball import __version__
 from mjxball.cli import plant_setup
 from mjxball.export import in_team, main
 from mjxball.policy import Policy, PolicyFile, load_file
@@ -243,6 +244,8 @@ def test_the_header_states_what_it_costs(contents: PolicyFile):
     assert 4 * (size + 2 * widest + own) == cost.stack
     assert f"{cost.stack} bytes of arrays on the stack" in text
     assert not re.search(r"\b(malloc|calloc|free|static (?!const float|inline))", text)
+    versions = re.search(r"trained by mjxball (\S+) .* exported by mjxball (\S+)\.\n", text).groups()
+    assert versions == (contents.card["package_version"], __version__)
 
 
 @pytest.mark.slow

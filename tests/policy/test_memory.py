@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+import re
 import threading
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ import pytest
 from tables import rows
 
 from mjxball.baselines import make_baseline
+from mjxball.cli import plant_setup
 from mjxball.config import preset
 from mjxball.control.observation import OBSERVATION
 from mjxball.errors import InputError
@@ -66,6 +69,9 @@ NO_OBSERVATIONS = {
     "complex numbers": (np.full(18, 0.5 + 0.5j), "complex"),
     "truths": (np.full(18, True), "bool"),
     "what is masked": (np.ma.masked_invalid(spoilt(3, np.nan)), "masked"),
+    "what is masked, in a list": ([np.ma.masked, *SEEN[0, 1:]], "masked"),
+    "fractions": (np.full(18, Fraction(1, 2)), "object"),
+    "a ragged list": ([[0.5]] * 17 + [[0.5, 0.5]], "no array"),
     "17 numbers": (SEEN[0, :17], "18"),
     "one number": (np.array(0.5), "18"),
 }
@@ -81,7 +87,7 @@ def test_what_is_no_observation_is_refused_and_not_remembered(name: str) -> None
             sound = np.broadcast_to(row, (*shape, 18))
             if number in (0, 10):
                 for bad, named in NO_OBSERVATIONS.values():
-                    both = np.stack([bad, bad]) if shape else bad
+                    both = [bad, bad] if shape else bad
                     with pytest.raises(InputError, match=named):
                         flown(both)
             np.testing.assert_array_equal(flown(sound), alone(sound))
@@ -121,6 +127,7 @@ def test_a_memory_that_is_none_is_refused() -> None:
         (np.full(size, 1e39), "not finite"),
         (np.zeros(size - 1), f"{size}"),
         (np.full(size, "0"), "<U1"),
+        (np.ma.array(flown.memory, mask=True), "masked"),
     ):
         kept = flown.memory
         with pytest.raises(InputError, match=named):
@@ -164,6 +171,40 @@ def test_one_memory_serves_one_thread() -> None:
             flown(SEEN[8])
         own = copy.copy(flown)  # goes on by itself, in any thread
         np.testing.assert_array_equal(own(SEEN[8]), alone(SEEN[8]))
+
+
+def test_a_later_thread_does_not_go_on_with_the_flight_of_one_that_has_ended() -> None:
+    """Its number is the ended one's, as often as not; nobody has reset the follower."""
+    for name in ("balance", "universal", "lqg"):
+        flown = followers()[name]()
+        found = [in_another_thread(flown, row) for row in SEEN[:20]]
+        assert isinstance(found[0], np.ndarray)
+        assert [type(one) for one in found[1:]] == [RuntimeError] * 19, name
+        flown.reset()
+        assert isinstance(in_another_thread(flown, SEEN[0]), np.ndarray)
+
+
+def test_another_number_of_flights_is_refused_before_a_reset() -> None:
+    """One, several, none, with an axis more; the flight goes on as without them."""
+    shapes: list[tuple[int, ...]] = [(), (2,), (3,), (0,), (3, 1), (1, 3)]
+    for name, make in followers().items():
+        for shape in shapes if name not in ("paper", "copy") else ():  # these remember nothing
+            flown, alone = make(), make()
+            for row in SEEN[:4]:
+                seen = np.broadcast_to(row, (*shape, 18))
+                np.testing.assert_array_equal(flown(seen), alone(seen))
+                for other in shapes:
+                    if other != shape:
+                        with pytest.raises(InputError, match=re.escape(f"of shape {(*shape, 18)}, not {(*other, 18)}")):
+                            flown(np.broadcast_to(row, (*other, 18)))
+            flown.reset()
+            assert flown(np.zeros((5, 18))).shape == (5, 3)
+    team = Policy(load_file(shipped_policy("universal")), "universal")
+    team.join(plant_setup(Path("team3")).plant)
+    for shape in ((), (3,), (2, 4)):
+        with pytest.raises(InputError, match="told of 2 followers"):
+            team(np.zeros((*shape, 18)))
+    assert team(np.zeros((3, 2, 18))).shape == (3, 2, 3)
 
 
 def test_many_threads_with_the_pure_law_fly_as_one_does() -> None:

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
+from typing import Any
 
 import numpy as np
 import pytest
+from tables import rows
 
 from mjxball.config import PRESETS, Config, apply_overrides, preset
 from mjxball.control import rotations
+from mjxball.errors import InputError
 from mjxball.sim.laws import MAX_LIFT_DIFFERENCE, WASHOUT_TIME, BodyState, Laws
+from mjxball.sim.rollout import simulate
+from mjxball.sim.scenario import Scenario
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 PERIOD = 0.01
@@ -130,3 +136,28 @@ def test_an_observation_tells_the_body_that_it_was_made_of(error: str) -> None:
         np.testing.assert_allclose(getattr(again, name), getattr(state, name), atol=1e-12)
     turned = rotations.matrix_from_quaternion(again.quaternion)
     np.testing.assert_allclose(turned, rotations.matrix_from_quaternion(state.quaternion), atol=1e-12)
+
+
+NO_COMMANDS = {
+    "what is masked": (np.ma.masked_less(np.zeros((1, 3)), 1.0), "some are masked"),
+    "complex numbers": (np.zeros((1, 3), complex), "not complex128"),
+    "words": ([["0.1"] * 3], "not <U3"),
+    "truths": (np.ones((1, 3), bool), "not bool"),
+    "nothing": (None, "not object"),
+    "of no flight": (np.zeros(3), "answered shape (3,) where (1, 3) was wanted"),
+    "of two flights": (np.zeros((2, 3)), "answered shape (2, 3) where (1, 3) was wanted"),
+}
+
+
+@rows("answer, named", NO_COMMANDS.values())
+def test_an_answer_that_is_no_command_is_refused(answer: Any, named: str) -> None:
+    """A follower that is no more than a function of one's own; NumPy would make commands of the first ones."""
+
+    class Own:
+        def reset(self) -> None: ...
+
+        def __call__(self, observation: np.ndarray) -> Any:
+            return answer
+
+    with pytest.raises(InputError, match=rf"follower Own .*{re.escape(named)}"):
+        simulate(preset("paper"), Own(), Scenario(seconds=1.0), "newton-euler")

@@ -22,8 +22,8 @@
 
 static bool in_fence(const float *place) {
     for (int i = 0; i < 3; i++)
-        if (!(place[i] >= mjxball_rig.fence_low[i] && place[i] <= mjxball_rig.fence_high[i])) return false;
-    return true;
+        if (place[i] < mjxball_rig.fence_low[i] || place[i] > mjxball_rig.fence_high[i]) return false;
+    return within(place, 3, 2 * MOST_PLACE);
 }
 
 static bool goal_is_good(const mjxball_parameters *set) {
@@ -38,7 +38,7 @@ static bool goal_is_good(const mjxball_parameters *set) {
 static bool mount_is_set(const mjxball_parameters *set) {
     float size = 0;
     for (int i = 0; i < 3; i++) size += set->mount[i] * set->mount[i];
-    return size > 1e-6f && size < 1;
+    return within(set->mount, 3, 1) && size > 1e-6f && size < 1;
 }
 
 /* What is wrong with parameters. */
@@ -46,7 +46,7 @@ static uint8_t fault_of(const mjxball_parameters *set) {
     if (!mount_is_set(set)) return MJXBALL_NO_MOUNT;
     if (!goal_is_good(set)) return MJXBALL_BAD_GOAL;
     if (set->curve > 1 || !mjxball_rig.maps[set->curve].known) return MJXBALL_BAD_CURVE;
-    return set->battery > 0 && set->battery <= MOST_VOLTAGE ? MJXBALL_GOOD : MJXBALL_BAD_BATTERY;
+    return within(&set->battery, 1, MOST_VOLTAGE) && set->battery > 0 ? MJXBALL_GOOD : MJXBALL_BAD_BATTERY;
 }
 
 /* Parameters can change at any moment. While some are unsound the last sound ones stay in use. Mount and curve are those
@@ -68,18 +68,19 @@ static bool state_is_good(const mjxball_state *state, uint32_t now) {
     const float *q = state->quaternion;
     float size = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
     return within(state->position, 3, MOST_PLACE) && within(state->velocity, 3, MOST_SPEED)
-        && within(state->rates, 3, MOST_RATE) && size > 0.9f && size < 1.1f && now - state->time <= STATE_AGE;
+        && within(state->rates, 3, MOST_RATE) && within(q, 4, 2) && size > 0.9f && size < 1.1f
+        && now - state->time <= STATE_AGE;
 }
 
 /* A variance of 0 is that of an estimator which does not run. */
 static bool estimate_is_good(const mjxball_state *state) {
     for (int i = mjxball_rig.stand ? 2 : 0; i < 3; i++)
-        if (!(state->variance[i] > 0 && state->variance[i] <= VARIANCE)) return false;
+        if (!within(state->variance + i, 1, VARIANCE) || state->variance[i] <= 0) return false;
     return true;
 }
 
 static bool is_charged(const mjxball_app *app, const mjxball_state *state) {
-    return state->voltage >= app->set.battery && state->voltage <= MOST_VOLTAGE;
+    return within(&state->voltage, 1, MOST_VOLTAGE) && state->voltage >= app->set.battery;
 }
 
 /* What the law commands, and what is sent. */
@@ -90,7 +91,7 @@ static bool command_is_good(const mjxball_app *app) {
 
 static bool setpoint_is_good(const mjxball_setpoint *out) {
     return within(&out->roll, 1, DEGREES * SENT_TILT) && within(&out->pitch, 1, DEGREES * SENT_TILT)
-        && out->thrust >= FLOOR && out->thrust <= CEILING;
+        && within(&out->thrust, 1, CEILING) && out->thrust >= FLOOR;
 }
 
 #endif

@@ -154,7 +154,7 @@ static float lifted_height(const mjxball_app *app) {
 
 static void watch_rest(mjxball_app *app, bool good) {
     float height = height_of(app);
-    if (!good || !(height >= app->low - RESTING)) {
+    if (!good || !within(&app->low, 1, 2 * MOST_PLACE) || height < app->low - RESTING) {
         app->low = height;
         app->low_since = app->now;
     } else if (height > app->low) {

@@ -12,15 +12,15 @@
 
 /* Numbers. */
 
+/* What is not finite stays so. */
 static float clip(float value, float low, float high) {
+    if (!mjxball_are_finite(&value, 1)) return value;
     return value < low ? low : value > high ? high : value;
 }
 
-/* False for NaN, too. */
+/* By their bits, which are in the order of values: false for NaN, too. */
 static bool within(const float *values, int count, float limit) {
-    for (int k = 0; k < count; k++)
-        if (!(values[k] >= -limit && values[k] <= limit)) return false;
-    return true;
+    return mjxball_most(values, count) <= mjxball_most(&limit, 1);
 }
 
 static float root(float x) {

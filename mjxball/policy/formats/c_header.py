@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from mjxball import __version__
 from mjxball.control.follower_law import NEAR_ERROR, NEAR_ERROR_RATE, FollowerLaw
+from mjxball.control.followers import LARGEST
 from mjxball.control.geometry import GEOMETRY_SIZE
 from mjxball.control.observation import (
     ACTION_SIZE,
@@ -28,7 +30,6 @@ from mjxball.policy.quantize import Rows, balanced, rows_of
 
 FLOAT = 4  # bytes
 WIDEST_INT8 = 512  # products of 8 and 16 bits whose sum fits into 32
-LARGEST = 1e6  # of an observation's absolute sum: no flight comes near it, and floats can filter it
 APP = "mjxball"  # what the names in an app on board begin with, of which there is one a program
 
 
@@ -88,7 +89,8 @@ def c_header(policy: PolicyFile, name: str, int8: bool = False, prefix: str | No
     text = c_texts.HEADER.format(
         name=_plain(name),
         origin=_plain(f"preset {card['preset']}, configuration {card['config_hash']}, {card['training_steps']} steps"),
-        version=_plain(card["package_version"]),
+        trained=_plain(card["package_version"]),
+        version=__version__,
         period=f"{card['control_period']:g}",
         gravity=_number(card["gravity"]),
         observation=_table(),
@@ -258,7 +260,7 @@ def _network(law: FollowerLaw, policy: PolicyFile, int8: bool) -> str:
         return "\n".join([*lines, *_layers(shapes, calls, "input")])
     units, state = law.units, f"memory + {law.history.size}"
     lines += [f"    mjxball_real given[{3 * units}], kept[{3 * units}], next[{units}], joined[{size + 2 * units}];"]
-    lines += [f"    {calls[0]}, input, given);", f"    {calls[1]}, {state}, kept);"]
+    lines += [_called(f"{calls[0]}, input, given)"), _called(f"{calls[1]}, {state}, kept)")]
     lines += [f"    mjxball_gru(given, kept, {state}, {units}, next);"]
     lines += [f"    mjxball_copy(joined, next, {units});", f"    mjxball_copy(joined + {units}, input, {size});"]
     return "\n".join([*lines, *_layers(shapes[2:], calls[2:], "joined", units)])
@@ -274,11 +276,15 @@ def _layers(shapes: Sequence[tuple[int, int]], calls: Sequence[str], source: str
         target = "action" if number == last else f"hidden[{number % 2}]"
         if number == last and units:
             lines.append(f"    mjxball_copy({source} + {inputs - units}, next, {units});")
-        lines.append(f"    {call}, {source}, {target});")
+        lines.append(_called(f"{call}, {source}, {target})"))
         if number < last:
             lines.append(f"    for (i = 0; i < {outputs}; i++) if ({target}[i] < 0) {target}[i] = 0;")
         source = target
     return lines
+
+
+def _called(layer: str) -> str:
+    return f"    if (!{layer}) return mjxball_no_answer(follower, action, command);"
 
 
 def stride(inputs: int) -> int:

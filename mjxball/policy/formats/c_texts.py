@@ -1,7 +1,7 @@
 """C texts of an exported follower, which `c_header` fills in."""
 
 HEADER = """\
-/* Follower {name}, exported by mjxball {version}: {origin}.
+/* Follower {name}, trained by mjxball {trained} ({origin}), exported by mjxball {version}.
  *
  *   mjxball_follower follower = {{0}};
  *   mjxball_reset(&follower);                                              before every flight
@@ -11,8 +11,8 @@ HEADER = """\
 {observation}
  * action (3): the network's mean in [-1, 1]. command (3): roll [rad], pitch [rad], vertical acceleration [m/s2].
  * status: 0, or else action and command are zeros, which is level. 1: a number of the observation is not finite, or
- * their absolute sum is not below MJXBALL_LARGEST; the memory stays as it was. 2: the result is not finite; the next
- * call starts a flight.
+ * their absolute sum is not below MJXBALL_LARGEST; the memory stays as it was. 2: a number on the way to the result is
+ * not finite; the next call starts a flight. Also with -ffast-math and the like: bits are looked at, not comparisons.
 {team} *
  * Network {layers}, ReLU, tanh{weights}. C99 without a library; no allocation, no globals but constants.
  * Bit for bit the same on every machine with IEEE floats if products and sums are not contracted (-ffp-contract=off).
@@ -46,14 +46,37 @@ typedef MJXBALL_REAL mjxball_real;
 static inline void mjxball_copy(mjxball_real *to, const mjxball_real *from, int count) {{
     for (int i = 0; i < count; i++) to[i] = from[i];
 }}
-static inline mjxball_real mjxball_clip(mjxball_real value, mjxball_real limit) {{
-    return value < -limit ? -limit : value > limit ? limit : value;
+/* The bits of the largest absolute value as float; bits are in the order of values, from 0x7F800000 on not finite. The
+ * result is volatile, so that a compiler that is told of finite numbers only cannot know anything of it. */
+static inline unsigned mjxball_most(const mjxball_real *values, int count) {{
+    volatile unsigned most;
+    unsigned found = 0;
+    for (int i = 0; i < count; i++) {{
+        union {{
+            float value;
+            unsigned bits;
+        }} one;
+        one.value = (float)values[i];
+        one.bits &= 0x7FFFFFFFu;
+        if (one.bits > found) found = one.bits;
+    }}
+    most = found;
+    return most;
+}}
+static inline int mjxball_are_finite(const mjxball_real *values, int count) {{
+    return mjxball_most(values, count) < 0x7F800000u;
 }}
 /* Whether the absolute sum is below `MJXBALL_LARGEST`: of numbers that are not finite it is not. */
 static inline int mjxball_is_sound(const mjxball_real *values, int count) {{
     mjxball_real sum = 0;
+    if (!mjxball_are_finite(values, count)) return 0;
     for (int i = 0; i < count; i++) sum += values[i] < 0 ? -values[i] : values[i];
     return sum < MJXBALL_LARGEST;
+}}
+/* What is not finite stays so. */
+static inline mjxball_real mjxball_clip(mjxball_real value, mjxball_real limit) {{
+    if (!mjxball_are_finite(&value, 1)) return value;
+    return value < -limit ? -limit : value > limit ? limit : value;
 }}
 {helpers}
 /* The leader's PD law on the observed error: what the `copy` follower commands. */
@@ -63,6 +86,11 @@ static inline void mjxball_copy_law(const mjxball_real *observation, mjxball_rea
 /* Forget the past: the next call starts a flight. */
 static inline void mjxball_reset(mjxball_follower *follower) {{
     follower->running = 0;
+}}
+static inline int mjxball_no_answer(mjxball_follower *follower, mjxball_real action[3], mjxball_real command[3]) {{
+    for (int i = 0; i < 3; i++) action[i] = command[i] = 0;
+    mjxball_reset(follower);
+    return 2;
 }}
 
 static inline int mjxball_follow(
@@ -74,13 +102,10 @@ static inline int mjxball_follow(
     mjxball_copy(input, observation, 18);
 {history}
 {network}
+    if (!mjxball_are_finite(action, 3)) return mjxball_no_answer(follower, action, command);
     for (i = 0; i < 3; i++) action[i] = mjxball_tanh(action[i]);
 {command}
-    if (!mjxball_is_sound(action, 3) || !mjxball_is_sound(command, 3)) {{
-        for (i = 0; i < 3; i++) action[i] = command[i] = 0;
-        mjxball_reset(follower);
-        return 2;
-    }}
+    if (!mjxball_are_finite(command, 3)) return mjxball_no_answer(follower, action, command);
 {history_update}
     return 0;
 }}
@@ -112,9 +137,10 @@ LAYER = """
     } while (0)
 
 /* to = weight from + bias, where a bias of 0 is none. Rows are filled up to a multiple of four. Sums over even and odd
- * inputs round less than one long sum. */
-static inline void mjxball_layer(
+ * inputs round less than one long sum. False, and nothing is written, if `from` is not finite. */
+static inline int mjxball_layer(
     const float *weight, const float *bias, int inputs, int outputs, const mjxball_real *from, mjxball_real *to) {
+    if (!mjxball_are_finite(from, inputs)) return 0;
     for (int row = 0; row < outputs; row += 4, weight += 4 * (inputs & 1)) {
         mjxball_real a = 0, b = 0, c = 0, d = 0, e = 0, f = 0, g = 0, h = 0;
         int k = 0;
@@ -126,6 +152,7 @@ static inline void mjxball_layer(
         const mjxball_real sums[4] = {a + e, b + f, c + g, d + h};
         for (int i = 0; i < 4 && row + i < outputs; i++) to[row + i] = sums[i] + (bias ? bias[row + i] : 0);
     }
+    return 1;
 }
 """
 LAYER_INT8 = """
@@ -135,17 +162,16 @@ static inline int16_t mjxball_whole(mjxball_real value) {
 }
 
 /* Values as 16 bit numbers of the step that is returned: the largest of them takes the whole range; zeros up to
- * `stride`. Of every four the middle ones change places, as `mjxball_products` wants them. The step is NaN, and nothing
- * is written, if one of the values is not finite. */
+ * `stride`. Of every four the middle ones change places, as `mjxball_products` wants them. 0, and nothing is written,
+ * if one of the values is not finite. */
 static inline mjxball_real mjxball_steps(const mjxball_real *from, int count, int stride, int16_t *to) {
-    mjxball_real largest = (mjxball_real)1e-30, per_step;
-    int k = 0;
-    for (; k < count; k++) {
-        mjxball_real size = from[k] < 0 ? -from[k] : from[k];
-        if (!(size <= largest)) largest = size + 0 * largest; /* NaN stays */
-    }
-    if (largest - largest != 0) return largest - largest;
-    per_step = 32767 / largest;
+    const union {
+        unsigned bits;
+        float value;
+    } most = {mjxball_most(from, count)};
+    const mjxball_real largest = most.value > 1e-30f ? most.value : 1e-30f, per_step = 32767 / largest;
+    int k;
+    if (most.bits >= 0x7F800000u) return 0;
     for (k = stride - 8; k < stride; k++) to[k] = 0;
     for (k = 0; k < (count & ~3); k += 4) {
         to[k] = mjxball_whole(from[k] * per_step);
@@ -180,15 +206,13 @@ static inline int32_t mjxball_products(const int8_t *weight, const int16_t *step
 #endif
 
 /* to = step weight from + bias of whole numbers, where a bias of 0 is none: rows of `stride` weights, of which `inputs`
- * are not 0, four rows at once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four. */
-static inline void mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
+ * are not 0, four rows at once: what is loaded of `from` serves them all. Rows are filled up to a multiple of four.
+ * False, and nothing is written, if `from` is not finite. */
+static inline int mjxball_layer(const int8_t *weight, const float *step, const float *bias, int inputs, int outputs,
     int stride, const mjxball_real *from, mjxball_real *to) {
     int16_t steps[MJXBALL_MOST_INPUTS + 7];
-    mjxball_real size = mjxball_steps(from, inputs, stride, steps);
-    if (size != size) {
-        for (int row = 0; row < outputs; row++) to[row] = size;
-        return;
-    }
+    const mjxball_real size = mjxball_steps(from, inputs, stride, steps);
+    if (size <= 0) return 0;
     for (int row = 0; row < outputs; row += 4, weight += 4 * stride) {
         int32_t a = 0, b = 0, c = 0, d = 0;
         for (int k = 0; k < stride; k += 8) {
@@ -206,6 +230,7 @@ static inline void mjxball_layer(const int8_t *weight, const float *step, const 
         for (int i = 0; i < 4 && row + i < outputs; i++)
             to[row + i] = (mjxball_real)sums[i] * (size * step[row + i]) + (bias ? bias[row + i] : 0);
     }
+    return 1;
 }
 """
 EXPONENTIAL = """
@@ -227,10 +252,9 @@ static inline mjxball_fraction mjxball_fraction_of(mjxball_real x) {
     return one;
 }
 
-/* NaN stays NaN. */
 static inline mjxball_real mjxball_tanh(mjxball_real x) {
     const mjxball_real size = x < 0 ? -x : x;
-    if (!(size < 20)) return x < 0 ? -1 : x > 0 ? 1 : x;
+    if (size > 20) return x < 0 ? -1 : 1;
     const mjxball_fraction one = mjxball_fraction_of(2 * size);
     const mjxball_real less = 1 - one.share, more = 1 + one.share;
     const mjxball_real value = (less * one.even + more * one.odd) / (more * one.even + less * one.odd);

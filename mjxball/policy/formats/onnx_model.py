@@ -14,7 +14,9 @@ import numpy as np
 import onnx
 from onnx import NodeProto, TensorProto, helper, numpy_helper
 
+from mjxball import __version__
 from mjxball.control import observation as layout
+from mjxball.control.followers import LARGEST
 from mjxball.policy.file import PolicyFile, law_of
 from mjxball.policy.inference import NetworkLaw, Policy, known_geometry
 
@@ -176,36 +178,52 @@ def onnx_model(contents: PolicyFile, name: str) -> Any:
 
     Inputs: `observation` (N, 18); with a memory of m numbers also `memory` (N, m) and `start` (N, 1) bool, true at
     the first step of a flight, where `memory` is not read. Outputs: `action` (N, 3) in [-1, 1], `command` (N, 3)
-    roll [rad], pitch [rad], vertical acceleration [m/s2]; with a memory also `next_memory` (N, m). A policy that is
-    told its team is that of the one follower that `team` in its card names, and sees and commands in its mount frame.
+    roll [rad], pitch [rad], vertical acceleration [m/s2], `valid` (N, 1) bool; with a memory also `next_memory` (N, m).
+    A row is not valid, and its action and command are zeros, if its observation is none (not finite, or an absolute sum
+    of 1e6 or more): `next_memory` is then `memory`, or at a start one that saw zeros; or if its memory or the answer is
+    not finite: `next_memory` is then that of a start. Other rows are as without it. A policy that is told its team is
+    that of the one follower that `team` in its card names, and sees and commands in its mount frame.
     """
     graph, around = Graph(), law_of(contents.card)
+    law = NetworkLaw(Policy(contents, "traced", np.float32))
     observation = TracedArray(graph, "observation", layout.OBSERVATION_SIZE)
     inputs = [_value("observation", TensorProto.FLOAT, layout.OBSERVATION_SIZE)]
-    memory = around.start(observation, known_geometry(contents.card, name))
+    sound = _is_below(LARGEST, observation)
+    seen = _where(sound, observation, np.zeros(1))
+    begun = memory = around.start(seen, known_geometry(contents.card, name))
     if around.size:
         inputs += [_value("memory", TensorProto.FLOAT, around.size), _value("start", TensorProto.BOOL, 1)]
-        start, given = TracedArray(graph, "start", 1), TracedArray(graph, "memory", around.size)
-        memory = TracedArray(graph, graph.add("Where", start, memory, given), around.size)
-    results = dict(zip(("action", "command", "next_memory"), _answers(contents, observation, memory), strict=True))
-    if not around.size:
-        del results["next_memory"]
+        memory = _where(TracedArray(graph, "start", 1), begun, TracedArray(graph, "memory", around.size))
+    action, command, following = law.answer(memory, seen)
+    finite = _is_below(float(np.finfo(np.float32).max), *([memory, following] if around.size else []), action, command)
+    valid = sound.binary("And", sound, finite)
+    results = {label: _where(valid, value, np.zeros(1)) for label, value in (("action", action), ("command", command))}
+    results["valid"] = valid
+    if around.size:
+        results["next_memory"] = _where(finite, _where(sound, following, memory), begun)
     for label, value in results.items():
         graph.nodes.append(helper.make_node("Identity", [value.name], [label], name=label))
-    outputs = [_value(label, TensorProto.FLOAT, *value.sizes) for label, value in results.items()]
+    kinds = {"valid": TensorProto.BOOL}
+    outputs = [_value(label, kinds.get(label, TensorProto.FLOAT), *value.sizes) for label, value in results.items()]
     made = helper.make_graph(graph.nodes, "follower", inputs, outputs, graph.constants, doc_string=onnx_model.__doc__)
-    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="mjxball")
+    maker = {"producer_name": "mjxball", "producer_version": __version__}
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], **maker)
     model.ir_version = IR_VERSION
     helper.set_model_props(model, {"name": name, "card": json.dumps(contents.card, sort_keys=True)})
     onnx.checker.check_model(model, full_check=True)
     return model
 
 
-def _answers(
-    contents: PolicyFile, observation: TracedArray, memory: TracedArray
-) -> tuple[TracedArray, TracedArray, TracedArray]:
-    """Action, command and next memory, by the laws that fly."""
-    return NetworkLaw(Policy(contents, "traced", np.float32)).answer(memory, observation)
+def _is_below(limit: float, *parts: TracedArray) -> TracedArray:
+    """Whether a row's absolute sum is below `limit` (N, 1); of NaN and infinity it is not."""
+    size = Namespace.concat(parts, -1).unary("Abs")
+    total = TracedArray(size.graph, size.graph.add("ReduceSum", size, np.array([-1], np.int64), keepdims=1), 1)
+    return total.binary("Less", total, np.array([limit]))
+
+
+def _where(condition: TracedArray, one: TracedArray, other: Any) -> TracedArray:
+    """`one` (N, k) in rows where `condition` (N, 1) is true, else `other`."""
+    return TracedArray(one.graph, one.graph.add("Where", condition, one, other), *one.sizes)
 
 
 def _value(name: str, kind: int, size: int | None) -> Any:

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from onboard_bench import AT_REST, Bench, cores_of, needs_gcc, policy_of
+import pytest
+from onboard_bench import AT_REST, Bench, compilers, cores_by, cores_of, needs_gcc, policy_of
 from tables import rows
 
 from mjxball.fly.app.host import App
@@ -196,8 +197,6 @@ def test_what_an_app_computes_is_checked_before_it_leaves():
             leader._c.integral(leader._core)[slot] = value
             sent = bench.tick(Phase.FLY)
             assert_within_limits(sent)
-            if math.isinf(value):  # clipped, as any large command
-                continue
             assert leader.phase is Phase.DESCEND
             assert bench.cause(0) == "the command is not finite"
             assert (sent[0].roll, sent[0].pitch) == (0.0, 0.0)
@@ -237,3 +236,26 @@ def test_the_leaders_integral_is_bounded():
         bench.tick(Phase.FLY)
     assert max(leader.integral[:3]) <= 1000.0
     assert bench.phases == [Phase.FLY] * 2
+
+
+@pytest.mark.slow
+@needs_gcc
+def test_compilers_that_are_told_of_finite_numbers_only_remove_no_check(monkeypatch: pytest.MonkeyPatch):
+    """All of this file that is about wild numbers, for -Ofast and the like."""
+    checks = (
+        test_parameters_that_cannot_be_leave_the_last_ones_in_use,
+        test_states_that_cannot_be_end_in_a_descent,
+        test_heartbeats_that_cannot_be_are_not_heard,
+        test_what_an_app_computes_is_checked_before_it_leaves,
+        test_a_state_of_the_network_that_is_not_finite_lands_the_pair,
+    )
+    for compiler in compilers():
+        monkeypatch.setitem(globals(), "cores_of", functools.cache(functools.partial(cores_by, compiler)))
+        taken_off.cache_clear()
+        for check in checks:
+            try:
+                check()
+            except BaseException as error:
+                error.add_note(f"{check.__name__}, {' '.join(compiler)}")
+                raise
+    taken_off.cache_clear()
