@@ -9,12 +9,12 @@ import select
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
 from mjxball.errors import InputError
+from mjxball.fly import clock
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class Metronome:
 
     def start(self) -> None:
         """The first deadline is one period from now."""
-        self._before = time.monotonic()
+        self._before = clock.now()
         self._deadline = self._before + self.period
 
     def wait(self) -> float:
         """Sleep until the next deadline; returns the monotonic time [s]."""
-        while (left := self._deadline - time.monotonic()) > 0:
-            time.sleep(left)
-        now = time.monotonic()
+        while (left := self._deadline - clock.now()) > 0:
+            clock.sleep(left)
+        now = clock.now()
         self.lateness = now - self._deadline
         self._late.append(self.lateness)
         passed = int(self.lateness / self.period)
@@ -128,11 +128,11 @@ def together(actions: Sequence[Callable[[], None]]) -> None:
 
 def wait_until(condition: Callable[[], bool], seconds: float) -> bool:
     """True once `condition` holds, false if it does not within `seconds`."""
-    end = time.monotonic() + seconds
+    end = clock.now() + seconds
     while not condition():
-        if time.monotonic() > end:
+        if clock.now() > end:
             return False
-        time.sleep(0.01)
+        clock.sleep(0.01)
     return True
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ from mjxball import __version__, terminal
 from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.errors import InputError
-from mjxball.fly import packets, positioning
+from mjxball.fly import clock, packets, positioning
 from mjxball.fly.app_flight import Apps, OnboardFlight
 from mjxball.fly.card import Controller
 from mjxball.fly.connection import LinkError
@@ -119,7 +118,7 @@ def run(flight: Flight) -> Timing:
 
     with listening(land, interrupt, kill), Display(lambda: flight.view, flight.settings.limits):
         metronome.start()
-        flight.begin(time.monotonic())
+        flight.begin(clock.now())
         going = True
         while going:
             now = metronome.wait()
@@ -140,8 +139,8 @@ def _emergency(flight: Flight) -> bool:
         for link in flight.links:
             link.command(packets.EMERGENCY_STOP)
             link.send(packets.setpoint_packet(packets.ZERO))
-        time.sleep(0.01)
-    flight.supervisor = Supervisor(State.DONE, time.monotonic(), Fault(Event.BAD_STATE, "the runner itself failed"))
+        clock.sleep(0.01)
+    flight.supervisor = Supervisor(State.DONE, clock.now(), Fault(Event.BAD_STATE, "the runner itself failed"))
     return False
 
 

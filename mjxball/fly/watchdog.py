@@ -14,12 +14,11 @@ import signal
 import struct
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from typing import Any
 
 from mjxball.cli import make_parser
-from mjxball.fly import packets
+from mjxball.fly import clock, packets
 from mjxball.fly.packets import Packet, Setpoint
 from mjxball.fly.process import Child
 from mjxball.fly.setpoints import LastKnownState, blind_shares
@@ -111,10 +110,10 @@ def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
     if driver is None:
         return
     for number, packet in enumerate(plan):
-        wait = start + number * PERIOD - time.monotonic()
+        wait = start + number * PERIOD - clock.now()
         if wait < -PERIOD and number < len(plan) - 5:
             continue  # the time of this one passed while the link was opened
-        time.sleep(max(wait, 0.0))
+        clock.sleep(max(wait, 0.0))
         wire = CRTPPacket()
         wire.set_header(packet.port, packet.channel)
         wire.data = packet.data
@@ -126,11 +125,11 @@ def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
 
 def _open(crtp: Any, uri: str) -> Any:
     """The driver for `uri`; tried again while the dead runner's radio is not free yet."""
-    deadline = time.monotonic() + OPENING
-    while time.monotonic() < deadline:
+    deadline = clock.now() + OPENING
+    while clock.now() < deadline:
         with contextlib.suppress(Exception):
             return crtp.get_link_driver(uri, lambda statistics: None, lambda error: None)
-        time.sleep(0.05)
+        clock.sleep(0.05)
     return None
 
 
@@ -147,7 +146,7 @@ def main(arguments: Sequence[str]) -> int:
     left = watch(sys.stdin.fileno(), options.runner)
     if left is None:
         return 0
-    start = time.monotonic()
+    start = clock.now()
     threads = [
         threading.Thread(target=bring_down, args=(uri, way_down(number, *left), start), daemon=True)
         for number, uri in enumerate(options.uris)

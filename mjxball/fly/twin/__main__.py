@@ -9,10 +9,10 @@ import argparse
 import json
 import sys
 import threading
-import time
 from pathlib import Path
 
 from mjxball.cli import make_parser, run_command
+from mjxball.fly import clock
 from mjxball.fly.app.host import compile_pair
 from mjxball.fly.card import load_policy
 from mjxball.fly.process import urgent
@@ -58,8 +58,8 @@ def serve(options: argparse.Namespace) -> int:
 def inject_later(twin: Twin, one: Injection) -> None:
     """Wait for the first motor to turn, then until the fault is due."""
     while twin.truth.pwm.max() == 0 or max(twin.truth.thrust) == 0:
-        time.sleep(0.01)
-    time.sleep(one.after)
+        clock.sleep(0.01)
+    clock.sleep(one.after)
     twin.inject(one)
 
 

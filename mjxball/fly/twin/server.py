@@ -5,11 +5,11 @@ from __future__ import annotations
 import select
 import socket
 import threading
-import time
 from dataclasses import dataclass
 
 import numpy as np
 
+from mjxball.fly import clock
 from mjxball.fly.app.host import Library
 from mjxball.fly.twin.conditions import Injection
 from mjxball.fly.twin.drone import TwinDrone, advance
@@ -49,7 +49,7 @@ class Twin:
         self._closed = [False, False]
         self._stop = threading.Event()
         self._lock = threading.Lock()
-        self._begun = time.monotonic()
+        self._begun = clock.now()
         self._thread = threading.Thread(target=self._run, name="twin", daemon=True)
         self.truth = self._seen(0.0)
         self.history: list[Truth] = []  # one in ten steps
@@ -82,10 +82,10 @@ class Twin:
 
     def _now(self) -> float:
         """Time [s] of the twin."""
-        return time.monotonic() - self._begun
+        return clock.now() - self._begun
 
     def _loop(self) -> None:
-        self._begun = time.monotonic()
+        self._begun = clock.now()
         step = 0
         while not self._stop.is_set():
             now, due = self._now(), (step + 1) * PERIOD
