@@ -164,7 +164,9 @@ class Flight:
         if self.flying and all(self._fresh):
             volts, sinking = [state.battery for state in self._states], self.settings.times.descend_speed
             faults += self._lift.update(volts, self.maps, self._height(self._object()), sinking, self._now)
-        if self.watchdog is not None and not self.watchdog.beat(self.flying, self._last_known_state()):
+        # Also on the ground once motors turn: the tick that begins the ramp may stand still before the next beat.
+        guarded = self.flying or (self.supervisor.state is State.SPIN and not self.settings.dry_run)
+        if self.watchdog is not None and not self.watchdog.beat(guarded, self._last_known_state()):
             faults.append(Fault(Event.WATCHDOG))
         return faults
 
