@@ -18,6 +18,7 @@ from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import DroneLink, Rig, Telemetry
 
 TICKS = 6  # in each state: longer than a command lasts
+STEP = 1e-4  # [s] between two of them: what has been heard must stay fresh
 
 
 class Deaf:
@@ -62,7 +63,7 @@ def warm_up(
     for state in State:
         cause = Fault(Event.STALE, "of a rehearsal on the ground")
         for number in range(TICKS):
-            now += settings.period
+            now += STEP
             flight.supervisor = Supervisor(state, now - number * settings.period, cause)
             flight.tick(now)
     flight.how_it_ended()

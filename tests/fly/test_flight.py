@@ -218,6 +218,10 @@ def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: 
         assert not any(drone.firmware.locked for drone in world.drones)
         speed = world.touchdown_speed()
         assert not speed > 0.8, (phase, speed)
+    world.flight.supervisor, world.flight.watchdog = Supervisor(State.FLY), None
+    with pytest.raises(Ended):  # the laws on board: nobody else takes over, and the apps land
+        session.run(world.flight)
+    assert "the apps on board land both drones" in capsys.readouterr().err
 
 
 def test_asking_twice_to_land_is_no_kill_but_ctrl_c_twice_is(monkeypatch: pytest.MonkeyPatch) -> None:
