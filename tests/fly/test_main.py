@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -100,6 +101,17 @@ def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
     script = f"import sys, {imports}; print([name for name in {heavy!r} if name in sys.modules])"
     done = run(["-c", f"import sys; sys.path.insert(0, {str(REPOSITORY)!r}); {script}"], tmp_path)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_a_flight_has_one_clock() -> None:
+    """Runner, watchdog and twin of a rehearsal slow down together."""
+    others = {"clock.py", "flight_log.py", "log_export.py", "mocap_child.py"}  # files on disk; cameras, never rehearsed
+    asked = {
+        str(path.relative_to(REPOSITORY))
+        for path in (REPOSITORY / "mjxball/fly").rglob("*.py")
+        if path.name not in others and re.search(r"\btime\.(monotonic|perf_counter|sleep)\(", path.read_text("utf-8"))
+    }
+    assert asked == set()
 
 
 class Ended(NamedTuple):
