@@ -145,6 +145,9 @@ def test_every_state_has_a_time_limit_in_the_air() -> None:
     assert all(math.isfinite(world.flight._limit(state)) for state in AIRBORNE)
 
 
+QUICK = Times(arm=0.1, ramp=0.5, stop=0.2)
+
+
 class Guard:
     """In the place of the watchdog."""
 
@@ -196,7 +199,7 @@ def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: 
 
     monkeypatch.setattr(session.os, "_exit", ended)
     for phase in (State.RAMP, State.FLY, State.LAND, State.DESCEND, State.HOLD):
-        world, guard, saved = VirtualTwin(FlightSettings(seconds=1.5)), Guard(), []
+        world, guard, saved = VirtualTwin(FlightSettings(seconds=1.2, times=QUICK)), Guard(), []
         world.fly_until(State.FLY if phase in (State.DESCEND, State.HOLD) else phase)
         if phase in (State.DESCEND, State.HOLD):
             world.fly_for(1.0)

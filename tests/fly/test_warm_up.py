@@ -10,7 +10,7 @@ from command_line import run
 from fly_virtual import VirtualTwin
 
 from mjxball.fly.flight import Flight
-from mjxball.fly.limits import FlightSettings
+from mjxball.fly.limits import FlightSettings, Times
 from mjxball.fly.supervisor import State
 from mjxball.fly.warm_up import warm_up
 
@@ -77,7 +77,7 @@ def test_a_warm_up_goes_through_every_state_and_leaves_nothing_behind() -> None:
             seen.add(self.supervisor.state)
             return super().tick(now, late, missed, gap)
 
-    world = VirtualTwin(FlightSettings(seconds=1.0))
+    world = VirtualTwin(FlightSettings(seconds=0.3, times=Times(arm=0.1, ramp=0.5, stop=0.2)))
     flight, before = world.flight, [len(link.packets) for link in world.links]
     pair = (world.links, flight.controller, world.variants, ["linear"] * 2, world.rig, world.settings)
     warm_up(Noted, *pair, world.now)
