@@ -16,13 +16,13 @@ import math
 import os
 import struct
 import threading
-import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mjxball.errors import InputError
+from mjxball.fly import clock
 from mjxball.fly.packets import Packet
 from mjxball.fly.process import bounded
 
@@ -74,7 +74,7 @@ def connect(
     import cflib.crtp
 
     _start_drivers(cflib.crtp)
-    started = time.monotonic()
+    started = clock.now()
     for attempt in range(1, deadlines.attempts + 1):
         crazyflie, reason, refused = _attempt(uri, name, deadlines, started, progress)
         if not reason:
@@ -86,7 +86,7 @@ def connect(
             bounded(crazyflie.link_statistics.stop, deadlines.close)
             return crazyflie
         bounded(crazyflie.close_link, deadlines.close)
-        if refused or time.monotonic() - started > deadlines.connect or attempt == deadlines.attempts:
+        if refused or clock.now() - started > deadlines.connect or attempt == deadlines.attempts:
             break
         progress(f"{name}: {reason}, trying again")
     raise LinkError(f"{name} at {uri} cannot be reached: {reason}")
@@ -100,14 +100,14 @@ def _attempt(
 
     crazyflie, ready = Crazyflie(rw_cache=table_cache()), threading.Event()
     failed: list[str] = []
-    heard = [time.monotonic()]
+    heard = [clock.now()]
 
     def refused(_: str, why: str) -> None:
         failed.append((why.strip().splitlines() or ["link error"])[0])
         ready.set()
 
     def arrived(_: Any) -> None:
-        heard[0] = time.monotonic()
+        heard[0] = clock.now()
 
     # The values of all parameters would take 240 round trips; those that matter are read by name.
     crazyflie.param.request_update_of_all_params = lambda: None
@@ -117,7 +117,7 @@ def _attempt(
     crazyflie.packet_received.add_callback(arrived)
     threading.Thread(target=crazyflie.open_link, args=(uri,), daemon=True).start()
     while not ready.wait(0.5):
-        now = time.monotonic()
+        now = clock.now()
         if now - heard[0] > deadlines.silence or now - started > deadlines.connect:
             return crazyflie, f"no answer within {now - heard[0]:.1f} s", False
         logs, params = _listed(crazyflie.log.toc), _listed(crazyflie.param.toc)
@@ -231,9 +231,9 @@ class Parameters:
         with self._changed:
             for key in keys.values():
                 self._answers.pop(key, None)
-        latest = time.monotonic()
+        latest = clock.now()
         while waiting:
-            now = time.monotonic()
+            now = clock.now()
             for name in waiting[:WINDOW]:
                 if now - sent.get(name, -math.inf) > REPEAT:
                     sent[name] = now
@@ -243,7 +243,7 @@ class Parameters:
                 answered = [name for name in waiting if keys[name] in self._answers]
                 found |= {name: self._answers.pop(keys[name]) for name in answered}
             waiting = [name for name in waiting if name not in found]
-            latest = time.monotonic() if answered else latest
-            if waiting and time.monotonic() - latest > self._wait:
+            latest = clock.now() if answered else latest
+            if waiting and clock.now() - latest > self._wait:
                 raise LinkError(f"the {self._drone} did not confirm parameter {waiting[0]}")
         return found

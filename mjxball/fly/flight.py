@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -52,6 +52,7 @@ class Flight:
         self.interrupts, self.kill = 0, False
         self.ready: bool | None = None  # checks before flight: not known yet, passed, failed
         self.refusal = ""
+        self.excuse: Callable[[Fault], Exception | None] = lambda cause: None  # for a fault that is this computer's
         self.view: View | None = None
         self.spin = SpinCheck(links, variants, assumed, settings.motor)
         self.highest = [0, 0]  # thrust of each drone that was wanted [units]
@@ -83,6 +84,11 @@ class Flight:
     def lifted(self) -> bool:
         """True if the pair left the ground, or was not to."""
         return self._highest_place >= self._lifts_at
+
+    @property
+    def flying(self) -> bool:
+        """True while the pair may be in the air."""
+        return self.supervisor.state in AIRBORNE and not self.settings.dry_run
 
     @property
     def _lifts_at(self) -> float:
@@ -155,11 +161,12 @@ class Flight:
             faults.append(Fault(Event.DEADLINES, f"{missed} missed in a second, longest gap {1000 * gap:.0f} ms"))
         if self._mocap is not None:
             faults += self._mocap.faults(self._now)
-        flying = self.supervisor.state in AIRBORNE and not self.settings.dry_run
-        if flying and all(self._fresh):
+        if self.flying and all(self._fresh):
             volts, sinking = [state.battery for state in self._states], self.settings.times.descend_speed
             faults += self._lift.update(volts, self.maps, self._height(self._object()), sinking, self._now)
-        if self.watchdog is not None and not self.watchdog.beat(flying, self._last_known_state()):
+        # Also on the ground once motors turn: the tick that begins the ramp may stand still before the next beat.
+        guarded = self.flying or (self.supervisor.state is State.SPIN and not self.settings.dry_run)
+        if self.watchdog is not None and not self.watchdog.beat(guarded, self._last_known_state()):
             faults.append(Fault(Event.WATCHDOG))
         return faults
 
@@ -285,6 +292,8 @@ class Flight:
     def _advance(self, faults: list[Fault]) -> None:
         before = self.supervisor
         self.supervisor = before.after(faults, self._now)
+        if self.supervisor.cause and not before.cause and (excuse := self.excuse(self.supervisor.cause)):
+            raise excuse
         entered = self.supervisor.state
         if entered is before.state:
             return

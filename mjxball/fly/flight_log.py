@@ -23,7 +23,7 @@ from typing import Any, BinaryIO
 
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.fly import log_import
+from mjxball.fly import clock, log_import
 from mjxball.fly.log_schema import SCHEMA, Record, decode
 from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.reading import parse_json, time_fault
@@ -62,7 +62,7 @@ class Journal:
     def note(self, kind: str, t: float | None = None, **fields: Any) -> None:
         """Add one record of a `kind` in `log_schema.KINDS`; returns at once."""
         if self._stream is not None:
-            self._queue.put({"t": time.monotonic() if t is None else t, "kind": kind, **fields})
+            self._queue.put({"t": clock.now() if t is None else t, "kind": kind, **fields})
 
     def close(self) -> None:
         """Write what waits and close the file."""

@@ -10,11 +10,10 @@ import contextlib
 import dataclasses
 import math
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from mjxball.fly import packets
+from mjxball.fly import clock, packets
 from mjxball.fly.app.protocol import APP_VARIABLES, Reply, reply_of, sample_of
 from mjxball.fly.connection import PORT, Deadlines, Element, Identity, LinkError, Parameters, connect
 from mjxball.fly.packets import Packet, PacketError
@@ -58,12 +57,12 @@ class Link:
 
     def open(self, progress: Callable[[str], None] = lambda text: None) -> None:
         """Connect, with both tables of contents, which are cached; `progress` gets lines to show. Raises LinkError."""
-        started = time.monotonic()
+        started = clock.now()
         self._crazyflie = connect(self.uri, self.name, self._deadlines, progress, self._end, self._console)
         self._driver = self._crazyflie.link
         self._sender.start()
         self._crazyflie.add_port_callback(PORT, self.parameters.received)
-        self._identify(time.monotonic() - started)
+        self._identify(clock.now() - started)
 
     def _console(self, text: str) -> None:
         self._note("console", drone=self.name, text=text)
@@ -83,11 +82,11 @@ class Link:
         self._crazyflie.add_port_callback(packets.VERSION.port, answered)
         for request in (packets.VERSION, packets.DEVICE):
             self._request(request)
-        both.wait(self._deadlines.version)
+        both.wait(clock.real(self._deadlines.version))
         self._crazyflie.remove_port_callback(packets.VERSION.port, answered)
-        names, began = self.parameters.listed(REVISION), time.monotonic()
+        names, began = self.parameters.listed(REVISION), clock.now()
         revision = self.parameters.read(names)
-        trip = (time.monotonic() - began) if names else math.nan
+        trip = (clock.now() - began) if names else math.nan
         self.identity = Identity(
             protocol=self._crazyflie.platform.get_protocol_version(),
             version=answers.get(1) or "?",
@@ -132,9 +131,9 @@ class Link:
 
         A firmware drops requests while its queue is full and cflib does not repeat them: a silent block is made anew.
         """
-        deadline = time.monotonic() + self._deadlines.first_state
+        deadline = clock.now() + self._deadlines.first_state
         while silent := [one for one in blocks if not came(one.name)]:
-            if time.monotonic() > deadline:
+            if clock.now() > deadline:
                 names, limit = ", ".join(one.name for one in silent[0].variables), self._deadlines.first_state
                 raise LinkError(f"the {self.name} does not send {names} within {limit:g} s")
             for one in silent:
@@ -228,7 +227,7 @@ class Link:
         try:
             for _ in range(ATTEMPTS):
                 self._request(packet)
-                if heard.wait(REPEAT):
+                if heard.wait(clock.real(REPEAT)):
                     return answers[0]
         finally:
             self._crazyflie.remove_port_callback(packet.port, answered)
@@ -270,7 +269,7 @@ class Link:
         """Change what waits to be sent, and wake the sender."""
         with self._wake:
             yield
-            self._waiting_since = self._waiting_since or time.monotonic()
+            self._waiting_since = self._waiting_since or clock.now()
             self._wake.notify()
 
     def stuck_for(self, now: float) -> float:
@@ -295,7 +294,7 @@ class Link:
         while True:
             with self._wake:
                 if not (self._commands or self._setpoint or self._pose or self._closing):
-                    self._wake.wait(QUIET)
+                    self._wake.wait(clock.real(QUIET))
                 if self._closing and not self._commands:
                     return
                 packet = packets.PING  # the firmware stops its logs if it hears nothing for 1 s
@@ -316,11 +315,11 @@ class Link:
             self.sent += packet.port != packets.POSE_PORT
             with self._wake:
                 waiting = self._commands or self._setpoint
-                self._waiting_since = time.monotonic() if waiting else None
+                self._waiting_since = clock.now() if waiting else None
 
     def _receive(self, packet: Any) -> None:
         """A log packet, in cflib's thread; whatever is not a whole state is counted and dropped."""
-        arrival, data = time.monotonic(), bytes(packet.data)
+        arrival, data = clock.now(), bytes(packet.data)
         if len(data) < 4 or data[0] != self._block:
             return
         try:
@@ -332,7 +331,7 @@ class Link:
             self._note("state", t=arrival, drone=self.name, raw=data.hex())
 
     def _take_health(self, values: Mapping[str, float]) -> None:
-        arrival, health = time.monotonic(), packets.health_of(values)
+        arrival, health = clock.now(), packets.health_of(values)
         self.telemetry.health = HealthSample(health, arrival)
         self._note("health", t=arrival, drone=self.name, **health._asdict())
 
@@ -340,7 +339,7 @@ class Link:
         self.telemetry.sensed = SensedSample(packets.sensed_of(values), stamp)
 
     def _take_app(self, values: Mapping[str, float]) -> None:
-        self.telemetry.app = sample_of(values, time.monotonic())
+        self.telemetry.app = sample_of(values, clock.now())
 
     def _end(self, why: str) -> None:
         self.lost = self.lost or (why.strip().splitlines() or ["link error"])[0]

@@ -17,7 +17,7 @@ from mjxball import cli, terminal
 from mjxball.cli import run_command
 from mjxball.config import Config
 from mjxball.errors import InputError
-from mjxball.fly import app_flight, limits
+from mjxball.fly import app_flight, clock, limits
 from mjxball.fly.app import generate
 from mjxball.fly.card import (
     Controller,
@@ -36,19 +36,19 @@ from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.mocap import KINDS, MocapSettings, ready
 from mjxball.fly.preflight import Preflight, read_gains
-from mjxball.fly.process import Child
+from mjxball.fly.rehearsal import Rehearsal
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
 from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
-from mjxball.reading import parse_json
 
 URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
 DONGLE = re.compile(r"radio://([^/]+)/")
 RADIO = re.compile(r"radio://([^/]+)/(\d{1,3})")
 APART = 2  # channels of 1 MHz that a link of 2 Mbit/s takes
+SLOW = ("slow", 1.0, clock.SLOWEST)
 # Numbers with least and most: of the battery, and of the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
 WORSE = {  # once the motors turn: cflib connects over a good link only
@@ -87,6 +87,7 @@ def make_parser() -> cli.Parser:
     about = "links and parameters of two robots of a Crazyswarm2 file; --leader and --follower then are names in it"
     add("--crazyflies", type=Path, metavar="FILE.yaml", help=about)
     add("--rehearse", action="store_true", help="fly the software twin; its ports are the URIs', if given")
+    add("--slow", type=float, metavar="FACTOR", help="--rehearse: on a clock so many times slower than real time (1)")
     add("--dry-run", action="store_true", help="connect, log, send zeros only; nothing is armed")
 
     add = parser.add_argument_group("the flight").add_argument
@@ -204,7 +205,7 @@ def check_options(options: argparse.Namespace) -> None:
     if options.leader is not None and options.leader == options.follower:
         raise InputError("--leader and --follower are the same drone")
     check_radios(options.leader or "", options.follower or "")
-    for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0), *LINK):
+    for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0), SLOW, *LINK):
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
             raise InputError(f"--{name} must be {low:g} to {high:g}, not {value:g}")
@@ -249,7 +250,8 @@ def check_radios(leader: str, follower: str) -> None:
 
 def check_twin_options(options: argparse.Namespace) -> None:
     """Raise InputError for options of a rehearsal that are unsound."""
-    given = [*(f"--{name}" for name in (*WORSE, "fault") if getattr(options, name)), *given_twin_options(options)]
+    own = [f"--{name}" for name in (*WORSE, "fault", "slow") if getattr(options, name)]
+    given = [*own, *given_twin_options(options)]
     if given and not options.rehearse:
         raise InputError(f"{given[0]} is for --rehearse only")
     if options.upload and options.onboard != "int8":
@@ -334,10 +336,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with contextlib.ExitStack() as stack:
             uris = (options.leader, options.follower)
             if options.rehearse:
-                flags = [*rehearsed_options(options), *twin_options(options)]
-                failure = "the twin did not start; are the ports of --leader and --follower free?"
-                twin = stack.enter_context(Child(["mjxball.fly.twin", *flags], failure))
-                uris, setup = tuple(parse_json(twin.line)["uris"]), replace(setup, twin=True)
+                clock.slow_down(options.slow or 1.0)
+                twin = stack.enter_context(Rehearsal([*rehearsed_options(options), *twin_options(options)]))
+                uris, setup = twin.uris, replace(setup, rehearsal=twin)
             if capture is not None:
                 setup = replace(setup, mocap=stack.enter_context(ready(capture, rig.span)))
             if options.view is not None and log is not None:

@@ -19,7 +19,6 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from mjxball.errors import InputError
+from mjxball.fly import clock, packets
 from mjxball.fly import mocap_supervision as supervision
-from mjxball.fly import packets
 from mjxball.fly.limits import NAMES, Check
 from mjxball.fly.link import Link
 from mjxball.fly.mocap_supervision import Frame, MocapLimits, Pose, Track, Tracks, pose_of
@@ -175,10 +174,10 @@ class Mocap:
     def _watch(self) -> str:
         """Why the pair cannot be flown on what comes within `limits.measure`, empty if it can."""
         before, bounds = self.tracks, self.limits
-        time.sleep(bounds.measure)
+        clock.sleep(bounds.measure)
         both = list(zip(before, self.tracks, strict=True))
         one, other = (dataclasses.replace(new, jumps=new.jumps - old.jumps) for old, new in both)
-        fault = supervision.standing_fault((one, other), time.monotonic(), bounds, self._span)
+        fault = supervision.standing_fault((one, other), clock.now(), bounds, self._span)
         if fault:
             return fault
         slow = min((new.received - old.received) / bounds.measure for old, new in both)
@@ -197,7 +196,7 @@ class Mocap:
 
     def checks(self) -> list[Check]:
         """What must hold of poses and estimates before the motors may turn; takes `limits.measure` seconds."""
-        fault, now = self._watch(), time.monotonic()
+        fault, now = self._watch(), clock.now()
         found = [Check("motion capture", not fault, fault or "both bodies in place")]
         for name, track, place in zip(NAMES, self.tracks, self._places(now), strict=True):
             error = math.dist(place, track.last.position) if place is not None and track.last is not None else math.inf
@@ -224,7 +223,7 @@ class Mocap:
 
     def take(self, frame: Frame, now: float | None = None) -> None:
         """One frame, in the reader's thread: check it, send what is fit to be sent."""
-        before, now = self.tracks, time.monotonic() if now is None else now
+        before, now = self.tracks, clock.now() if now is None else now
         places = self._places(now) if self.guarding else (None, None)
         after = supervision.follow(before, frame, self.limits, self._span, places)
         self.tracks = after

@@ -8,11 +8,11 @@ tdoaEngine.stEst is the rate of measurements.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from mjxball.fly import clock
 from mjxball.fly.connection import LinkError, Parameters
 from mjxball.fly.limits import Check, Limits
 
@@ -163,8 +163,8 @@ def check(link: DeckLink) -> Check | None:
 
 def wait(link: DeckLink, seconds: float) -> None:
     """Give the system `seconds` to be ready. Raises LinkError with what is missing."""
-    began = time.monotonic()
+    began = clock.now()
     while (state := check(link)) is not None and not state.passed:
-        if found(link) is FLOW or time.monotonic() - began > seconds:
+        if found(link) is FLOW or clock.now() - began > seconds:
             raise LinkError(f"positioning of the {state.name}: {state.found}")
-        time.sleep(0.2)
+        clock.sleep(0.2)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 import re
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from mjxball.control.crazyflie import Gains, PairGains, read_pair_gains
 from mjxball.control.motors import Motor
 from mjxball.errors import InputError
 from mjxball.files import read_text
-from mjxball.fly import packets, positioning
+from mjxball.fly import clock, packets, positioning
 from mjxball.fly.app.protocol import CONTROLLER, OUT_OF_TREE, PID
 from mjxball.fly.connection import LinkError
 from mjxball.fly.limits import NAMES, Check, Limits
@@ -145,16 +144,16 @@ def check_kind(link: Link, required: Preflight, measured: bool = False) -> None:
 def reset_estimator(link: Link, required: Preflight) -> None:
     """Reset the Kalman filter and wait until its position has converged. Raises LinkError."""
     link.write_parameters({"kalman.resetEstimation": 1.0}, check=False)  # the firmware clears it by itself
-    time.sleep(required.reset)
+    clock.sleep(required.reset)
     link.write_parameters({"kalman.resetEstimation": 0.0}, check=False)
-    started, good, checked, found = time.monotonic(), 0, 0.0, math.inf
+    started, good, checked, found = clock.now(), 0, 0.0, math.inf
     while good < 5:
-        if time.monotonic() - started > required.converge:
+        if clock.now() - started > required.converge:
             raise LinkError(
                 f"the estimator of the {link.name} has not converged after {required.converge:g} s: "
                 f"position variance {found:.2g} m2, {required.variance:g} needed; does it get its position?"
             )
-        time.sleep(0.01)
+        clock.sleep(0.01)
         sample = link.telemetry.health
         if sample is None or sample.arrival <= max(checked, started):
             continue
@@ -180,11 +179,11 @@ def _wait_until_ready(links: Sequence[Link], seconds: float) -> None:
 def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) -> list[Check]:
     """All checks, with what was found; takes `required.measure` seconds, more if a firmware re-arms after a landing."""
     _wait_until_ready(links, required.rearm)
-    began = time.monotonic()
+    began = clock.now()
     before = [link.telemetry.received for link in links]
-    time.sleep(required.measure)
+    clock.sleep(required.measure)
     _wait_until_ready(links, required.rearm)
-    checks, now = [], time.monotonic()
+    checks, now = [], clock.now()
     states = []
     for link, count in zip(links, before, strict=True):
         sample, rate = link.telemetry.newest, (link.telemetry.received - count) / max(now - began, 1e-3)

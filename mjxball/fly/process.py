@@ -9,12 +9,12 @@ import select
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
 from mjxball.errors import InputError
+from mjxball.fly import clock
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class Metronome:
 
     def start(self) -> None:
         """The first deadline is one period from now."""
-        self._before = time.monotonic()
+        self._before = clock.now()
         self._deadline = self._before + self.period
 
     def wait(self) -> float:
         """Sleep until the next deadline; returns the monotonic time [s]."""
-        while (left := self._deadline - time.monotonic()) > 0:
-            time.sleep(left)
-        now = time.monotonic()
+        while (left := self._deadline - clock.now()) > 0:
+            clock.sleep(left)
+        now = clock.now()
         self.lateness = now - self._deadline
         self._late.append(self.lateness)
         passed = int(self.lateness / self.period)
@@ -74,15 +74,16 @@ REAL_TIME = 5  # priority among real-time threads, low: the kernel's own stay ah
 
 
 @contextlib.contextmanager
-def urgent() -> Iterator[str]:
+def urgent(above: int = 0) -> Iterator[str]:
     """Run this thread, and those and the processes that it starts, before all others where the system allows it.
 
-    Yields what was granted: real time (root, or a limit on rtprio), a better nice value, or nothing.
+    Of two that are urgent, the one `above` goes first. Yields what was granted: real time (root, or a limit on rtprio),
+    a better nice value, or nothing.
     """
     granted, undo = "nothing", contextlib.ExitStack()
     with contextlib.suppress(OSError, AttributeError):
         before = (os.sched_getscheduler(0), os.sched_getparam(0))
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REAL_TIME))
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REAL_TIME + above))
         granted = "real time"
         undo.callback(os.sched_setscheduler, 0, *before)
     if granted == "nothing":
@@ -128,11 +129,11 @@ def together(actions: Sequence[Callable[[], None]]) -> None:
 
 def wait_until(condition: Callable[[], bool], seconds: float) -> bool:
     """True once `condition` holds, false if it does not within `seconds`."""
-    end = time.monotonic() + seconds
+    end = clock.now() + seconds
     while not condition():
-        if time.monotonic() > end:
+        if clock.now() > end:
             return False
-        time.sleep(0.01)
+        clock.sleep(0.01)
     return True
 
 
@@ -142,8 +143,11 @@ class Child:
     A context manager. Ctrl-C does not reach it: what it serves lands first.
     """
 
-    def __init__(self, arguments: Sequence[str], failure: str, start_limit: float = 30.0):
-        """Start it. Raises InputError with the sentence `failure` if it is not ready within `start_limit` [s]."""
+    def __init__(self, arguments: Sequence[str], failure: str, start_limit: float = 30.0, late: str = ""):
+        """Start it. Raises InputError with the sentence `failure` if it ends, or is not ready within `start_limit` [s].
+
+        `late` is the sentence for the latter, if it is another one.
+        """
         self._process = subprocess.Popen(
             [sys.executable, "-m", *arguments],
             stdin=subprocess.PIPE,
@@ -156,7 +160,7 @@ class Child:
         self.line = self._process.stdout.readline().strip() if readable else ""
         if not self.line:
             self.close()
-            raise InputError(failure)
+            raise InputError(failure if readable else late or failure)
 
     def __enter__(self) -> Self:
         return self

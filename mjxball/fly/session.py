@@ -5,18 +5,19 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import gc
+import os
 import sys
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from mjxball import __version__, terminal
 from mjxball import config as configs
 from mjxball.control.crazyflie import gains_to_json
 from mjxball.errors import InputError
-from mjxball.fly import packets, positioning
+from mjxball.fly import clock, packets, positioning
 from mjxball.fly.app_flight import Apps, OnboardFlight, check_ready
 from mjxball.fly.card import Controller
 from mjxball.fly.connection import LinkError
@@ -28,13 +29,16 @@ from mjxball.fly.limits import NAMES, FlightSettings
 from mjxball.fly.link import Link
 from mjxball.fly.mocap import Mocap
 from mjxball.fly.preflight import Preflight, check, prepare
-from mjxball.fly.process import Metronome, Timing, together, urgent
+from mjxball.fly.process import Metronome, Timing, bounded, together, urgent
+from mjxball.fly.rehearsal import Rehearsal, TooSlowError
 from mjxball.fly.setpoints import CurveName, Variants
 from mjxball.fly.supervisor import Event, Fault, State, Supervisor
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.drone import only_kept
+from mjxball.fly.warm_up import warm_up
 from mjxball.fly.watchdog import NOTHING, Watchdog
 
+SAVING = 0.2  # [s] for the log of a program that failed in the air: its radio is wanted
 SWITCH_INTERVAL = 5e-4  # [s] after which a thread hands Python on; the default of 5 ms is half a tick
 
 
@@ -49,7 +53,11 @@ class FlightSetup:
     preflight: Preflight
     mocap: Mocap | None = None  # ready; the caller ends it
     apps: Apps | None = None  # on board, if the laws are to run there
-    twin: bool = False  # of our own, which must have all that a flight asks a drone for
+    rehearsal: Rehearsal | None = None  # the twin that is flown; the caller ends it
+
+    def excuse(self, cause: Fault | None = None) -> TooSlowError | None:
+        """What is to be said instead of what went wrong, if it is a rehearsal and that may be this computer's."""
+        return None if self.rehearsal is None else self.rehearsal.excuse(cause)
 
 
 def fly(
@@ -69,15 +77,16 @@ def fly(
     header |= {"mocap": str(setup.mocap.settings)} if setup.mocap else {}
     header |= {"config": configs.to_dict(setup.controller.config), "gains": gains_to_json((gains[0], gains[1]))}
     header |= {"curve": setup.curve}
-    if setup.twin and (kept := only_kept(name for own in gains for name in own)):
+    if setup.rehearsal is not None and (kept := only_kept(name for own in gains for name in own)):
         _say(f"the twin does not act on {', '.join(kept)}: this rehearsal does not show what they do")
     before = sys.getswitchinterval()
     with Journal(log, **header) as journal:
-        links = [Link(uri, name, journal.note, twin=setup.twin) for uri, name in zip(uris, NAMES, strict=True)]
+        links = [Link(uri, name, journal.note, twin=setup.rehearsal is not None) for uri, name in zip(uris, NAMES, strict=True)]
         try:
             sys.setswitchinterval(SWITCH_INTERVAL)
             # Apps land by themselves: nobody else must take their place.
-            guard = contextlib.nullcontext() if setup.apps is not None else Watchdog(uris)
+            alone = setup.apps is not None
+            guard = contextlib.nullcontext() if alone else Watchdog(uris, rehearses=setup.rehearsal is not None)
             with urgent() as priority, guard as watchdog:
                 journal.note("priority", granted=priority)
                 if setup.mocap is not None:
@@ -92,24 +101,31 @@ def fly(
                 pair = (links, setup.controller, setup.variants, curves, setup.rig)
                 kind = Flight if setup.apps is None else OnboardFlight
                 flight = kind(*pair, settings, journal.note, watchdog, setup.mocap)
+                flight.excuse = setup.excuse
+                warm_up(kind, *pair, settings, clock.now())
                 flight.ready = _checked(links, setup, settings, journal)
                 flight.refusal = "" if flight.ready else "see the checks"
-                timing = run(flight)
-                return _ended(flight, timing, journal, setup.mocap is not None)
+                timing = run(flight, journal.close)
+                return _ended(flight, timing, journal, setup)
         except KeyboardInterrupt:  # before take-off; afterwards Ctrl-C is the flight's own
             journal.note("refused", text="interrupted")
             _say("interrupted before take-off")
             return 1
         except (InputError, OSError) as error:
-            journal.note("refused", text=str(error))
-            raise
+            told = setup.excuse() or error
+            journal.note("refused", text=str(told))
+            raise told from None
         finally:
             together([link.close for link in links])
             sys.setswitchinterval(before)
+            gc.unfreeze()
 
 
-def run(flight: Flight) -> Timing:
-    """Tick until the flight is done; Ctrl-C, SIGTERM and keys are obeyed. Never raises: a bug lands too."""
+def run(flight: Flight, save: Callable[[], None] = lambda: None) -> Timing:
+    """Tick until the flight is done; Ctrl-C, SIGTERM and keys are obeyed. Raises TooSlowError alone.
+
+    An error of the program in the air ends the process after `save`, see `_leave`; on the ground it stops the motors.
+    """
     metronome = Metronome(flight.settings.period)
 
     def land() -> None:
@@ -122,31 +138,49 @@ def run(flight: Flight) -> Timing:
         flight.kill = True
 
     with listening(land, interrupt, kill), Display(lambda: flight.view, flight.settings.limits):
-        metronome.start()
-        flight.begin(time.monotonic())
-        going = True
-        while going:
-            now = metronome.wait()
-            try:
+        try:
+            metronome.start()
+            flight.begin(clock.now())
+            going = True
+            while going:
+                now = metronome.wait()
                 going = flight.tick(now, metronome.lateness, metronome.missed_lately(now), metronome.gap)
-            except Exception as error:  # nothing in here may leave thrust on
-                flight.note("error", text=f"{type(error).__name__}: {error}")
-                flight.kill = True
-                going = _emergency(flight)
+        except TooSlowError:
+            raise
+        except BaseException as error:  # nothing in here may leave thrust on, or let a pair fall that flies
+            flight.note("error", text=f"{type(error).__name__}: {error}")
+            if flight.flying:
+                _leave(flight, error, save)
+            _emergency(flight)
     return metronome.timing()
 
 
-def _emergency(flight: Flight) -> bool:
-    """A tick failed: stop both drones without the flight's help. Returns false: it is over."""
+def _leave(flight: Flight, error: BaseException, save: Callable[[], None]) -> NoReturn:
+    """End as a killed runner does, without a word to the drones: zeros from here would turn the motors off.
+
+    The watchdog, or the apps on board, bring both down level.
+    """
+    others = "the apps on board land both drones"
+    if flight.watchdog is not None:
+        flight.watchdog.leave()
+        others = "the watchdog brings both drones down"
+    bounded(save, SAVING)
+    with contextlib.suppress(OSError, ValueError):
+        terminal.warn(f"error: the flight program failed in the air, {others}: {type(error).__name__}: {error}")
+    os._exit(1)
+
+
+def _emergency(flight: Flight) -> None:
+    """The program failed on the ground: stop both drones without the flight's help."""
+    flight.kill = True
     for _ in range(50):
         if flight.watchdog is not None:
             flight.watchdog.beat(False, NOTHING)  # it has nothing to take over any more
         for link in flight.links:
             link.command(packets.EMERGENCY_STOP)
             link.send(packets.setpoint_packet(packets.ZERO))
-        time.sleep(0.01)
-    flight.supervisor = Supervisor(State.DONE, time.monotonic(), Fault(Event.BAD_STATE, "the runner itself failed"))
-    return False
+        clock.sleep(0.01)
+    flight.supervisor = Supervisor(State.DONE, clock.now(), Fault(Event.BAD_STATE, "the runner itself failed"))
 
 
 def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings, journal: Journal) -> bool:
@@ -157,17 +191,21 @@ def _checked(links: Sequence[Link], setup: FlightSetup, settings: FlightSettings
         checks += setup.mocap.checks()
         setup.mocap.guarding = True
     checks += [] if setup.apps is None else map(check_ready, links)
+    if not all(one.passed for one in checks) and (slow := setup.excuse()):
+        raise slow
     for one in checks:
         journal.note("check", name=one.name, passed=one.passed, found=one.found)
         _say(f"{'good' if one.passed else 'BAD '}  {one.name}: {one.found}")
     return all(one.passed for one in checks)
 
 
-def _ended(flight: Flight, timing: Timing, journal: Journal, captured: bool) -> int:
+def _ended(flight: Flight, timing: Timing, journal: Journal, setup: FlightSetup) -> int:
     supervisor = flight.supervisor
     cause = supervisor.cause
     stayed = not (flight.settings.dry_run or flight.interrupts or flight.lifted)
     code = 0 if cause is None and not stayed else 1
+    if stayed and cause is None and (slow := setup.excuse()):
+        raise slow
     sent = [getattr(link, "overwritten", 0) for link in flight.links]
     figures = flight.flown.figures
     why, told = str(cause) if cause else "", flight.how_it_ended()
@@ -187,7 +225,7 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, captured: bool) -> 
     if flight.settings.dry_run and flight.highest:
         text = ", ".join(f"{name} up to {units}" for name, units in zip(NAMES, flight.highest, strict=True))
         _say(f"dry run: zeros were sent; it would have sent thrust units of {text}")
-    if flight.settings.dry_run and captured:
+    if flight.settings.dry_run and setup.mocap is not None:
         _say(
             f"axes: not shown yet: {flight.carry}" if flight.carry else "axes: every turn and way agrees with the IMUs"
         )
@@ -199,6 +237,8 @@ def _ended(flight: Flight, timing: Timing, journal: Journal, captured: bool) -> 
         _say(str(figures))
     if journal.failure:
         _say(f"the log is not complete: {journal.failure}")
+    if setup.rehearsal is not None:
+        _say(setup.rehearsal.end())
     return code
 
 

@@ -1,31 +1,33 @@
 """The watchdog: a process of its own that brings both drones down if the runner dies or hangs in the air.
 
-The runner writes a frame at every tick. A closed pipe is its death, a silent one while flying a hang: it is then
-killed, so that its radio is free, and the watchdog opens both links itself and flies the blind way down: level, a
-little less than the last trim, then stop. It uses cflib's drivers alone: no tables, no parameters, no waiting.
+The runner's main thread writes a frame with its time at every tick. A closed pipe is its death, a frame that is too old
+while flying a hang, whatever its other threads do: it is then killed, so that its radio is free, and the watchdog opens
+both links itself and flies the blind way down: level, a little less than the last trim, then stop. It uses cflib's
+drivers alone: no tables, no parameters, no waiting. It goes before the runner wherever that goes before others.
 """
 
 from __future__ import annotations
 
 import contextlib
+import gc
+import math
 import os
 import select
 import signal
 import struct
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from typing import Any
 
 from mjxball.cli import make_parser
-from mjxball.fly import packets
+from mjxball.fly import clock, packets
 from mjxball.fly.packets import Packet, Setpoint
-from mjxball.fly.process import Child
+from mjxball.fly.process import Child, urgent
 from mjxball.fly.setpoints import LastKnownState, blind_shares
 from mjxball.terminal import warn
 
-FRAME = struct.Struct("<BHHfff")  # what is going on, then `LastKnownState`
+FRAME = struct.Struct("<BdHHfff")  # what is going on, when [s], then `LastKnownState`
 IDLE, FLYING, GOODBYE = 0, 1, 2
 SILENCE = 0.3  # [s] without a frame while flying: the firmware levels at 0.5 s and stops at 2 s
 PERIOD = 0.02  # [s] of the setpoints on the way down
@@ -36,17 +38,21 @@ NOTHING = LastKnownState((0, 0), 0.0, 0.0, 0.0)
 
 
 def packed(state: int, seen: LastKnownState) -> bytes:
-    """One frame."""
-    return FRAME.pack(state, *seen.trims, seen.height, seen.climb, seen.lift)
+    """One frame, of now."""
+    return FRAME.pack(state, clock.now(), *seen.trims, seen.height, seen.climb, seen.lift)
 
 
 class Watchdog(Child):
     """The runner's end. A context manager; `beat` never blocks."""
 
-    def __init__(self, uris: Sequence[str], start_limit: float = 15.0):
-        """Start the process. Raises InputError if it is not ready within `start_limit` [s]."""
+    def __init__(self, uris: Sequence[str], start_limit: float = 15.0, rehearses: bool = False):
+        """Start the process, with this one's clock. Raises InputError if it is not ready within `start_limit` [s].
+
+        In a rehearsal a flight that stands still is taken for a computer that is too slow.
+        """
         failure = f"the watchdog process was not ready within {start_limit:g} s"
-        super().__init__(["mjxball.fly.watchdog", str(os.getpid()), *uris], failure, start_limit)
+        flags = [f"--slow={clock.factor()}", *(["--rehearses"] if rehearses else [])]
+        super().__init__(["mjxball.fly.watchdog", str(os.getpid()), *uris, *flags], failure, start_limit)
         assert self._process.stdin is not None
         self._pipe = self._process.stdin.fileno()
         os.set_blocking(self._pipe, False)
@@ -54,6 +60,12 @@ class Watchdog(Child):
     def beat(self, flying: bool, seen: LastKnownState) -> bool:
         """We live, and this is what it would take over; false if the watchdog has ended, or does not read."""
         return self._write(packed(FLYING if flying else IDLE, seen))
+
+    def leave(self) -> None:
+        """Have it take over what flies, as if this process were dead."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
 
     def _write(self, frame: bytes) -> bool:
         try:
@@ -69,22 +81,23 @@ class Watchdog(Child):
 def watch(pipe: int, runner: int) -> tuple[LastKnownState, float] | None:
     """Read frames from `pipe` until the runner is gone; None if all is well, else what to take over with.
 
-    That is the last one and how long ago it was taken [s].
+    That is the last one and how long ago it was written [s].
     """
-    state, seen, waiting = IDLE, NOTHING, b""
+    state, written, seen, waiting = IDLE, 0.0, NOTHING, b""
     while True:
-        readable, _, _ = select.select([pipe], [], [], SILENCE if state == FLYING else None)
+        # Not from when it was read: a watchdog that woke late would wait for as long again.
+        left = written + SILENCE - clock.now() if state == FLYING else math.inf
+        readable, _, _ = select.select([pipe], [], [], None if math.isinf(left) else clock.real(max(left, 0.0)))
         if not readable:  # it hangs in the air: only its death frees the radio
             with contextlib.suppress(ProcessLookupError):
                 os.kill(runner, signal.SIGKILL)
-            warn(f"the watchdog heard nothing of the flight for {SILENCE:g} s and ended it; it brings both drones down")
-            return seen, SILENCE
+            return seen, clock.now() - written
         received = os.read(pipe, 4096)
         if not received:
-            return (seen, 0.0) if state == FLYING else None
+            return (seen, clock.now() - written) if state == FLYING else None
         waiting += received
         while len(waiting) >= FRAME.size:
-            state, leader, follower, *rest = FRAME.unpack(waiting[: FRAME.size])
+            state, written, leader, follower, *rest = FRAME.unpack(waiting[: FRAME.size])
             seen, waiting = LastKnownState((leader, follower), *rest), waiting[FRAME.size :]
             if state == GOODBYE:
                 return None
@@ -111,10 +124,10 @@ def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
     if driver is None:
         return
     for number, packet in enumerate(plan):
-        wait = start + number * PERIOD - time.monotonic()
+        wait = start + number * PERIOD - clock.now()
         if wait < -PERIOD and number < len(plan) - 5:
             continue  # the time of this one passed while the link was opened
-        time.sleep(max(wait, 0.0))
+        clock.sleep(max(wait, 0.0))
         wire = CRTPPacket()
         wire.set_header(packet.port, packet.channel)
         wire.data = packet.data
@@ -126,11 +139,11 @@ def bring_down(uri: str, plan: Sequence[Packet], start: float) -> None:
 
 def _open(crtp: Any, uri: str) -> Any:
     """The driver for `uri`; tried again while the dead runner's radio is not free yet."""
-    deadline = time.monotonic() + OPENING
-    while time.monotonic() < deadline:
+    deadline = clock.now() + OPENING
+    while clock.now() < deadline:
         with contextlib.suppress(Exception):
             return crtp.get_link_driver(uri, lambda statistics: None, lambda error: None)
-        time.sleep(0.05)
+        clock.sleep(0.05)
     return None
 
 
@@ -139,24 +152,53 @@ def main(arguments: Sequence[str]) -> int:
     parser = make_parser("python -m mjxball.fly.watchdog", "Watch over a flight; started by mjxball.fly, not by hand.")
     parser.add_argument("runner", type=int, metavar="RUNNER_PID")
     parser.add_argument("uris", nargs=2, metavar="URI")
+    parser.add_argument("--slow", type=float, default=1.0, metavar="FACTOR", help="of the runner's clock")
+    parser.add_argument("--rehearses", action="store_true", help="the drones are the twin's")
     options = parser.parse_args(arguments)
+    clock.slow_down(options.slow)
     import cflib.crtp
 
     cflib.crtp.init_drivers()
-    os.write(sys.stdout.fileno(), b"ready\n")
-    left = watch(sys.stdin.fileno(), options.runner)
-    if left is None:
-        return 0
-    start = time.monotonic()
+    _warm_up()
+    with urgent(above=1):
+        os.write(sys.stdout.fileno(), b"ready\n")
+        left = watch(sys.stdin.fileno(), options.runner)
+        if left is not None:
+            take_over(options.uris, left, options.rehearses)
+    return 0
+
+
+def _warm_up() -> None:
+    """Whatever taking over would do for the first time."""
+    import cflib.crtp.crtpstack
+    import cflib.crtp.udpdriver  # noqa: F401
+
+    for number in range(2):
+        way_down(number, LastKnownState((40000, 40000), 0.1, 0.0, 0.0), SILENCE)
+    gc.collect()
+    gc.freeze()
+
+
+def take_over(uris: Sequence[str], left: tuple[LastKnownState, float], rehearses: bool) -> None:
+    """Bring both drones down, from what `watch` returned."""
+    start = clock.now()
     threads = [
         threading.Thread(target=bring_down, args=(uri, way_down(number, *left), start), daemon=True)
-        for number, uri in enumerate(options.uris)
+        for number, uri in enumerate(uris)
     ]
     for thread in threads:
         thread.start()
+    if left[1] >= SILENCE:
+        warn(told(left[1], rehearses))
     for thread in threads:
-        thread.join(timeout=OPENING + 5)
-    return 0
+        thread.join(timeout=clock.real(OPENING + 5))
+
+
+def told(silent: float, rehearses: bool) -> str:
+    """Of a flight process that was `silent` for so long [s], one sentence."""
+    if rehearses:
+        return clock.too_slow(f"the flight process stood still for {silent:.2f} s")
+    return f"the watchdog heard nothing of the flight for {silent:.2f} s and ended it; it brings both drones down"
 
 
 if __name__ == "__main__":

@@ -11,11 +11,13 @@ import pytest
 from fly_virtual import ARMED_BY_HAND, VirtualTwin, thrusts
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tables import rows
 
 from mjxball.fly import packets, session
 from mjxball.fly.limits import FlightSettings, Times
 from mjxball.fly.setpoints import LastKnownState, Variant
 from mjxball.fly.supervisor import AIRBORNE, Event, Fault, State, Supervisor
+from mjxball.fly.watchdog import PERIOD, way_down
 
 NORMAL = ["arm", "spin", "ramp", "fly", "land", "stop", "done"]
 
@@ -143,31 +145,86 @@ def test_every_state_has_a_time_limit_in_the_air() -> None:
     assert all(math.isfinite(world.flight._limit(state)) for state in AIRBORNE)
 
 
-def test_a_bug_in_the_runner_stops_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = VirtualTwin()
-    world.fly_until(State.FLY)
-    assert world.running() == [True, True]
+QUICK = Times(arm=0.1, ramp=0.5, stop=0.2)
 
-    def broken(*_: object) -> bool:
+
+class Guard:
+    """In the place of the watchdog."""
+
+    def __init__(self) -> None:
+        self.beats: list[bool] = []
+        self.left = False
+
+    def beat(self, flying: bool, seen: LastKnownState) -> bool:
+        self.beats.append(flying)
+        return True
+
+    def leave(self) -> None:
+        self.left = True
+
+
+def fail(world: VirtualTwin, guard: Guard) -> None:
+    """Have the flight go on from where it is, to a tick that fails."""
+
+    def tick(*_: object) -> bool:
         raise RuntimeError("a bug")
 
-    beats: list[bool] = []
+    world.flight.watchdog, world.flight.begin, world.flight.tick = guard, lambda now: None, tick
 
-    class Listening:
-        def beat(self, flying: bool, seen: LastKnownState) -> bool:
-            beats.append(flying)
-            return True
 
-    world.flight.watchdog = Listening()
-    monkeypatch.setattr(world.flight, "tick", broken)
+@rows("phase", [State.CHECK, State.ARM, State.SPIN])
+def test_a_bug_in_the_runner_on_the_ground_stops_both(phase: State) -> None:
+    world, guard = VirtualTwin(), Guard()
+    world.fly_until(phase)
+    fail(world, guard)
     session.run(world.flight)
-    assert len(beats) > 20  # the watchdog is told throughout, or it would end us and send thrust again
-    assert not any(beats)
+    assert len(guard.beats) > 20  # the watchdog is told throughout, or it would end us and send thrust again
+    assert not any(guard.beats)
     world.advance(0.05)
     assert world.running() == [False, False]
     assert world.flight.supervisor.state is State.DONE
     assert world.flight.supervisor.cause is not None
     assert any("RuntimeError: a bug" in record.get("text", "") for record in world.log.records)
+
+
+class Ended(BaseException):
+    """The process has ended."""
+
+
+def test_a_bug_in_the_runner_in_the_air_is_no_worse_than_its_death(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """It was an emergency stop: a fall from wherever the pair was, and locked drones."""
+
+    def ended(code: int) -> None:
+        raise Ended(code)
+
+    monkeypatch.setattr(session.os, "_exit", ended)
+    for phase in (State.RAMP, State.FLY, State.LAND, State.DESCEND, State.HOLD):
+        world, guard, saved = VirtualTwin(FlightSettings(seconds=1.2, times=QUICK)), Guard(), []
+        world.fly_until(State.FLY if phase in (State.DESCEND, State.HOLD) else phase)
+        if phase in (State.DESCEND, State.HOLD):
+            world.fly_for(1.0)
+            world.flight.supervisor = Supervisor(phase, world.now, Fault(Event.STICK))
+            world.flight._hold([]) if phase is State.HOLD else world.tick()
+        seen, before = world.flight._last_known_state(), [len(link.packets) for link in world.links]
+        fail(world, guard)
+        with pytest.raises(Ended) as left:
+            session.run(world.flight, lambda saved=saved: saved.append(True))
+        assert (left.value.args, guard.left, saved) == ((1,), True, [True])
+        assert "RuntimeError: a bug" in capsys.readouterr().err
+        assert [len(link.packets) for link in world.links] == before  # not a word to the drones
+        for packets_of_both in zip(*(way_down(number, seen, 0.0) for number in range(2)), strict=True):
+            for link, packet in zip(world.links, packets_of_both, strict=True):
+                link.send(packet)
+            world.advance(PERIOD)
+            world.track.append(world.moment())
+        assert world.running() == [False, False], phase
+        assert not any(drone.firmware.locked for drone in world.drones)
+        speed = world.touchdown_speed()
+        assert not speed > 0.8, (phase, speed)
+    world.flight.supervisor, world.flight.watchdog = Supervisor(State.FLY), None
+    with pytest.raises(Ended):  # the laws on board: nobody else takes over, and the apps land
+        session.run(world.flight)
+    assert "the apps on board land both drones" in capsys.readouterr().err
 
 
 def test_asking_twice_to_land_is_no_kill_but_ctrl_c_twice_is(monkeypatch: pytest.MonkeyPatch) -> None:

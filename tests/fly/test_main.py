@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -41,6 +42,9 @@ REFUSALS = [
     ([TRANSPORT, *URIS, "--log", "flight.MCAP"], "must end in .jsonl or .mcap"),
     ([TRANSPORT, *URIS, "--log", "/no/such/place/log.jsonl"], "does not exist"),
     ([TRANSPORT, *URIS, "--loss", "0.1"], "--loss is for --rehearse only"),
+    ([TRANSPORT, *URIS, "--slow", "2"], "--slow is for --rehearse only"),
+    ([TRANSPORT, "--rehearse", "--slow", "0.5"], "--slow must be 1 to 100"),
+    ([TRANSPORT, "--rehearse", "--slow", "nan"], "--slow must be 1 to 100"),
     ([TRANSPORT, "--rehearse", "--loss", "2"], "--loss must be 0 to 1"),
     ([TRANSPORT, "--rehearse", "--fault", "rain:leader@1"], "no KIND:DRONE@S"),
     ([TRANSPORT, "--rehearse", "--fault", "crash:both@1"], "no KIND:DRONE@S"),
@@ -80,12 +84,34 @@ def test_gain_files_that_are_none(text: str, tmp_path: Path, capsys: pytest.Capt
 
 
 def test_nothing_heavy_is_imported(tmp_path: Path) -> None:
-    modules = ["main", "link", "session", "watchdog", "display", "twin.server", "twin.physics", "process"]
+    modules = [
+        "main",
+        "link",
+        "session",
+        "watchdog",
+        "display",
+        "rehearsal",
+        "warm_up",
+        "twin.server",
+        "twin.physics",
+        "process",
+    ]
     imports = ", ".join(f"mjxball.fly.{name}" for name in modules)
     heavy = ("jax", "jaxlib", "mujoco", "flax", "brax", "cflib")
     script = f"import sys, {imports}; print([name for name in {heavy!r} if name in sys.modules])"
     done = run(["-c", f"import sys; sys.path.insert(0, {str(REPOSITORY)!r}); {script}"], tmp_path)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_a_flight_has_one_clock() -> None:
+    """Runner, watchdog and twin of a rehearsal slow down together."""
+    others = {"clock.py", "flight_log.py", "log_export.py", "mocap_child.py"}  # files on disk; cameras, never rehearsed
+    asked = {
+        str(path.relative_to(REPOSITORY))
+        for path in (REPOSITORY / "mjxball/fly").rglob("*.py")
+        if path.name not in others and re.search(r"\btime\.(monotonic|perf_counter|sleep)\(", path.read_text("utf-8"))
+    }
+    assert asked == set()
 
 
 class Ended(NamedTuple):
@@ -170,6 +196,8 @@ def reaches(log: Path, state: str, process: subprocess.Popen) -> bool:
 
 def landed(flight: Ended) -> None:
     """The flight must have ended safely; a machine too busy to fly it, which rightly aborts, tries all again."""
+    if "this computer is too slow" in flight.err:
+        too_busy(flight.err)
     assert flight.err == ""
     assert flight.states()[-2:] == ["stop", "done"]
     assert not flight.ticks("done")[-1]["sent"].any()

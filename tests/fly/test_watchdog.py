@@ -7,17 +7,20 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from command_line import REPOSITORY, TRANSPORT, environment
+from command_line import REPOSITORY, TRANSPORT, assert_one_line, environment
 from conftest import too_busy
 from tables import rows
 
 from mjxball.fly import flight_log, packets, watchdog
 from mjxball.fly.process import urgent
-from mjxball.fly.setpoints import LastKnownState, blind_shares
+from mjxball.fly.setpoints import SPIN_THRUST, LastKnownState, blind_shares
+from mjxball.fly.twin.drone import TwinDrone
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin
 from mjxball.fly.watchdog import FLYING, GOODBYE, IDLE, NOTHING, packed
@@ -48,13 +51,36 @@ def watched(frames: list[bytes], close: bool = True) -> tuple[LastKnownState, fl
 
 @pytest.mark.clock
 def test_a_closed_pipe_in_the_air_is_a_death() -> None:
-    frames = [packed(IDLE, NOTHING), packed(FLYING, SEEN)]
-    assert watched(frames) == (SEEN, 0.0)
+    left = watched([packed(IDLE, NOTHING), packed(FLYING, SEEN)])
+    assert left is not None
+    assert left[0] == SEEN
+    assert 0 <= left[1] < watchdog.SILENCE
 
 
 @pytest.mark.clock
 def test_silence_in_the_air_is_a_hang_and_the_runner_is_killed() -> None:
-    assert watched([packed(FLYING, SEEN)], close=False) == (SEEN, watchdog.SILENCE)
+    left = watched([packed(FLYING, SEEN)], close=False)
+    assert left is not None
+    assert left[0] == SEEN
+    assert left[1] >= watchdog.SILENCE
+
+
+def test_silence_counts_from_when_a_frame_was_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A watchdog that woke late read one that was 0.28 s old, and waited for another 0.3 s."""
+    waited: list[float | None] = []
+    select = watchdog.select.select
+
+    def told(*given):
+        waited.append(given[3])
+        return select(*given[:3], 0)
+
+    frame = packed(FLYING, SEEN)
+    written = watchdog.FRAME.unpack(frame)[1]
+    monkeypatch.setattr(watchdog.select, "select", told)
+    monkeypatch.setattr(watchdog.clock, "now", lambda: written + 0.28)
+    left = watched([frame], close=False)
+    assert waited == [None, pytest.approx(watchdog.SILENCE - 0.28)]
+    assert left == (SEEN, pytest.approx(0.28))
 
 
 @pytest.mark.parametrize("last", [IDLE, GOODBYE])
@@ -96,46 +122,130 @@ def test_a_blind_descent_ends_on_the_ground(height: float, climb: float, error: 
     assert abs(speed) < 1.5
 
 
-def lost_in_the_air(number: signal.Signals, log: Path) -> Twin | None:
-    """Fly, send the runner `number` in the air, wait until the twin's motors are off; None if it never took off."""
+class Flown(NamedTuple):
+    """A flight of a runner that was lost in the air."""
+
+    twin: Twin
+    code: int
+    told: str  # on stderr
+    gaps: list[float]  # the longest time between two setpoints, of either drone [s]
+    log: Path
+
+
+def flown(place: Path, lose: Callable[[subprocess.Popen, Twin], None] | None, program: Sequence[str]) -> Flown | None:
+    """Fly `program`, the runner or what spoils it, on a twin; `lose` it in the air, if need be.
+
+    Returns once the twin's motors are off; None if it never took off.
+    """
     with urgent(), Twin(make_pair(load_file(TRANSPORT).card)) as twin:
+        sent = tuple(setpoint_times(drone) for drone in twin.drones)
         uris = ["--leader", twin.uris[0], "--follower", twin.uris[1]]
-        command = [sys.executable, "-m", "mjxball.fly", str(TRANSPORT), *uris, "--seconds", "60", "--log", str(log)]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        with subprocess.Popen(command, cwd=REPOSITORY, env=environment(), **quiet) as runner:
+        log = place / f"{len(list(place.iterdir()))}.jsonl"
+        command = [sys.executable, *program, str(TRANSPORT), *uris, "--log", str(log)]
+        pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+        with subprocess.Popen(command, cwd=REPOSITORY, env=environment(), text=True, **pipes) as runner:
             try:
-                while twin.truth.state.position[:, 2].min() < 0.25:
+                while max(twin.truth.thrust) < SPIN_THRUST:
                     if runner.poll() is not None:
                         return None
                     time.sleep(0.01)
-                runner.send_signal(number)
+                if lose is not None:
+                    lose(runner, twin)
+                told = runner.communicate(timeout=60)[1]
                 end = time.monotonic() + 10
                 while twin.truth.thrust != (0, 0) or twin.truth.last_wire_thrust != (0, 0):
-                    assert time.monotonic() < end, f"still {twin.truth.thrust} 10 s after {number.name}"
+                    assert time.monotonic() < end, f"still {twin.truth.thrust} 10 s after the runner's end"
                     time.sleep(0.01)
                 time.sleep(0.7)  # to fall what is left, and for whatever might turn a motor on again
-                assert runner.wait(timeout=5) == -signal.SIGKILL
             finally:
                 runner.kill()
-    return twin
+    return Flown(twin, runner.returncode, told, [max(np.diff(times)) for times in sent], log)
 
 
-@pytest.mark.alone
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
-def test_a_runner_lost_in_the_air_is_brought_down(number: signal.Signals, tmp_path: Path) -> None:
-    for attempt in range(3):
-        log = tmp_path / f"{attempt}.jsonl"
-        twin = lost_in_the_air(number, log)
-        if twin is not None:
-            break
-    else:
-        too_busy("the runner's own checks ended every flight on the ground")
-    assert twin.failure is None
+def setpoint_times(drone: TwinDrone) -> list[float]:
+    """When `drone` was sent setpoints [s], from now on."""
+    times: list[float] = []
+    receive = drone.receive
+
+    def noted(datagram: bytes, now: float) -> None:
+        if datagram[0] >> 4 == packets.setpoint_packet(packets.ZERO).port:
+            times.append(now)
+        receive(datagram, now)
+
+    drone.receive = noted  # type: ignore[method-assign]
+    return times
+
+
+def brought_down(flight: Flown | None) -> Flown:
+    """It must have come down level, without the firmware's own watchdog."""
+    if flight is None:
+        too_busy("the runner's own checks ended the flight on the ground")
+    twin = flight.twin
+    if twin.failure is not None:
+        too_busy(str(twin.failure))
     assert twin.truth.thrust == (0, 0)
     # Not by the firmware's own watchdog, which locks a drone that hears nothing for 2 s.
     assert not any(info & packets.LOCKED for info in twin.truth.info)
     assert twin.truth.state.position[:, 2].max() < 0.02
     tilts = [packets.level_share(truth.state.quaternion[0]) for truth in twin.history]
     assert min(tilts) > np.cos(np.radians(35))
+    return flight
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "hung"])
+def test_a_runner_lost_in_the_air_is_brought_down(number: signal.Signals, tmp_path: Path) -> None:
+    def lose(runner: subprocess.Popen, twin: Twin) -> None:
+        while twin.truth.state.position[:, 2].min() < 0.25 and runner.poll() is None:
+            time.sleep(0.01)
+        runner.send_signal(number)
+
+    flight = brought_down(flown(tmp_path, lose, ["-m", "mjxball.fly", "--seconds", "60"]))
+    assert flight.code == -signal.SIGKILL
     # The log is whole but for its last moments: every line that was written parses, and the flight is in it.
-    assert any(record["kind"] == "tick" and record["state"] == "fly" for record in flight_log.read(log))
+    assert any(record["kind"] == "tick" and record["state"] == "fly" for record in flight_log.read(flight.log))
+
+
+# At the change to the phase of its first argument the main thread alone stands still, or the program fails.
+SPOILED = """
+import sys, time
+from mjxball.fly import flight
+from mjxball.fly.main import main
+from mjxball.fly.supervisor import Event, Fault, State
+
+phase, how, advance = State(sys.argv[1]), sys.argv[2], flight.Flight._advance
+led = {State.DESCEND: Event.STICK, State.HOLD: Event.UNHEARD}
+
+def spoiled(self, faults):
+    before = self.supervisor.state
+    if before is State.FLY and self.elapsed > 0.5 and phase in led:
+        faults = [*faults, Fault(led[phase])]
+    advance(self, faults)
+    if self.supervisor.state is phase is not before and self.watchdog is not None:
+        if how == "fails":
+            raise RuntimeError("a bug")
+        time.sleep(5.0)
+
+flight.Flight._advance = spoiled
+sys.exit(main(sys.argv[3:]))
+"""
+TAKEN_OVER = 0.4  # [s] after the last setpoint
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("phase", ["ramp", "fly", "land", "descend", "hold", "stop"])
+def test_a_main_thread_that_stands_still_at_a_change_of_phase_is_found(phase: str, tmp_path: Path) -> None:
+    """Its other threads go on: states come, the display writes, pings go out."""
+    flight = brought_down(flown(tmp_path, None, ["-c", SPOILED, phase, "stands", "--seconds", "1"]))
+    assert flight.code == -signal.SIGKILL
+    assert max(flight.gaps) < TAKEN_OVER
+
+
+@pytest.mark.alone
+def test_a_runner_that_fails_in_the_air_is_brought_down_like_a_killed_one(tmp_path: Path) -> None:
+    flight = brought_down(flown(tmp_path, None, ["-c", SPOILED, "land", "fails", "--seconds", "1"]))
+    assert flight.code == 1
+    assert_one_line(flight.told)
+    assert "RuntimeError: a bug" in flight.told
+    assert max(flight.gaps) < TAKEN_OVER
+    assert any(record["kind"] == "error" for record in flight_log.read(flight.log))

@@ -1,21 +1,26 @@
 """`python -m mjxball.fly.twin`: the twin as a process of its own. Prints its two URIs as one line of JSON.
 
-It ends when its standard input closes, so that it never outlives the process that started it.
+It ends when its standard input closes and its motors are off, so that it does not outlive the process that started it.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import contextlib
+import math
 import sys
 import threading
-import time
 from pathlib import Path
 
+import numpy as np
+
 from mjxball.cli import make_parser, run_command
+from mjxball.fly import clock
 from mjxball.fly.app.host import compile_pair
 from mjxball.fly.card import load_policy
 from mjxball.fly.process import urgent
+from mjxball.fly.rehearsal import BEAT, LAST, listen_on, tell
+from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import Injection, LinkFaults, add_twin_options, drone_kind, read_fault, surroundings
 from mjxball.fly.twin.physics import make_pair
 from mjxball.fly.twin.server import Twin
@@ -30,6 +35,8 @@ def main() -> int:
         parser.add_argument(f"--{name}", type=float, default=0.0, metavar="X", help="of both links, once motors turn")
     parser.add_argument("--onboard", choices=("float32", "int8"), help="apps on the drones, with these weights")
     add_twin_options(parser)
+    parser.add_argument("--slow", type=float, default=1.0, metavar="FACTOR", help="of the runner's clock")
+    parser.add_argument("--tell", action="store_true", help="say how late it is, and at its end where the object is")
     parser.add_argument("--fault", type=read_fault, action="append", default=[], metavar="KIND:DRONE@S")
     options = parser.parse_args()
     return run_command(lambda: serve(options))
@@ -37,6 +44,7 @@ def main() -> int:
 
 def serve(options: argparse.Namespace) -> int:
     """Run the twin that `options` ask for until standard input ends."""
+    clock.slow_down(options.slow)
     policy = load_policy(options.policy) if options.policy else None
     card = policy.card if policy else None
     cores = compile_pair(policy, options.policy.stem, options.onboard == "int8") if policy and options.onboard else None
@@ -46,20 +54,37 @@ def serve(options: argparse.Namespace) -> int:
         links = [Injection(worse, drone, 0.0) for drone in range(2)] if worse != LinkFaults() else []
         for one in (*links, *options.fault):
             threading.Thread(target=inject_later, args=(twin, one), daemon=True).start()
-        print(json.dumps({"uris": twin.uris}), flush=True)  # noqa: T201
-        try:
-            while sys.stdin.readline():
-                pass
-        except KeyboardInterrupt:
-            pass
+        tell(uris=twin.uris)
+        with contextlib.suppress(KeyboardInterrupt):
+            attend(twin, options.tell)
+        if options.tell:
+            weights = Rig.of_card(card).weights if card else (0.5, 0.5)
+            place = np.array(weights) @ (twin.truth.state.position - twin.start.position)
+            failure = str(twin.failure or "")
+            found = {"place": place.tolist(), "turning": twin.turning, "most_behind": twin.most_behind}
+            tell(**found, failure=failure)
     return 0
+
+
+def attend(twin: Twin, tells: bool) -> None:
+    """Until standard input has ended and the motors are off, or the twin cannot keep up."""
+    left = math.inf  # when the runner left [s]
+    while twin.failure is None and clock.now() < left + LAST:
+        if math.isinf(left) and listen_on(sys.stdin.fileno(), BEAT):
+            left = clock.now()
+        if not math.isinf(left):
+            if not twin.turning:
+                return
+            clock.sleep(BEAT)
+        if tells:
+            tell(at=clock.now(), behind=twin.behind)
 
 
 def inject_later(twin: Twin, one: Injection) -> None:
     """Wait for the first motor to turn, then until the fault is due."""
     while twin.truth.pwm.max() == 0 or max(twin.truth.thrust) == 0:
-        time.sleep(0.01)
-    time.sleep(one.after)
+        clock.sleep(0.01)
+    clock.sleep(one.after)
     twin.inject(one)
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import select
 import socket
 import threading
-import time
 from dataclasses import dataclass
 
 import numpy as np
 
+from mjxball.errors import InputError
+from mjxball.fly import clock
 from mjxball.fly.app.host import Library
 from mjxball.fly.twin.conditions import Injection
 from mjxball.fly.twin.drone import TwinDrone, advance
@@ -17,7 +18,7 @@ from mjxball.fly.twin.pair import Pair, PairState
 
 HOST = "127.0.0.1"
 PERIOD = 0.005  # of physics, firmware and sockets [s]
-MOST_BEHIND = 0.1  # [s] of physics that a twin that was held up makes good; the rest of the time it stands still
+MOST_BEHIND = 0.5  # [s] that a twin makes good which was held up; the runner thinks it lost after 0.1 s
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class Twin:
     def __init__(self, pair: Pair, ports: tuple[int, int] = (0, 0), cores: tuple[Library, Library] | None = None):
         """`ports` of leader and follower, 0: any free one; `cores`: the apps on board, see `app.host`."""
         self._pair, self._state = pair, pair.start()
+        self.start = self._state  # how the pair stands
         one, other = cores or (None, None)
         self.drones = TwinDrone(pair, 0, one), TwinDrone(pair, 1, other)
         self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in ports]
@@ -49,11 +51,12 @@ class Twin:
         self._closed = [False, False]
         self._stop = threading.Event()
         self._lock = threading.Lock()
-        self._begun = time.monotonic()
+        self._begun = clock.now()
         self._thread = threading.Thread(target=self._run, name="twin", daemon=True)
         self.truth = self._seen(0.0)
         self.history: list[Truth] = []  # one in ten steps
         self.failure: BaseException | None = None
+        self.behind = self.most_behind = 0.0  # real time, now and ever [s]
 
     def __enter__(self) -> Twin:
         self._thread.start()
@@ -64,6 +67,11 @@ class Twin:
         self._thread.join(timeout=5)
         for sock in self._sockets:
             sock.close()
+
+    @property
+    def turning(self) -> bool:
+        """Whether any motor turns."""
+        return bool(self.truth.pwm.max() > 0)
 
     def inject(self, one: Injection) -> None:
         """Have a fault come to pass now."""
@@ -82,21 +90,27 @@ class Twin:
 
     def _now(self) -> float:
         """Time [s] of the twin."""
-        return time.monotonic() - self._begun
+        return clock.now() - self._begun
 
     def _loop(self) -> None:
-        self._begun = time.monotonic()
+        """Until it is left, or cannot keep up: one that stood still meanwhile would have the runner blame its links."""
+        self._begun = clock.now()
         step = 0
         while not self._stop.is_set():
             now, due = self._now(), (step + 1) * PERIOD
+            self.behind = max(now - due, 0.0)
+            self.most_behind = max(self.most_behind, self.behind)
             if now < due:
                 self._wait(min(due, *(drone.next_arrival for drone in self.drones)) - now)
                 continue
-            if now - due > MOST_BEHIND:
-                self._begun += now - due
+            if self.behind > MOST_BEHIND:
+                self.failure = InputError(clock.too_slow(f"the twin is {self.behind:.2f} s behind"))
+                return
             step += 1
             with self._lock:
-                self._step(step * PERIOD)
+                for number in range(2):
+                    self._receive(number, due)
+                self._step(due)
             if step % 10 == 0:
                 self.history.append(self.truth)
 
@@ -107,7 +121,8 @@ class Twin:
         """
         alive = [n for n in range(2) if not self._closed[n]]
         try:
-            readable, _, _ = select.select([self._sockets[n] for n in alive], [], [], max(seconds, 0.0))
+            sockets = [self._sockets[n] for n in alive]
+            readable, _, _ = select.select(sockets, [], [], clock.real(max(seconds, 0.0)))
         except (OSError, ValueError):
             if not any(self._closed[n] for n in alive):
                 raise
@@ -115,11 +130,12 @@ class Twin:
         with self._lock:
             for number in alive:
                 if self._sockets[number] in readable:
-                    self._receive(number)
+                    self._receive(number, self._now())
                 self.drones[number].answer(self._now())
                 self._transmit(number, self.drones[number].transmit(self._now()))
 
-    def _receive(self, number: int) -> None:
+    def _receive(self, number: int, now: float) -> None:
+        """Take all that has come. It came at `now` [s], to a twin that is late at the time of its step."""
         for _ in range(50):
             if self._closed[number]:
                 return
@@ -128,7 +144,7 @@ class Twin:
             except (BlockingIOError, ConnectionError):
                 return
             self._clients[number] = client
-            self.drones[number].receive(datagram, self._now())
+            self.drones[number].receive(datagram, now)
 
     def _step(self, now: float) -> None:
         self._state = advance(self._pair, self.drones, self._state, now, PERIOD)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,7 +19,7 @@ from mjxball.fly.twin import logs
 from mjxball.fly.twin.pair import RUNNING, Modes, PairState
 from mjxball.fly.twin.parameters import PARAMETERS
 from mjxball.fly.twin.physics import StandIn
-from mjxball.fly.twin.server import HOST, Twin
+from mjxball.fly.twin.server import HOST, MOST_BEHIND, Twin
 
 cflib = pytest.importorskip("cflib")
 pytestmark = pytest.mark.clock  # by the clock
@@ -161,3 +162,29 @@ def test_the_stick_is_rigid_and_what_falls_falls() -> None:
         if thrust and state.position[0, 2] > 0.05:
             assert state.specific_force[0, 2] > 0.5 * 9.81
     assert state.velocity[0, 2] < 0 or state.position[:, 2].max() < 0.01
+
+
+class Slow(Told):
+    """Physics of which 5 ms take longer."""
+
+    def advance(self, setpoints: np.ndarray, dt: float, modes: Modes = RUNNING) -> PairState:
+        time.sleep(0.02)
+        return super().advance(setpoints, dt, modes)
+
+
+def test_a_twin_that_is_late_hears_all_the_same_and_ends_by_saying_so() -> None:
+    """It read its sockets only while it waited: a busy one heard neither setpoints nor stops."""
+    heard = []
+    with Twin(Slow()) as twin, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        begun = wait_until(lambda: twin.behind > 0.05, LIMIT)
+        host, port = twin.uris[0].removeprefix("udp://").split(":")
+        for thrust in (0, 12000):  # the first one opens the firmware's thrust lock
+            packet = packets.setpoint_packet(packets.Setpoint(0.0, 0.0, 0.0, thrust))
+            sock.sendto(bytes([protocol.header(packet.port, packet.channel)]) + packet.data, (host, int(port)))
+        heard.append(wait_until(lambda: twin.truth.last_wire_thrust[0] == 12000, LIMIT))
+        ended = wait_until(lambda: twin.failure is not None, LIMIT)
+    assert begun
+    assert heard == [True]
+    assert ended
+    assert "too slow for a rehearsal in real time: the twin is 0.5" in str(twin.failure)
+    assert twin.most_behind == pytest.approx(MOST_BEHIND, abs=0.1)

@@ -1,0 +1,122 @@
+"""The twin as a process, and whether this computer keeps up with it.
+
+The twin says 50 times a second how late it is. Where that comes late or not at all, by whichever of both processes, a
+rehearsal that goes wrong says nothing of links, parameters and laws: it ends with one sentence that says so. At its end
+the twin tells where the object is.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import json
+import math
+import os
+import select
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+from mjxball import terminal
+from mjxball.errors import InputError
+from mjxball.fly import clock
+from mjxball.fly.process import Child
+from mjxball.fly.supervisor import Event, Fault
+from mjxball.reading import parse_json
+
+BEAT = 0.02  # [s] between two lines of the twin
+LATE = 0.04  # [s] of such a line, from where on it may be why something went wrong: a drone is lost after 0.1 s
+WINDOW = 3.0  # [s] for which it counts: longer than what the runner waits for
+LAST = 5.0  # [s] that the twin flies on once it is left, until its motors are off
+
+
+class TooSlowError(InputError):
+    """This computer cannot fly a rehearsal by this clock."""
+
+
+class Rehearsal(Child):
+    """A running twin. A context manager."""
+
+    def __init__(self, flags: Sequence[str]):
+        """Start it with `flags` and this process's clock. Raises InputError."""
+        failure = "the twin did not start; are the ports of --leader and --follower free?"
+        command = ["mjxball.fly.twin", f"--slow={clock.factor()}", "--tell", *flags]
+        super().__init__(command, failure, late=clock.too_slow("the twin was not ready within 30 s"))
+        assert self._process.stdout is not None
+        self.uris: tuple[str, str] = tuple(parse_json(self.line)["uris"])
+        self._pipe = self._process.stdout.fileno()
+        self._lateness: collections.deque[tuple[float, float]] = collections.deque()  # time and lateness [s]
+        self._newest = clock.now()  # when the newest line was written [s]
+        self._told: dict[str, Any] = {}  # its last line
+        self._ended = threading.Event()
+        threading.Thread(target=self._listen, name="rehearsal", daemon=True).start()
+
+    def _listen(self) -> None:
+        rest = b""
+        with contextlib.suppress(OSError):
+            while received := os.read(self._pipe, 4096):
+                *lines, rest = (rest + received).split(b"\n")
+                for line in lines:
+                    self._take(line)
+        self._ended.set()
+
+    def _take(self, line: bytes) -> None:
+        try:
+            told = parse_json(line)
+        except ValueError:  # the rest of one that was read with the first
+            return
+        if "behind" not in told:
+            self._told = told
+            return
+        written, now = told["at"], clock.now()
+        self._lateness.append((now, max(told["behind"], now - written, written - self._newest - BEAT)))
+        self._newest = written
+        while self._lateness[0][0] < now - WINDOW:
+            self._lateness.popleft()
+
+    def late(self) -> float:
+        """How late the twin, or what it says, has been of late [s]."""
+        waiting = math.inf if self._ended.is_set() else clock.now() - self._newest - BEAT
+        return max([waiting, *(late for _, late in list(self._lateness))])
+
+    def excuse(self, cause: Fault | None = None) -> TooSlowError | None:
+        """What is to be said instead of what went wrong, such as a fault, if that may be this computer's."""
+        if cause is not None and cause.event is Event.DEADLINES:
+            return TooSlowError(clock.too_slow(cause.detail))
+        if self._told.get("failure"):
+            return TooSlowError(self._told["failure"])
+        late = self.late()
+        return (
+            TooSlowError(clock.too_slow(f"the twin is up to {min(late, WINDOW):.2f} s behind")) if late > LATE else None
+        )
+
+    def end(self) -> str:
+        """Leave the twin; where the object is once its motors are off, one sentence."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        self._ended.wait(clock.real(LAST) + 5)
+        if "place" not in self._told:
+            return "the twin did not tell where the object is"
+        x, y, z = self._told["place"]
+        motors = "on" if self._told["turning"] else "off"
+        late = 1e3 * self._told["most_behind"]
+        place = f"the object is at ({x:+z.2f}, {y:+z.2f}, {z:+z.2f}) m from where it stood"
+        return f"twin: {place}, motors {motors}; the twin was at most {late:.0f} ms behind"
+
+    def close(self) -> None:
+        """End it, at once."""
+        self._process.kill()
+        super().close()
+
+
+def listen_on(pipe: int, seconds: float) -> bool:
+    """Whether `pipe` was closed within `seconds`; whatever comes over it is dropped."""
+    readable, _, _ = select.select([pipe], [], [], clock.real(seconds))
+    return bool(readable) and not os.read(pipe, 4096)
+
+
+def tell(**fields: Any) -> None:
+    """One line for the runner, which may be gone."""
+    with contextlib.suppress(OSError):
+        terminal.say(json.dumps(fields))

@@ -1,0 +1,89 @@
+"""Nothing is loaded, opened or compiled in a flight: what it does for the first time was done on the ground."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from command_line import run
+from fly_virtual import VirtualTwin
+
+from mjxball.fly.flight import Flight
+from mjxball.fly.limits import FlightSettings, Times
+from mjxball.fly.supervisor import State
+from mjxball.fly.warm_up import warm_up
+
+# Prints in which states a flight does what only comes once: without and with a warm-up. A process of its own: in this
+# one everything has been loaded.
+FIRST = """
+import json, sys
+from mjxball.fly.card import Controller
+from mjxball.fly.flight import Flight
+from mjxball.fly.limits import FlightSettings
+from mjxball.fly.telemetry import Rig
+from mjxball.fly.twin.physics import StandIn, StandInPlant
+from mjxball.fly.twin.virtual import VirtualTwin
+from mjxball.fly.warm_up import warm_up
+from mjxball.policy import Policy, shipped_policy
+
+found, ticking = [], False
+
+def audit(event, arguments):
+    if ticking and event in ("import", "open", "compile", "exec", "marshal.loads", "os.listdir", "os.scandir"):
+        found.append([world.flight.supervisor.state.value, event])
+
+policy = Policy.load(shipped_policy("flight"))
+rig = Rig.of_card(policy.card)
+physics = StandIn(StandInPlant(mass=0.07, mounts=(rig.leader_mount, rig.follower_mount)))
+world = VirtualTwin(policy, FlightSettings(seconds=1.0), physics=physics)
+tick = world.flight.tick
+
+def watched(*given):
+    global ticking
+    ticking = True
+    try:
+        return tick(*given)
+    finally:
+        ticking = False
+
+world.flight.tick = watched
+if sys.argv[1] == "warm":
+    pair = world.links, Controller(policy), world.variants, ["linear"] * 2, world.rig, world.settings
+    warm_up(Flight, *pair, world.now)
+sys.addaudithook(audit)
+assert world.run() == "done"
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+def test_a_flight_does_nothing_for_the_first_time(tmp_path: Path) -> None:
+    """A part of NumPy was loaded from 17 files in the first tick of "fly", which took 30 ms on an idle machine."""
+    found = {}
+    for how in ("cold", "warm"):
+        done = run(["-c", FIRST, how], tmp_path)
+        assert done.returncode == 0, done.stderr
+        found[how] = json.loads(done.stdout)
+    assert ["fly", "import"] in found["cold"]  # else this test cannot fail
+    assert found["warm"] == []
+
+
+def test_a_warm_up_goes_through_every_state_and_leaves_nothing_behind() -> None:
+    seen: set[State] = set()
+
+    class Noted(Flight):
+        def tick(self, now: float, late: float = 0.0, missed: int = 0, gap: float = 0.0) -> bool:
+            seen.add(self.supervisor.state)
+            return super().tick(now, late, missed, gap)
+
+    world = VirtualTwin(FlightSettings(seconds=0.3, times=Times(arm=0.1, ramp=0.5, stop=0.2)))
+    flight, before = world.flight, [len(link.packets) for link in world.links]
+    pair = (world.links, flight.controller, world.variants, ["linear"] * 2, world.rig, world.settings)
+    warm_up(Noted, *pair, world.now)
+    assert seen == set(State)
+    assert [len(link.packets) for link in world.links] == before
+    assert flight.controller.policy.memory is None
+    assert not flight.controller.integral.any()
+    assert world.run() == "done"
+    assert flight.supervisor.cause is None
