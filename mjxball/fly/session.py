@@ -81,7 +81,10 @@ def fly(
         _say(f"the twin does not act on {', '.join(kept)}: this rehearsal does not show what they do")
     before = sys.getswitchinterval()
     with Journal(log, **header) as journal:
-        links = [Link(uri, name, journal.note, twin=setup.rehearsal is not None) for uri, name in zip(uris, NAMES, strict=True)]
+        links = [
+            Link(uri, name, journal.note, twin=setup.rehearsal is not None)
+            for uri, name in zip(uris, NAMES, strict=True)
+        ]
         try:
             sys.setswitchinterval(SWITCH_INTERVAL)
             # Apps land by themselves: nobody else must take their place.

@@ -100,7 +100,7 @@ def test_log_requests_that_a_firmware_drops_are_repeated(
             link = links(twin.uris[0], dataclasses.replace(SHORT, connect=10.0, first_state=2.0, parameter=3.0))
             link.open()
             if times > 10:
-                with pytest.raises(LinkError, match="does not send stateEstimateZ.x"):
+                with pytest.raises(LinkError, match=r"does not send stateEstimateZ\.x"):
                     link.start_states()
             else:
                 link.start_states()

@@ -15,7 +15,7 @@ from mjxball.control import rotations
 from mjxball.fly import packets
 from mjxball.fly.packets import Setpoint
 from mjxball.fly.process import wait_until
-from mjxball.fly.twin import logs
+from mjxball.fly.twin import logs, protocol
 from mjxball.fly.twin.pair import RUNNING, Modes, PairState
 from mjxball.fly.twin.parameters import PARAMETERS
 from mjxball.fly.twin.physics import StandIn
