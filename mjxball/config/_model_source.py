@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import struct
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+import numpy as np
+
 from mjxball.errors import InputError
 from mjxball.files import read_text
 
-MODELS = (".xml", ".urdf")  # endings of the files
+XACRO = ".xacro"
+MODELS = (".xml", ".urdf", XACRO)  # endings of the files
 MAX_MODEL = 2**20  # bytes of a model, and of one that it includes
 MAX_ASSET = 2**26  # bytes of a mesh or texture
 MAX_ELEMENTS = 5000  # of XML; MuJoCo takes seconds for more
 MAX_PIXELS = 2**22  # of all height fields and textures of a model
+UNEXPANDED = "it is a xacro file, expand it with xacro first: xacro FILE.xacro > FILE.urdf"
 LONGEST = 200  # characters of a name or a message that a sentence shows
 FIRST = re.compile(r"\ufeff?(?>\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*+<([\w:.-]+)", re.DOTALL)
 COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 COUNTS = re.compile(r"count|nrow|ncol|nsample|nkey|nuser\w*")  # attributes: how many there are
 FILE = re.compile(r"file(?:right|left|up|down|front|back)?")  # attributes of MJCF; URDF's shapes do not matter
+MACRO = re.compile(r"\$\$?[{(]")  # of xacro, in an attribute
 ROTOR = re.compile(r"prop|rotor|motor|thrust", re.IGNORECASE)  # in the name of a URDF's link
 
 
@@ -33,23 +39,24 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
     """
     import mujoco
 
+    if path.suffix.lower() == XACRO:
+        raise InputError(UNEXPANDED)
     found = FIRST.match(text)
     first = found[1] if found else None
     if first not in ("mujoco", "robot"):
         begins = f"it begins with <{printable(first)}>" if first else "it is no XML"
         raise InputError(f"{begins}, expected <mujoco> (MJCF) or <robot> (URDF)")
-    _Check(path, text)
-    warnings: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(warnings.append)  # else they go to a file in the current directory
+    checked = _Check(path, text)
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        if first == "robot":
-            _free(spec, rotors)
-        model = spec.compile()
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
+        with heard() as warnings:
+            spec = mujoco.MjSpec.from_file(str(path))
+            if first == "robot":
+                _turn(spec, checked.turned)
+                _free(spec, rotors)
+            model = spec.compile()
+            data = mujoco.MjData(model)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
     except InputError:
         raise
     except Exception as error:  # whatever MuJoCo's parser, compiler and plug-ins raise
@@ -57,11 +64,42 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
         if "mjMINVAL" in said:
             raise InputError("a body that moves has no mass or no inertia, expected both above 0") from None
         raise InputError(f"MuJoCo does not compile it: {said}") from None
-    finally:
-        mujoco.set_mju_user_warning(before)
     if any("NaN" in warning for warning in warnings):
         raise InputError("a number of it is NaN, expected numbers")
     return model, data, first == "robot"
+
+
+@contextlib.contextmanager
+def heard() -> Iterator[list[str]]:
+    """MuJoCo's warnings, which else go to a file in the current directory."""
+    import mujoco
+
+    warnings: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(warnings.append)
+    try:
+        yield warnings
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def _turn(spec: Any, turned: Mapping[str, str]) -> None:
+    """Turn the inertia of links of a URDF as the rpy [rad] of their <inertial> says, which MuJoCo does from 3.14 on."""
+    for body in spec.bodies:
+        angles = [_number(word) for word in turned.get(body.name, "").split()]
+        if len(angles) == 3 and body.explicitinertial:
+            (ca, cb, cc), (sa, sb, sc) = np.cos(angles), np.sin(angles)  # Rz(c) Ry(b) Rx(a)
+            axes = np.array(
+                [
+                    [cb * cc, sa * sb * cc - ca * sc, ca * sb * cc + sa * sc],
+                    [cb * sc, sa * sb * sc + ca * cc, ca * sb * sc - sa * cc],
+                    [-sb, sa * cb, ca * cb],
+                ]
+            )
+            xx, yy, zz, xy, xz, yz = body.fullinertia
+            inertia = axes @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ axes.T
+            body.iquat = [1.0, 0.0, 0.0, 0.0]
+            body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
 def _free(spec: Any, rotors: Collection[str]) -> None:
@@ -77,13 +115,26 @@ def _free(spec: Any, rotors: Collection[str]) -> None:
     for body in spec.bodies:
         if not body.explicitinertial:
             body.ipos = [0.0, 0.0, 0.0]
+    still = {joint.name for joint in spec.joints if _is_rotor(joint.parent.name, rotors)}
+    for mimicry in [*spec.equalities]:
+        if still & {mimicry.name1, mimicry.name2}:
+            spec.delete(mimicry)
     for joint in [*spec.joints]:
-        if _is_rotor(joint.parent.name, rotors):
+        if joint.name in still:
             spec.delete(joint)
     base = spec.worldbody.first_body()
-    if base.joints:
+    for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:
+        carried = {joint.parent.name, *(body.name for body in joint.parent.find_all("body"))}
+        if joint.parent.name != base.name and not any(b.mass for b in spec.bodies if b.name not in carried):
+            # Below a frame such as odom, which MuJoCo takes for a body that carries it.
+            base.add_joint(
+                name=f"{joint.name} ", type=joint.type, damping=joint.damping, frictionloss=joint.frictionloss
+            )
+            spec.delete(joint)
+    if base.joints and base.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
         raise InputError(f"joint {base.joints[0].name} holds its base to the world, expected a base that flies free")
-    base.add_freejoint()
+    if not base.joints:
+        base.add_freejoint()
 
 
 class _Check:
@@ -100,6 +151,8 @@ class _Check:
         self.parents += around.parents if around else []
         self.models: dict[Path, float] = around.models if around else {}  # elements of those that may be attached
         self.files: list[tuple[str, str]] = []
+        self.within, self.link = [""], ""
+        self.turned: dict[str, str] = {}  # rpy of inertia, by the link of a URDF
         self._text(text)
         self._count(self.attached * self.largest)
         for kind, name in self.files:
@@ -107,14 +160,24 @@ class _Check:
 
     def _text(self, text: str) -> None:
         parser = expat.ParserCreate()
-        parser.StartElementHandler, parser.EndElementHandler = self._begin, lambda name: self.times.pop()
+        parser.StartElementHandler, parser.EndElementHandler = self._begin, self._end
         try:
             # MuJoCo allows -- in a comment, and blanks before the declaration.
             parser.Parse(COMMENT.sub("", text).lstrip("\ufeff \t\r\n"), True)
         except expat.ExpatError as error:
             raise InputError(f"it is no well-formed XML: {error}") from None
 
+    def _end(self, name: str) -> None:
+        self.times.pop()
+        self.within.pop()
+
     def _begin(self, name: str, given: dict[str, str]) -> None:
+        if name.startswith("xacro:") or any(map(MACRO.search, given.values())):
+            raise InputError(UNEXPANDED)
+        self.link = given.get("name", "") if name == "link" else self.link
+        if self.within[-1] == "inertial" and name == "origin":
+            self.turned[self.link] = given.get("rpy", "")
+        self.within.append(name)
         sizes = {"numeric": ("size",), "texture": ("width", "height")}.get(name, ())
         counts = [value for key, value in given.items() if COUNTS.fullmatch(key) or key in sizes]
         size = math.prod(max(1.0, _number(word)) for value in counts for word in value.split())
