@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config._model_acts import (
+    Rigid,
+    Rotor,
     Slide,
     Thruster,
     check_all_was_named,
@@ -25,28 +27,11 @@ WANTED = "expected rotors: <motor> on a <site> with gear 0 0 1 0 0 YAW"
 Vector = np.ndarray
 
 
-class Rigid(NamedTuple):
-    """A rigid body in the axes of the model's free body, from its origin."""
-
-    mass: float  # [kg]
-    centre: Vector  # (3,) centre of mass [m]
-    inertia: np.ndarray  # (3, 3) about `centre` [kg m2]
-
-
 class Told(NamedTuple):
     """A rotor of which the file beside the model tells."""
 
     name: str  # of the site or body where it is; of `place` the body in whose axes that is, "": the one that flies
     place: tuple[float, float, float] | None = None  # [m]
-
-
-class Rotor(NamedTuple):
-    """What pushes up; None is what the model does not say."""
-
-    place: Vector  # (3,) in the same axes [m]
-    force_max: float | None = None  # [N]
-    yaw: float | None = None  # yaw moment over force, signed [m]
-    lag: float | None = None  # time constant of the force [s]
 
 
 class ModelDrone(NamedTuple):

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjxball.config._model_source import heard
 from mjxball.errors import InputError
-
-if TYPE_CHECKING:
-    from mjxball.config._model import Rigid, Rotor
 
 ACTS = {  # attributes of a joint, and the arrays that hold them
     "armature": ("dof_armature",),
@@ -30,6 +27,24 @@ STATES = 3  # random ones at which accelerations are compared
 CLOSE = 1e-6  # of the largest acceleration
 LOCKED = 1e9  # armature of propellers [kg m2]: they do not spin up
 Named = Callable[[str, int], str]
+Vector = np.ndarray
+
+
+class Rigid(NamedTuple):
+    """A rigid body in the axes of the model's free body, from its origin."""
+
+    mass: float  # [kg]
+    centre: Vector  # (3,) centre of mass [m]
+    inertia: np.ndarray  # (3, 3) about `centre` [kg m2]
+
+
+class Rotor(NamedTuple):
+    """What pushes up; None is what the model does not say."""
+
+    place: Vector  # (3,) in the same axes [m]
+    force_max: float | None = None  # [N]
+    yaw: float | None = None  # yaw moment over force, signed [m]
+    lag: float | None = None  # time constant of the force [s]
 
 
 class Slide(NamedTuple):
@@ -95,6 +110,9 @@ def without(model: Any, slides: Sequence[Slide], load_mass: float, named: Named)
     bare.opt.density = bare.opt.viscosity = 0.0
     bare.opt.enableflags = 0
     bare.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    if model.actuator_delay.any():
+        lines.append(f"delay {model.actuator_delay.max():g} of actuators")
+    bare.actuator_delay[:] = 0
     free = [int(joint) for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
     for joint in (*free, *(slide.joint for slide in slides)):
         start, place = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
@@ -133,6 +151,8 @@ def check_all_was_named(
     """
     import mujoco
 
+    if not thrusters:  # nothing pushes where the file beside the model tells the rotors
+        bare.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     draw, data = np.random.default_rng(0), mujoco.MjData(bare)
     free = int(np.flatnonzero(bare.jnt_type == mujoco.mjtJoint.mjJNT_FREE)[0])
     place, start = bare.jnt_qposadr[free], bare.jnt_dofadr[free]

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.config._model import Model, ModelDrone, Rigid
-from mjxball.config._model_acts import ROLLING
+from mjxball.config._model import Model, ModelDrone
+from mjxball.config._model_acts import ROLLING, Rigid
 from mjxball.config._plant import Drone, Plant
 from mjxball.config._settings import Config
 from mjxball.config._tree import leaves
@@ -235,7 +235,7 @@ def _leave_out_of_load(load: Rigid, origin: np.ndarray, settings: _Settings) -> 
     """Say where the load is, which in the plant starts at O, and its inertia, there a ball's or a box's."""
     size = settings.said.get("plant.object_size", settings.found.get("plant.object_size"))
     try:
-        x, y, z = (float(edge) for edge in size)  # type: ignore[union-attr]
+        x, y, z = (float(edge) for edge in size)
     except (TypeError, ValueError, OverflowError):
         return  # refused where the settings are checked
     place = load.centre - origin

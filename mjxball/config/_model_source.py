@@ -6,6 +6,7 @@ import contextlib
 import math
 import re
 import struct
+import warnings
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
         raise InputError(f"{begins}, expected <mujoco> (MJCF) or <robot> (URDF)")
     checked = _Check(path, text)
     try:
-        with heard() as warnings:
+        with heard() as said_so:
             spec = mujoco.MjSpec.from_file(str(path))
             if first == "robot":
                 _turn(spec, checked.turned)
@@ -64,21 +65,23 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
         if "mjMINVAL" in said:
             raise InputError("a body that moves has no mass or no inertia, expected both above 0") from None
         raise InputError(f"MuJoCo does not compile it: {said}") from None
-    if any("NaN" in warning for warning in warnings):
+    if any("NaN" in warning for warning in said_so):
         raise InputError("a number of it is NaN, expected numbers")
     return model, data, first == "robot"
 
 
 @contextlib.contextmanager
 def heard() -> Iterator[list[str]]:
-    """MuJoCo's warnings, which else go to a file in the current directory."""
+    """MuJoCo's warnings, which else go to a file in the current directory; not those of its compiler, on stderr."""
     import mujoco
 
-    warnings: list[str] = []
+    said: list[str] = []
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(warnings.append)
+    mujoco.set_mju_user_warning(said.append)
     try:
-        yield warnings
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            yield said
     finally:
         mujoco.set_mju_user_warning(before)
 

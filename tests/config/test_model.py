@@ -149,7 +149,8 @@ def test_a_rig_flies_as_mujoco_steps_its_model(tmp_path: Path) -> None:
         state = moved(mean, 1e-3)
     assert np.abs(data.qvel).min() > 1e-3  # it moves in every direction
     np.testing.assert_allclose(state.position, data.qpos[:3], atol=1e-7)
-    np.testing.assert_allclose(state.quaternion / np.linalg.norm(state.quaternion), data.qpos[3:7], atol=1e-7)
+    # MuJoCo before 4 turns by the mean rate of a step, which is 3e-7 off here.
+    np.testing.assert_allclose(state.quaternion / np.linalg.norm(state.quaternion), data.qpos[3:7], atol=1e-6)
     np.testing.assert_allclose(state.rates, data.qvel[3:6], atol=1e-6)
 
 
