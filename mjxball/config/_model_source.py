@@ -7,12 +7,10 @@ import math
 import re
 import struct
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
-
-import numpy as np
 
 from mjxball.errors import InputError
 from mjxball.files import read_text
@@ -47,12 +45,11 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
     if first not in ("mujoco", "robot"):
         begins = f"it begins with <{printable(first)}>" if first else "it is no XML"
         raise InputError(f"{begins}, expected <mujoco> (MJCF) or <robot> (URDF)")
-    checked = _Check(path, text)
+    _Check(path, text)
     try:
         with heard() as said_so:
             spec = mujoco.MjSpec.from_file(str(path))
             if first == "robot":
-                _turn(spec, checked.turned)
                 _free(spec, rotors)
             model = spec.compile()
             data = mujoco.MjData(model)
@@ -84,25 +81,6 @@ def heard() -> Iterator[list[str]]:
             yield said
     finally:
         mujoco.set_mju_user_warning(before)
-
-
-def _turn(spec: Any, turned: Mapping[str, str]) -> None:
-    """Turn the inertia of links of a URDF as the rpy [rad] of their <inertial> says, which MuJoCo does from 3.14 on."""
-    for body in spec.bodies:
-        angles = [_number(word) for word in turned.get(body.name, "").split()]
-        if len(angles) == 3 and body.explicitinertial:
-            (ca, cb, cc), (sa, sb, sc) = np.cos(angles), np.sin(angles)  # Rz(c) Ry(b) Rx(a)
-            axes = np.array(
-                [
-                    [cb * cc, sa * sb * cc - ca * sc, ca * sb * cc + sa * sc],
-                    [cb * sc, sa * sb * sc + ca * cc, ca * sb * sc - sa * cc],
-                    [-sb, sa * cb, ca * cb],
-                ]
-            )
-            xx, yy, zz, xy, xz, yz = body.fullinertia
-            inertia = axes @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ axes.T
-            body.iquat = [1.0, 0.0, 0.0, 0.0]
-            body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
 
 def _free(spec: Any, rotors: Collection[str]) -> None:
@@ -154,8 +132,6 @@ class _Check:
         self.parents += around.parents if around else []
         self.models: dict[Path, float] = around.models if around else {}  # elements of those that may be attached
         self.files: list[tuple[str, str]] = []
-        self.within, self.link = [""], ""
-        self.turned: dict[str, str] = {}  # rpy of inertia, by the link of a URDF
         self._text(text)
         self._count(self.attached * self.largest)
         for kind, name in self.files:
@@ -163,24 +139,16 @@ class _Check:
 
     def _text(self, text: str) -> None:
         parser = expat.ParserCreate()
-        parser.StartElementHandler, parser.EndElementHandler = self._begin, self._end
+        parser.StartElementHandler, parser.EndElementHandler = self._begin, lambda name: self.times.pop()
         try:
             # MuJoCo allows -- in a comment, and blanks before the declaration.
             parser.Parse(COMMENT.sub("", text).lstrip("\ufeff \t\r\n"), True)
         except expat.ExpatError as error:
             raise InputError(f"it is no well-formed XML: {error}") from None
 
-    def _end(self, name: str) -> None:
-        self.times.pop()
-        self.within.pop()
-
     def _begin(self, name: str, given: dict[str, str]) -> None:
         if name.startswith("xacro:") or any(map(MACRO.search, given.values())):
             raise InputError(UNEXPANDED)
-        self.link = given.get("name", "") if name == "link" else self.link
-        if self.within[-1] == "inertial" and name == "origin":
-            self.turned[self.link] = given.get("rpy", "")
-        self.within.append(name)
         sizes = {"numeric": ("size",), "texture": ("width", "height")}.get(name, ())
         counts = [value for key, value in given.items() if COUNTS.fullmatch(key) or key in sizes]
         size = math.prod(max(1.0, _number(word)) for value in counts for word in value.split())

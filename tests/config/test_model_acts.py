@@ -136,7 +136,7 @@ PLACES = "rotors = [[0.15, 0, 0], [0, 0.15, 0], [-0.15, 0, 0], [0, -0.15, 0]]"
     ],
 )
 def test_inertia_of_a_urdf_is_turned_as_it_says(angles: str, inertia: tuple | None, tmp_path: Path) -> None:
-    """In every MuJoCo, of which those before 3.14 lose the turn; rotors are told by their places."""
+    """MuJoCo before 3.14, which pyproject.toml does not allow, loses the turn; rotors are told by their places."""
     if inertia is None:
         from scipy.spatial.transform import Rotation
 
