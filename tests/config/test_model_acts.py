@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import tomllib
+import venv
 from pathlib import Path
 
 import models
 import numpy as np
 import pytest
+from command_line import REPOSITORY, environment
 from models import BALL, DRONE, LOAD, written
 from tables import rows
 
@@ -146,6 +151,33 @@ def test_inertia_of_a_urdf_is_turned_as_it_says(angles: str, inertia: tuple | No
     plant = plant_setup(written(tmp_path, TURNED.format(angles, ""), PLACES, "t.urdf")).plant
     assert plant.drones[0].inertia == pytest.approx(inertia, rel=1e-6)
     assert (plant.arm, plant.layout) == (pytest.approx(0.15), "plus")
+
+
+READ = """import sys
+from mjxball.config import preset, with_plant
+print(*with_plant(preset("transport"), sys.argv[1]).plant.drones[0].inertia)"""
+
+
+@pytest.mark.slow
+def test_the_lowest_mujoco_that_is_allowed_turns_inertia(tmp_path: Path) -> None:
+    """In an environment of its own; first tier and other packages at their lowest versions are CI's."""
+    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    (floor,) = {found[1] for line in extras["fly"] if (found := re.match(r"mujoco>=([\d.]+),", line))}
+    venv.create(tmp_path / "venv", with_pip=True)
+    python = tmp_path / "venv" / "bin" / "python"
+    wanted = ["-c", REPOSITORY / "constraints.txt", "numpy"]
+    for packages in (wanted, [f"mujoco=={floor}.*"]):
+        done = subprocess.run(
+            [python, "-m", "pip", "install", "-q", *packages], capture_output=True, text=True, check=False
+        )
+        if "(from versions: none)" in done.stderr:  # as without a network
+            pytest.skip(f"no packages can be had: {done.stderr.splitlines()[-1]}")
+        assert done.returncode == 0, done.stderr
+    path = written(tmp_path, TURNED.format("0 0 1.5707963267948966", ""), PLACES, "t.urdf")
+    done = subprocess.run(
+        [python, "-c", READ, path], cwd=REPOSITORY, env=environment(), capture_output=True, text=True, check=True
+    )
+    assert [float(word) for word in done.stdout.split()] == pytest.approx((0.004, 0.002, 0.0055), rel=1e-6)
 
 
 def links(joint: str, last: str = "") -> str:
