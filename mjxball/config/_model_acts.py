@@ -113,33 +113,40 @@ def without(model: Any, slides: Sequence[Slide], load_mass: float, named: Named)
     if model.actuator_delay.any():
         lines.append(f"delay {model.actuator_delay.max():g} of actuators")
     bare.actuator_delay[:] = 0
-    free = [int(joint) for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
-    for joint in (*free, *(slide.joint for slide in slides)):
-        start, place = model.jnt_dofadr[joint], model.jnt_qposadr[joint]
-        for attribute, arrays in ACTS.items():
-            found = 0.0
-            for name in arrays:
-                array = getattr(bare, name)
-                rows = slice(start, start + (6 if joint in free else 1)) if name.startswith("dof_") else joint
-                found = max(found, float(np.abs(array[rows]).max()))
-                array[rows] = 0
-            shown = {
-                "range": "range {} {}".format(*model.jnt_range[joint]),
-                "stiffness": f"stiffness {found:g} and springref {model.qpos_spring[place]:g}",
-            }.get(attribute, f"{attribute} {found:g}")
-            rolls = (
-                joint not in free and attribute == "armature" and abs(found - ROLLING * load_mass) < 1e-3 * load_mass
-            )
-            if found and not rolls:
-                lines.append(f"{shown} of {named('joint', joint)}")
-        if joint not in free and model.qpos0[place]:
-            lines.append(
-                f"ref {model.qpos0[place]:g} of {named('joint', joint)}: the load starts where the model shows it"
-            )
+    for joint in (_free(model), *(slide.joint for slide in slides)):
+        lines += [f"{what} of {named('joint', joint)}" for what in _taken_out(bare, joint, load_mass)]
     hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     bare.dof_armature[model.jnt_dofadr[hinges]] = LOCKED
     mujoco.mj_setConst(bare, mujoco.MjData(bare))  # armature is part of inertias that MuJoCo keeps
     return bare, lines
+
+
+def _free(model: Any) -> int:
+    import mujoco
+
+    return int(np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)[0])
+
+
+def _taken_out(bare: Any, joint: int, load_mass: float) -> list[str]:
+    """Attributes of a free joint or of a slide of the load, with their numbers, that are no longer in `bare`."""
+    slides, start, place = joint != _free(bare), bare.jnt_dofadr[joint], bare.jnt_qposadr[joint]
+    shown = []
+    for attribute, arrays in ACTS.items():
+        found = 0.0
+        for name in arrays:
+            array = getattr(bare, name)
+            rows = slice(start, start + (1 if slides else 6)) if name.startswith("dof_") else joint
+            found = max(found, float(np.abs(array[rows]).max()))
+            array[rows] = 0
+        if attribute == "range" and found:
+            shown.append("range {:g} {:g}".format(*bare.jnt_range[joint]))
+        elif attribute == "stiffness" and found:
+            shown.append(f"stiffness {found:g} and springref {bare.qpos_spring[place]:g}")
+        elif found and not (slides and attribute == "armature" and abs(found / load_mass - ROLLING) < 1e-3):
+            shown.append(f"{attribute} {found:g}")
+    if slides and bare.qpos0[place]:
+        shown.append(f"ref {bare.qpos0[place]:g}")
+    return shown
 
 
 def check_all_was_named(
@@ -154,23 +161,14 @@ def check_all_was_named(
     if not thrusters:  # nothing pushes where the file beside the model tells the rotors
         bare.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
     draw, data = np.random.default_rng(0), mujoco.MjData(bare)
-    free = int(np.flatnonzero(bare.jnt_type == mujoco.mjtJoint.mjJNT_FREE)[0])
-    place, start = bare.jnt_qposadr[free], bare.jnt_dofadr[free]
+    place, start = bare.jnt_qposadr[_free(bare)], bare.jnt_dofadr[_free(bare)]
     moving = [*range(start, start + 6), *(bare.jnt_dofadr[slide.joint] for slide in slides)]
     weight = sum(part.mass for part in (*parts, *([load] if load else []))) * -bare.opt.gravity[2]
     for _ in range(STATES):
         turned = draw.normal(size=4)
         data.qpos[place + 3 : place + 7] = turned / np.linalg.norm(turned)
         data.qvel[moving] = draw.normal(size=len(moving))
-        forces = []
-        for thruster in thrusters:
-            low, high = thruster.inputs
-            most = min(high, 2 * weight / len(thrusters) / thruster.per_input)
-            put = draw.uniform(max(low, 0.0), max(most, low, 0.0))
-            data.ctrl[thruster.number] = put
-            if bare.actuator_actadr[thruster.number] >= 0:
-                data.act[bare.actuator_actadr[thruster.number]] = put
-            forces.append((thruster.rotor, thruster.per_input * put))
+        forces = _push(bare, data, thrusters, 2 * weight, draw)
         with heard():
             mujoco.mj_forward(bare, data)
         axes = np.zeros(9)
@@ -184,9 +182,24 @@ def check_all_was_named(
         off = np.abs(theirs - ours).max()
         if np.isfinite(ours).all() and not off <= CLOSE * np.abs([theirs, ours]).max():
             raise InputError(
-                f"MuJoCo's accelerations of it are up to {off:.2g} off those of its masses and rotors, expected that "
-                "nothing else acts on it"
+                f"MuJoCo's accelerations of it are up to {off:.2g} m/s2 or rad/s2 off those of its masses and "
+                "rotors, expected that nothing else acts on it"
             )
+
+
+def _push(
+    bare: Any, data: Any, thrusters: Sequence[Thruster], most: float, draw: np.random.Generator
+) -> list[tuple[Rotor, float]]:
+    """Set controls of rotors in `data` at random within their limits, of together `most` [N]; the force of each [N]."""
+    forces = []
+    for number, per_input, (low, high), rotor in thrusters:
+        least = max(low, 0.0)
+        put = least + draw.uniform() * (max(min(high, most / len(thrusters) / per_input), least) - least)
+        data.ctrl[number] = put
+        if bare.actuator_actadr[number] >= 0:
+            data.act[bare.actuator_actadr[number]] = put
+        forces.append((rotor, per_input * put))
+    return forces
 
 
 def _accelerations(
