@@ -18,7 +18,7 @@ from mjxball.config._model_acts import (
     refuse_other_models,
     without,
 )
-from mjxball.config._model_source import MAX_MODEL, ROTOR, compiled, printable
+from mjxball.config._model_source import MAX_MODEL, ROTOR, compiled, heard, printable
 from mjxball.errors import InputError
 from mjxball.files import read_text
 
@@ -90,8 +90,9 @@ class _Tree:
         drones, carrier, load = self._bodies()
         rigids = [*(drone.rigid for drone in drones), *([carrier] if carrier else [])]
         slid = load[0] if load else None
-        bare, lines = without(self.m, self.slides, slid.mass if slid else 0.0, self._named)
-        check_all_was_named(bare, rigids, slid, self.slides, self.thrusters)
+        with heard():
+            bare, lines = without(self.m, self.slides, slid.mass if slid else 0.0, self._named)
+            check_all_was_named(bare, rigids, slid, self.slides, self.thrusters)
         return Model(drones, carrier, load, -self.m.opt.gravity[2], (*self.left_out, *lines))
 
     def _bodies(self) -> tuple[tuple[ModelDrone, ...], Rigid | None, tuple[Rigid, str] | None]:
