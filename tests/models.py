@@ -35,16 +35,28 @@ def mjcf(bodies: str, actuators: str, more: str = "") -> str:
 DRONE = mjcf(f'<body name="quad" pos="0 0 1"><freejoint/>{INERTIAL}{rotors()}</body>', motors())
 
 
-def rig(second: str = "") -> str:
-    """A bar with a drone at each end, one heavier, turned, with stronger rotors; `second` goes into its body."""
+def rig(second: str = "", more: str = "") -> str:
+    """A bar with a drone at each end, one heavier, turned, with stronger rotors.
+
+    `second` goes into that one's body, `more` into the bar's.
+    """
     bar = '<geom type="box" size="0.3 0.02 0.01" mass="0.25" contype="0" conaffinity="0"/>'
     heavy = '<inertial pos="0 0 0.01" mass="1.5" diaginertia="0.004 0.004 0.007"/>'
     return mjcf(
         f'<body name="bar" pos="0 0 1"><freejoint/>{bar}'
         f'<body name="one" pos="0.31 0 0.02">{INERTIAL}{rotors("a")}</body>'
-        f'<body name="two" pos="-0.29 0.01 0.03" euler="0 0 0.4">{heavy}{rotors("b", 0.17)}{second}</body></body>',
+        f'<body name="two" pos="-0.29 0.01 0.03" euler="0 0 0.4">{heavy}{rotors("b", 0.17)}{second}</body>'
+        f"{more}</body>",
         motors("a") + motors("b", 9.0, -0.03),
     )
+
+
+# The rig's load: a ball of the radius beside, with the armature of one that rolls.
+BALL = "[plant]\nball_radius = 0.05"
+LOAD = (
+    '<body name="load"><joint name="slide" type="slide" axis="1 0 0" armature="0.12"/>'
+    '<inertial pos="0 0 0" mass="0.3" diaginertia="0.0003 0.0003 0.0003"/></body>'
+)
 
 
 def urdf(mass: str = "0.6", names: str = "prop", inertial: bool = True) -> str:

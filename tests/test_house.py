@@ -19,10 +19,14 @@ def test_hooks_are_local() -> None:
     assert {hook["entry"].split()[0] for hook in repository["hooks"]} == {"ruff", "mypy"}
 
 
-def test_the_workflow_runs_ci_on_every_supported_python() -> None:
-    (job,) = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"].values()
-    assert job["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13"]
-    assert job["steps"][-1]["run"] == ".ci/run"
+def test_the_workflow_runs_ci_on_every_supported_python_and_on_the_lowest_versions() -> None:
+    jobs = yaml.safe_load((REPOSITORY / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    whole, lowest = jobs["test"], jobs["lowest"]
+    assert whole["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13"]
+    assert whole["steps"][-1]["run"] == ".ci/run"
+    *_, install, tests = (step.get("run", "") for step in lowest["steps"])
+    assert "--resolution lowest-direct -e '.[dev,fly]'" in install
+    assert tests == "python -m pytest -n 2 --dist loadfile"
 
 
 def test_what_ci_leaves_out_runs_every_week() -> None:

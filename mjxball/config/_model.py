@@ -8,7 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjxball.config._model_source import MAX_MODEL, ROTOR, compiled, printable
+from mjxball.config._model_acts import (
+    Rigid,
+    Rotor,
+    Slide,
+    Thruster,
+    check_all_was_named,
+    refuse_disabled,
+    refuse_other_models,
+    without,
+)
+from mjxball.config._model_source import MAX_MODEL, ROTOR, compiled, heard, printable
 from mjxball.errors import InputError
 from mjxball.files import read_text
 
@@ -17,21 +27,11 @@ WANTED = "expected rotors: <motor> on a <site> with gear 0 0 1 0 0 YAW"
 Vector = np.ndarray
 
 
-class Rigid(NamedTuple):
-    """A rigid body in the axes of the model's free body, from its origin."""
+class Told(NamedTuple):
+    """A rotor of which the file beside the model tells."""
 
-    mass: float  # [kg]
-    centre: Vector  # (3,) centre of mass [m]
-    inertia: np.ndarray  # (3, 3) about `centre` [kg m2]
-
-
-class Rotor(NamedTuple):
-    """What pushes up; None is what the model does not say."""
-
-    place: Vector  # (3,) in the same axes [m]
-    force_max: float | None = None  # [N]
-    yaw: float | None = None  # yaw moment over force, signed [m]
-    lag: float | None = None  # time constant of the force [s]
+    name: str  # of the site or body where it is; of `place` the body in whose axes that is, "": the one that flies
+    place: tuple[float, float, float] | None = None  # [m]
 
 
 class ModelDrone(NamedTuple):
@@ -47,19 +47,20 @@ class Model(NamedTuple):
 
     drones: tuple[ModelDrone, ...]
     carrier: Rigid | None  # what is no drone and no load; None of a single drone
-    load: tuple[float, str] | None  # mass [kg] of a body on slides, and their axes: x, y or xy
+    load: tuple[Rigid, str] | None  # a body on slides as it is at the start, and their axes: x, y or xy
     gravity: float  # [m/s2]
     left_out: tuple[str, ...]  # of what the model says
 
 
-def read_model(path: Path, rotors: Sequence[str] = ()) -> Model:
-    """The model in `path`; `rotors` names its sites or bodies where rotors are, if no actuators say so.
+def read_model(path: Path, rotors: Sequence[Told] = ()) -> Model:
+    """The model in `path`; `rotors` tells where rotors are, if no actuators say so.
 
     Raises InputError, one sentence, for what is no model, or neither a quadrotor nor a rigid rig of several.
     """
     text = read_text(path, "model", MAX_MODEL)
     try:
-        return _Tree(*compiled(path, text, rotors), rotors, path).model()
+        names = [rotor.name for rotor in rotors if not rotor.place]
+        return _Tree(*compiled(path, text, names), rotors, path).model()
     except InputError as error:
         raise InputError(f"model {path}: {error}") from None
 
@@ -67,35 +68,40 @@ def read_model(path: Path, rotors: Sequence[str] = ()) -> Model:
 class _Tree:
     """A compiled model at its start: the one tree of bodies that flies."""
 
-    def __init__(self, model: Any, data: Any, is_urdf: bool, named: Sequence[str], path: Path):
+    def __init__(self, model: Any, data: Any, is_urdf: bool, told: Sequence[Told], path: Path):
         import mujoco
 
         self.m, self.d, self.mujoco = model, data, mujoco
-        self.is_urdf, self.named, self.beside = is_urdf, named, path.with_suffix(".toml").name
+        self.is_urdf, self.told, self.beside = is_urdf, told, path.with_suffix(".toml").name
         self.root = self._root()
         self.turn = self.d.xmat[self.root].reshape(3, 3).T
         self.moments: set[int] = set()  # bodies that actuators turn without pushing
         self.bearing: set[int] = set()  # bodies at which rotors are
         self.left_out: list[str] = []
+        self.thrusters: list[Thruster] = []
+        self.slides: list[Slide] = []
 
     def model(self) -> Model:
         """All that is to be known."""
-        m, d = self.m, self.d
-        if m.neq or m.ntendon:
-            raise InputError("it has equality constraints or tendons, expected bodies that are fixed to each other")
-        if d.ncon:
-            one, other = (self._named("geom", geom) for geom in d.contact[0].geom)
+        refuse_other_models(self.m, self.root, self._named)
+        if self.d.ncon:
+            one, other = (self._named("geom", geom) for geom in self.d.contact[0].geom)
             raise InputError(f"{one} touches {other} at the start, expected no contact: the rig flies free")
-        gravity = m.opt.gravity
-        if gravity[:2].any() or gravity[2] >= 0:
-            raise InputError(f"gravity is {_words(gravity)} m/s2, expected one that pulls along -z")
-        if m.opt.density or m.opt.viscosity or m.opt.wind.any():
-            self._leave_out("air: density, viscosity and wind")
+        drones, carrier, load = self._bodies()
+        rigids = [*(drone.rigid for drone in drones), *([carrier] if carrier else [])]
+        slid = load[0] if load else None
+        with heard():
+            bare, lines = without(self.m, self.slides, slid.mass if slid else 0.0, self._named)
+            check_all_was_named(bare, rigids, slid, self.slides, self.thrusters)
+        return Model(drones, carrier, load, -self.m.opt.gravity[2], (*self.left_out, *lines))
+
+    def _bodies(self) -> tuple[tuple[ModelDrone, ...], Rigid | None, tuple[Rigid, str] | None]:
+        """Drones, carrier and load."""
         groups = self._groups()
         if len(groups) == 1:
             (rotors,) = groups.values()
             self._load(lone=True)
-            return Model((self._drone(self.root, rotors),), None, None, -gravity[2], tuple(self.left_out))
+            return (self._drone(self.root, rotors),), None, None
         if self.root in groups:
             raise InputError(
                 f"{self._named('body', self.root)} carries rotors and drones, expected each drone in a body of its own"
@@ -103,8 +109,7 @@ class _Tree:
         drones = tuple(self._drone(body, rotors) for body, rotors in groups.items())
         flying = set().union(*(self._below(body) for body in groups))
         load, bodies = self._load(lone=False)
-        carrier = self._rigid(self._below(self.root) - flying - bodies)
-        return Model(drones, carrier, load, -gravity[2], tuple(self.left_out))
+        return drones, self._rigid(self._below(self.root) - flying - bodies), load
 
     def _drone(self, body: int, rotors: Sequence[Rotor]) -> ModelDrone:
         return ModelDrone(self._name(body), self._rigid(self._below(body)), tuple(rotors))
@@ -126,11 +131,11 @@ class _Tree:
         """The rotors of every drone, by the drone's body."""
         m = self.m
         found: dict[int, list[Rotor]] = {}
-        for body, rotor in self._named_rotors() if self.named or self.is_urdf else self._actuated():
+        for body, rotor in self._told_rotors() if self.told or self.is_urdf else self._actuated():
             found.setdefault(body, []).append(rotor)
         self.bearing = set(found)
         if not found:
-            where = f"links called like rotors, or named in {self.beside}: rotors = [...]"
+            where = f"links called like rotors, or names or places in {self.beside}: rotors = [...]"
             raise InputError(f"it has no rotors, {f'expected {where}' if self.is_urdf else WANTED}")
         if len(found) > 1 and not self.moments and all(len(rotors) == 1 for rotors in found.values()):
             groups: dict[int, list[Rotor]] = {}
@@ -139,22 +144,26 @@ class _Tree:
             found = groups
         for body, rotors in found.items():
             if len(rotors) not in ((1, 4) if body in self.moments else (4,)):
-                named = f"; name them in {self.beside}: rotors = [...]" if self.is_urdf else ""
+                named = f"; tell them in {self.beside}: rotors = [...]" if self.is_urdf else ""
                 raise InputError(f"{self._named('body', body)} has {len(rotors)} rotors, expected 4 a drone{named}")
         return found
 
-    def _named_rotors(self) -> list[tuple[int, Rotor]]:
-        """At the sites or bodies that are named, of a URDF those called like rotors."""
+    def _told_rotors(self) -> list[tuple[int, Rotor]]:
+        """Where the file beside the model says, of a URDF else at the links called like rotors."""
         m, d, kind = self.m, self.d, self.mujoco.mjtObj
         if m.nu:
-            self._leave_out("actuators: the file beside the model names its rotors")
-        names = self.named or [one for body in range(m.nbody) if ROTOR.search(one := m.body(body).name)]
+            self._leave_out("actuators: the file beside the model tells its rotors")
+        links = [Told(one) for body in range(m.nbody) if ROTOR.search(one := m.body(body).name)]
         found = []
-        for name in names:
+        for name, told in self.told or links:
+            if told:
+                body = self.mujoco.mj_name2id(m, kind.mjOBJ_BODY, name) if name else self.root
+                self._check_told(name, body)
+                found.append((body, Rotor(self._here(d.xpos[body] + d.xmat[body].reshape(3, 3) @ told))))
+                continue
             site = self.mujoco.mj_name2id(m, kind.mjOBJ_SITE, name)
             body = int(m.site_bodyid[site]) if site >= 0 else self.mujoco.mj_name2id(m, kind.mjOBJ_BODY, name)
-            if body <= 0 or m.body_rootid[body] != self.root:
-                raise InputError(f"{self.beside} says rotors {name!r}, expected a site or body of what flies")
+            self._check_told(name, body)
             place = d.site_xpos[site] if site >= 0 else d.xipos[body] if self.is_urdf else d.xpos[body]
             axis = self.turn @ (d.site_xmat[site] if site >= 0 else d.xmat[body]).reshape(3, 3)[:, 2]
             if self.is_urdf and (np.linalg.norm(axis[:2]) > UPRIGHT or axis[2] < 0):
@@ -162,7 +171,13 @@ class _Tree:
             found.append((body, Rotor(self._here(place))))
         return found
 
+    def _check_told(self, name: str, body: int) -> None:
+        if body <= 0 or self.m.body_rootid[body] != self.root:
+            raise InputError(f"{self.beside} says rotors {name!r}, expected a site or body of what flies")
+
     def _actuated(self) -> list[tuple[int, Rotor]]:
+        if self.m.nu != getattr(self.m, "nactuator", self.m.nu):  # from MuJoCo 3.13 on
+            raise InputError(f"an actuator of it has several controls, {WANTED}")
         return [one for number in range(self.m.nu) if (one := self._actuator(number)) is not None]
 
     def _actuator(self, number: int) -> tuple[int, Rotor] | None:
@@ -175,6 +190,7 @@ class _Tree:
         fixed = m.actuator_gaintype[number] == self.mujoco.mjtGain.mjGAIN_FIXED
         if not fixed or m.actuator_biasprm[number].any() or not gain or lag is None:
             raise InputError(f"{name} is no plain motor, {WANTED}")
+        refuse_disabled(m, number, self._named)
         frame = self.turn @ self.d.site_xmat[site].reshape(3, 3)
         force, moment = (frame @ (gain * part) for part in m.actuator_gear[number].reshape(2, 3))
         body, size = int(m.site_bodyid[site]), float(np.linalg.norm(force))
@@ -191,8 +207,12 @@ class _Tree:
             raise InputError(f"{name} pushes with at most {high * size:g} N, expected more than 0")
         if -np.inf < low < 0:
             self._leave_out("rotors that push down")
+        if low > 0:
+            self._leave_out(f"the least force of rotors, {low * size:g} N by the lower end of ctrlrange or forcerange")
         most = high * size if np.isfinite(high) else None
-        return body, Rotor(self._here(self.d.site_xpos[site]), most, moment[2] / size, lag or None)
+        rotor = Rotor(self._here(self.d.site_xpos[site]), most, moment[2] / size, lag or None)
+        self.thrusters.append(Thruster(number, size, (low, high), rotor))
+        return body, rotor
 
     def _lag(self, number: int) -> float | None:
         """Time constant of an actuator [s], 0: none; None if its dynamics are others."""
@@ -203,21 +223,24 @@ class _Tree:
         return float(self.m.actuator_dynprm[number][0]) if kind in filters else None
 
     def _inputs(self, number: int, gain: float) -> tuple[float, float]:
-        """Least and largest control [ctrl], by ctrlrange and forcerange."""
+        """Least and largest control [ctrl], by ctrlrange, actrange and forcerange."""
         m, low, high = self.m, -np.inf, np.inf
-        if m.actuator_ctrllimited[number]:
+        if m.actuator_ctrllimited[number] and not m.opt.disableflags & self.mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
             low, high = m.actuator_ctrlrange[number]
+        if m.actuator_actlimited[number]:
+            low, high = max(low, m.actuator_actrange[number][0]), min(high, m.actuator_actrange[number][1])
         if m.actuator_forcelimited[number]:
             least, most = sorted(m.actuator_forcerange[number] / gain)
             low, high = max(low, least), min(high, most)
         return float(low), float(high)
 
-    def _load(self, lone: bool) -> tuple[tuple[float, str] | None, set[int]]:
+    def _load(self, lone: bool) -> tuple[tuple[Rigid, str] | None, set[int]]:
         """The load on its slides, and its bodies; propellers may spin, nothing else may move."""
         m, kinds = self.m, self.mujoco.mjtJoint
         loads: dict[int, set[str]] = {}
         for joint, (body, kind) in enumerate(zip(m.jnt_bodyid, m.jnt_type, strict=True)):
-            axis = np.abs(self.turn @ self.d.xmat[body].reshape(3, 3) @ m.jnt_axis[joint])
+            direction = self.turn @ self.d.xmat[body].reshape(3, 3) @ m.jnt_axis[joint]
+            axis = np.abs(direction)
             if kind == kinds.mjJNT_FREE:
                 continue
             if kind == kinds.mjJNT_HINGE and int(body) in self.bearing - {self.root}:
@@ -229,12 +252,13 @@ class _Tree:
                     f"{'drone' if lone else 'rig with at most a load that slides along x or y'}"
                 )
             loads.setdefault(int(body), set()).add("xy"[int(axis[:2].argmax())])
+            self.slides.append(Slide(joint, direction))
         if len(loads) > 1:
             one, other = (self._named("body", body) for body in [*loads][:2])
             raise InputError(f"{one} and {other} both slide, expected one load")
         for body, axes in loads.items():
             below = self._below(body)
-            return (self._rigid(below).mass, "".join(sorted(axes))), below
+            return (self._rigid(below), "".join(sorted(axes))), below
         return None, set()
 
     def _leave_out(self, what: str) -> None:

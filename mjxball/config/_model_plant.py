@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config._model import Model, ModelDrone
+from mjxball.config._model_acts import ROLLING, Rigid
 from mjxball.config._plant import Drone, Plant
 from mjxball.config._settings import Config
 from mjxball.config._tree import leaves
@@ -212,9 +213,8 @@ def _repeated(drone: dict[str, Any], count: int | None, settings: _Settings) -> 
 
 def _placed(drones: list[dict[str, Any]], model: Model, settings: _Settings) -> list[dict[str, Any]]:
     """The drones of a whole rig from O, the carrier's centre; of a pair on a line the one ahead is first."""
-    carrier = model.carrier
+    carrier, origin = model.carrier, _origin(model)
     assert carrier is not None
-    origin = carrier.centre if carrier.mass else np.mean([drone["mount"] for drone in drones], axis=0)
     settings.found["plant.carrier_mass"] = carrier.mass
     if carrier.mass:
         settings.found["plant.carrier_inertia"] = _principal(carrier.inertia, "the carrier", settings)
@@ -222,6 +222,33 @@ def _placed(drones: list[dict[str, Any]], model: Model, settings: _Settings) -> 
         drone["mount"] = (np.round(np.subtract(drone["mount"], origin), 9) + 0.0).tolist()
     axis = _axis([drone["mount"] for drone in drones])
     return drones if axis == "xy" else sorted(drones, key=lambda drone: -drone["mount"]["xy".index(axis)])
+
+
+def _origin(model: Model) -> np.ndarray:
+    """O (3,) in the axes of the model: the carrier's centre, or the middle of the drones."""
+    if model.carrier is not None and model.carrier.mass:
+        return model.carrier.centre
+    return np.mean([drone.rigid.centre for drone in model.drones], axis=0)
+
+
+def _leave_out_of_load(load: Rigid, origin: np.ndarray, settings: _Settings) -> None:
+    """Say where the load is, which in the plant starts at O, and its inertia, there a ball's or a box's."""
+    size = settings.said.get("plant.object_size", settings.found.get("plant.object_size"))
+    try:
+        x, y, z = (float(edge) for edge in size)
+    except (TypeError, ValueError, OverflowError):
+        return  # refused where the settings are checked
+    place = load.centre - origin
+    if np.abs(place).max() > SHOWN * max(x, y, z):
+        shown = " ".join(f"{part:.3g}" for part in place + 0.0)
+        settings.leave_out(f"place of the load, {shown} m from O, where the carrier's centre is")
+    what, taken = "box of plant.object_size", np.array([y * y + z * z, x * x + z * z, x * x + y * y]) / 12
+    if settings.number("carrier_mass"):
+        what, taken = "ball of plant.ball_radius", np.full(3, ROLLING * settings.number("ball_radius") ** 2)
+    beside = load.inertia - load.mass * np.diag(taken)
+    if np.abs(beside).max() > SHOWN * load.mass * max(*taken):
+        own, shown = (" ".join(f"{part:.2g}" for part in one) for one in (np.diag(load.inertia), load.mass * taken))
+        settings.leave_out(f"inertia of the load, {own} kg m2: it is taken for a {what}, {shown} kg m2")
 
 
 def _axis(mounts: list[Any]) -> str:
@@ -251,7 +278,7 @@ def _assume_load(drones: list[Any], model: Model, settings: _Settings) -> None:
         why = "a tenth of the drones'" if mass == LOAD * sum(masses) else "a quarter of what they lift besides"
         settings.assume("object_mass", float(f"{mass:.4g}"), why)
     else:
-        settings.found["plant.object_mass"], settings.found["plant.cg_axis"] = model.load
+        settings.found["plant.object_mass"], settings.found["plant.cg_axis"] = model.load[0].mass, model.load[1]
     axis = str(settings.said.get("plant.cg_axis", settings.found.get("plant.cg_axis")))
     if len(axis) == 1:
         along = [mount["xy".index(axis) if axis in "xy" else 0] for mount in mounts]
@@ -263,5 +290,7 @@ def _assume_load(drones: list[Any], model: Model, settings: _Settings) -> None:
         size = [length, length, length / 10]
     settings.assume("object_size", [float(f"{edge:.4g}") for edge in size], "as far as drones stand")
     settings.assume("ball_radius", float(f"{BALL * length:.3g}"), "a seventeenth of the object")
+    if model.load is not None:
+        _leave_out_of_load(model.load[0], _origin(model), settings)
     furthest = float(f"{AMPLITUDE * length:.3g}")
     settings.assume("scenario.cg_amplitude", [0.0, furthest], "up to 5/34 of the object, as the reference pair's")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import struct
-from collections.abc import Collection
+import warnings
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -13,16 +15,19 @@ from xml.parsers import expat
 from mjxball.errors import InputError
 from mjxball.files import read_text
 
-MODELS = (".xml", ".urdf")  # endings of the files
+XACRO = ".xacro"
+MODELS = (".xml", ".urdf", XACRO)  # endings of the files
 MAX_MODEL = 2**20  # bytes of a model, and of one that it includes
 MAX_ASSET = 2**26  # bytes of a mesh or texture
 MAX_ELEMENTS = 5000  # of XML; MuJoCo takes seconds for more
 MAX_PIXELS = 2**22  # of all height fields and textures of a model
+UNEXPANDED = "it is a xacro file, expand it with xacro first: xacro FILE.xacro > FILE.urdf"
 LONGEST = 200  # characters of a name or a message that a sentence shows
 FIRST = re.compile(r"\ufeff?(?>\s|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*+<([\w:.-]+)", re.DOTALL)
 COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 COUNTS = re.compile(r"count|nrow|ncol|nsample|nkey|nuser\w*")  # attributes: how many there are
 FILE = re.compile(r"file(?:right|left|up|down|front|back)?")  # attributes of MJCF; URDF's shapes do not matter
+MACRO = re.compile(r"\$\$?[{(]")  # of xacro, in an attribute
 ROTOR = re.compile(r"prop|rotor|motor|thrust", re.IGNORECASE)  # in the name of a URDF's link
 
 
@@ -33,23 +38,23 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
     """
     import mujoco
 
+    if path.suffix.lower() == XACRO:
+        raise InputError(UNEXPANDED)
     found = FIRST.match(text)
     first = found[1] if found else None
     if first not in ("mujoco", "robot"):
         begins = f"it begins with <{printable(first)}>" if first else "it is no XML"
         raise InputError(f"{begins}, expected <mujoco> (MJCF) or <robot> (URDF)")
     _Check(path, text)
-    warnings: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(warnings.append)  # else they go to a file in the current directory
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
-        if first == "robot":
-            _free(spec, rotors)
-        model = spec.compile()
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
+        with heard() as said_so:
+            spec = mujoco.MjSpec.from_file(str(path))
+            if first == "robot":
+                _free(spec, rotors)
+            model = spec.compile()
+            data = mujoco.MjData(model)
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
     except InputError:
         raise
     except Exception as error:  # whatever MuJoCo's parser, compiler and plug-ins raise
@@ -57,11 +62,25 @@ def compiled(path: Path, text: str, rotors: Collection[str]) -> tuple[Any, Any, 
         if "mjMINVAL" in said:
             raise InputError("a body that moves has no mass or no inertia, expected both above 0") from None
         raise InputError(f"MuJoCo does not compile it: {said}") from None
-    finally:
-        mujoco.set_mju_user_warning(before)
-    if any("NaN" in warning for warning in warnings):
+    if any("NaN" in warning for warning in said_so):
         raise InputError("a number of it is NaN, expected numbers")
     return model, data, first == "robot"
+
+
+@contextlib.contextmanager
+def heard() -> Iterator[list[str]]:
+    """MuJoCo's warnings, which else go to a file in the current directory; not those of its compiler, on stderr."""
+    import mujoco
+
+    said: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            yield said
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _free(spec: Any, rotors: Collection[str]) -> None:
@@ -77,13 +96,26 @@ def _free(spec: Any, rotors: Collection[str]) -> None:
     for body in spec.bodies:
         if not body.explicitinertial:
             body.ipos = [0.0, 0.0, 0.0]
+    still = {joint.name for joint in spec.joints if _is_rotor(joint.parent.name, rotors)}
+    for mimicry in [*spec.equalities]:
+        if still & {mimicry.name1, mimicry.name2}:
+            spec.delete(mimicry)
     for joint in [*spec.joints]:
-        if _is_rotor(joint.parent.name, rotors):
+        if joint.name in still:
             spec.delete(joint)
     base = spec.worldbody.first_body()
-    if base.joints:
+    for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:
+        carried = {joint.parent.name, *(body.name for body in joint.parent.find_all("body"))}
+        if joint.parent.name != base.name and not any(b.mass for b in spec.bodies if b.name not in carried):
+            # Below a frame such as odom, which MuJoCo takes for a body that carries it.
+            base.add_joint(
+                name=f"{joint.name} ", type=joint.type, damping=joint.damping, frictionloss=joint.frictionloss
+            )
+            spec.delete(joint)
+    if base.joints and base.joints[0].type != mujoco.mjtJoint.mjJNT_FREE:
         raise InputError(f"joint {base.joints[0].name} holds its base to the world, expected a base that flies free")
-    base.add_freejoint()
+    if not base.joints:
+        base.add_freejoint()
 
 
 class _Check:
@@ -115,6 +147,8 @@ class _Check:
             raise InputError(f"it is no well-formed XML: {error}") from None
 
     def _begin(self, name: str, given: dict[str, str]) -> None:
+        if name.startswith("xacro:") or any(map(MACRO.search, given.values())):
+            raise InputError(UNEXPANDED)
         sizes = {"numeric": ("size",), "texture": ("width", "height")}.get(name, ())
         counts = [value for key, value in given.items() if COUNTS.fullmatch(key) or key in sizes]
         size = math.prod(max(1.0, _number(word)) for value in counts for word in value.split())

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjxball.config._load import follow_plant
-from mjxball.config._model import read_model
+from mjxball.config._model import Told, read_model
 from mjxball.config._model_plant import plant_of
 from mjxball.config._model_source import MODELS
 from mjxball.config._plant import Plant
@@ -43,8 +43,8 @@ def read_plant(source: Path | str) -> PlantFile:
     A file holds tables `[plant]`, `[attitude]`, ... of settings, or dotted paths; `preset`, which it belongs to; and
     `base`, a shipped plant from which it differs. One that lists `[[plant.drones]]` describes a whole plant: what it
     leaves out has its default. Values are not checked. Beside a model its `.toml` may say what the model does not, and
-    `drones`, how many fly of a single one, and `rotors`, names of the sites or bodies where they are. Raises InputError
-    if the source is none of these.
+    `drones`, how many fly of a single one, and `rotors`, where they are: names of sites or bodies, places in the axes
+    of what flies, or a table of places by body. Raises InputError if the source is none of these.
     """
     path = Path(source)
     if path.suffix.lower() in MODELS:
@@ -71,17 +71,34 @@ def _of_model(path: Path) -> PlantFile:
     count, rotors = values.pop("drones", None), values.pop("rotors", [])
     if count is not None and (type(count) is not int or not 2 <= count <= MOST_DRONES):
         raise InputError(f"plant file {beside}: drones must be a whole number from 2 to {MOST_DRONES}, not {count!r}")
-    if not isinstance(rotors, list) or not all(isinstance(name, str) for name in rotors):
-        raise InputError(f"plant file {beside}: rotors must be a list of names, not {rotors!r}")
+    told = _told(beside, rotors)
     said = _settings(beside, values)
     with np.errstate(all="ignore"):  # numbers that are not finite are refused where the settings are checked
-        model = read_model(path, rotors)
+        model = read_model(path, told)
         try:
             settings, assumed = plant_of(model, said.settings, count)
         except InputError as error:
             raise InputError(f"model {path}: {error}") from None
     own = {name: value for name, value in said.settings.items() if name != DRONES}
     return PlantFile(said.preset, _defaults() | settings | own, tuple(assumed))
+
+
+def _told(beside: Path, rotors: Any) -> list[Told]:
+    """The rotors that the file `beside` a model tells of."""
+    rows = {"": rotors} if isinstance(rotors, list) else rotors
+    found = []
+    for body, entries in rows.items() if isinstance(rows, dict) else [("", None)]:
+        for entry in entries if isinstance(entries, list) else [None]:
+            if isinstance(entry, str) and not body:
+                found.append(Told(entry))
+            elif isinstance(entry, list) and len(entry) == 3 and all(type(part) in (int, float) for part in entry):
+                found.append(Told(body, (float(entry[0]), float(entry[1]), float(entry[2]))))
+            else:
+                raise InputError(
+                    f"plant file {beside}: rotors must be a list of names or of places [x, y, z] in m, or a table of "
+                    f"such places by body, not {rotors!r:.200}"
+                )
+    return found
 
 
 def _defaults() -> dict[str, Any]:

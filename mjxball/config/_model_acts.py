@@ -1,0 +1,240 @@
+"""What acts in a compiled model beside masses, gravity and rotors: named, and whether that was all. Needs MuJoCo.
+
+Whether it was all is measured: without what is named MuJoCo's own accelerations of the model, at random states, are
+those of the masses and rotors that were read.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjxball.errors import InputError
+
+ACTS = {  # attributes of a joint, and the arrays that hold them
+    "armature": ("dof_armature",),
+    "damping": ("dof_damping", "dof_dampingpoly"),
+    "frictionloss": ("dof_frictionloss",),
+    "stiffness": ("jnt_stiffness", "jnt_stiffnesspoly"),
+    "range": ("jnt_limited",),
+}
+ROLLING = 0.4  # armature over mass of a ball that rolls on its slide, which the plant's load does
+STATES = 3  # random ones at which accelerations are compared
+CLOSE = 1e-6  # of the largest acceleration
+WORST = 1e9  # condition of the mass matrix up to which accelerations are that good; no rig is beyond it
+LOCKED = 1e9  # armature of propellers [kg m2]: they do not spin up
+Named = Callable[[str, int], str]
+Vector = np.ndarray
+
+
+class Rigid(NamedTuple):
+    """A rigid body in the axes of the model's free body, from its origin."""
+
+    mass: float  # [kg]
+    centre: Vector  # (3,) centre of mass [m]
+    inertia: np.ndarray  # (3, 3) about `centre` [kg m2]
+
+
+class Rotor(NamedTuple):
+    """What pushes up; None is what the model does not say."""
+
+    place: Vector  # (3,) in the same axes [m]
+    force_max: float | None = None  # [N]
+    yaw: float | None = None  # yaw moment over force, signed [m]
+    lag: float | None = None  # time constant of the force [s]
+
+
+class Slide(NamedTuple):
+    """One direction in which the load moves."""
+
+    joint: int
+    axis: np.ndarray  # (3,) in the axes of the free body
+
+
+class Thruster(NamedTuple):
+    """An actuator that is a rotor."""
+
+    number: int
+    per_input: float  # force over control [N]
+    inputs: tuple[float, float]  # least and largest control
+    rotor: Rotor
+
+
+def refuse_other_models(model: Any, root: int, named: Named) -> None:
+    """Raise InputError for what makes the model fly otherwise than by its weight and its rotors."""
+    import mujoco
+
+    if model.neq or model.ntendon:
+        raise InputError("it has equality constraints or tendons, expected bodies that are fixed to each other")
+    gravity = model.opt.gravity
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+        raise InputError('<flag gravity="disable"/> takes its weight, expected gravity that pulls along -z')
+    if gravity[:2].any() or gravity[2] >= 0:
+        shown = " ".join(f"{part:.3g}" for part in gravity + 0.0)
+        raise InputError(f"gravity is {shown} m/s2, expected one that pulls along -z")
+    for body, share in enumerate(model.body_gravcomp):
+        if share and model.body_rootid[body] == root:
+            raise InputError(
+                f"{named('body', body)} has gravcomp {share:g}, expected 0: rotors carry all of its weight"
+            )
+    for joint, body in enumerate(model.jnt_bodyid):
+        if body == root and model.jnt_stiffness[joint]:
+            raise InputError(
+                f"{named('joint', joint)} has stiffness {model.jnt_stiffness[joint]:g}, expected 0: it flies free"
+            )
+
+
+def refuse_disabled(model: Any, number: int, named: Named) -> None:
+    """Raise InputError for an actuator that is switched off."""
+    import mujoco
+
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION:
+        raise InputError('<flag actuation="disable"/> stops all actuators, expected rotors that push')
+    group = int(model.actuator_group[number])
+    if 0 <= group < 31 and model.opt.disableactuator >> group & 1:
+        raise InputError(
+            f"actuatorgroupdisable stops group {group}, of {named('actuator', number)}, expected rotors that push"
+        )
+
+
+def without(model: Any, slides: Sequence[Slide], load_mass: float, named: Named) -> tuple[Any, list[str]]:
+    """(`model` without what acts on its free joint and the load's slides, a line for each such attribute)."""
+    import mujoco
+
+    bare, lines = copy.copy(model), []
+    if model.opt.density or model.opt.viscosity:
+        lines.append("air: density, viscosity and wind of <option>")
+    bare.opt.density = bare.opt.viscosity = 0.0
+    bare.opt.enableflags = 0
+    bare.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    if model.actuator_delay.any():
+        lines.append(f"delay {model.actuator_delay.max():g} of actuators")
+    bare.actuator_delay[:] = 0
+    for joint in (_free(model), *(slide.joint for slide in slides)):
+        lines += [f"{what} of {named('joint', joint)}" for what in _taken_out(bare, joint, load_mass)]
+    hinges = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    bare.dof_armature[model.jnt_dofadr[hinges]] = LOCKED
+    mujoco.mj_setConst(bare, mujoco.MjData(bare))  # armature is part of inertias that MuJoCo keeps
+    return bare, lines
+
+
+def _free(model: Any) -> int:
+    import mujoco
+
+    return int(np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)[0])
+
+
+def _taken_out(bare: Any, joint: int, load_mass: float) -> list[str]:
+    """Attributes of a free joint or of a slide of the load, with their numbers, that are no longer in `bare`."""
+    slides, start, place = joint != _free(bare), bare.jnt_dofadr[joint], bare.jnt_qposadr[joint]
+    shown = []
+    for attribute, arrays in ACTS.items():
+        found = 0.0
+        for name in arrays:
+            array = getattr(bare, name)
+            rows = slice(start, start + (1 if slides else 6)) if name.startswith("dof_") else joint
+            found = max(found, float(np.abs(array[rows]).max()))
+            array[rows] = 0
+        if attribute == "range" and found:
+            shown.append("range {:g} {:g}".format(*bare.jnt_range[joint]))
+        elif attribute == "stiffness" and found:
+            shown.append(f"stiffness {found:g} and springref {bare.qpos_spring[place]:g}")
+        elif found and not (slides and attribute == "armature" and abs(found / load_mass - ROLLING) < 1e-3):
+            shown.append(f"{attribute} {found:g}")
+    if slides and bare.qpos0[place]:
+        shown.append(f"ref {bare.qpos0[place]:g}")
+    return shown
+
+
+def check_all_was_named(
+    bare: Any, parts: Sequence[Rigid], load: Rigid | None, slides: Sequence[Slide], thrusters: Sequence[Thruster]
+) -> None:
+    """Raise InputError unless MuJoCo accelerates `bare` as masses and rotors do: the `parts`, and the `load` on slides.
+
+    Both lie as at the model's start, where the free body's attitude, all velocities and the rotors' forces are drawn.
+    """
+    import mujoco
+
+    if not thrusters:  # nothing pushes where the file beside the model tells the rotors
+        bare.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    draw, data = np.random.default_rng(0), mujoco.MjData(bare)
+    place, start = bare.jnt_qposadr[_free(bare)], bare.jnt_dofadr[_free(bare)]
+    moving = [*range(start, start + 6), *(bare.jnt_dofadr[slide.joint] for slide in slides)]
+    weight = sum(part.mass for part in (*parts, *([load] if load else []))) * -bare.opt.gravity[2]
+    for _ in range(STATES):
+        turned = draw.normal(size=4)
+        data.qpos[place + 3 : place + 7] = turned / np.linalg.norm(turned)
+        data.qvel[moving] = draw.normal(size=len(moving))
+        forces = _push(bare, data, thrusters, 2 * weight, draw)
+        mujoco.mj_forward(bare, data)
+        axes = np.zeros(9)
+        mujoco.mju_quat2Mat(axes, data.qpos[place + 3 : place + 7])
+        turn = axes.reshape(3, 3).T
+        theirs = data.qacc[moving]
+        theirs[:3] = turn @ theirs[:3]
+        ours = _accelerations(
+            parts, load, [slide.axis for slide in slides], turn @ bare.opt.gravity, data.qvel[moving][3:], forces
+        )
+        off = np.abs(theirs - ours).max()
+        if np.isfinite(ours).all() and not off <= CLOSE * np.abs([theirs, ours]).max():
+            raise InputError(
+                f"MuJoCo's accelerations of it are up to {off:.2g} m/s2 or rad/s2 off those of its masses and "
+                "rotors: something else acts on it, or its numbers are those of no rig"
+            )
+
+
+def _push(
+    bare: Any, data: Any, thrusters: Sequence[Thruster], most: float, draw: np.random.Generator
+) -> list[tuple[Rotor, float]]:
+    """Set controls of rotors in `data` at random within their limits, of together `most` [N]; the force of each [N]."""
+    forces = []
+    for number, per_input, (low, high), rotor in thrusters:
+        least = max(low, 0.0)
+        put = least + draw.uniform() * (max(min(high, most / len(thrusters) / per_input), least) - least)
+        data.ctrl[number] = put
+        if bare.actuator_actadr[number] >= 0:
+            data.act[bare.actuator_actadr[number]] = put
+        forces.append((rotor, per_input * put))
+    return forces
+
+
+def _accelerations(
+    parts: Sequence[Rigid],
+    load: Rigid | None,
+    slides: Sequence[np.ndarray],
+    gravity: np.ndarray,
+    rates: np.ndarray,
+    forces: Sequence[tuple[Rotor, float]],
+) -> np.ndarray:
+    """(6 + slides,) accelerations of the free body's origin, of its rates and of the load, in its axes (ours).
+
+    `rates`: those of the body, then of the load. From sum_parts J^T (m a, I w' + w x I w) = J^T (forces), J the
+    Jacobian of a part's centre and attitude. NaN for numbers that no rig has, which the settings' checks name.
+    """
+    spin, across = rates[:3], np.array(slides).reshape(-1, 3)
+    size = 6 + len(across)
+    matrix, side = np.zeros((size, size)), np.zeros(size)
+
+    def jacobians(place: np.ndarray, slid: bool) -> tuple[np.ndarray, np.ndarray]:
+        linear, angular = np.zeros((3, size)), np.zeros((3, size))
+        linear[:, :3] = angular[:, 3:6] = np.eye(3)
+        linear[:, 3:6] = np.cross(np.eye(3), place).T
+        if slid:
+            linear[:, 6:] = across.T
+        return linear, angular
+
+    for part in (*parts, *([load] if load else [])):
+        linear, angular = jacobians(part.centre, part is load)
+        carried = np.cross(spin, np.cross(spin, part.centre))
+        if part is load:
+            carried = carried + 2 * np.cross(spin, across.T @ rates[3:])
+        matrix += part.mass * linear.T @ linear + angular.T @ part.inertia @ angular
+        side += part.mass * linear.T @ (gravity - carried) - angular.T @ np.cross(spin, part.inertia @ spin)
+    for rotor, force in forces:
+        linear, angular = jacobians(rotor.place, False)
+        side += force * (linear[2] + (rotor.yaw or 0.0) * angular[2])
+    sound = np.isfinite(matrix).all() and np.linalg.cond(matrix) < WORST
+    return np.linalg.solve(matrix, side) if sound else np.full(size, np.nan)
