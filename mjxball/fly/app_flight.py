@@ -171,7 +171,7 @@ class OnboardFlight(Flight):
         if fault.event in THEIRS:
             return None
         # Whoever is still heard lands, and takes the other one along.
-        lost = fault.event in (Event.STALE, Event.LINK_LOST)
+        lost = fault.event in (Event.STALE, Event.LINK_LOST, Event.FROZEN)
         return Fault(Event.APP_LANDS, fault.detail) if lost else fault
 
     def _spun(self, fault: Fault) -> Fault | None:

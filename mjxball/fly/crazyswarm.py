@@ -19,6 +19,7 @@ from mjxball.errors import InputError
 from mjxball.files import read_text
 from mjxball.fly.limits import NAMES
 from mjxball.fly.telemetry import Rig
+from mjxball.fly.uri import check_pair, parse_uri
 
 LARGEST, MOST_ALIASES = 2**20, 20  # [bytes]; of a file
 WRITTEN = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
@@ -106,8 +107,8 @@ def read_pair(path: Path, leader: str | None = None, follower: str | None = None
         raise InputError(f"{path}: fileversion {version!r:.60} is none of {', '.join(map(str, VERSIONS))}")
     names, chosen = _choose(path, list(flying), [leader, follower])
     found = [_robot(f"{path}: robot {name}", name, flying[name], types, data) for name in names]
-    if found[0].uri.casefold() == found[1].uri.casefold():
-        raise InputError(f"{path}: {names[0]} and {names[1]} have one uri, {found[0].uri}; each drone needs its own")
+    one, other = (parse_uri(robot.uri, f"{path}: the uri of robot {robot.name},") for robot in found)
+    check_pair(one, other, f"{path}: {names[0]} and {names[1]}")
     return CrazyswarmPair(path, (found[0], found[1]), chosen)
 
 

@@ -3,6 +3,10 @@
 Legs hide the load from the laws: a side that stands answers no command, and what a follower remembers of that is wrong
 in the air. With the load off the middle the light side comes up first. What the drones lift apart is therefore found
 here, while the thrust still rises, by the stick's own angle. Pure.
+
+What holds the stick level at the end of the ramp is what hovers, whether the load lies to one side or one drone's motors
+give less than the other's. The laws go on from there (`TakeOff.needed`): else the stick tips as soon as they take over,
+and slides until the drones' integrals have made up for it.
 """
 
 from __future__ import annotations
@@ -73,6 +77,14 @@ class TakeOff:
         apart = _clip(self._apart + LEVEL_GAIN * off + LEVEL_DAMPING * turning, APART)
         both = min(self._share + CLIMB_GAIN * missing, MOST)
         return both - apart, both + apart
+
+    @property
+    def needed(self) -> tuple[float, float]:
+        """Force of leader and follower that keeps the stick level, as shares of what should hover.
+
+        On a `stand` it is the ball's place, which the laws change at once.
+        """
+        return (1.0, 1.0) if self._stand else (1.0 - self._apart, 1.0 + self._apart)
 
     def stuck(self, maps: Sequence[CommandMap]) -> str:
         """What is seen of a pair that has not come off: which drone gives what, and at which bound."""
