@@ -15,6 +15,7 @@ from pathlib import Path
 from mjxball import cli, terminal
 from mjxball.cli import run_command
 from mjxball.config import Config
+from mjxball.control.crazyflie import PairGains
 from mjxball.errors import InputError
 from mjxball.fly import app_flight, limits
 from mjxball.fly.app import generate
@@ -34,6 +35,7 @@ from mjxball.fly.crazyswarm import CrazyswarmPair, read_pair
 from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.mocap import KINDS, MocapSettings, ready
+from mjxball.fly.parameters import check_parameters
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.process import Child
 from mjxball.fly.session import FlightSetup, fly
@@ -177,6 +179,12 @@ def crazyflies(options: argparse.Namespace) -> CrazyswarmPair | None:
     return pair
 
 
+def parameters_of(options: argparse.Namespace, swarm: CrazyswarmPair | None) -> list[tuple[Path, PairGains]]:
+    """The files that firmware parameters come from, a later one's over an earlier one's. Raises InputError."""
+    found = [] if swarm is None else [(swarm.path, swarm.parameters)]
+    return found + ([(options.gains, read_gains(options.gains))] if options.gains else [])
+
+
 def default_rate(uris: Sequence[str | None]) -> float:
     """Poses a second to each drone: 100, and 50 where both share one dongle, which 400 packets a second would fill."""
     links = [parse_uri(uri, f"--{name}") if uri else None for name, uri in zip(limits.NAMES, uris, strict=True)]
@@ -292,9 +300,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         policy = Policy(load_policy(options.policy), options.policy.stem)
         controller = Controller(policy)
         config = controller.config
-        more = read_gains(options.gains) if options.gains else ({}, {})
-        if swarm is not None:
-            more = {**swarm.parameters[0], **more[0]}, {**swarm.parameters[1], **more[1]}
+        choice = ThrustChoice(options.thrust, options.hover, options.curve, options.mass)
+        more = ({}, {})
+        for path, given in parameters_of(options, swarm):
+            check_parameters(config, list(variants(config, choice)[0]), given, f"{path}")
+            more = {**more[0], **given[0]}, {**more[1], **given[1]}
         if options.twin_load is not None:
             check_loaded(config)
         rig = Rig.of_card(policy.card)
@@ -306,7 +316,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = FlightSettings(
             options.seconds, goal, options.dry_run, period, motor_of(config), stand, bounds, times_of(config)
         )
-        choice = ThrustChoice(options.thrust, options.hover, options.curve, options.mass)
         setup = FlightSetup(
             controller, variants(config, choice, more), choice.curve or "linear", rig, Preflight(drone=drone_of(config))
         )

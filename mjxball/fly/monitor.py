@@ -30,11 +30,11 @@ APART, DOUBT = 0.015, 4.0  # the same along any axis against its mean: [m], and 
 USUAL = 10.0  # [s] of that mean
 LIMITS = Limits()
 ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
-RECENT = 0.1  # [s] within which a thrust in force that stands still must have been sent
+RECENT = 0.1  # [s] in which what is sent must have moved, where a thrust in force that stands still tells something
 SAME = 1.5  # [thrust units] within which two thrusts are one, rounded
 FROZEN = 0.1  # [s] of states that come and do not change, from which on a drone that does not hear does nothing at all
 RISING = (State.RAMP, State.FLY)  # a drone that touches the ground feels more than its packets tell
-UNHEARD = 3  # health packets in a row without such an echo, or with one that stands still
+UNHEARD = 4  # health packets in a row without such an echo, or with one that stands still
 
 
 class Sustained:
@@ -270,9 +270,9 @@ class EstimatorWatch:
 
 
 class UplinkWatch:
-    """Whether one drone acts on what it is sent: its thrust in force was sent a moment ago.
+    """Whether one drone acts on what it is sent: its thrust in force was sent a moment ago, and moves as that does.
 
-    One that stands still while other ones are sent tells a lost uplink 0.3 s before it is too old.
+    One that stands still tells a lost uplink before it is too old, even if its number happens to be sent again.
     """
 
     def __init__(self, name: str):
@@ -304,7 +304,7 @@ class UplinkWatch:
         recent = [thrust for time, thrust in self._sent if time >= arrival - RECENT]
         steady = not recent or max(recent) - min(recent) < SAME
         self.hears = bool(times) and (moved or steady)
-        if times and (moved or times[-1] >= arrival - RECENT):
+        if self.hears:
             self._missing, self.heard = 0, max(self.heard, times[-1])
             return []
         self._missing += 1

@@ -54,9 +54,9 @@ def closed_poles(gains: Gains, gain: float, lag: float, delay: float) -> Array:
     bottom = poly.polymul([0, 0, 0, 0, 1], [1, lag])
     pade = np.array([120, 60 * delay, 12 * delay**2, delay**3])
     top = poly.polymul(gain * number, pade * [1, -1, 1, -1])
-    whole: Array = np.trim_zeros(
-        poly.polyadd(top, poly.polymul(bottom, pade))
-    )  # without the integrators that are not there
+    # Without the integrators that are not there; those of angle and rate stay, also where nothing feeds them back.
+    absent = (ai == 0) + (ri == 0)
+    whole: Array = np.trim_zeros(poly.polyadd(top, poly.polymul(bottom, pade))[absent:], "b")
     return poly.polyroots(whole)
 
 
