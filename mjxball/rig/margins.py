@@ -65,6 +65,14 @@ def is_stable(gains: Gains, gain: float, lag: float, delay: float) -> bool:
     return bool((closed_poles(gains, gain, lag, delay).real < 0).all())
 
 
+def unstable_axes(config: Config) -> list[str]:
+    """Axes about which the gains of `config`'s Crazyflies do not hold the pair, at the nominal delay; others have none."""
+    if config.autopilot.kind != "crazyflie" or config.plant.count != 2:
+        return []
+    lag, delay = config.plant.rotor_lag, REQUIREMENTS.delay
+    return [axis.name for axis in axes(config) if not is_stable(gains_of(config.autopilot, axis), axis.gain, lag, delay)]
+
+
 def margins(gains: Gains, gain: float, lag: float, delay: float) -> Margins:
     """Margins of the loop; found on a grid of frequencies, good to 1 %."""
     if not is_stable(gains, gain, lag, delay):
