@@ -41,8 +41,8 @@ def check_units(config: Config) -> None:
     """Raise InputError for proportions that no rig has; the sentence says which unit was probably meant.
 
     Checked are gravity, thrust over weight, arm over spacing, radii of gyration, yaw torque over arm, object over
-    mounts, rotor lag, the attitude loop's natural frequency against rotor lag, physics step and leader, and the loop that
-    the leader's law closes around it.
+    mounts, rotor lag, the attitude loop's natural frequency against rotor lag, physics step and leader, and the loop
+    that the leader's law closes around it.
     """
     plant = config.plant
     if plant.gravity > MOST_GRAVITY:
@@ -222,7 +222,7 @@ def _check_leader(config: Config) -> None:
         top = bottom[-1] * np.array([law.kd[place], law.kp[place], law.ki[place]])
         poles = np.roots(np.polyadd([*bottom, 0.0, 0.0, 0.0], top)) if law.ki[place] else np.zeros(0)
         without = np.roots(np.polyadd([*bottom, 0.0, 0.0], top[:2]))
-        if poles.size and poles.real.max() >= 0 or without.real.max() > -1 / LONGEST_ERROR:
+        if (poles.size and poles.real.max() >= 0) or without.real.max() > -1 / LONGEST_ERROR:
             raise InputError(
                 f"leader.kp, kd, ki {law.kp[place]:g}, {law.kd[place]:g}, {law.ki[place]:g} along {axis} do not hold "
                 f"the object with this {below}: the loop that they close is unstable, or takes more than "

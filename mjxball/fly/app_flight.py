@@ -45,7 +45,7 @@ class Apps:
                 raise InputError(f"the {link.name} carries the app of the {NAMES[1 - number]}; exchange the URIs")
             if int(found["period"]) != self.period:
                 own = f"the app of the {link.name} has a period of {found['period']:.0f} ms"
-                raise InputError(f"{own}, and {self.name} one of {self.period} ms")
+                raise InputError(f"{own}, and {self.name} one of {self.period} ms: flash its own")
         follower = links[1]
         if self.upload is not None:
             send_weights(follower, *self.upload, say)

@@ -111,6 +111,11 @@ class Check(NamedTuple):
     passed: bool
     found: str
 
+    @classmethod
+    def judged(cls, name: str, passed: bool, found: str, remedy: str) -> Check:
+        """One that tells its `remedy` unless it is `passed`."""
+        return cls(name, passed, found if passed else f"{found}: {remedy}")
+
 
 def within_fence(goal: Sequence[float], rig: Rig, limits: Limits) -> bool:
     """True if both drones are within the fence when O is at `goal`, from where it stood at the start [m]."""

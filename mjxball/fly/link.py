@@ -122,7 +122,8 @@ class Link:
         deadline = time.monotonic() + self._deadlines.first_state
         while self.telemetry.newest is None or self.telemetry.health is None:
             if time.monotonic() > deadline:
-                raise LinkError(f"the {self.name} sends no state within {self._deadlines.first_state:g} s")
+                text = f"the {self.name} sends no state within {self._deadlines.first_state:g} s"
+                raise LinkError(f"{text}; switch it off and on again")
             time.sleep(0.01)
 
     def _listed(self, variables: Iterable[Variable]) -> list[Variable]:
@@ -153,7 +154,9 @@ class Link:
         arrived = came.wait(self._deadlines.first_state)
         self._ask(block.delete)
         if not arrived:
-            raise LinkError(f"the {self.name} does not send {', '.join(name for name, _ in listed)}")
+            raise LinkError(
+                f"the {self.name} does not send {', '.join(name for name, _ in listed)}; switch it off and on again"
+            )
         return values
 
     def write_parameters(self, values: Mapping[str, float], check: bool = True) -> None:
@@ -183,7 +186,7 @@ class Link:
             block.add_variable(name, kind)
         missing = self._ask(lambda: self._crazyflie.log.add_config(block))
         if missing is not None:
-            raise LinkError(f"the firmware of the {self.name} lacks a log variable: {missing}")
+            raise LinkError(f"the firmware of the {self.name} lacks a log variable: {missing}; update it")
         return block
 
     def _ask(self, request: Callable[[], Any]) -> Any:
@@ -200,7 +203,8 @@ class Link:
                 refused.append(error.args[0] if error.args else type(error).__name__)
 
         if not bounded(ask, self._deadlines.request):
-            raise LinkError(f"the link to the {self.name} takes no packet within {self._deadlines.request:g} s")
+            text = f"the link to the {self.name} takes no packet within {self._deadlines.request:g} s"
+            raise LinkError(f"{text}; is it on and in reach?")
         return refused[0] if refused else None
 
     def ask_app(self, packet: Packet) -> Reply:
@@ -222,7 +226,7 @@ class Link:
                     return answers[0]
         finally:
             self._crazyflie.remove_port_callback(packet.port, answered)
-        raise LinkError(f"the app of the {self.name} does not answer")
+        raise LinkError(f"the app of the {self.name} does not answer; switch the drone off and on again")
 
     # In flight; these never block.
 

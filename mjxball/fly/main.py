@@ -301,7 +301,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         controller = Controller(policy)
         config = controller.config
         choice = ThrustChoice(options.thrust, options.hover, options.curve, options.mass)
-        more = ({}, {})
+        more: PairGains = ({}, {})
         for path, given in parameters_of(options, swarm):
             check_parameters(config, list(variants(config, choice)[0]), given, f"{path}")
             more = {**more[0], **given[0]}, {**more[1], **given[1]}

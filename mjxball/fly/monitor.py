@@ -286,7 +286,9 @@ class UplinkWatch:
     @property
     def frozen(self) -> Fault:
         """Of a drone that acts on nothing because it does nothing."""
-        return Fault(Event.FROZEN, f"all numbers of the {self._name} stand still: its IMU is dead, or its control hangs")
+        return Fault(
+            Event.FROZEN, f"all numbers of the {self._name} stand still: its IMU is dead, or its control hangs"
+        )
 
     def sent(self, thrust: int, now: float) -> None:
         """`thrust` [units] goes out at `now` [s]."""

@@ -30,7 +30,7 @@ RANGE = 3.0  # factor of the bandwidth, either way: at a third of the gains the 
 
 def is_written(name: str) -> bool:
     """Whether the parameter `name` of a file goes to the drones: a gain, or a setting of their positioning."""
-    return name in PARAMETERS or (name.split(".")[0] in ESTIMATION and name not in OWN)
+    return name in PARAMETERS or (name.split(".", maxsplit=1)[0] in ESTIMATION and name not in OWN)
 
 
 def check_parameters(config: Config, curves: Sequence[CurveName], more: PairGains, where: str) -> None:
@@ -52,7 +52,9 @@ def check_parameters(config: Config, curves: Sequence[CurveName], more: PairGain
 def _check_value(parameter: str, value: float, where: str) -> None:
     if not is_written(parameter):
         groups = ", ".join(ESTIMATION)
-        raise InputError(f"{where} is neither a gain of pid_attitude or pid_rate nor a setting of {groups}: leave it out")
+        raise InputError(
+            f"{where} is neither a gain of pid_attitude or pid_rate nor a setting of {groups}: leave it out"
+        )
     if parameter in PARAMETERS and not 0 <= value <= LARGEST:
         raise InputError(f"{where} must be 0 to {LARGEST:g}, not {value:g}")
     low, high = DEVIATIONS

@@ -4,9 +4,9 @@ Legs hide the load from the laws: a side that stands answers no command, and wha
 in the air. With the load off the middle the light side comes up first. What the drones lift apart is therefore found
 here, while the thrust still rises, by the stick's own angle. Pure.
 
-What holds the stick level at the end of the ramp is what hovers, whether the load lies to one side or one drone's motors
-give less than the other's. The laws go on from there (`TakeOff.needed`): else the stick tips as soon as they take over,
-and slides until the drones' integrals have made up for it.
+What holds the stick level at the end of the ramp is what hovers, whether the load lies to one side or one drone's
+motors give less than the other's. The laws go on from there (`TakeOff.needed`): else the stick tips as soon as they
+take over, and slides until the drones' integrals have made up for it.
 """
 
 from __future__ import annotations

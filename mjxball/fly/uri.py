@@ -20,7 +20,9 @@ LAST_CHANNEL = 125  # of 1 MHz each, from 2400 MHz on: what a Crazyradio and a d
 APART = 2  # channels that a link of 2 Mbit/s takes
 RATES = ("250K", "1M", "2M")
 ADDRESS = "E7E7E7E7E7"  # where a link names none
-RADIO = re.compile(r"radio://([0-9A-Za-z]+)/([0-9]{1,6})(?:/([^/?]+))?(?:/([0-9A-Fa-f]{1,10}))?/?(?:\?(\S*))?", re.ASCII)
+RADIO = re.compile(
+    r"radio://([0-9A-Za-z]+)/([0-9]{1,6})(?:/([^/?]+))?(?:/([0-9A-Fa-f]{1,10}))?/?(?:\?(\S*))?", re.ASCII
+)
 UDP = re.compile(r"udp://([\w.\-]+):([0-9]{1,5})")
 USB = re.compile(r"usb://([0-9]{1,4})")
 LIMITED = re.compile(r"(?:^|&)rate_limit=(?![1-9][0-9]*(?:&|$))")  # cflib takes whole numbers
@@ -115,9 +117,8 @@ def check_pair(leader: Uri, follower: Uri, names: str = "--leader and --follower
     if not isinstance(leader, Radio) or not isinstance(follower, Radio):
         return
     if isinstance(leader.dongle, str) is not isinstance(follower.dongle, str):
-        raise InputError(
-            f"radio {leader.dongle} and radio {follower.dongle} may be one: name both by number, or both by serial number"
-        )
+        named = f"radio {leader.dongle} and radio {follower.dongle}"
+        raise InputError(f"{named} may be one: name both by number, or both by serial number")
     one, other = leader.channel, follower.channel
     if leader.dongle != follower.dongle:
         if abs(one - other) < APART:

@@ -66,11 +66,13 @@ def is_stable(gains: Gains, gain: float, lag: float, delay: float) -> bool:
 
 
 def unstable_axes(config: Config) -> list[str]:
-    """Axes about which the gains of `config`'s Crazyflies do not hold the pair, at the nominal delay; others have none."""
+    """Axes about which the gains of a pair of Crazyflies do not hold it, at the nominal delay; none for others."""
     if config.autopilot.kind != "crazyflie" or config.plant.count != 2:
         return []
     lag, delay = config.plant.rotor_lag, REQUIREMENTS.delay
-    return [axis.name for axis in axes(config) if not is_stable(gains_of(config.autopilot, axis), axis.gain, lag, delay)]
+    return [
+        axis.name for axis in axes(config) if not is_stable(gains_of(config.autopilot, axis), axis.gain, lag, delay)
+    ]
 
 
 def margins(gains: Gains, gain: float, lag: float, delay: float) -> Margins:
