@@ -16,7 +16,9 @@ from mjxball.cli import plant_setup
 from mjxball.config import Autopilot, _model_source, apply_overrides, preset, thrust_over_weight, total_mass
 from mjxball.config._validate import MOST_DRONES, THRUST_MARGIN
 from mjxball.control import crazyflie, follower_law, motors
+from mjxball.control.axes import axes
 from mjxball.control.constants import hover
+from mjxball.control.margins import REQUIREMENTS as NEED
 from mjxball.evaluate import metrics
 from mjxball.fly import card, main, measured, monitor, positioning, preflight, probe, setpoints, takeoff, watchdog
 from mjxball.fly.app import protocol
@@ -29,8 +31,6 @@ from mjxball.plant import plant_parameters
 from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.policy import container, file
 from mjxball.policy.formats.c_header import weight_bytes
-from mjxball.rig.attitude import axes
-from mjxball.rig.margins import REQUIREMENTS as NEED
 from mjxball.sim import disturbances
 from mjxball.sim.rigs import HELD_OUT_RIGS
 from mjxball.train import lock, loop

@@ -310,7 +310,7 @@ class Flight:
             self._land_height = self._height(self._object())
         if entered is State.DESCEND:
             # The fault may be a jump of the height.
-            self._descend_for = self.settings.times.descent_limit(max(self._heights))
+            self._descend_for = self.settings.times.descent_limit(max(filter(math.isfinite, self._heights), default=0.0))
             self._shares = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
         if entered is State.HOLD:
             self._hold(faults)

@@ -1,7 +1,7 @@
 """Which firmware parameters a file may have written to the drones, and whether they still fly with its gains.
 
-Gains are judged by the closed loop that they make: the pair's attitude loop (`rig.margins`), both drones with the gains
-of one. It must be stable, with something to spare, and about as fast as the one that the policy was trained on.
+Gains are judged by the closed loop that they make: the pair's attitude loop (`control.margins`), both drones with the
+gains of one. It must be stable, with something to spare, and about as fast as the one that the policy was trained on.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 
 from mjxball import config as configs
 from mjxball.config import Config
+from mjxball.control.axes import Axis, axes
 from mjxball.control.crazyflie import PARAMETERS, PairGains, pair_gains, with_gains
+from mjxball.control.margins import REQUIREMENTS, Margins, gains_of, margins
 from mjxball.errors import InputError
 from mjxball.fly.card import is_crazyflie, with_curve
 from mjxball.fly.limits import NAMES
 from mjxball.fly.setpoints import CurveName
-from mjxball.rig.attitude import Axis, axes
-from mjxball.rig.margins import REQUIREMENTS, Margins, gains_of, margins
 
 ESTIMATION = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
 OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")

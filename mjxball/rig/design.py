@@ -10,10 +10,10 @@ from pathlib import Path
 
 from mjxball import cli, pictures
 from mjxball.config import Config, cg_limit, thrust_over_weight, total_mass
+from mjxball.control.margins import unstable_axes
 from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.plant.trim import heaviest_object, largest_amplitude
-from mjxball.rig.margins import unstable_axes
 from mjxball.terminal import say
 
 WAYS = tuple((math.cos(turn * math.pi / 6), math.sin(turn * math.pi / 6)) for turn in range(6))  # and their opposites

@@ -13,11 +13,8 @@ from attitude_trials import Trial, pair, simulate
 
 from mjxball.cli import read_plant
 from mjxball.config import Autopilot, apply_overrides, preset, with_plant
-from mjxball.errors import InputError
-from mjxball.fly.preflight import read_gains
-from mjxball.rig import gains as command
-from mjxball.rig.attitude import axes
-from mjxball.rig.margins import (
+from mjxball.control.axes import axes
+from mjxball.control.margins import (
     REQUIREMENTS,
     Gains,
     delivered_gains,
@@ -27,6 +24,9 @@ from mjxball.rig.margins import (
     margins,
     worst_margins,
 )
+from mjxball.errors import InputError
+from mjxball.fly.preflight import read_gains
+from mjxball.rig import gains as command
 
 PAIR = preset("flight")
 ROLL, PITCH, YAW = axes(PAIR)

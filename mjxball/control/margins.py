@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.config import Autopilot, Config
+from mjxball.control.axes import Axis, axes
 from mjxball.control.crazyflie import RATE_LIMITS
-from mjxball.rig.attitude import Axis, axes
 
 Array = np.ndarray
 FREQUENCIES = np.geomspace(0.02, 400.0, 1200)  # [rad/s]
