@@ -309,8 +309,8 @@ class Flight:
         if entered is State.LAND and before.state is not State.HOLD:
             self._land_height = self._height(self._object())
         if entered is State.DESCEND:
-            # The fault may be a jump of the height.
-            self._descend_for = self.settings.times.descent_limit(max(filter(math.isfinite, self._heights), default=0.0))
+            highest = max(filter(math.isfinite, self._heights), default=0.0)  # the fault may be a jump of the height
+            self._descend_for = self.settings.times.descent_limit(highest)
             self._shares = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
         if entered is State.HOLD:
             self._hold(faults)

@@ -33,7 +33,8 @@ def test_gains_far_from_those_of_the_training_are_refused(name: str) -> None:
     assert not refused(name, leader, follower)
     for factor, flies in ((0.0, False), (-1.0, False), (1e30, False), (0.1, False), (0.5, True), (4.0, False)):
         for scaled in ((factor, factor), (factor, 1.0), (1.0, factor)):
-            gains = [{key: share * value for key, value in one.items()} for one, share in zip(own(name), scaled, strict=True)]
+            shares = zip(own(name), scaled, strict=True)
+            gains = [{key: share * value for key, value in one.items()} for one, share in shares]
             assert bool(refused(name, *gains)) != flies, (factor, scaled)
 
 
