@@ -67,7 +67,8 @@ class Flight:
         self._saturated = Sustained(settings.limits.saturation_time)
         self._back = Sustained(settings.limits.fresh)
         self._holds = 0
-        self._hold_for, self._descend_for = settings.times.drone_watchdog, math.inf
+        self._hold_for = settings.times.drone_watchdog
+        self._descend_for = settings.times.descent_limit(settings.goal[2])
         self._shares = [1.0]  # of the trims, tick by tick, where the height is not measured
         self._land_height = 0.0
         self._heights = collections.deque([math.inf], round(settings.times.rest / settings.period) + 1)  # of O [m]
