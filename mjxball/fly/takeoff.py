@@ -32,6 +32,7 @@ CLIMB_INTEGRAL = 1.5  # likewise per m: a pair that stands gets 15 % of hover mo
 # delay the stick settles within half a second; twice these gains let it swing.
 LEVEL_GAIN, LEVEL_DAMPING, LEVEL_INTEGRAL = 2.5, 0.35, 15.0
 STUCK = "the pair is not seen to leave the ground"
+LOAD = 0.03  # share of hover that a load of 20 g, 2 cm beside the middle, has the drones lift apart
 APART = 0.15  # share of hover that the drones lift apart at most
 
 
@@ -82,9 +83,10 @@ class TakeOff:
     def needed(self) -> tuple[float, float]:
         """Force of leader and follower that keeps the stick level, as shares of what should hover.
 
-        On a `stand` it is the ball's place, which the laws change at once.
+        Up to `LOAD` it may be the load's place, as the laws know it, and on a `stand` it is the ball's.
         """
-        return (1.0, 1.0) if self._stand else (1.0 - self._apart, 1.0 + self._apart)
+        motors = abs(self._apart) > LOAD and not self._stand
+        return (1.0 - self._apart, 1.0 + self._apart) if motors else (1.0, 1.0)
 
     def stuck(self, maps: Sequence[CommandMap]) -> str:
         """What is seen of a pair that has not come off: which drone gives what, and at which bound."""

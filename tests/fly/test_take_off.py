@@ -150,13 +150,13 @@ def test_a_side_that_stays_down_in_the_air_is_lifted_apart_and_a_floor_that_slop
 
 
 def test_what_holds_the_stick_level_is_what_hovers() -> None:
-    """The integral of 1 degree over 0.2 s; on a stand it is a ball's, which rolls on."""
-    for stand in (False, True):
+    """The integral of 1 degree over 0.2 s; a load's place and, on a stand, a ball's are the laws' own."""
+    for stand, degrees, taken in ((False, 1.0, True), (False, 0.5, False), (True, 1.0, False)):
         one = TakeOff(RIG, Times(), PERIOD, 0.05, stand)
         for now in np.arange(0.0, Times().ramp * BEGIN + 0.2, PERIOD):
-            one.wanted(float(now), seen(math.radians(-1.0)), 0.05, (CommandMap(carried_mass=0.03),) * 2)
+            one.wanted(float(now), seen(math.radians(-degrees)), 0.05, (CommandMap(carried_mass=0.03),) * 2)
         leader, follower = one.needed
-        apart = 0.0 if stand else 15.0 * math.radians(1.0) * 0.2
+        apart = 15.0 * math.radians(degrees) * 0.2 if taken else 0.0
         assert (leader, follower) == (pytest.approx(1 + apart, abs=0.01), pytest.approx(1 - apart, abs=0.01))
     for law in ("paper", "calibrated"):
         own = CommandMap(law)

@@ -36,6 +36,7 @@
 #define LEVEL_DAMPING 0.35f
 #define LEVEL_INTEGRAL 15.0f
 #define APART 0.15f
+#define LOAD 0.03f
 #define SIDE (MJXBALL_FOLLOWER ? 1.0f : -1.0f) /* sign of `apart` in this drone's lift */
 
 const char *mjxball_text(int cause) {
@@ -113,7 +114,8 @@ static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_
     app->cause = cause;
     app->since = app->now;
     if (phase == MJXBALL_SPIN) app->needed = 1;
-    if (phase == MJXBALL_FLY && !mjxball_rig.stand) app->needed = 1 + SIDE * app->apart;
+    if (phase == MJXBALL_FLY && !mjxball_rig.stand && (app->apart > LOAD || app->apart < -LOAD))
+        app->needed = 1 + SIDE * app->apart;
     if (phase <= MJXBALL_FLY) app->trim = hover_of(app, map);
     if (phase == MJXBALL_SPIN) {
         for (int i = 0; i < 3; i++) app->origin[i] = app->position[i];
