@@ -71,13 +71,19 @@ def _prints(letter: str) -> bool:
 
 def say(text: str) -> None:
     """Print a sentence on stdout, now; at a terminal it breaks between words."""
-    print(fitted_to(sys.stdout, text), flush=True)  # noqa: T201
+    _print(text, sys.stdout)
 
 
 def warn(text: str) -> None:
     """The same on stderr."""
-    if sys.stderr:
-        print(fitted_to(sys.stderr, text), file=sys.stderr, flush=True)  # noqa: T201
+    _print(text, sys.stderr)
+
+
+def _print(text: str, stream: TextIO | None) -> None:
+    """Text and its end in one piece: `print` writes two, between which another thread's may come."""
+    if stream:
+        stream.write(f"{fitted_to(stream, text)}\n")
+        stream.flush()
 
 
 class Status:

@@ -10,8 +10,8 @@ import numpy as np
 
 from mjxball.config import Autopilot, Config
 from mjxball.control import crazyflie, mixer, rotations
+from mjxball.control.axes import inertia_about_o
 from mjxball.control.constants import hover
-from mjxball.rig.attitude import inertia_about_o
 
 UPSET = 90.0  # attitude beyond which a case counts as diverged and is frozen [deg]
 

@@ -16,9 +16,11 @@ from mjxball.cli import plant_setup
 from mjxball.config import Autopilot, _model_source, apply_overrides, preset, thrust_over_weight, total_mass
 from mjxball.config._validate import MOST_DRONES, THRUST_MARGIN
 from mjxball.control import crazyflie, follower_law, motors
+from mjxball.control.axes import axes
 from mjxball.control.constants import hover
+from mjxball.control.margins import REQUIREMENTS as NEED
 from mjxball.evaluate import metrics
-from mjxball.fly import card, main, measured, monitor, positioning, preflight, probe, setpoints, takeoff, watchdog
+from mjxball.fly import card, measured, monitor, positioning, preflight, probe, setpoints, takeoff, uri, watchdog
 from mjxball.fly.app import protocol
 from mjxball.fly.limits import Limits, Times
 from mjxball.fly.mocap_supervision import MocapLimits
@@ -29,8 +31,6 @@ from mjxball.plant import plant_parameters
 from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.policy import container, file
 from mjxball.policy.formats.c_header import weight_bytes
-from mjxball.rig.attitude import axes
-from mjxball.rig.margins import REQUIREMENTS as NEED
 from mjxball.sim import disturbances
 from mjxball.sim.rigs import HELD_OUT_RIGS
 from mjxball.train import lock, loop
@@ -121,7 +121,7 @@ SAID: dict[str, tuple[tuple[Any, ...], ...]] = {  # page: phrase with # for its 
     "docs/flying": (
         ("# % too much hover thrust is # m", 5, 0.05 * LAW.hover_thrust / LAW.thrust_per_acceleration / STAND.kp[2]),
         ("twin of # g … hover above # % of", 1e3 * card.UNKNOWN_MASS, 100 * preflight.RESERVE),
-        ("along +X within # degrees … at least # MHz apart", DEG * READY.yaw, main.APART),
+        ("along +X within # degrees … at least # MHz apart", DEG * READY.yaw, uri.APART),
         ("is cut after # s … may give # % less", TIMES.drone_watchdog, 100 * setpoints.UNEVEN / 9.81),
         (" # m/s² for the pair … lifts about # of the weight", setpoints.UNEVEN / 2, LIFT),
         ("(1 - #)): # m/s from # m", LIFT, math.sqrt(2 * 9.81 * 0.4 * (1 - LIFT)), 0.4),

@@ -91,7 +91,7 @@ def bounds() -> str:
         "sent thrust": f"{THRUST_FLOOR} .. {THRUST_CEILING} units",
         "ramp to hover": f"{times.ramp:g} s, and at most {times.lift:g} s more until the pair is off the ground",
         "landing speed of the goal": f"{times.land_speed:g} m/s",
-        "descent": f"{times.descend_speed:g} m/s for at most {times.descend_limit:g} s",
+        "descent": f"{times.descend_speed:g} m/s for at most {times.descent_limit(0.4):.2g} s from 0.4 m",
         "*hold* ends after the last word of a drone by": f"{times.drone_watchdog:g} s",
         "thrust in *hold* below hover": f"up to {100 * setpoints.UNEVEN / setpoints.GRAVITY:.0f} %, "
         f"{100 * setpoints.GENTLE / setpoints.GRAVITY:.0f} % where neither drone is heard",

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from mjxball.config._plant import Drone, Plant
 from mjxball.config._settings import Config
 from mjxball.errors import InputError
@@ -19,6 +21,7 @@ ARM_OF_SPACING = 1.0  # arm over the distance to the nearest drone; shipped plan
 GYRATION = (0.02, 5.0)  # radius of gyration over the arm; shipped plants have 0.4 to 0.9
 CARRIER_OF_REACH = 3.0  # the carrier's radius of gyration over its own reach; shipped plants have 0.5
 SIZE_OF_REACH = 20.0  # longest edge of the object over the farthest mount; shipped plants have 1 to 2
+LONGEST_ERROR = 20.0  # [s] time constant of the slowest pole under the leader's law; shipped presets have 0.6 to 3
 FASTEST = 0.5  # natural frequency times physics step, beyond which the sampled loop has too little phase
 
 
@@ -38,7 +41,8 @@ def check_units(config: Config) -> None:
     """Raise InputError for proportions that no rig has; the sentence says which unit was probably meant.
 
     Checked are gravity, thrust over weight, arm over spacing, radii of gyration, yaw torque over arm, object over
-    mounts, rotor lag, and the attitude loop's natural frequency against rotor lag, physics step and leader.
+    mounts, rotor lag, the attitude loop's natural frequency against rotor lag, physics step and leader, and the loop
+    that the leader's law closes around it.
     """
     plant = config.plant
     if plant.gravity > MOST_GRAVITY:
@@ -51,6 +55,7 @@ def check_units(config: Config) -> None:
     _check_carrier(plant)
     if config.autopilot.kind == "ideal":
         _check_loop(config)
+    _check_leader(config)
 
 
 def _meant(value: float, unit: str, base: str, cured: bool = True) -> str:
@@ -194,6 +199,34 @@ def _check_loop(config: Config) -> None:
             raise InputError(
                 f"{named} is slower than the leader's position loop, {slowest:.3g} rad/s by leader.kp, and cannot "
                 "follow it"
+            )
+
+
+def _check_leader(config: Config) -> None:
+    """The leader's law and the attitude loop below it are stable together, and forget an error in time.
+
+    Poles of the object that hovers: what a tilt moves it by is gravity's, what thrust lifts it by the rotors'. An
+    integral is slow where it is small: stability counts with it, speed without.
+    """
+    law, loop, lag = config.leader, config.attitude, max(config.plant.of_drones("rotor_lag"))
+    ways = {"x": (0, "pitch"), "y": (1, "roll"), "z": (2, "")} if config.plant.stand == "free" else {}
+    for axis, (place, turned) in ways.items():
+        bottom: list[float] = [lag, 1.0]
+        below = "rotors"
+        if turned and config.autopilot.kind == "ideal":
+            frequency, below = loop.natural_frequency[1 - place], f"attitude loop (attitude.damping {loop.damping:g})"
+            bottom = [lag / frequency**2, 1 / frequency**2, 2 * loop.damping / frequency, 1.0]
+        elif turned:
+            gain, below = getattr(config.autopilot, turned)[0], f"autopilot.{turned}"
+            bottom = [1.0, gain]
+        top = bottom[-1] * np.array([law.kd[place], law.kp[place], law.ki[place]])
+        poles = np.roots(np.polyadd([*bottom, 0.0, 0.0, 0.0], top)) if law.ki[place] else np.zeros(0)
+        without = np.roots(np.polyadd([*bottom, 0.0, 0.0], top[:2]))
+        if (poles.size and poles.real.max() >= 0) or without.real.max() > -1 / LONGEST_ERROR:
+            raise InputError(
+                f"leader.kp, kd, ki {law.kp[place]:g}, {law.kd[place]:g}, {law.ki[place]:g} along {axis} do not hold "
+                f"the object with this {below}: the loop that they close is unstable, or takes more than "
+                f"{LONGEST_ERROR:g} s to forget an error"
             )
 
 

@@ -44,7 +44,7 @@ class Apps:
             raise InputError(f"the {link.name} carries the app of the {NAMES[1 - number]}; exchange the URIs")
         if int(found["period"]) != self.period:
             own = f"the app of the {link.name} has a period of {found['period']:.0f} ms"
-            raise InputError(f"{own}, and {self.name} one of {self.period} ms")
+            raise InputError(f"{own}, and {self.name} one of {self.period} ms: flash its own")
         if number == 0:
             return
         if self.upload is not None:
@@ -179,7 +179,7 @@ class OnboardFlight(Flight):
         if fault.event in THEIRS:
             return None
         # Whoever is still heard lands, and takes the other one along.
-        lost = fault.event in (Event.STALE, Event.LINK_LOST)
+        lost = fault.event in (Event.STALE, Event.LINK_LOST, Event.FROZEN)
         return Fault(Event.APP_LANDS, fault.detail) if lost else fault
 
     def _spun(self, fault: Fault) -> Fault | None:

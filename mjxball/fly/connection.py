@@ -81,7 +81,7 @@ def connect(
             crazyflie.connection_lost.add_callback(lambda _, why: lost(why))
             crazyflie.console.receivedChar.add_callback(console)
             if crazyflie.link is None:  # it ended in between
-                raise LinkError(f"{name} at {uri} cannot be reached: the link ended")
+                raise LinkError(f"{name} at {uri} cannot be reached: the link ended; {REACH}")
             # Its pings share a lock with every send, and their thread holds that lock for ever when a link dies.
             bounded(crazyflie.link_statistics.stop, deadlines.close)
             return crazyflie
@@ -89,7 +89,7 @@ def connect(
         if refused or clock.now() - started > deadlines.connect or attempt == deadlines.attempts:
             break
         progress(f"{name}: {reason}, trying again")
-    raise LinkError(f"{name} at {uri} cannot be reached: {reason}")
+    raise LinkError(f"{name} at {uri} cannot be reached: {reason}; {REACH}")
 
 
 def _attempt(
@@ -145,6 +145,7 @@ def _start_drivers(crtp: Any) -> None:
             logger.propagate = False
 
 
+REACH = "is it on and in reach, and is the URI its own?"
 PORT, READ, WRITE = 2, 1, 2
 WINDOW = 4  # requests on their way at once: the firmware's queue is short
 REPEAT = 0.25  # [s] after which a request is sent again
@@ -191,7 +192,9 @@ class Parameters:
         try:  # a status byte precedes the value
             return {name: float(struct.unpack(e.code, answers[name][1:])[0]) for name, e in elements.items()}
         except struct.error:
-            raise LinkError(f"a parameter of the {self._drone} cannot be read: {', '.join(elements)}") from None
+            raise LinkError(
+                f"a parameter of the {self._drone} cannot be read: {', '.join(elements)}; update its firmware"
+            ) from None
 
     def write(self, values: Mapping[str, float], check: bool = True) -> None:
         """Write `values`, and read them back unless the firmware may change them itself (`check` false).
@@ -205,7 +208,8 @@ class Parameters:
         for name, found in self.read(values).items():
             value = values[name]
             if not math.isclose(found, value, rel_tol=1e-6, abs_tol=1e-6):
-                raise LinkError(f"parameter {name} of the {self._drone} reads {found:g} after {value:g} was written")
+                text = f"parameter {name} of the {self._drone} reads {found:g} after {value:g} was written"
+                raise LinkError(f"{text}; does another program write it?")
 
     def _element(self, name: str) -> Element:
         element = self._find(name)
@@ -216,7 +220,7 @@ class Parameters:
     def _request(self, name: str, value: float) -> bytes:
         element = self._element(name)
         if element.read_only:
-            raise LinkError(f"parameter {name} of the {self._drone} cannot be written: it is read-only")
+            raise LinkError(f"parameter {name} of the {self._drone} cannot be written: it is read-only; leave it out")
         try:
             number = value if element.code[-1] in "efd" else int(value)
             return struct.pack("<H", element.ident) + struct.pack(element.code, number)
@@ -245,5 +249,5 @@ class Parameters:
             waiting = [name for name in waiting if name not in found]
             latest = clock.now() if answered else latest
             if waiting and clock.now() - latest > self._wait:
-                raise LinkError(f"the {self._drone} did not confirm parameter {waiting[0]}")
+                raise LinkError(f"the {self._drone} did not confirm parameter {waiting[0]}; is it in reach?")
         return found

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from mjxball.control.crazyflie import Gains, PairGains
+from mjxball.control.crazyflie import PARAMETERS, Gains, PairGains
 from mjxball.errors import InputError
 from mjxball.files import read_text
 from mjxball.fly.limits import NAMES
+from mjxball.fly.parameters import is_written
 from mjxball.fly.telemetry import Rig
+from mjxball.fly.uri import check_pair, parse_uri
 
 LARGEST, MOST_ALIASES = 2**20, 20  # [bytes]; of a file
-WRITTEN = ("kalman", "locSrv", "lighthouse", "loco", "tdoa2", "tdoa3", "motion", "flowdeck")  # groups of parameters
-OWN = ("kalman.resetEstimation", "kalman.initialX", "kalman.initialY", "kalman.initialZ", "kalman.initialYaw")
 MERGE = "tag:yaml.org,2002:merge"  # the key <<
 VERSIONS = (1, 2, 3)  # of the file
 NEAR = 0.1  # [m] that a start may be beside the mount
@@ -106,8 +106,8 @@ def read_pair(path: Path, leader: str | None = None, follower: str | None = None
         raise InputError(f"{path}: fileversion {version!r:.60} is none of {', '.join(map(str, VERSIONS))}")
     names, chosen = _choose(path, list(flying), [leader, follower])
     found = [_robot(f"{path}: robot {name}", name, flying[name], types, data) for name in names]
-    if found[0].uri.casefold() == found[1].uri.casefold():
-        raise InputError(f"{path}: {names[0]} and {names[1]} have one uri, {found[0].uri}; each drone needs its own")
+    one, other = (parse_uri(robot.uri, f"{path}: the uri of robot {robot.name},") for robot in found)
+    check_pair(one, other, f"{path}: {names[0]} and {names[1]}")
     return CrazyswarmPair(path, (found[0], found[1]), chosen)
 
 
@@ -204,7 +204,7 @@ def _robot(where: str, name: str, robot: Mapping[Any, Any], types: Mapping[Any, 
     wanted: Gains = {}
     for one, source in ((shared, "all"), (kind, "its type"), (robot, "it")):
         wanted |= dict(_parameters(one.get("firmware_params"), f"{where}: firmware_params of {source}"))
-    taken = {key: value for key, value in wanted.items() if key.split(".")[0] in WRITTEN and key not in OWN}
+    taken = {key: value for key, value in wanted.items() if is_written(key) and key not in PARAMETERS}
     motion = _mapping(kind.get("motion_capture"), f"{where}: motion_capture of its type")
     used = {"enabled", "uri", "initial_position", "type", "firmware_params", "connection", "big_quad", "robots"}
     used |= {"robot_types", "all", "fileversion"}

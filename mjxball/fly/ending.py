@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mjxball.fly.limits import NAMES, FlightSettings
+from mjxball.fly.packets import GRAVITY
 from mjxball.fly.supervisor import ENDED, PLANNED, Event, Fault, Supervisor
 
 LAST = 1.0  # [s] before the abort from which on a signal may be its cause
@@ -22,6 +23,7 @@ LATE = 0.03  # [s] of a tick, from where on it is a signal
 SHOWN = 3  # signals at most
 CONTACT = 0.02  # [m] of O above where it stood
 SPEED_TIME = 0.15  # [s] before the contact in which the fastest descent counts
+SPARE = 0.5  # [m/s] that a descent may be faster than a free fall from the highest place
 
 
 @dataclass
@@ -44,6 +46,7 @@ class Signals:
             Event.STALE: bounds.state_age,
             Event.LINK_LOST: bounds.state_age,
             Event.UNHEARD: bounds.state_age,
+            Event.FROZEN: bounds.state_age,
             Event.SATURATED: bounds.saturation_time,
         }
         self._period = settings.period
@@ -91,12 +94,23 @@ class Touchdown:
         """`lifted` [m] of O above where it stood is up."""
         self._lifted, self.up = lifted, False
         self._fall: collections.deque[tuple[float, float]] = collections.deque()
+        self._highest = 0.0  # [m]
+        self.doubt = ""  # why what the estimators have is no fact
         self.speed = math.nan  # downward [m/s]
         self.place = np.full(2, math.nan)  # (2,) of O from where it stood [m]
 
-    def update(self, place: np.ndarray, climb: float, now: float) -> None:
-        """O is at `place` (3,) from where it stood [m] and climbs at `climb` [m/s]."""
-        if math.isfinite(self.speed) or not (np.isfinite(place).all() and math.isfinite(climb)):
+    def update(self, place: np.ndarray, climb: float, now: float, doubt: str = "") -> None:
+        """O is at `place` (3,) from where it stood [m] and climbs at `climb` [m/s].
+
+        One `doubt` of that in the air, or a descent faster than any fall, and nothing is told any more.
+        """
+        if math.isfinite(self.speed) or self.doubt or not (np.isfinite(place).all() and math.isfinite(climb)):
+            return
+        self._highest = max(self._highest, float(place[2]))
+        if not doubt and -climb > math.sqrt(2 * GRAVITY * self._highest) + SPARE:
+            doubt = "its estimated speed is faster than a fall"
+        self.doubt = doubt if self.up else ""
+        if self.doubt:
             return
         self.up = self.up or place[2] >= self._lifted
         self._fall.append((now, -climb))
@@ -108,7 +122,7 @@ class Touchdown:
     def __str__(self) -> str:
         """Speed and place."""
         if not math.isfinite(self.speed):
-            return "no touchdown was seen"
+            return f"how fast and where is not known: {self.doubt}" if self.doubt else "no touchdown was seen"
         x, y = self.place
         return f"{max(self.speed, 0.0):.2f} m/s, at ({x:+z.2f}, {y:+z.2f}) m from the start"
 

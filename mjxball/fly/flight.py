@@ -57,6 +57,7 @@ class Flight:
         self.spin = SpinCheck(links, variants, assumed, settings.motor)
         self.highest = [0, 0]  # thrust of each drone that was wanted [units]
         self._sent: list[Setpoint] = [ZERO, ZERO]
+        self._needed = (1.0, 1.0)  # force of leader and follower by which they hover level, of what the card says
         self._trims = [0.0, 0.0]  # thrust that hovers [units]: a running average of what was sent
         self._commands: Commands | None = None
         self._every = max(round(controller.period / settings.period), 1)  # ticks per command
@@ -68,6 +69,7 @@ class Flight:
         self._back = Sustained(settings.limits.fresh)
         self._holds = 0
         self._hold_for = settings.times.drone_watchdog
+        self._descend_for = settings.times.descent_limit(settings.goal[2])
         self._shares = [1.0]  # of the trims, tick by tick, where the height is not measured
         self._land_height = 0.0
         self._heights = collections.deque([math.inf], round(settings.times.rest / settings.period) + 1)  # of O [m]
@@ -76,9 +78,9 @@ class Flight:
 
     @property
     def maps(self) -> tuple[CommandMap, CommandMap]:
-        """Command maps of leader and follower for their firmwares' force curves."""
-        leader, follower = self.spin.chosen()
-        return leader.map, follower.map
+        """Command maps of leader and follower for their firmwares' force curves, and for what the take-off found."""
+        leader, follower = (own.map.scaled(s) for own, s in zip(self.spin.chosen(), self._needed, strict=True))
+        return leader, follower
 
     @property
     def lifted(self) -> bool:
@@ -129,9 +131,19 @@ class Flight:
 
     def _note_ending(self, faults: list[Fault], gap: float) -> None:
         self.ending.update(faults, self.supervisor, self._now, gap)
-        seen = self._trusted()
-        if seen is not None and any(self._fresh) and self.supervisor.state not in ON_GROUND:
-            self.ending.touchdown.update(seen.position - self._monitor.origin, float(seen.velocity[2]), self._now)
+        if any(self._fresh) and self.supervisor.state not in ON_GROUND:
+            seen = self._object()
+            place, climb = seen.position - self._monitor.origin, float(seen.velocity[2])
+            self.ending.touchdown.update(place, climb, self._now, self._doubt())
+
+    def _doubt(self) -> str:
+        """Why what is known of the pair is no fact, empty if it is."""
+        fresh = [state for state, known in zip(self._states, self._fresh, strict=True) if known]
+        if not all(tilt_angle(state.quaternion) <= self.settings.limits.tilt for state in fresh):
+            return "it turned over"
+        estimators = self._monitor.estimators
+        believed = any(estimators.trusted) and not estimators.contradiction
+        return "" if believed else "no estimator is believed"
 
     def how_it_ended(self) -> list[str]:
         """Why, and how the pair came down, a sentence each."""
@@ -210,7 +222,8 @@ class Flight:
             seen = object_state(self._states, self.rig)
             if self.supervisor.state is State.FLY:
                 distance = float(np.linalg.norm(self.goal(self._now) - seen.position))
-                one, other = (s.thrust / c.hover_thrust for s, c in zip(self._sent, self.maps, strict=True))
+                card = [own.map.hover_thrust for own in self.spin.chosen()]
+                one, other = (sent.thrust / hover for sent, hover in zip(self._sent, card, strict=True))
                 self.flown.update(self._now, self.elapsed, distance, tilt_angle(seen.quaternion), (one, other))
             if self._commands is None or self._count % self._every == 0:
                 self._commands = self.controller.step(seen, self.goal(self._now))
@@ -286,7 +299,8 @@ class Flight:
         """How long a state may last [s]."""
         times = self.settings.times
         landing = (self._land_height + 0.3) / times.land_speed + times.land_spare
-        own = {State.FLY: self.settings.seconds + 1.0, State.LAND: landing, State.HOLD: self._hold_for}
+        own = {State.FLY: self.settings.seconds + 1.0, State.LAND: landing}
+        own |= {State.HOLD: self._hold_for, State.DESCEND: self._descend_for}
         return own.get(state, times.limits.get(state, math.inf))
 
     def _advance(self, faults: list[Fault]) -> None:
@@ -301,10 +315,12 @@ class Flight:
         self.note("transition", self._now, before=before.state.value, after=entered.value, events=names)
         if entered is State.FLY and before.state is State.RAMP:
             self.controller.reset()
-            self._commands = None
+            self._commands, self._needed = None, self._take_off.needed
         if entered is State.LAND and before.state is not State.HOLD:
             self._land_height = self._height(self._object())
         if entered is State.DESCEND:
+            highest = max(filter(math.isfinite, self._heights), default=0.0)  # the fault may be a jump of the height
+            self._descend_for = self.settings.times.descent_limit(highest)
             self._shares = setpoints.blind_shares(self._last_known_state(), 0.0, self.settings.period)
         if entered is State.HOLD:
             self._hold(faults)
@@ -314,7 +330,7 @@ class Flight:
         self._holds += 1
         self._back = Sustained(self.settings.limits.fresh)
         age = max((value for value in self._ages if math.isfinite(value)), default=0.0)
-        if any(fault.event is Event.UNHEARD for fault in faults):
+        if any(fault.event in (Event.UNHEARD, Event.FROZEN) for fault in faults):
             heard = [watch.heard for watch in self._monitor.uplinks if math.isfinite(watch.heard)]
             age = self._now - min(heard, default=self._now)
         self._hold_for = max(self.settings.times.drone_watchdog - age, 0.0)
@@ -344,7 +360,7 @@ class Flight:
             share = setpoints.timed_share(self._height(seen), float(seen.velocity[2]), self._hold_for - self.elapsed)
         else:
             share = self._shares[min(int(self.elapsed / self.settings.period), len(self._shares) - 1)]
-        shares = self._lift.shared(share, seen, self.rig) if state is State.DESCEND else [share] * 2
+        shares = self._lift.shared(share, seen, self.rig)
         return [setpoints.level(one * trim, tilt) for one, trim in zip(shares, self._trims, strict=True)]
 
     def _transmit(self, wanted: list[Setpoint]) -> None:

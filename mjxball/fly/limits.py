@@ -63,7 +63,8 @@ class Times:
     land_speed: float = 0.25  # at which the goal sinks [m/s]
     land_spare: float = 6.0  # beyond the time the goal takes to the ground [s]
     descend_speed: float = 0.4  # [m/s]
-    descend_limit: float = 4.0  # [s]
+    descend_share: float = 1.5  # of the time that the height takes at that speed, and
+    descend_spare: float = 1.0  # [s] more, in which a descent is over: nothing may be left to see the ground by
     drone_watchdog: float = 2.0  # after which the firmware stops a drone that hears nothing [s]
     stop: float = 0.5  # stops are repeated for this long [s]
     stop_limit: float = 4.0  # [s]: the firmware counts as flying for 2 s after the last thrust
@@ -73,6 +74,10 @@ class Times:
     rest: float = 0.15  # that it must not have sunk in [s]
     rest_sunk: float = 0.005  # by more than that [m]: a slow landing is as slow, and is not over
 
+    def descent_limit(self, height: float) -> float:
+        """How long a descent from `height` [m] may last [s]."""
+        return self.descend_share * max(height, 0.0) / self.descend_speed + self.descend_spare
+
     @property
     def limits(self) -> dict[State, float]:
         """How long a state may last [s], where that does not depend on the flight."""
@@ -80,7 +85,6 @@ class Times:
             State.ARM: self.arm_limit,
             State.SPIN: self.spin_limit,
             State.RAMP: self.ramp + self.lift,
-            State.DESCEND: self.descend_limit,
             State.STOP: self.stop_limit,
             State.KILL: self.stop,
         }
@@ -106,6 +110,11 @@ class Check(NamedTuple):
     name: str
     passed: bool
     found: str
+
+    @classmethod
+    def judged(cls, name: str, passed: bool, found: str, remedy: str) -> Check:
+        """One that tells its `remedy` unless it is `passed`."""
+        return cls(name, passed, found if passed else f"{found}: {remedy}")
 
 
 def within_fence(goal: Sequence[float], rig: Rig, limits: Limits) -> bool:

@@ -134,8 +134,8 @@ class Link:
         deadline = clock.now() + self._deadlines.first_state
         while silent := [one for one in blocks if not came(one.name)]:
             if clock.now() > deadline:
-                names, limit = ", ".join(one.name for one in silent[0].variables), self._deadlines.first_state
-                raise LinkError(f"the {self.name} does not send {names} within {limit:g} s")
+                names = ", ".join(one.name for one in silent[0].variables)
+                raise LinkError(f"the {self.name} does not send {names}; switch it off and on again")
             for one in silent:
                 self._ask(one.delete if one.added else one.start)
             wait_until(lambda: all(came(one.name) for one in blocks), REPEAT)
@@ -192,7 +192,7 @@ class Link:
             block.add_variable(name, kind)
         missing = self._ask(lambda: self._crazyflie.log.add_config(block))
         if missing is not None:
-            raise LinkError(f"the firmware of the {self.name} lacks a log variable: {missing}")
+            raise LinkError(f"the firmware of the {self.name} lacks a log variable: {missing}; update it")
         return block
 
     def _ask(self, request: Callable[[], Any]) -> Any:
@@ -209,7 +209,8 @@ class Link:
                 refused.append(error.args[0] if error.args else type(error).__name__)
 
         if not bounded(ask, self._deadlines.request):
-            raise LinkError(f"the link to the {self.name} takes no packet within {self._deadlines.request:g} s")
+            text = f"the link to the {self.name} takes no packet within {self._deadlines.request:g} s"
+            raise LinkError(f"{text}; is it on and in reach?")
         return refused[0] if refused else None
 
     def ask_app(self, packet: Packet) -> Reply:
@@ -231,7 +232,7 @@ class Link:
                     return answers[0]
         finally:
             self._crazyflie.remove_port_callback(packet.port, answered)
-        raise LinkError(f"the app of the {self.name} does not answer")
+        raise LinkError(f"the app of the {self.name} does not answer; switch the drone off and on again")
 
     # In flight; these never block.
 

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import importlib.util
 import math
-import re
 import sys
 import time
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from pathlib import Path
 from mjxball import cli, terminal
 from mjxball.cli import run_command
 from mjxball.config import Config
+from mjxball.control.crazyflie import PairGains
 from mjxball.errors import InputError
 from mjxball.fly import app_flight, clock, limits
 from mjxball.fly.app import generate
@@ -35,19 +35,17 @@ from mjxball.fly.crazyswarm import CrazyswarmPair, read_pair
 from mjxball.fly.display import live_view
 from mjxball.fly.limits import FlightSettings, Limits
 from mjxball.fly.mocap import KINDS, MocapSettings, ready
+from mjxball.fly.parameters import check_parameters
 from mjxball.fly.preflight import Preflight, read_gains
 from mjxball.fly.rehearsal import Rehearsal
 from mjxball.fly.session import FlightSetup, fly
 from mjxball.fly.setpoints import CURVE_NAMES
 from mjxball.fly.telemetry import Rig
 from mjxball.fly.twin.conditions import FAULT_KINDS, add_twin_options, check_twin, given_twin_options, read_fault
+from mjxball.fly.uri import HERE, Udp, check_pair, parse_uri, share_dongle
 from mjxball.policy import Policy, policy_path
 from mjxball.policy.formats.c_header import weight_bytes
 
-URI = re.compile(r"(radio|usb)://\S+|udp://[\w.\-]+:(\d{1,5})")
-DONGLE = re.compile(r"radio://([^/]+)/")
-RADIO = re.compile(r"radio://([^/]+)/(\d{1,3})")
-APART = 2  # channels of 1 MHz that a link of 2 Mbit/s takes
 SLOW = ("slow", 1.0, clock.SLOWEST)
 # Numbers with least and most: of the battery, and of the rehearsal's link.
 LINK = (("battery", 2.5, 4.2), ("loss", 0.0, 1.0), ("delay", 0.0, 2.0), ("jitter", 0.0, 2.0))
@@ -182,29 +180,32 @@ def crazyflies(options: argparse.Namespace) -> CrazyswarmPair | None:
     return pair
 
 
+def parameters_of(options: argparse.Namespace, swarm: CrazyswarmPair | None) -> list[tuple[Path, PairGains]]:
+    """The files that firmware parameters come from, a later one's over an earlier one's. Raises InputError."""
+    found = [] if swarm is None else [(swarm.path, swarm.parameters)]
+    return found + ([(options.gains, read_gains(options.gains))] if options.gains else [])
+
+
 def default_rate(uris: Sequence[str | None]) -> float:
     """Poses a second to each drone: 100, and 50 where both share one dongle, which 400 packets a second would fill."""
-    dongles = [DONGLE.match(uri or "") for uri in uris]
-    shared = dongles[0] and dongles[1] and dongles[0][1] == dongles[1][1]
-    return 50.0 if shared else 100.0
+    links = [parse_uri(uri, f"--{name}") if uri else None for name, uri in zip(limits.NAMES, uris, strict=True)]
+    return 50.0 if share_dongle(links) else 100.0
 
 
 def check_options(options: argparse.Namespace) -> None:
     """Raise InputError for anything unsound."""
     if importlib.util.find_spec("cflib") is None:
         raise InputError("cflib is not installed; pip install 'mjxball[fly]'")
-    for flag in ("leader", "follower"):
+    links = []
+    for flag in limits.NAMES:
         uri = getattr(options, flag)
         if uri is None and not options.rehearse:
             raise InputError(f"--{flag} URI is needed, or --rehearse to fly the software twin")
-        match = URI.fullmatch(uri) if uri is not None else None
-        if uri is not None and (match is None or int(match[2] or 1) not in range(1, 65536)):
-            raise InputError(f"--{flag} {uri} is no URI such as radio://0/80/2M/E7E7E7E7E7 or udp://127.0.0.1:19850")
-        if uri is not None and options.rehearse and not uri.startswith("udp://127.0.0.1:"):
-            raise InputError(f"--{flag} {uri}: the twin of --rehearse answers at udp://127.0.0.1:PORT only")
-    if options.leader is not None and options.leader == options.follower:
-        raise InputError("--leader and --follower are the same drone")
-    check_radios(options.leader or "", options.follower or "")
+        links += [parse_uri(uri, f"--{flag}")] if uri is not None else []
+        if uri is not None and options.rehearse and not (isinstance(links[-1], Udp) and links[-1].host == HERE):
+            raise InputError(f"--{flag} {uri}: the twin of --rehearse answers at udp://{HERE}:PORT only")
+    if len(links) == 2:
+        check_pair(links[0], links[1])
     for name, low, high in (("seconds", 0.0, 3600.0), ("hover", 10001.0, 60000.0), ("mass", 1e-3, 10.0), SLOW, *LINK):
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
@@ -236,16 +237,6 @@ def check_log(log: Path, viewed: bool) -> None:
         raise InputError("a log in MCAP needs mcap-ros2-support; pip install 'mjxball[logs]'")
     if log.suffix == ".mcap" and viewed:
         raise InputError("--view follows a log of JSON lines: --log FILE.jsonl")
-
-
-def check_radios(leader: str, follower: str) -> None:
-    """Raise InputError if two radios would disturb each other: they send whenever they like."""
-    one, other = (RADIO.match(uri) for uri in (leader, follower))
-    if one and other and one[1] != other[1] and abs(int(one[2]) - int(other[2])) < APART:
-        raise InputError(
-            f"two radios on channels {one[2]} and {other[2]} disturb each other: leave {APART} MHz between them, or "
-            "use one radio for both"
-        )
 
 
 def check_twin_options(options: argparse.Namespace) -> None:
@@ -311,9 +302,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         policy = Policy(load_policy(options.policy), options.policy.stem)
         controller = Controller(policy)
         config = controller.config
-        more = read_gains(options.gains) if options.gains else ({}, {})
-        if swarm is not None:
-            more = {**swarm.parameters[0], **more[0]}, {**swarm.parameters[1], **more[1]}
+        choice = ThrustChoice(options.thrust, options.hover, options.curve, options.mass)
+        more: PairGains = ({}, {})
+        for path, given in parameters_of(options, swarm):
+            check_parameters(config, list(variants(config, choice)[0]), given, f"{path}")
+            more = {**more[0], **given[0]}, {**more[1], **given[1]}
         if options.twin_load is not None:
             check_loaded(config)
         rig = Rig.of_card(policy.card)
@@ -325,7 +318,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = FlightSettings(
             options.seconds, goal, options.dry_run, period, motor_of(config), stand, bounds, times_of(config)
         )
-        choice = ThrustChoice(options.thrust, options.hover, options.curve, options.mass)
         setup = FlightSetup(
             controller, variants(config, choice, more), choice.curve or "linear", rig, Preflight(drone=drone_of(config))
         )

@@ -35,6 +35,10 @@ class Repeats:
         self._changes = [0] * len(names)
         self._before, self._changed, self._interval = math.nan, math.nan, 0.0  # [s]
 
+    def stands(self, seconds: float) -> bool:
+        """True if no part of a live stream has changed for `seconds` by the newest packet."""
+        return self.live and self._before - max(self._since) >= seconds - 1e-6
+
     @property
     def live(self) -> bool:
         """True once the stream has changed often enough to be one."""
@@ -197,6 +201,10 @@ class DroneWatch:
         self._seen: Sample | None = None
         self._sensed = -math.inf  # [s] of the newest packet
         self._measured: Sequence[object] = ()  # pose in it
+
+    def stands(self, seconds: float) -> bool:
+        """True if states have kept coming for `seconds`, and neither estimate nor gyroscope has changed."""
+        return self._estimate.stands(seconds)
 
     def state(self, sample: Sample) -> str:
         """What stands still in the drone's states, empty if nothing."""

@@ -18,7 +18,7 @@ from mjxball.fly import packets
 from mjxball.fly.limits import NAMES, FlightSettings, Limits
 from mjxball.fly.measured import REPEATING, DroneWatch
 from mjxball.fly.packets import DroneState, Health
-from mjxball.fly.supervisor import AIRBORNE, GUIDED, ON_GROUND, Event, Fault, State
+from mjxball.fly.supervisor import AIRBORNE, ON_GROUND, Event, Fault, State
 from mjxball.fly.telemetry import DroneLink, ObjectState, Rig, Sample, object_of_one, object_state
 
 # From where on an estimator is not believed, and a drone counts as not hearing.
@@ -30,9 +30,9 @@ APART, DOUBT = 0.015, 4.0  # the same along any axis against its mean: [m], and 
 USUAL = 10.0  # [s] of that mean
 LIMITS = Limits()
 ECHO = 0.3  # [s] within which a thrust that was sent comes back as the one in force
-RECENT = 0.1  # [s] within which a thrust in force that stands still must have been sent
+RECENT = 0.1  # [s] in which what is sent must have moved, where a thrust in force that stands still tells something
 SAME = 1.5  # [thrust units] within which two thrusts are one, rounded
-CLOSED = (State.RAMP, *GUIDED)  # what is measured decides on the thrust; before, a pair at rest may be quiet
+FROZEN = 0.1  # [s] of states that come and do not change, from which on a drone that does not hear does nothing at all
 RISING = (State.RAMP, State.FLY)  # a drone that touches the ground feels more than its packets tell
 UNHEARD = 4  # health packets in a row without such an echo, or with one that stands still
 
@@ -110,8 +110,9 @@ class Monitor:
         if phase in AIRBORNE and all(fresh):
             faults += self.estimators.update(samples, [one and one.health for one in healths], now)
         if phase in AIRBORNE and not dry:  # a dry run is never echoed
-            for health, watch in zip(healths, self.uplinks, strict=True):
-                faults += watch.update(*health) if health is not None else []
+            for health, watch, drone in zip(healths, self.uplinks, self._drones, strict=True):
+                found = watch.update(*health) if health is not None else []
+                faults += [watch.frozen] if found and drone.stands(FROZEN) else found
         self.object = self.estimators.object(samples, fresh) or self.object
         bounds = self._held if phase is State.HOLD else self._settings.limits
         states = [sample.state for sample in samples]
@@ -138,7 +139,7 @@ class Monitor:
             if sensed is not None:
                 repeated, wrong = watch.sensed(sensed.sensed, clock.seconds(sensed.stamp))
                 still = still or repeated
-            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and phase in CLOSED else []
+            own = [Fault(Event.ESTIMATOR, f"{name}: {still}")] if still and phase in AIRBORNE else []
             own += [Fault(Event.FRAME, f"{name}: {wrong}")] if wrong and phase in RISING else []
             if self._settings.dry_run:  # carried by hand it shows its axes as well; at rest it may be quiet
                 own = [fault for fault in own if fault.event is Event.FRAME]
@@ -269,9 +270,9 @@ class EstimatorWatch:
 
 
 class UplinkWatch:
-    """Whether one drone acts on what it is sent: its thrust in force was sent a moment ago.
+    """Whether one drone acts on what it is sent: its thrust in force was sent a moment ago, and moves as that does.
 
-    One that stands still while other ones are sent tells a lost uplink 0.3 s before it is too old.
+    One that stands still tells a lost uplink before it is too old, even if its number happens to be sent again.
     """
 
     def __init__(self, name: str):
@@ -281,6 +282,13 @@ class UplinkWatch:
         self._checked, self._before = -math.inf, math.nan
         self.heard = -math.inf  # [s] when the last thrust that it acted on was sent
         self.hears = True  # by the newest health packet, beyond what chance may match
+
+    @property
+    def frozen(self) -> Fault:
+        """Of a drone that acts on nothing because it does nothing."""
+        return Fault(
+            Event.FROZEN, f"all numbers of the {self._name} stand still: its IMU is dead, or its control hangs"
+        )
 
     def sent(self, thrust: int, now: float) -> None:
         """`thrust` [units] goes out at `now` [s]."""
@@ -298,7 +306,7 @@ class UplinkWatch:
         recent = [thrust for time, thrust in self._sent if time >= arrival - RECENT]
         steady = not recent or max(recent) - min(recent) < SAME
         self.hears = bool(times) and (moved or steady)
-        if times and (moved or times[-1] >= arrival - RECENT):
+        if self.hears:
             self._missing, self.heard = 0, max(self.heard, times[-1])
             return []
         self._missing += 1

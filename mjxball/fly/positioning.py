@@ -140,7 +140,7 @@ def common(links: Sequence[DeckLink]) -> System:
     one, other = (found(link) for link in links)
     if one is not other:
         told = " and ".join(f"{system.name} ({link.name})" for system, link in zip((one, other), links, strict=True))
-        raise LinkError(f"both drones need one positioning system, not {told}")
+        raise LinkError(f"both drones need one positioning system, not {told}: fit one kind to both")
     return one
 
 

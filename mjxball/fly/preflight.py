@@ -119,7 +119,7 @@ def promised_curve(link: Link, own: Variants) -> CurveName:
         return known or first
     raise LinkError(
         f"the firmware {link.identity.version} of the {link.name} has the {known} force curve, "
-        f"and this flight has gains for the {first} one only"
+        f"and this flight has gains for the {first} one only: {OTHER}"
     )
 
 
@@ -130,12 +130,13 @@ def check_kind(link: Link, required: Preflight, measured: bool = False) -> None:
     """
     device, brushless = link.identity.device, "brushless" in link.identity.device.lower()
     if device.startswith("Crazyflie 2") and brushless != (required.drone == "brushless"):
-        raise LinkError(f"the {link.name} is a {device}, and the policy was trained for the {required.drone}")
+        trained = f"the policy was trained for the {required.drone}: fly one that was trained for it"
+        raise LinkError(f"the {link.name} is a {device}, and {trained}")
     if not measured and link.parameters.read(["stabilizer.estimator"])["stabilizer.estimator"] != KALMAN:
         system = positioning.found(link)
-        why = (
-            "it has found no positioning deck" if system is positioning.UNKNOWN else f"its {system.name} deck needs it"
-        )
+        why = "it has found no positioning deck: fit one, or forward poses with --mocap"
+        if system is not positioning.UNKNOWN:
+            why = f"its {system.name} deck needs it: write that parameter with cfclient and keep it"
         raise LinkError(
             f"the estimator of the {link.name} is not the Kalman filter (stabilizer.estimator is not {KALMAN}): {why}"
         )
@@ -193,18 +194,23 @@ def check(links: Sequence[Link], rig: Rig, bounds: Limits, required: Preflight) 
         refusal = down_reason(state.info, armed=False)
         can = _ready(state.info)
         tilt, yaw = tilt_angle(state.quaternion), yaw_of(state)
-        checks += [
-            Check(f"{link.name} states", rate >= required.rate, f"{rate:.0f} Hz, {required.rate:.0f} needed"),
-            Check(f"{link.name} state age", age <= bounds.state_age, f"{1000 * age:.0f} ms"),
-            Check(f"{link.name} battery", state.battery > bounds.battery, f"{state.battery:.2f} V"),
-            Check(f"{link.name} firmware", can and not refusal, refusal or ("can fly" if can else "cannot arm")),
-            Check(f"{link.name} level", tilt <= required.tilt, f"{math.degrees(tilt):.1f} degrees"),
-            Check(f"{link.name} heading", abs(yaw) <= required.yaw, f"{math.degrees(yaw):z.0f} degrees from +x"),
-        ]
+        fresh, alive = rate >= required.rate, refusal or ("can fly" if can else "cannot arm")
+        rows: tuple[tuple[str, bool, str, str], ...] = (
+            ("states", fresh, f"{rate:.0f} Hz, {required.rate:.0f} needed", BUSY),
+            ("state age", age <= bounds.state_age, f"{1000 * age:.0f} ms", BUSY),
+            ("battery", state.battery > bounds.battery, f"{state.battery:.2f} V", "charge it"),
+            ("firmware", can and not refusal, alive, "switch it off and on again, upright and at rest"),
+            ("level", tilt <= required.tilt, f"{math.degrees(tilt):.1f} degrees", "put the pair on level ground"),
+            ("heading", abs(yaw) <= required.yaw, f"{math.degrees(yaw):z.0f} degrees from +x", TURNED),
+        )
+        checks += [Check.judged(f"{link.name} {name}", good, text, remedy) for name, good, text, remedy in rows]
         checks += gravity_checks(link, state, required)
     return [*checks, heading_check(states, required), stick_check(states, rig, bounds, required)]
 
 
+OTHER = "leave --curve out, or take other firmware or another policy"
+BUSY = "take a free radio channel, come closer, end other programs"
+TURNED = "turn it, or its body in the cameras' program, to look along +x"
 YAW_COST = 6  # [mm] of hover error for each degree between both yaws: 29 mm for 5 on the real firmware
 
 
@@ -212,7 +218,8 @@ def heading_check(states: Sequence[DroneState], required: Preflight) -> Check:
     """Whether both drones, which one stick holds, measure one yaw; the difference is the frames' or the bodies'."""
     beside = math.degrees(math.remainder(yaw_of(states[0]) - yaw_of(states[1]), 2 * math.pi))
     text = f"leader {beside:+z.1f} degrees from the follower; each one costs {YAW_COST:g} mm of hover error"
-    return Check("headings", abs(beside) <= math.degrees(required.apart), text)
+    remedy = "turn both alike on the stick, or their bodies in the cameras' program"
+    return Check.judged("headings", abs(beside) <= math.degrees(required.apart), text, remedy)
 
 
 def gravity_checks(link: Link, state: DroneState, required: Preflight) -> list[Check]:
@@ -226,7 +233,8 @@ def gravity_checks(link: Link, state: DroneState, required: Preflight) -> list[C
     off = math.acos(min(max(up / max(size, 1e-9), -1.0), 1.0))
     good = off <= required.gravity and abs(size - GRAVITY) <= 0.1 * GRAVITY
     text = f"{size / GRAVITY:.2f} g, {math.degrees(off):.1f} degrees from the attitude's"
-    return [Check(f"{link.name} gravity", good, text)]
+    remedy = "keep it at rest; else switch it off and on again on level ground"
+    return [Check.judged(f"{link.name} gravity", good, text, remedy)]
 
 
 NOISY = 4.0  # standard deviations of a position that a check allows
@@ -242,7 +250,8 @@ def stick_check(states: Sequence[DroneState], rig: Rig, bounds: Limits, required
     placed = (
         not faults and beside <= bounds.stick_error and abs(length - known) <= required.length + NOISY * bounds.noise
     )
-    return Check("stick", placed, faults[0].detail if faults else text)
+    remedy = "are the URIs exchanged, is it the policy's stick, and have both drones one origin?"
+    return Check.judged("stick", placed, faults[0].detail if faults else text, remedy)
 
 
 COMPENSATES_SINCE = (2025, 12)  # version of the firmware, as delivered
@@ -306,7 +315,8 @@ class SpinCheck:
         for name, curve, variant in zip(NAMES, self.curves, self.chosen(), strict=True):
             if variant.map.hover_thrust > RESERVE * THRUST_CEILING:
                 units = f"{variant.map.hover_thrust:.0f} of {THRUST_CEILING} thrust units on the {curve} force curve"
-                heavy.append(Fault(Event.CURVE_UNKNOWN, f"the {name} would hover at {units}"))
+                text = f"the {name} would hover at {units}: make the rig lighter"
+                heavy.append(Fault(Event.CURVE_UNKNOWN, text))
         if heavy or any(link.busy for link in self._links):
             return heavy
         return [Fault(Event.CURVE_KNOWN, ", ".join(self.curves))]
@@ -331,7 +341,8 @@ class SpinCheck:
         self._decided[number] = True
         changed = curve != self.curves[number]
         if curve not in self._variants[number]:
-            self._unfit.append(f"the {NAMES[number]} has the {curve} force curve, which this flight has no gains for")
+            text = f"the {NAMES[number]} has the {curve} force curve, which this flight has no gains for"
+            self._unfit.append(f"{text}: {OTHER}")
         elif changed:
             self.curves[number] = curve
             self._links[number].write_later(self._variants[number][curve].gains)

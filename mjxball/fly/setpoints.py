@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -75,6 +75,11 @@ class CommandMap:
     def hover_thrust(self) -> float:
         """Thrust units at level hover."""
         return self.hover if self.law == "paper" else self.curve.thrust(self.carried_mass * self.gravity)
+
+    def scaled(self, share: float) -> CommandMap:
+        """The map of a drone that hovers at `share` of the force that this one takes it to need."""
+        hover, mass = share * self.hover, share * self.carried_mass
+        return replace(self, hover=hover, per_acceleration=share * self.per_acceleration, carried_mass=mass)
 
 
 class Variant(NamedTuple):

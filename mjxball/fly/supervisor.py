@@ -48,6 +48,7 @@ class Event(Enum):
     RESUMED = "fresh states of both drones have come back"
     LINK_LOST = "a link reported its end"
     UNHEARD = "a drone does not act on what it is sent"
+    FROZEN = "a drone's sensors and control stand still"
     BAD_STATE = "a state or a command is not finite"
     FENCE = "a drone left the geofence"
     TILT = "a drone tilts beyond the limit"
@@ -132,7 +133,7 @@ def _in_the_air() -> dict[tuple[State, Event], State]:
         table |= {(state, event): S.DESCEND for event in _CONTROLLED}
     for state in AIRBORNE:
         table |= {(state, event): S.STOP for event in (E.DRONE_DOWN, E.TILT, E.APP_STOPS)}
-        table |= {(state, event): S.HOLD for event in (E.STALE, E.LINK_LOST, E.UNHEARD)}
+        table |= {(state, event): S.HOLD for event in (E.STALE, E.LINK_LOST, E.UNHEARD, E.FROZEN)}
     table |= {(state, E.TIMEOUT): S.STOP for state in (S.DESCEND, S.HOLD)}
     table[S.DESCEND, E.BAD_STATE] = S.STOP
     return table

@@ -3,6 +3,10 @@
 Legs hide the load from the laws: a side that stands answers no command, and what a follower remembers of that is wrong
 in the air. With the load off the middle the light side comes up first. What the drones lift apart is therefore found
 here, while the thrust still rises, by the stick's own angle. Pure.
+
+What holds the stick level at the end of the ramp is what hovers, whether the load lies to one side or one drone's
+motors give less than the other's. The laws go on from there (`TakeOff.needed`): else the stick tips as soon as they
+take over, and slides until the drones' integrals have made up for it.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ CLIMB_INTEGRAL = 1.5  # likewise per m: a pair that stands gets 15 % of hover mo
 # delay the stick settles within half a second; twice these gains let it swing.
 LEVEL_GAIN, LEVEL_DAMPING, LEVEL_INTEGRAL = 2.5, 0.35, 15.0
 STUCK = "the pair is not seen to leave the ground"
+LOAD = 0.03  # share of hover that a load of 20 g, 2 cm beside the middle, has the drones lift apart
 APART = 0.15  # share of hover that the drones lift apart at most
 
 
@@ -73,6 +78,15 @@ class TakeOff:
         apart = _clip(self._apart + LEVEL_GAIN * off + LEVEL_DAMPING * turning, APART)
         both = min(self._share + CLIMB_GAIN * missing, MOST)
         return both - apart, both + apart
+
+    @property
+    def needed(self) -> tuple[float, float]:
+        """Force of leader and follower that keeps the stick level, as shares of what should hover.
+
+        Up to `LOAD` it may be the load's place, as the laws know it, and on a `stand` it is the ball's.
+        """
+        motors = abs(self._apart) > LOAD and not self._stand
+        return (1.0 - self._apart, 1.0 + self._apart) if motors else (1.0, 1.0)
 
     def stuck(self, maps: Sequence[CommandMap]) -> str:
         """What is seen of a pair that has not come off: which drone gives what, and at which bound."""

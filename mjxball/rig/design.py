@@ -10,6 +10,8 @@ from pathlib import Path
 
 from mjxball import cli, pictures
 from mjxball.config import Config, cg_limit, thrust_over_weight, total_mass
+from mjxball.control.margins import unstable_axes
+from mjxball.errors import InputError
 from mjxball.files import write_whole
 from mjxball.plant.trim import heaviest_object, largest_amplitude
 from mjxball.terminal import say
@@ -37,6 +39,11 @@ def _design(options: argparse.Namespace) -> int:
     if options.out:
         cli.output_file(options.out, ".svg")
     settings = cli.plant_setup(options.plant)
+    for name in unstable_axes(settings):
+        raise InputError(
+            f"{options.plant}: with its autopilot.{name} and {name}_rate the rig does not hold its {name}; "
+            "mjxball.rig.gains computes gains"
+        )
     held = balanced(settings)
     for line in report(settings, held):
         say(line)

@@ -13,11 +13,11 @@ import numpy as np
 
 from mjxball.config import Config
 from mjxball.control import crazyflie, mixer, motors
+from mjxball.control.axes import inertia_about_o
 from mjxball.control.crazyflie import PERIOD
 from mjxball.errors import InputError
 from mjxball.fly.card import motor_of
 from mjxball.plant import plant_parameters
-from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.log import Log
 
 Array = np.ndarray

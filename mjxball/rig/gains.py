@@ -10,9 +10,7 @@ from pathlib import Path
 
 from mjxball import cli, config
 from mjxball.control.crazyflie import gains_to_json, pair_gains
-from mjxball.errors import InputError
-from mjxball.files import write_whole
-from mjxball.rig.margins import (
+from mjxball.control.margins import (
     REQUIREMENTS,
     Design,
     Gains,
@@ -22,6 +20,8 @@ from mjxball.rig.margins import (
     design,
     nominal_and_worst,
 )
+from mjxball.errors import InputError
+from mjxball.files import write_whole
 
 PRESETS = ("flight", "stand")
 

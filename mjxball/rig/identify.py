@@ -15,6 +15,7 @@ import numpy as np
 
 from mjxball import cli, config
 from mjxball.control import crazyflie
+from mjxball.control.axes import inertia_about_o
 from mjxball.control.constants import hover
 from mjxball.control.crazyflie import PARAMETERS, THRUST_CEILING, PairGains, pair_gains
 from mjxball.errors import InputError
@@ -23,7 +24,6 @@ from mjxball.fly.card import with_curve
 from mjxball.fly.preflight import read_gains
 from mjxball.fly.recording import one_curve, own_curve
 from mjxball.fly.setpoints import CurveName
-from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify, pair_mass
 from mjxball.rig.log import Log, read_log
 from mjxball.terminal import warn

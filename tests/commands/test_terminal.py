@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 import subprocess
 import sys
@@ -198,3 +199,19 @@ def test_a_closed_stream_is_no_fault(monkeypatch: pytest.MonkeyPatch, capsys: py
     terminal.say("a sentence")
     monkeypatch.undo()
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_sentence_of_one_thread_is_not_cut_by_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`print` writes a text and its end apart: lines of two drones that connect were glued together."""
+    pieces: list[str] = []
+
+    class Shared(io.StringIO):
+        def write(self, text: str) -> int:
+            pieces.append(text)
+            return len(text)
+
+    monkeypatch.setattr(sys, "stdout", Shared())
+    monkeypatch.setattr(sys, "stderr", Shared())
+    terminal.say("leader: connecting")
+    terminal.warn("follower: connecting")
+    assert pieces == ["leader: connecting\n", "follower: connecting\n"]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 from fly_virtual import VirtualTwin
 from tables import rows
 
-from mjxball.fly.ending import Signals
+from mjxball.fly.ending import Signals, Touchdown
 from mjxball.fly.limits import FlightSettings
 from mjxball.fly.supervisor import Event, Fault, State
 
@@ -92,3 +95,20 @@ def test_a_link_that_fails_is_no_busy_computer() -> None:
     why = world.flight.how_it_ended()[0]
     assert "dongle unplugged" in why
     assert "busy" not in why
+
+
+def test_a_touchdown_that_is_not_known_is_not_told() -> None:
+    """(height [m], climb [m/s], doubt) every 10 ms: speeds of estimates that are no facts were told as such."""
+    up, fall = [(0.4, 0.0, "")], [(0.4 - 0.02 * n, -1.0, "") for n in range(1, 21)]
+    for way, told in (
+        ([*up, *fall], 1.0),
+        ([(0.0, 0.0, "it stands on its head"), *up, *fall], 1.0),  # it was on the ground
+        ([*up, *fall, (0.0, -3.0, "it turned over")], 1.0),  # it was down
+        ([*up, (0.3, -1.0, "it turned over"), *fall], math.nan),
+        ([*up, (0.3, -4.0, ""), *fall], math.nan),  # 2.8 m/s is a fall from there
+    ):
+        touchdown = Touchdown(0.05)
+        for number, (height, climb, doubt) in enumerate(way):
+            touchdown.update(np.array([0.0, 0.0, height]), climb, 0.01 * number, doubt)
+        assert touchdown.speed == pytest.approx(told, nan_ok=True)
+        assert ("m/s" in str(touchdown)) == math.isfinite(told)

@@ -68,6 +68,53 @@ def test_both_stand_before_the_firmware_cuts_a_drone_that_hears_nothing(drone: i
     assert max(moment.tilt for moment in track) < math.radians(10)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0, 1])
+def test_uplinks_lost_one_soon_after_the_other_leave_the_stick_level(first: int) -> None:
+    """0.3 s apart: the first loss was noticed after the second, both hovered, and 0.3 s between the firmwares' cuts
+    turned the stick over. Noticed before, the second keeps a thrust by which both are down first.
+    """
+    world = hovering()
+    world.drones[first].inject(FAULT_KINDS["silent-up"])
+    world.fly_for(0.3)
+    track = after(world, "silent-up", 1 - first)
+    assert max(moment.tilt for moment in track) < math.radians(30)
+    assert world.touchdown_speed() < 0.8
+
+
+@pytest.mark.slow
+def test_poses_that_freeze_one_after_the_other_leave_no_thrust_on_the_ground() -> None:
+    """The second one was not watched in a descent: it went on by an estimate that stood still, 0.81 m/s at the ground,
+    and motors at 0.9 of hover for 3 s on it.
+    """
+    world = hovering()
+    began = world.now
+    world.drones[0].inject(FAULT_KINDS["pose-frozen"])
+    world.fly_for(0.03)
+    track = after(world, "pose-frozen", 1)
+    assert world.touchdown_speed() < 0.7
+    assert cut(track).time - began < 2.5
+    assert "no estimator is believed" in world.flight.how_it_ended()[-1]
+
+
+def test_a_descent_takes_no_longer_than_its_height_asks() -> None:
+    """4 s were left for it, whatever the height: motors that nothing tells of the ground pull that long."""
+    for height, seconds in ((0.0, 1.0), (0.4, 2.5), (1.5, 6.6)):
+        assert FlightSettings().times.descent_limit(height) == pytest.approx(seconds, abs=0.05)
+
+
+def test_a_dead_imu_is_told_as_one() -> None:
+    """It was "unheard": the log goes on with fresh stamps, and nothing in it moves."""
+    world = hovering()
+    after(world, "imu", 0)
+    cause = world.flight.supervisor.cause
+    assert cause.event is Event.FROZEN
+    assert "leader" in cause.detail
+    told = world.flight.how_it_ended()
+    assert "turned over" in told[-1]
+    assert "m/s" not in told[-1]
+
+
 def test_an_uplink_that_comes_back_is_flown_through() -> None:
     world = StandInTwin(FlightSettings(seconds=6.0))
     world.fly_until(State.FLY)

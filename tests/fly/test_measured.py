@@ -272,7 +272,7 @@ def test_a_state_that_stands_still_ends_the_flight() -> None:
     world.fault_drone(0, frozen=True)
     after, _, event, _ = ended(world, 1.0)
     assert after <= 0.6
-    assert event in ("ESTIMATOR", "UNHEARD")
+    assert event in ("ESTIMATOR", "FROZEN")
 
 
 def test_an_estimate_or_a_gyroscope_that_repeats_itself_is_found_within_half_a_second() -> None:

@@ -140,6 +140,21 @@ def test_a_drone_without_an_app_is_refused_before_anything_is_written() -> None:
     assert drone.events == ["open"]
 
 
+def test_what_is_refused_says_what_to_do() -> None:
+    """ "The estimator is not the Kalman filter" was all that was said; a check that failed told what it found."""
+    with pytest.raises(LinkError, match="--mocap"):
+        check_kind(Drone(estimator=COMPLEMENTARY), ASKED)
+    with pytest.raises(LinkError, match=r"version|--curve"):
+        prepare([Drone()], [{"older": OWN["linear"]}], ASKED, print)
+    bad = [standing(0, 1.2, yaw=-12.0), standing(1, 1.2)]
+    sensed = SensedSample(Sensed((0.0, 0.0, 6.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), 0)
+    link = SimpleNamespace(name="leader", telemetry=SimpleNamespace(sensed=sensed))
+    found = [stick_check(bad, RIG, Limits(), Preflight()), heading_check(bad, Preflight())]
+    for one in [*found, *gravity_checks(link, bad[0], Preflight())]:
+        assert not one.passed
+        assert ": " in one.found, one  # what to do
+
+
 def test_gains_for_another_firmware_are_refused() -> None:
     with pytest.raises(LinkError, match="has the linear force curve"):
         prepare([Drone()], [{"older": OWN["linear"]}], ASKED, print)

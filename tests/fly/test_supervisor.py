@@ -42,7 +42,7 @@ def test_every_pair(state: State, event: Event) -> None:
         assert reached is State.KILL
     if event in (Event.DRONE_DOWN, Event.TILT) and state in (*AIRBORNE, *ON_GROUND):
         assert reached is State.STOP  # a drone that is down must not be lifted by the other
-    if event in (Event.STALE, Event.LINK_LOST, Event.UNHEARD) and state in AIRBORNE:
+    if event in (Event.STALE, Event.LINK_LOST, Event.UNHEARD, Event.FROZEN) and state in AIRBORNE:
         assert reached is State.HOLD
 
 

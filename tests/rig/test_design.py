@@ -46,6 +46,27 @@ def test_the_heaviest_object_is_the_last_that_keeps_the_margin() -> None:
             assert (margin >= settings.scenario.trim_margin) == keeps
 
 
+def test_a_rig_whose_loops_do_not_close_cannot_fly(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """ "The rig can fly" was said of each."""
+    for number, (base, flaw) in enumerate(
+        (
+            ("pair", "attitude.damping = 70"),
+            ("pair", "leader.kp = [0, 0, 0]\nleader.kd = [0, 0, 0]"),
+            ("pair", "leader.kd = [0, 0, 0]"),
+            ("pair", "leader.ki = [9, 9, 9]"),
+            ("crazyflie", "autopilot.roll = [0, 0, 0]"),
+            ("crazyflie", "autopilot.roll_rate = [0, 0, 0]"),
+            ("crazyflie", "autopilot.pitch_rate = [2500, 0, 0]"),
+        )
+    ):
+        rig = tmp_path / f"{number}.toml"
+        rig.write_text(f'base = "{base}"\n{flaw}')
+        assert design.main(["--plant", str(rig)]) == 2, flaw
+        assert "can fly" not in capsys.readouterr().out
+    for name in ("pair", "crazyflie", "stand", "team4"):
+        assert design.main(["--plant", name]) == 0, name
+
+
 def test_a_rig_that_does_not_balance_its_own_object_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A follower that is too weak to lift its share beside a strong leader."""
     rig = tmp_path / "rig.toml"

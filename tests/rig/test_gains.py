@@ -13,11 +13,8 @@ from attitude_trials import Trial, pair, simulate
 
 from mjxball.cli import read_plant
 from mjxball.config import Autopilot, apply_overrides, preset, with_plant
-from mjxball.errors import InputError
-from mjxball.fly.preflight import read_gains
-from mjxball.rig import gains as command
-from mjxball.rig.attitude import axes
-from mjxball.rig.margins import (
+from mjxball.control.axes import axes
+from mjxball.control.margins import (
     REQUIREMENTS,
     Gains,
     delivered_gains,
@@ -27,6 +24,9 @@ from mjxball.rig.margins import (
     margins,
     worst_margins,
 )
+from mjxball.errors import InputError
+from mjxball.fly.preflight import read_gains
+from mjxball.rig import gains as command
 
 PAIR = preset("flight")
 ROLL, PITCH, YAW = axes(PAIR)
@@ -63,7 +63,10 @@ class TestAxes:
 class TestMargins:
     def test_closed_form(self) -> None:
         """Rate P on gain / s (lag s + 1): crossover, phase and delay margin by hand; no gain makes it unstable."""
-        found = margins(Gains((0, 0, 0), (10.0, 0, 0)), 2.0, 0.05, 0.0)
+        rate = (10.0, 0, 0)
+        assert not is_stable(Gains((0, 0, 0), rate), 2.0, 0.05, 0.0)  # nothing holds the angle
+        assert not is_stable(Gains((0, 0, 0), (0, 0, 0)), 2.0, 0.05, 0.0)
+        found = margins(Gains((1e-3, 0, 0), rate), 2.0, 0.05, 0.0)
         # |20 / (w (0.05 j w + 1))| = 1 at w^2 = (sqrt(1 + 4 0.05^2 20^2) - 1) / (2 0.05^2)
         crossover = math.sqrt((math.sqrt(1 + 4 * 0.0025 * 400) - 1) / 0.005)
         phase = 90 - math.degrees(math.atan(0.05 * crossover))

@@ -16,6 +16,7 @@ from fly_virtual import VirtualTwin, log_header
 from mjxball import cli
 from mjxball import config as configs
 from mjxball.config import Config
+from mjxball.control.axes import inertia_about_o
 from mjxball.fly import card
 from mjxball.fly.flight_log import Journal, read
 from mjxball.fly.limits import NAMES, FlightSettings
@@ -28,7 +29,6 @@ from mjxball.fly.twin.virtual import STEP
 from mjxball.policy import load_file
 from mjxball.policy.file import shipped_policy
 from mjxball.rig import identify as command
-from mjxball.rig.attitude import inertia_about_o
 from mjxball.rig.fit import Estimate, identify
 from mjxball.rig.log import Log, read_log
 

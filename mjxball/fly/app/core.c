@@ -36,6 +36,8 @@
 #define LEVEL_DAMPING 0.35f
 #define LEVEL_INTEGRAL 15.0f
 #define APART 0.15f
+#define LOAD 0.03f
+#define SIDE (MJXBALL_FOLLOWER ? 1.0f : -1.0f) /* sign of `apart` in this drone's lift */
 
 const char *mjxball_text(int cause) {
     return cause >= 0 && cause < MJXBALL_CAUSES ? mjxball_texts[cause] : "unknown";
@@ -60,9 +62,9 @@ static float thrust_of_force(const mjxball_map *map, float force) {
     return 65535 * (a > 0 ? (root(b * b + 4 * a * each) - b) / (2 * a) : each / b);
 }
 
-static float hover_of(const mjxball_map *map) {
-    float weight = mjxball_rig.carried[MJXBALL_FOLLOWER] * (float)MJXBALL_GRAVITY;
-    return mjxball_rig.paper ? map->hover : thrust_of_force(map, weight);
+static float hover_of(const mjxball_app *app, const mjxball_map *map) {
+    float weight = app->needed * mjxball_rig.carried[MJXBALL_FOLLOWER] * (float)MJXBALL_GRAVITY;
+    return mjxball_rig.paper ? app->needed * map->hover : thrust_of_force(map, weight);
 }
 
 static void send_level(mjxball_setpoint *out, float roll, float pitch, float thrust) {
@@ -75,9 +77,9 @@ static void send_level(mjxball_setpoint *out, float roll, float pitch, float thr
 /* True if the thrust was cut. */
 static bool send_command(const mjxball_app *app, const mjxball_map *map, mjxball_setpoint *out) {
     float roll = clip(app->command[0], -SENT_TILT, SENT_TILT), pitch = clip(app->command[1], -SENT_TILT, SENT_TILT);
-    float up = app->command[2], thrust = map->hover + map->per_acceleration * up;
+    float up = app->command[2], thrust = app->needed * (map->hover + map->per_acceleration * up);
     if (!mjxball_rig.paper) {
-        float force = mjxball_rig.carried[MJXBALL_FOLLOWER] * ((float)MJXBALL_GRAVITY + up);
+        float force = app->needed * mjxball_rig.carried[MJXBALL_FOLLOWER] * ((float)MJXBALL_GRAVITY + up);
         thrust = thrust_of_force(map, force / (cosine(roll) * cosine(pitch)));
     }
     send_level(out, roll, pitch, thrust);
@@ -111,7 +113,10 @@ static void enter(mjxball_app *app, uint8_t phase, uint8_t cause, const mjxball_
     app->phase = phase;
     app->cause = cause;
     app->since = app->now;
-    if (phase <= MJXBALL_FLY) app->trim = hover_of(map);
+    if (phase == MJXBALL_SPIN) app->needed = 1;
+    if (phase == MJXBALL_FLY && !mjxball_rig.stand && (app->apart > LOAD || app->apart < -LOAD))
+        app->needed = 1 + SIDE * app->apart;
+    if (phase <= MJXBALL_FLY) app->trim = hover_of(app, map);
     if (phase == MJXBALL_SPIN) {
         for (int i = 0; i < 3; i++) app->origin[i] = app->position[i];
         app->copying = 0;
@@ -230,7 +235,7 @@ static void brake(const float *velocity, float *tilt) {
 
 /* Thrust rises until the pair is off the ground; the stick is held level, by what each drone sees for itself. */
 static void take_off(mjxball_app *app, const seen *one, const mjxball_map *map, mjxball_setpoint *out) {
-    const float period = (float)mjxball_rig.period / 1000, hover = hover_of(map), side = MJXBALL_FOLLOWER ? 1 : -1;
+    const float period = (float)mjxball_rig.period / 1000, hover = hover_of(app, map);
     const float ramped = clip((float)(app->now - app->since) / (float)RAMP_TIME, 0, 1);
     float along[3] = {0, 0, 0}, turning[3], moving[3], tilt[2], length = 0, sine, angle, missing, off, apart;
     for (int i = 0; i < 2; i++) {
@@ -258,7 +263,7 @@ static void take_off(mjxball_app *app, const seen *one, const mjxball_map *map, 
     app->apart = clip(app->apart + LEVEL_INTEGRAL * period * off, -APART, APART);
     apart = clip(app->apart + LEVEL_GAIN * off + LEVEL_DAMPING * moving[2], -APART, APART);
     send_level(out, tilt[0], tilt[1],
-        hover * (clip(app->share + CLIMB_GAIN * missing, 0, MOST_LIFT) + side * apart));
+        hover * (clip(app->share + CLIMB_GAIN * missing, 0, MOST_LIFT) + SIDE * apart));
 }
 
 /* Brake sideways and sink, by what is measured here and by the other drone; else by a model of the fall. */
@@ -288,14 +293,14 @@ static void distrust(mjxball_app *app, const mjxball_map *map, mjxball_setpoint 
     app->peer_time = 0; /* until it is heard again */
     for (int i = 0; i < 7; i++) app->integral[i] = 0; /* the other drone hears numbers only */
     if (!within(app->velocity, 3, MOST_SPEED)) app->velocity[0] = app->velocity[1] = app->velocity[2] = 0;
-    app->trim = hover_of(map);
+    app->trim = hover_of(app, map);
     if (!within(&app->climb, 1, MOST_SPEED)) app->climb = 0;
     if (!within(&app->height, 1, MOST_PLACE)) app->height = mjxball_rig.fence_high[2];
     descend(app, false, out);
 }
 
 static void fly(mjxball_app *app, const seen *one, const mjxball_map *map, mjxball_setpoint *out) {
-    const float period = (float)mjxball_rig.period / 1000, hover = hover_of(map);
+    const float period = (float)mjxball_rig.period / 1000, hover = hover_of(app, map);
     float goal[3];
     for (int i = 0; i < 3; i++) goal[i] = app->origin[i] + app->set.goal[i];
     if (mjxball_rig.stand) goal[0] = goal[1] = 0;

@@ -135,6 +135,7 @@ typedef struct {
     float trim;       /* thrust that hovers [thrust units] */
     float climb, height; /* of a descent that is flown blind */
     float share, apart, resting; /* of the take-off: lift of both, their difference [shares of hover], the stick's angle [rad] */
+    float needed; /* force by which this drone hovers with the stick level, of what the card says, as the take-off found it */
     uint32_t low_since; /* it has not sunk since then by more than RESTING from `low` [m] */
     float low;
     float action[3], command[3];

@@ -77,6 +77,17 @@ def test_a_ball_at_either_end_is_lifted_and_kept(ball: float):
 
 
 @needs_gcc
+@pytest.mark.slow
+def test_motors_that_give_less_on_one_side_do_not_push_it_away():
+    """As on the laptop: 175 mm sideways where the law began with equal thrusts."""
+    twin = world(seconds=3.0, gains=(0.92, 1.08))
+    twin.fly_until(Laptop.FLY)
+    twin.fly_for(2.5)
+    gone = np.array([moment.position for moment in twin.track])
+    assert np.hypot(gone[:, 0], gone[:, 1]).max() < 0.06
+
+
+@needs_gcc
 def test_a_low_battery_lands_both():
     """One drone finds its battery low for 5 s, without the laptop's knowledge; a moment does not count."""
     twin = world(seconds=30.0)

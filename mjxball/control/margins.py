@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mjxball.config import Autopilot, Config
+from mjxball.control.axes import Axis, axes
 from mjxball.control.crazyflie import RATE_LIMITS
-from mjxball.rig.attitude import Axis, axes
 
 Array = np.ndarray
 FREQUENCIES = np.geomspace(0.02, 400.0, 1200)  # [rad/s]
@@ -54,15 +54,25 @@ def closed_poles(gains: Gains, gain: float, lag: float, delay: float) -> Array:
     bottom = poly.polymul([0, 0, 0, 0, 1], [1, lag])
     pade = np.array([120, 60 * delay, 12 * delay**2, delay**3])
     top = poly.polymul(gain * number, pade * [1, -1, 1, -1])
-    whole: Array = np.trim_zeros(
-        poly.polyadd(top, poly.polymul(bottom, pade))
-    )  # without the integrators that are not there
+    # Without the integrators that are not there; those of angle and rate stay, also where nothing feeds them back.
+    absent = (ai == 0) + (ri == 0)
+    whole: Array = np.trim_zeros(poly.polyadd(top, poly.polymul(bottom, pade))[absent:], "b")
     return poly.polyroots(whole)
 
 
 def is_stable(gains: Gains, gain: float, lag: float, delay: float) -> bool:
     """Whether all poles of the closed loop lie left."""
     return bool((closed_poles(gains, gain, lag, delay).real < 0).all())
+
+
+def unstable_axes(config: Config) -> list[str]:
+    """Axes about which the gains of a pair of Crazyflies do not hold it, at the nominal delay; none for others."""
+    if config.autopilot.kind != "crazyflie" or config.plant.count != 2:
+        return []
+    lag, delay = config.plant.rotor_lag, REQUIREMENTS.delay
+    return [
+        axis.name for axis in axes(config) if not is_stable(gains_of(config.autopilot, axis), axis.gain, lag, delay)
+    ]
 
 
 def margins(gains: Gains, gain: float, lag: float, delay: float) -> Margins:
