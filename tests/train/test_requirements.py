@@ -26,7 +26,7 @@ from mjxball.xla import explained
 
 PHYSICS = ["--physics", "newton-euler"]
 TOO_MUCH: list[tuple[list[Any], str]] = [
-    (["--algorithm", "gradient", "--gradient.num_envs", 10**11], "at least .* GB|environment steps"),
+    (["--algorithm", "gradient", "--gradient.num_envs", 10**11], "at least .* GB|environment steps|must be between"),
     (["--algorithm", "gradient", "--gradient.num_envs", 10**6, "--gradient.gradient_steps", 1], "GB are free"),
     (["--algorithm", "ppo", "--ppo.num_envs", 10**11, "--ppo.minibatches", 8], "at least"),
     (["--sac.policy_layers", 10**11], "GB are free"),
