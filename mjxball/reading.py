@@ -11,7 +11,7 @@ import math
 import statistics
 import tomllib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 LONGEST_NAME = 60  # characters of a key that a sentence shows
 GAP = 5.0  # steps from which on a recording has a hole
@@ -40,7 +40,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     return values
 
 
-def is_number(value: Any, most: float = LARGEST) -> bool:
+def is_number(value: Any, most: float = LARGEST) -> TypeGuard[float]:
     """Whether `value` is a number that can be computed with: no truth value, 0 or from `SMALLEST` to `most` in size."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return False
